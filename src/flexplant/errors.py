@@ -1,0 +1,74 @@
+"""Everything that flexplant raises or warns with.
+
+::
+
+    FlexplantError
+    ├── LabelError       (ValueError)    a name or a point that the model does not know
+    ├── ShapeError       (ValueError)    arrays whose sizes do not belong together
+    ├── ModelError       (ValueError)    a model that is not physical, or not what is needed here
+    ├── AssumptionError  (ValueError)    a standard assumption of the asked design does not hold
+    ├── InfeasibleError  (RuntimeError)  no solution of the asked quality exists
+    ├── SolverError      (RuntimeError)  a numerical method did not reach its own tolerance
+    └── CertificateError (RuntimeError)  an answer failed the check by another route
+    FlexplantWarning     (UserWarning)
+
+Every message says what is wrong, what was got, why it matters and what to do next.
+"""
+
+from collections.abc import Iterable
+from difflib import get_close_matches
+
+
+class FlexplantError(Exception):
+    """Base of all errors of this package."""
+
+
+class LabelError(FlexplantError, ValueError):
+    """A name or a point is unknown, doubled or not allowed."""
+
+
+class ShapeError(FlexplantError, ValueError):
+    """The sizes of the arrays do not belong together."""
+
+
+class ModelError(FlexplantError, ValueError):
+    """The model is not physical (say, an indefinite M) or not fit for the asked operation."""
+
+
+class AssumptionError(FlexplantError, ValueError):
+    """A standard assumption of the asked design does not hold."""
+
+
+class InfeasibleError(FlexplantError, RuntimeError):
+    """No solution of the asked quality exists."""
+
+
+class SolverError(FlexplantError, RuntimeError):
+    """A numerical method did not reach its own tolerance."""
+
+
+class CertificateError(FlexplantError, RuntimeError):
+    """A computed answer failed its check by another route."""
+
+
+class FlexplantWarning(UserWarning):
+    """Something the caller should know, although an answer is given."""
+
+
+def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = "") -> LabelError:
+    """Return the LabelError for an unknown `name`, with the closest known ones.
+
+    Examples
+    --------
+    >>> print(unknown_label("DOF", "41:zz", ["41:z", "4:z"]))
+    no DOF '41:zz' (2 known). Close matches: '41:z', '4:z'.
+    """
+    known = list(known)
+    close = get_close_matches(str(name), known, n=3, cutoff=0.5)
+    shown = close or known[:6]
+    listed = ", ".join(repr(label) for label in shown) + (
+        ", ..." if not close and len(known) > len(shown) else ""
+    )
+    lead = "Close matches" if close else "Known are"
+    where = f" in {owner}" if owner else ""
+    return LabelError(f"no {kind} {name!r}{where} ({len(known)} known). {lead}: {listed}.")

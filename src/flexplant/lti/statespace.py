@@ -1,0 +1,286 @@
+"""The one LTI type: labelled, frozen, and aware of the blocks that a structure gives its A."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError, ShapeError, unknown_label
+from ..values import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    positive,
+    real_array,
+    signal_names,
+)
+
+if TYPE_CHECKING:
+    import control
+
+#: what functions of systems accept: ours, or a labelled one of python-control
+System: TypeAlias = "StateSpace | control.StateSpace"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StateSpace(Value):
+    """A linear time-invariant system with named channels.
+
+    ``dx/dt = A x + B u, y = C x + D u`` (dt = 0), or ``x[k+1] = A x[k] + B u[k]`` with
+    sampling time dt > 0.
+
+    Parameters
+    ----------
+    A, B, C, D : (n, n), (n, m), (p, n), (p, m) arrays
+        Real and finite. n = 0 is a static gain.
+    dt : float [s]
+        Sampling time; 0 for continuous time.
+    inputs, outputs, states : sequences of str, optional
+        Unique names; `u1`..., `y1`..., `x1`... when not given.
+    name : str, optional
+        For display.
+    blocks : sequence of int, optional
+        Sizes of the diagonal blocks of A where A is block upper triangular: a structure's modes
+        give 2 x 2 blocks. Poles, frequency responses and discretisation then cost O(n).
+
+    Raises
+    ------
+    ShapeError, ModelError, LabelError
+        When sizes do not match, entries are not finite, names are doubled or `blocks` do not
+        describe A.
+
+    Examples
+    --------
+    >>> g = StateSpace([[0, 1], [-4, -0.1]], [[0], [1]], [[1, 0]], [[0]], inputs=["f"])
+    >>> g
+    <StateSpace: 2 states, continuous, f -> y1>
+    >>> bool(g.is_stable)
+    True
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    dt: float = 0.0
+    inputs: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+    states: Sequence[str] = ()
+    name: str | None = None
+    blocks: Sequence[int] | None = None
+
+    def __post_init__(self) -> None:
+        D = real_array(self.D, "D", (None, None))
+        p, m = D.shape
+        A = real_array(self.A, "A", (None, None)) if np.size(self.A) else np.zeros((0, 0))
+        n = A.shape[0]
+        A = real_array(A, "A", (n, n))
+        B = real_array(self.B, "B", (n, m)) if n else np.zeros((0, m))
+        C = real_array(self.C, "C", (p, n)) if n else np.zeros((p, 0))
+        self._set(
+            A=A,
+            B=B,
+            C=C,
+            D=D,
+            dt=positive(self.dt, "dt", zero=True),
+            inputs=signal_names(self.inputs, m, "u", "inputs"),
+            outputs=signal_names(self.outputs, p, "y", "outputs"),
+            states=signal_names(self.states, n, "x", "states"),
+            blocks=None if self.blocks is None else _checked_blocks(A, self.blocks),
+        )
+
+    def __repr__(self) -> str:
+        kind = "continuous" if not self.dt else f"dt {self.dt:g} s"
+        named = f" {self.name!r}" if self.name else ""
+        sides = f"{_listed(self.inputs)} -> {_listed(self.outputs)}"
+        return f"<StateSpace{named}: {self.n_states} states, {kind}, {sides}>"
+
+    @property
+    def n_states(self) -> int:
+        """Number of states."""
+        return int(self.A.shape[0])
+
+    @cached_property
+    def _poles(self) -> ComplexArray:
+        if self.blocks is None:
+            return np.asarray(la.eigvals(self.A), dtype=np.complex128)
+        return block_eigenvalues(self.A, self.blocks)
+
+    def poles(self) -> ComplexArray:
+        """Return the eigenvalues of A, block by block where its blocks are known [rad/s or 1]."""
+        return self._poles.copy()
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all poles lie strictly inside the stability region."""
+        if not self.n_states:
+            return True
+        poles = self._poles
+        return bool(np.max(np.abs(poles)) < 1 if self.dt else np.max(poles.real) < 0)
+
+    def input_index(self, names: Iterable[str]) -> IntArray:
+        """Return the columns of the named inputs."""
+        return _rows(self.inputs, names, "input", self.name)
+
+    def output_index(self, names: Iterable[str]) -> IntArray:
+        """Return the rows of the named outputs."""
+        return _rows(self.outputs, names, "output", self.name)
+
+    def select(
+        self, outputs: Iterable[str] | None = None, inputs: Iterable[str] | None = None
+    ) -> StateSpace:
+        """Return the system between some channels, in the order given; all states are kept.
+
+        Raises
+        ------
+        LabelError
+            When a name is unknown.
+        """
+        rows = self.output_index(self.outputs if outputs is None else outputs)
+        cols = self.input_index(self.inputs if inputs is None else inputs)
+        return self.replace(
+            B=self.B[:, cols],
+            C=self.C[rows],
+            D=self.D[np.ix_(rows, cols)],
+            inputs=[self.inputs[i] for i in cols],
+            outputs=[self.outputs[i] for i in rows],
+        )
+
+    def __getitem__(self, key: tuple[str | Sequence[str], str | Sequence[str]]) -> StateSpace:
+        """Return the channel `sys["output", "input"]`; lists of names select several."""
+        outputs, inputs = key
+        return self.select(
+            [outputs] if isinstance(outputs, str) else outputs,
+            [inputs] if isinstance(inputs, str) else inputs,
+        )
+
+    def renamed(
+        self, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None
+    ) -> StateSpace:
+        """Return the system with some channels renamed, as {old: new}."""
+        self.input_index(inputs or ())
+        self.output_index(outputs or ())
+        return self.replace(
+            inputs=[(inputs or {}).get(name, name) for name in self.inputs],
+            outputs=[(outputs or {}).get(name, name) for name in self.outputs],
+        )
+
+    def evaluated(self, s: complex) -> ComplexArray:
+        """Return the gain ``C (s I - A)^-1 B + D`` at one complex frequency s (z when sampled)."""
+        shifted = s * np.eye(self.n_states) - self.A
+        return np.asarray(self.C @ np.linalg.solve(shifted, self.B) + self.D, dtype=np.complex128)
+
+    def to_control(self) -> control.StateSpace:
+        """Return the system as a `control.StateSpace` with the same names."""
+        import control
+
+        return control.StateSpace(
+            self.A,
+            self.B,
+            self.C,
+            self.D,
+            self.dt,
+            inputs=list(self.inputs),
+            outputs=list(self.outputs),
+            states=list(self.states),
+            name=self.name,
+            remove_useless_states=False,
+        )
+
+    @classmethod
+    def from_control(cls, sys: Any) -> StateSpace:
+        """Return a `control.StateSpace` as ours, names kept.
+
+        Raises
+        ------
+        ModelError
+            When it is not a state-space system, or its sampling time is not stated.
+        """
+        if not all(hasattr(sys, part) for part in ("A", "B", "C", "D", "dt", "input_labels")):
+            raise ModelError(
+                f"need a flexplant or python-control StateSpace, got {type(sys).__name__}. "
+                "Convert it first: control.ss(...)."
+            )
+        if sys.dt is None or sys.dt is True:
+            raise ModelError(
+                f"the sampling time of {sys.name!r} is {sys.dt}: state it in seconds (0 for "
+                "continuous time), frequencies depend on it."
+            )
+        return cls(
+            sys.A,
+            sys.B,
+            sys.C,
+            sys.D,
+            float(sys.dt),
+            inputs=sys.input_labels,
+            outputs=sys.output_labels,
+            states=sys.state_labels,
+            name=sys.name,
+        )
+
+
+def as_statespace(sys: System | FloatArray) -> StateSpace:
+    """Return `sys` as our StateSpace; arrays are static gains.
+
+    Raises
+    ------
+    ModelError
+        When it is neither a system nor a (p, m) array.
+    """
+    if isinstance(sys, StateSpace):
+        return sys
+    if isinstance(sys, np.ndarray | list | tuple | float | int):
+        gain = np.atleast_2d(real_array(sys, "a static gain"))
+        return StateSpace(
+            np.zeros((0, 0)), np.zeros((0, gain.shape[1])), np.zeros((gain.shape[0], 0)), gain
+        )
+    return StateSpace.from_control(sys)
+
+
+def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
+    """Return the eigenvalues of a block upper triangular A; 1 x 1 and 2 x 2 in closed form."""
+    starts = np.concatenate([[0], np.cumsum(blocks)[:-1]]).astype(int)
+    poles = np.zeros(A.shape[0], dtype=np.complex128)
+    sizes = np.asarray(blocks)
+    ones, twos = starts[sizes == 1], starts[sizes == 2]
+    poles[ones] = A[ones, ones]
+    a, b, c, d = (A[twos + i, twos + j] for i in (0, 1) for j in (0, 1))
+    # (a-d)^2/4 + b c rather than mean^2 - det: no cancellation for rigid-body pairs (b or c = 0)
+    root = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
+    poles[twos], poles[twos + 1] = 0.5 * (a + d) + root, 0.5 * (a + d) - root
+    for start, size in zip(starts[sizes > 2], sizes[sizes > 2], strict=True):
+        part = slice(start, start + size)
+        poles[part] = la.eigvals(A[part, part])
+    return poles
+
+
+def _checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
+    sizes = tuple(int(size) for size in blocks)
+    if any(size < 1 for size in sizes) or sum(sizes) != A.shape[0]:
+        raise ShapeError(f"blocks must be positive and add up to {A.shape[0]} states, got {sizes}.")
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    if np.any(A[owner[:, None] > owner[None, :]]):
+        raise ShapeError("A is not block upper triangular with the given blocks; pass blocks=None.")
+    return sizes
+
+
+def _rows(known: Sequence[str], names: Iterable[str], side: str, owner: str | None) -> IntArray:
+    position = {name: i for i, name in enumerate(known)}
+    if isinstance(names, str):
+        names = [names]
+    rows = []
+    for name in names:
+        if name not in position:
+            raise unknown_label(side, name, known, owner or "")
+        rows.append(position[name])
+    return np.array(rows, dtype=np.int64)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, ... {names[-1]} ({len(names)})"

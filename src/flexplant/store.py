@@ -1,0 +1,131 @@
+"""Save and load values: one .npz with arrays and a JSON header, no pickle, written atomically."""
+
+from __future__ import annotations
+
+import json
+import os
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from .errors import FlexplantError
+from .values import Value, rebuild
+
+_HEADER = "__flexplant__"
+
+
+def save(value: Value, path: str | Path) -> None:
+    """Write `value` to `path` as .npz; a crash leaves the old file or none.
+
+    Parameters
+    ----------
+    value : Value
+        Any value of this package.
+    path : str or Path
+        The file to write, overwritten if present.
+    """
+    arrays: dict[str, Any] = {}
+    header = json.dumps(_encode(value, arrays))
+    target = Path(path)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
+    try:
+        with os.fdopen(handle, "wb") as file:
+            arrays[_HEADER] = np.array(header)
+            np.savez_compressed(file, **arrays)
+        os.replace(name, target)
+    except BaseException:
+        Path(name).unlink(missing_ok=True)
+        raise
+
+
+def load(path: str | Path) -> Any:
+    """Return the value that `.save(path)` wrote.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Returns
+    -------
+    Value
+        Of the type that was saved, arrays read-only.
+
+    Raises
+    ------
+    FlexplantError
+        When the file was not written by flexplant.
+    """
+    with np.load(path, allow_pickle=False) as file:
+        if _HEADER not in file:
+            raise FlexplantError(
+                f"{str(path)!r} was not written by flexplant: it holds {sorted(file)[:5]}. "
+                "Use flexplant.io for foreign formats."
+            )
+        arrays = {name: file[name] for name in file.files}
+    return _decode(json.loads(str(arrays[_HEADER])), arrays)
+
+
+def _encode(item: Any, arrays: dict[str, Any]) -> Any:
+    if isinstance(item, np.generic):
+        item = item.item()
+    if item is None or isinstance(item, bool | int | str):
+        return item
+    if isinstance(item, float):
+        return item if np.isfinite(item) else {"float": repr(item)}
+    if isinstance(item, complex):
+        return {"complex": [item.real, item.imag]}
+    if isinstance(item, np.ndarray):
+        return {"array": _keep(item, arrays)}
+    if sp.issparse(item):
+        coo: Any = sp.coo_array(item)
+        parts = [_keep(np.asarray(part), arrays) for part in (coo.data, *coo.coords)]
+        return {"sparse": parts, "shape": list(coo.shape)}
+    if isinstance(item, Value):
+        fields = {name: _encode(part, arrays) for name, part in item._fields().items()}
+        return {"value": type(item).__name__, "fields": fields}
+    if isinstance(item, Mapping):
+        return {"mapping": [[_encode(k, arrays), _encode(v, arrays)] for k, v in item.items()]}
+    if isinstance(item, tuple):
+        return {"tuple": [_encode(part, arrays) for part in item]}
+    if isinstance(item, list):
+        return [_encode(part, arrays) for part in item]
+    raise FlexplantError(
+        f"cannot save a {type(item).__name__}: files hold values, arrays, numbers and names only."
+    )
+
+
+def _keep(array: Any, arrays: dict[str, Any]) -> str:
+    name = f"a{len(arrays)}"
+    arrays[name] = array
+    return name
+
+
+def _decode(item: Any, arrays: Mapping[str, Any]) -> Any:
+    if isinstance(item, list):
+        return [_decode(part, arrays) for part in item]
+    if not isinstance(item, dict):
+        return item
+    if "value" in item:
+        cls = Value.registry.get(item["value"])
+        if cls is None:
+            raise FlexplantError(
+                f"the file holds a {item['value']!r}, which this version of flexplant lacks."
+            )
+        return rebuild(cls, {name: _decode(part, arrays) for name, part in item["fields"].items()})
+    if "array" in item:
+        return arrays[item["array"]]
+    if "sparse" in item:
+        data, *coords = (arrays[name] for name in item["sparse"])
+        return sp.csc_array((data, tuple(coords)), shape=tuple(item["shape"]))
+    if "mapping" in item:
+        return {_decode(k, arrays): _decode(v, arrays) for k, v in item["mapping"]}
+    if "tuple" in item:
+        return tuple(_decode(part, arrays) for part in item["tuple"])
+    if "complex" in item:
+        return complex(*item["complex"])
+    return float(item["float"])
