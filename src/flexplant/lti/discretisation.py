@@ -1,0 +1,182 @@
+"""Sampling: exact zero-order hold, block by block in closed form, with any delay of the inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError
+from ..values import FloatArray, IntArray, positive
+from .statespace import StateSpace, System, as_statespace
+
+
+def discretized(
+    sys: System,
+    rate: float,
+    *,
+    delay: float = 0.0,
+    delayed: Iterable[str] | None = None,
+) -> StateSpace:
+    """Return the zero-order-hold equivalent at a rate, with the inputs delayed.
+
+    ``x[k+1] = e^(A h) x[k] + (int_0^h e^(A s) ds) B u[k - delay]``, h = 1 / rate; exact, also for
+    delays that are no multiple of h. Where A is block diagonal each block is done in closed form.
+
+    Parameters
+    ----------
+    sys : StateSpace
+        A continuous system.
+    rate : float [Hz]
+        Sampling rate.
+    delay : float [samples]
+        From the sampling of an input to its arrival; its integer part adds that many states per
+        delayed input, a fraction one more.
+    delayed : iterable of str, optional
+        The inputs that are delayed; all when not given.
+
+    Returns
+    -------
+    StateSpace
+        With dt = 1 / rate; states of `sys` first, then the delay lines `u1:delay1`, ...
+
+    Raises
+    ------
+    ModelError
+        When `sys` is sampled already, or rate or delay is not positive.
+    LabelError
+        When `delayed` names an unknown input.
+    """
+    g = as_statespace(sys)
+    if g.dt and g.n_states:
+        raise ModelError(
+            f"{g!r} is sampled already: a rate cannot be changed exactly without the continuous "
+            "model. Discretise that one."
+        )
+    h = 1.0 / positive(rate, "rate")
+    late = g.input_index(g.inputs if delayed is None else delayed)
+    whole, fraction = divmod(positive(delay, "delay", zero=True), 1.0)
+    if not late.size:
+        whole = fraction = 0.0
+    rest = propagated(g, (1.0 - fraction) * h)
+    Ad, Bd = propagated(g, h)
+    held, D = Bd.copy(), g.D.copy()
+    # u[k - whole] holds for the last (1 - fraction) of the interval, its predecessor before that
+    held[:, late] = rest.integral[:, late]
+    before = rest.exponential @ propagated(g, fraction * h).integral[:, late]
+    return _with_delay_line(
+        g.replace(A=Ad, B=held, dt=h), late, int(whole), before if fraction else None, D
+    )
+
+
+def _with_delay_line(
+    g: StateSpace, late: IntArray, whole: int, before: FloatArray | None, D: FloatArray
+) -> StateSpace:
+    """Route the late inputs through unit delays: the newest last, so A stays upper triangular."""
+    length = whole + (before is not None)
+    if not length:
+        return g
+    n, m = g.n_states, late.size
+    A = np.zeros((n + m * length,) * 2)
+    B = np.zeros((n + m * length, len(g.inputs)))
+    C = np.hstack([g.C, np.zeros((len(g.outputs), m * length))])
+    A[:n, :n], B[:n] = g.A, g.B
+    D = D.copy()
+
+    def slot(age: int) -> slice:  # states that hold u[k - age]
+        return slice(n + m * (length - age), n + m * (length - age + 1))
+
+    if whole:  # the input acts from the line, not at once
+        A[:n, slot(whole)] = g.B[:, late]
+        B[:n, late] = 0.0
+    if before is not None:
+        A[:n, slot(length)] = before
+    C[:, slot(length)] = D[:, late]
+    D[:, late] = 0.0
+    for age in range(2, length + 1):
+        A[slot(age), slot(age - 1)] = np.eye(m)
+    B[slot(1), late] = np.eye(m)
+    names = [f"{g.inputs[i]}:delay{age}" for age in range(length, 0, -1) for i in late]
+    blocks = None if g.blocks is None else [*g.blocks, *[1] * (m * length)]
+    return g.replace(A=A, B=B, C=C, D=D, states=[*g.states, *names], blocks=blocks)
+
+
+class Propagated(NamedTuple):
+    """``e^(A h)`` and ``int_0^h e^(A s) ds B``."""
+
+    exponential: FloatArray
+    integral: FloatArray
+
+
+def propagated(g: StateSpace, h: float) -> Propagated:
+    """Return ``e^(A h)`` (n, n) and ``int_0^h e^(A s) ds B`` (n, m)."""
+    n = g.n_states
+    if not n or not h:
+        return Propagated(np.eye(n), np.zeros_like(g.B))
+    pairs = diagonal_pairs(g)
+    if pairs is None:
+        augmented = np.zeros((n + g.B.shape[1],) * 2)
+        augmented[:n, :n], augmented[:n, n:] = g.A * h, g.B * h
+        exponential = la.expm(augmented)
+        return Propagated(exponential[:n, :n], exponential[:n, n:])
+    E, integral = pair_exponential(pairs, h)
+    driven = np.einsum("bij,bjm->bim", integral, g.B.reshape(-1, 2, g.B.shape[1]))
+    return Propagated(block_diagonal(E), driven.reshape(g.B.shape))
+
+
+def diagonal_pairs(g: StateSpace) -> FloatArray | None:
+    """Return the (n/2, 2, 2) diagonal blocks of A, or None when A is not made of those alone."""
+    if g.blocks is None or set(g.blocks) - {2}:
+        return None
+    n = g.n_states
+    pairs = g.A.reshape(n // 2, 2, n // 2, 2)[np.arange(n // 2), :, np.arange(n // 2), :]
+    if np.count_nonzero(g.A) != np.count_nonzero(pairs):
+        return None
+    return pairs
+
+
+def block_diagonal(pairs: FloatArray) -> FloatArray:
+    """Return the (2 b, 2 b) matrix with the (b, 2, 2) blocks on its diagonal."""
+    b = pairs.shape[0]
+    matrix = np.zeros((b, 2, b, 2))
+    matrix[np.arange(b), :, np.arange(b), :] = pairs
+    return matrix.reshape(2 * b, 2 * b)
+
+
+def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArray]:
+    """Return ``e^(A h)`` and ``int_0^h e^(A s) ds`` of (b, 2, 2) blocks, both (b, 2, 2).
+
+    With m half the trace and N = A - m I, N^2 = q I (Cayley-Hamilton), so
+    ``e^(A h) = e^(m h) (cosh(r h) I + sinh(r h) / r N)``, r^2 = q: trigonometric for an oscillating
+    pair, linear in h for a rigid-body pair. The integral is a Taylor series on h / 2^s, doubled
+    by ``I(2 t) = I(t) + e^(A t) I(t)``: no division by small frequencies.
+    """
+    size = float(np.max(np.abs(pairs).sum(axis=2))) * h
+    doublings = max(0, int(np.ceil(np.log2(max(size, 1e-300) / 0.5))))
+    t = h / 2**doublings
+    identity = np.broadcast_to(np.eye(2), pairs.shape)
+    term = identity * t
+    integral = term.copy()
+    for k in range(2, 18):
+        term = pairs @ term * (t / k)
+        integral = integral + term
+    for k in range(doublings):
+        integral = integral + pair_expm(pairs, t * 2**k) @ integral
+    return pair_expm(pairs, h), integral
+
+
+def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
+    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
+    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
+    N = pairs - mean[:, None, None] * np.eye(2)
+    q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+    root = np.sqrt(np.abs(q))
+    safe = np.where(root > 0, root, 1.0)
+    swing = q < 0
+    even = np.where(swing, np.cos(root * h), np.cosh(np.where(swing, 0.0, root * h)))
+    odd = np.where(swing, np.sin(root * h), np.sinh(np.where(swing, 0.0, root * h))) / safe
+    odd = np.where(root > 0, odd, h)
+    scale = np.exp(mean * h)
+    return np.asarray((scale * even)[:, None, None] * np.eye(2) + (scale * odd)[:, None, None] * N)
