@@ -1,1 +1,8 @@
-"""To be written."""
+"""What the machine is: finite-element matrices with labelled degrees of freedom, and damping."""
+
+from .damping import Damping as Damping
+from .damping import ModalDamping as ModalDamping
+from .damping import Rayleigh as Rayleigh
+from .model import FEModel as FEModel
+from .plate import PlateShape as PlateShape
+from .plate import kirchhoff_plate as kirchhoff_plate

@@ -1,0 +1,142 @@
+"""Residual attachment vectors: the static compliance that the kept modes leave out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ..errors import ModelError
+from ..labels import DofSet, Place
+from ..structure import FEModel
+from ..structure.factor import DENSE_LIMIT, dense, diagonal, symmetric_lu
+from ..values import FloatArray, Matrix
+from .normal_form import signed
+
+#: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
+_NEGLIGIBLE = 1e-9
+
+
+def places(at: Place | Iterable[Place]) -> list[Place]:
+    """Return one place, or several, as a list."""
+    if isinstance(at, str | Mapping):
+        return [at]
+    listed: list[Any] = list(at)
+    if listed and all(
+        np.ndim(item) == 0 and not isinstance(item, str | Mapping) for item in listed
+    ):
+        return [listed]
+    return listed
+
+
+def named(place: Place) -> str:
+    """Return a short text for a place."""
+    if isinstance(place, str):
+        return place
+    if isinstance(place, Mapping):
+        return " + ".join(f"{weight:g} {label}" for label, weight in place.items())
+    return "(" + ", ".join(f"{float(x):g}" for x in place) + ")"
+
+
+def attachment_vectors(
+    model: FEModel, omega: FloatArray, phi: FloatArray, at: Sequence[Place]
+) -> tuple[FloatArray, FloatArray]:
+    """Return residual attachment vectors (n, m) and their frequencies (m,) [rad/s].
+
+    The static response to a unit load at each place (free structures accelerate as rigid bodies
+    under it: inertia relief), less the part that the modes give; then made M-orthogonal to the
+    modes, mass-normalised, and diagonal in K among each other.
+
+    Raises
+    ------
+    ModelError
+        When the modes already hold the compliance of a place, or two places give the same vector.
+    """
+    M, K, rigid = model.M, model.K, model.rigid_body
+    loads = np.column_stack([model.dofs.row(place) for place in at])
+    response = static_response(M, K, rigid, loads)
+    whole = np.sum(loads * response, axis=0)
+    for _ in range(2):
+        response = response - phi @ (phi.T @ np.asarray(M @ response))
+    left = np.sum(loads * response, axis=0)
+    for place, part, total in zip(at, left, whole, strict=True):
+        if not part > _NEGLIGIBLE * total:
+            raise ModelError(
+                f"the {phi.shape[1]} modes already hold all of the static compliance at "
+                f"{named(place)} ({part:.2g} of {total:.3g} m/N is left): an attachment vector "
+                "there adds nothing. Leave it out of compliance_at, or keep fewer modes."
+            )
+    response = response / np.sqrt(left)
+    gram = response.T @ np.asarray(M @ response)
+    size = np.sqrt(np.diag(gram))
+    lowest = la.eigvalsh(gram / np.outer(size, size))[0]
+    if lowest < 1e-10:
+        raise ModelError(
+            f"the attachment vectors of {', '.join(named(place) for place in at)} depend on each "
+            f"other (lowest eigenvalue {lowest:.2g} of their Gram matrix): is a place there twice?"
+        )
+    squares, mix = la.eigh(response.T @ np.asarray(K @ response), gram)
+    vectors = response @ mix
+    vectors = vectors - phi @ (phi.T @ np.asarray(M @ vectors))
+    return signed(vectors), np.sqrt(squares)
+
+
+def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) -> FloatArray:
+    """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
+
+    ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes.
+    The structure is held at r DOFs, where its rigid-body motions are best told apart; in balance,
+    these carry no force, and the rigid-body part of the answer is taken out afterwards.
+
+    Raises
+    ------
+    ModelError
+        When K is singular beyond the rigid-body motions.
+    """
+    balanced = loads - np.asarray(M @ (rigid @ (rigid.T @ loads)))
+    n, r = rigid.shape
+    held = np.zeros(n, dtype=bool)
+    if r:
+        # in units of sqrt(energy), so that rotations and displacements compare
+        weighted = np.sqrt(diagonal(M))[:, None] * rigid
+        held[la.qr(weighted.T, mode="economic", pivoting=True)[2][:r]] = True
+    free = np.flatnonzero(~held)
+    response = np.zeros_like(balanced)
+    if sp.issparse(K) and n > DENSE_LIMIT:
+        sparse: Any = K
+        part_of_K = sparse[free][:, free]
+        solve = symmetric_lu(part_of_K).solve
+        part = solve(balanced[free])
+        part = part + solve(balanced[free] - part_of_K @ part)
+    else:
+        stiffness = dense(K)[np.ix_(free, free)]
+        size = np.sqrt(np.diag(stiffness))[:, None]
+        try:
+            factor = la.cho_factor(stiffness / size / size.T)
+        except la.LinAlgError as error:
+            raise ModelError(
+                f"K is singular beyond the {r} rigid-body motions of the geometry (a mechanism, a "
+                "DOF without stiffness, or wrong coordinates): there is no static response."
+            ) from error
+        part = la.cho_solve(factor, balanced[free] / size) / size
+    response[free] = part
+    for _ in range(2):
+        response = response - rigid @ (rigid.T @ np.asarray(M @ response))
+    return response
+
+
+def projected_zeta(D: Matrix | None, vectors: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return the damping ratios (m,) that a matrix D gives to vectors, taken one by one."""
+    if D is None or not omega.size:
+        return np.zeros(omega.size)
+    return np.sum(vectors * np.asarray(D @ vectors), axis=0) / (2 * omega)
+
+
+def labels_of(at: Sequence[Place], dofs: DofSet) -> tuple[str, ...]:
+    """Return the names of places, after checking that the model knows them."""
+    for place in at:
+        dofs.row(place)
+    return tuple(named(place) for place in at)

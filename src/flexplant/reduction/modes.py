@@ -1,0 +1,165 @@
+"""Modes of a structure: frequencies, damping, shapes, and what the truncated ones leave behind."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from ..labels import DofSet, Place
+from ..values import ComplexArray, FloatArray, Value, real_array
+
+
+def _none(*shape: int) -> FloatArray:
+    return np.zeros(shape)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Modes(Value):
+    """The first k modes of a structure, mass-normalised (paper, eq. (2), (3) and (5)).
+
+    ``q = phi p`` with ``p'' + 2 Z Omega p' + Omega^2 p = phi^T f``. Modes are numbered from 1,
+    rigid-body modes included: mode 4 of a free plate is its first elastic one.
+
+    Residual attachment vectors extend the basis: what a unit force at a chosen place moves
+    statically beyond the k modes. They are made M-orthogonal to the modes and diagonal among each
+    other, so that (5) holds for the basis `[phi, vectors]` too, with `vector_omega` as frequencies.
+
+    Parameters
+    ----------
+    omega : (k,) array [rad/s]
+        Undamped frequencies; exactly 0 for the rigid-body modes, which come first.
+    zeta : (k,) array [-]
+        Damping ratios.
+    phi : (n, k) array [1/sqrt(kg)]
+        Shapes. Complex for a structure whose damping is not proportional, then normalised to
+        ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``.
+    dofs : DofSet
+        The n rows.
+    n_rigid : int
+        How many rigid-body modes there are.
+    vectors, vector_omega, vector_zeta : (n, m), (m,), (m,) arrays
+        Residual attachment vectors.
+    vector_dofs : sequence of m str
+        The places they belong to (together: they are mixed to become diagonal).
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When sizes do not match or the rigid-body modes are not at 0.
+    """
+
+    omega: FloatArray
+    zeta: FloatArray
+    phi: FloatArray | ComplexArray
+    dofs: DofSet
+    n_rigid: int = 0
+    vectors: FloatArray = field(default=None)  # type: ignore[assignment]
+    vector_omega: FloatArray = field(default=None)  # type: ignore[assignment]
+    vector_zeta: FloatArray = field(default=None)  # type: ignore[assignment]
+    vector_dofs: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        omega = real_array(self.omega, "omega", (None,))
+        k, n = omega.size, len(self.dofs)
+        if not 0 <= self.n_rigid <= k or np.any(omega[: self.n_rigid] != 0):
+            raise ModelError(
+                f"n_rigid is {self.n_rigid}, but the first frequencies of {k} are "
+                f"{omega[: max(self.n_rigid, 1)].tolist()} rad/s: rigid-body modes are exactly 0."
+            )
+        if np.any(omega[self.n_rigid :] <= 0):
+            raise ModelError("elastic modes need frequencies above 0; rigid-body modes come first.")
+        places = (self.vector_dofs,) if isinstance(self.vector_dofs, str) else self.vector_dofs
+        m = len(places)
+        if np.iscomplexobj(self.phi):
+            phi = np.array(self.phi, dtype=np.complex128)
+            real_array(phi.real, "phi", (n, k)), real_array(phi.imag, "phi", (n, k))
+        else:
+            phi = real_array(self.phi, "phi", (n, k))
+        if m and np.iscomplexobj(phi):
+            raise ModelError("attachment vectors go with real modes only.")
+        given = (self.vectors, self.vector_omega, self.vector_zeta)
+        if not m and any(part is not None and np.size(part) for part in given):
+            raise ShapeError("vectors are given, but no vector_dofs that name them.")
+        vectors, vector_omega, vector_zeta = (_none(n, 0), _none(0), _none(0)) if not m else given
+        self._set(
+            omega=omega,
+            zeta=real_array(self.zeta, "zeta", (k,)),
+            phi=phi,
+            n_rigid=int(self.n_rigid),
+            vectors=real_array(vectors, "vectors", (n, m)),
+            vector_omega=real_array(vector_omega, "vector_omega", (m,)),
+            vector_zeta=real_array(vector_zeta, "vector_zeta", (m,)),
+            vector_dofs=tuple(str(place) for place in places),
+        )
+
+    def __repr__(self) -> str:
+        freq = self.freq[self.n_rigid :]
+        span = f"{self.n_rigid} rigid-body" if self.n_rigid else ""
+        if freq.size:
+            span += f"{' and ' if span else ''}{freq.size} elastic at {freq[0]:.4g}"
+            span += f" to {freq[-1]:.4g} Hz" if freq.size > 1 else " Hz"
+        kind = "complex " if np.iscomplexobj(self.phi) else ""
+        extra = (
+            f", attachment vectors at {', '.join(self.vector_dofs[:4])}" if self.n_vectors else ""
+        )
+        extra += ", ..." if self.n_vectors > 4 else ""
+        return f"<Modes: {self.n_modes} {kind}({span or 'none'}) of {len(self.dofs)} DOFs{extra}>"
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes k, without attachment vectors."""
+        return int(self.omega.size)
+
+    @property
+    def n_vectors(self) -> int:
+        """Number of attachment vectors m."""
+        return len(self.vector_dofs)
+
+    @property
+    def freq(self) -> FloatArray:
+        """Undamped frequencies (k,) [Hz]."""
+        return self.omega / (2 * np.pi)
+
+    @property
+    def poles(self) -> ComplexArray:
+        """Poles (k,) [rad/s] in the upper half plane; rigid-body ones exactly 0.
+
+        ``-zeta omega + i omega sqrt(1 - zeta^2)``.
+        """
+        root = np.sqrt((1 - self.zeta**2).astype(np.complex128))
+        return np.asarray(self.omega * (-self.zeta + 1j * root), dtype=np.complex128)
+
+    @property
+    def basis(self) -> FloatArray | ComplexArray:
+        """Modes and attachment vectors side by side (n, k + m)."""
+        return np.hstack([self.phi, self.vectors])
+
+    @property
+    def basis_omega(self) -> FloatArray:
+        """Frequencies (k + m,) [rad/s] of the basis: equation (5) is diagonal in it."""
+        return np.concatenate([self.omega, self.vector_omega])
+
+    @property
+    def basis_zeta(self) -> FloatArray:
+        """Damping ratios (k + m,) of the basis."""
+        return np.concatenate([self.zeta, self.vector_zeta])
+
+    def at(self, place: Place, direction: str = "z") -> FloatArray | ComplexArray:
+        """Return the modes' motion (k,) at a place.
+
+        Parameters
+        ----------
+        place : str, (3,) array [m] or mapping
+            A DOF label, a point, or {label: weight}.
+        direction : str
+            The motion at a point.
+
+        Raises
+        ------
+        LabelError
+            When the place is unknown.
+        """
+        return self.dofs.row(place, direction) @ self.phi

@@ -1,0 +1,94 @@
+"""Symmetric sparse factorisation, with the inertia of the matrix as a by-product."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from ..errors import SolverError
+from ..values import FloatArray, Matrix
+
+#: up to this many DOFs dense LAPACK is as fast as a sparse factorisation, and safer
+DENSE_LIMIT = 1500
+
+
+def dense(matrix: Matrix) -> FloatArray:
+    """Return a matrix as a dense array."""
+    if sp.issparse(matrix):
+        sparse: Any = matrix
+        return np.asarray(sparse.toarray(), dtype=np.float64)
+    return np.asarray(matrix, dtype=np.float64)
+
+
+def diagonal(matrix: Matrix) -> FloatArray:
+    """Return the diagonal of a dense or sparse matrix."""
+    return np.asarray(matrix.diagonal(), dtype=np.float64)
+
+
+def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
+    """Return ``S A S`` with ones (or zeros) on its diagonal, and the diagonal of S.
+
+    Displacements and rotations have different units: only after this scaling do entries compare.
+    """
+    size = np.sqrt(np.abs(diagonal(matrix)))
+    scale = 1.0 / np.where(size > 0, size, size.max(initial=0.0) or 1.0)
+    if sp.issparse(matrix):
+        weight = sp.diags_array(scale)
+        return sp.csc_array(weight @ matrix @ weight), scale
+    return scale[:, None] * np.asarray(matrix) * scale, scale
+
+
+def symmetric_lu(matrix: Matrix) -> Any:
+    """Return the SuperLU factorisation of a symmetric sparse matrix with diagonal pivots only.
+
+    Raises
+    ------
+    SolverError
+        When the matrix is singular, or SuperLU had to leave the diagonal.
+    """
+    try:
+        lu = spla.splu(
+            sp.csc_matrix(matrix),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as error:
+        raise SolverError(
+            f"a sparse symmetric factorisation met a singular matrix ({error}): the shift hits an "
+            "eigenvalue, or DOFs without any stiffness are in the model. Remove those DOFs."
+        ) from error
+    if not np.array_equal(lu.perm_r, lu.perm_c):
+        raise SolverError(
+            "a sparse symmetric factorisation met a zero pivot and left the diagonal: its inertia "
+            "is not known. A zero on the diagonal of K or M is the usual reason."
+        )
+    return lu
+
+
+def negative_pivots(lu: Any) -> int:
+    """Return how many eigenvalues of the factored symmetric matrix are negative (Sylvester)."""
+    return int(np.count_nonzero(lu.U.diagonal() < 0))
+
+
+def is_positive_definite(matrix: Matrix, tolerance: float = 0.0) -> bool:
+    """Return whether ``S A S + tolerance I`` is positive definite, S scaling A's diagonal to 1."""
+    if np.any(diagonal(matrix) < 0) or (tolerance == 0 and np.any(diagonal(matrix) == 0)):
+        return False
+    scaled, _ = unit_diagonal(matrix)
+    n = scaled.shape[0]
+    if sp.issparse(scaled) and n > DENSE_LIMIT:
+        shifted = sp.csc_array(scaled + tolerance * sp.eye_array(n)) if tolerance else scaled
+        try:
+            return negative_pivots(symmetric_lu(shifted)) == 0
+        except SolverError:
+            return False
+    try:
+        la.cholesky(dense(scaled) + tolerance * np.eye(n), lower=True, check_finite=False)
+    except la.LinAlgError:
+        return False
+    return True

@@ -1,0 +1,90 @@
+"""Rigid-body motions from the geometry of the degrees of freedom."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError
+from ..labels import DIRECTIONS, DofSet
+from ..values import FloatArray, Matrix
+
+#: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
+_ENERGY_TOLERANCE = 1e-9
+
+
+def rigid_motions(dofs: DofSet, centre: FloatArray | None = None) -> FloatArray:
+    """Return the six rigid-body motions (n, 6) of the DOFs: x, y, z, rx, ry, rz.
+
+    Rotations are small ones about `centre` (the origin when None): a rotation by rx moves a point
+    at height z and width y by ``-z rx`` in y and ``y rx`` in z; a plate's rx = dz/dy, ry = -dz/dx.
+    """
+    n = len(dofs)
+    arm = dofs.xyz - (np.zeros(3) if centre is None else centre)
+    kind = np.array([DIRECTIONS.index(direction) for direction in dofs.directions], dtype=np.int64)
+    motions = np.zeros((n, 6))
+    motions[np.arange(n), kind] = 1.0
+    for axis in range(3):
+        turn = np.cross(np.eye(3)[axis], arm)
+        moved = kind < 3
+        motions[moved, 3 + axis] = turn[moved, kind[moved]]
+    return motions
+
+
+def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
+    """Return the M-orthonormal rigid-body vectors (n, r) of a structure, ``K R = 0``.
+
+    They come from the coordinates, not from an eigenvalue solver, so that they are exact.
+    Translations come first, then rotations about the centre of gravity. Partly held structures
+    (a hinge, say) keep the combinations of the six motions that cost no energy.
+    """
+    n = len(dofs)
+    motions = rigid_motions(dofs, dofs.xyz.mean(axis=0) if n else None)
+    size = np.linalg.norm(motions, axis=0)
+    extent = float(np.ptp(dofs.xyz, axis=0).max(initial=0.0))
+    present = size > 1e-12 * np.where(np.arange(6) < 3, 1.0, max(extent, 1e-300)) * np.sqrt(n)
+    motions = motions[:, present]
+    # K and |K| |r|, row by row: forces of rounding size say that no energy is stored
+    scale = np.linalg.norm(abs(K) @ np.abs(motions), axis=0)
+    force = np.asarray(K @ motions) / np.where(scale > 0, scale, 1.0)
+    free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
+    basis = motions[:, free]
+    if not np.all(free):
+        _, values, right = la.svd(force, full_matrices=False)
+        null = right[values < _ENERGY_TOLERANCE].T
+        if null.shape[1] > basis.shape[1]:
+            basis = motions @ (null / np.where(scale > 0, scale, 1.0)[:, None])
+    return orthonormalised(M, basis, dependent="drop")
+
+
+def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:
+    """Return the M-orthonormal vectors of a basis, in order, by Gram-Schmidt done twice.
+
+    Raises
+    ------
+    ModelError
+        When a vector depends on those before it, unless `dependent` is "drop".
+    """
+    done = np.zeros((basis.shape[0], 0))
+    for i in range(basis.shape[1]):
+        vector = basis[:, i]
+        length = _length(M, vector)
+        for _ in range(2):
+            vector = vector - done @ (done.T @ (M @ vector))
+        left = _length(M, vector)
+        if left <= 1e-9 * length:
+            if dependent == "drop":
+                continue
+            raise ModelError(
+                f"vector {i + 1} of the rigid-body basis depends on those before it "
+                f"(M-norm {left:.3g} of {length:.3g} is left): give independent vectors."
+            )
+        vector = vector / left
+        # once more, now that rounding of the normalisation shows
+        vector = vector - done @ (done.T @ (M @ vector))
+        done = np.column_stack([done, vector / _length(M, vector)])
+    return done
+
+
+def _length(M: Matrix, vector: FloatArray) -> float:
+    return float(np.sqrt(max(vector @ (M @ vector), 0.0)))
