@@ -12,9 +12,9 @@ import scipy.sparse as sp
 from ..errors import ModelError
 from ..labels import DofSet, Place
 from ..structure import FEModel
+from ..structure.eigen import signed
 from ..structure.factor import DENSE_LIMIT, dense, diagonal, symmetric_lu
 from ..values import FloatArray, Matrix
-from .normal_form import signed
 
 #: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
 _NEGLIGIBLE = 1e-9
@@ -121,18 +121,19 @@ def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) 
                 f"K is singular beyond the {r} rigid-body motions of the geometry (a mechanism, a "
                 "DOF without stiffness, or wrong coordinates): there is no static response."
             ) from error
-        part = la.cho_solve(factor, balanced[free] / size) / size
+        part = np.asarray(la.cho_solve(factor, balanced[free] / size) / size)
     response[free] = part
     for _ in range(2):
         response = response - rigid @ (rigid.T @ np.asarray(M @ response))
-    return response
+    return np.asarray(response, dtype=np.float64)
 
 
 def projected_zeta(D: Matrix | None, vectors: FloatArray, omega: FloatArray) -> FloatArray:
     """Return the damping ratios (m,) that a matrix D gives to vectors, taken one by one."""
     if D is None or not omega.size:
         return np.zeros(omega.size)
-    return np.sum(vectors * np.asarray(D @ vectors), axis=0) / (2 * omega)
+    rate = np.sum(vectors * np.asarray(D @ vectors), axis=0)
+    return np.asarray(rate / (2 * omega), dtype=np.float64)
 
 
 def labels_of(at: Sequence[Place], dofs: DofSet) -> tuple[str, ...]:

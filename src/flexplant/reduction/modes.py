@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
 
@@ -12,8 +13,8 @@ from ..labels import DofSet, Place
 from ..values import ComplexArray, FloatArray, Value, real_array
 
 
-def _none(*shape: int) -> FloatArray:
-    return np.zeros(shape)
+def _nothing() -> FloatArray:
+    return np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -56,9 +57,9 @@ class Modes(Value):
     phi: FloatArray | ComplexArray
     dofs: DofSet
     n_rigid: int = 0
-    vectors: FloatArray = field(default=None)  # type: ignore[assignment]
-    vector_omega: FloatArray = field(default=None)  # type: ignore[assignment]
-    vector_zeta: FloatArray = field(default=None)  # type: ignore[assignment]
+    vectors: FloatArray = field(default_factory=_nothing)
+    vector_omega: FloatArray = field(default_factory=_nothing)
+    vector_zeta: FloatArray = field(default_factory=_nothing)
     vector_dofs: Sequence[str] = ()
 
     def __post_init__(self) -> None:
@@ -73,17 +74,15 @@ class Modes(Value):
             raise ModelError("elastic modes need frequencies above 0; rigid-body modes come first.")
         places = (self.vector_dofs,) if isinstance(self.vector_dofs, str) else self.vector_dofs
         m = len(places)
+        phi: FloatArray | ComplexArray = real_array(np.real(self.phi), "phi", (n, k))
         if np.iscomplexobj(self.phi):
-            phi = np.array(self.phi, dtype=np.complex128)
-            real_array(phi.real, "phi", (n, k)), real_array(phi.imag, "phi", (n, k))
-        else:
-            phi = real_array(self.phi, "phi", (n, k))
+            phi = phi + 1j * real_array(np.imag(self.phi), "the imaginary part of phi", (n, k))
         if m and np.iscomplexobj(phi):
             raise ModelError("attachment vectors go with real modes only.")
         given = (self.vectors, self.vector_omega, self.vector_zeta)
-        if not m and any(part is not None and np.size(part) for part in given):
+        if not m and any(np.size(part) for part in given):
             raise ShapeError("vectors are given, but no vector_dofs that name them.")
-        vectors, vector_omega, vector_zeta = (_none(n, 0), _none(0), _none(0)) if not m else given
+        vectors, vector_omega, vector_zeta = given if m else (np.zeros((n, 0)), *given[1:])
         self._set(
             omega=omega,
             zeta=real_array(self.zeta, "zeta", (k,)),
@@ -97,16 +96,15 @@ class Modes(Value):
 
     def __repr__(self) -> str:
         freq = self.freq[self.n_rigid :]
-        span = f"{self.n_rigid} rigid-body" if self.n_rigid else ""
+        parts = [f"{self.n_rigid} rigid-body"] if self.n_rigid else []
         if freq.size:
-            span += f"{' and ' if span else ''}{freq.size} elastic at {freq[0]:.4g}"
-            span += f" to {freq[-1]:.4g} Hz" if freq.size > 1 else " Hz"
-        kind = "complex " if np.iscomplexobj(self.phi) else ""
-        extra = (
-            f", attachment vectors at {', '.join(self.vector_dofs[:4])}" if self.n_vectors else ""
-        )
-        extra += ", ..." if self.n_vectors > 4 else ""
-        return f"<Modes: {self.n_modes} {kind}({span or 'none'}) of {len(self.dofs)} DOFs{extra}>"
+            to = f" to {freq[-1]:.4g}" if freq.size > 1 else ""
+            parts.append(f"{freq.size} elastic at {freq[0]:.4g}{to} Hz")
+        kind = " complex" if np.iscomplexobj(self.phi) else ""
+        held = f" ({', '.join(parts)})" if parts else ""
+        more = ", ..." if self.n_vectors > 4 else ""
+        extra = f", vectors at {', '.join(self.vector_dofs[:4])}{more}" if self.n_vectors else ""
+        return f"<Modes: {self.n_modes}{kind} of {len(self.dofs)} DOFs{held}{extra}>"
 
     @property
     def n_modes(self) -> int:
@@ -135,7 +133,8 @@ class Modes(Value):
     @property
     def basis(self) -> FloatArray | ComplexArray:
         """Modes and attachment vectors side by side (n, k + m)."""
-        return np.hstack([self.phi, self.vectors])
+        both: Any = np.hstack([self.phi, self.vectors])
+        return cast(FloatArray | ComplexArray, both)
 
     @property
     def basis_omega(self) -> FloatArray:
@@ -162,4 +161,5 @@ class Modes(Value):
         LabelError
             When the place is unknown.
         """
-        return self.dofs.row(place, direction) @ self.phi
+        motion: FloatArray | ComplexArray = self.dofs.row(place, direction) @ self.phi
+        return motion

@@ -8,12 +8,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
-from ..structure.factor import dense, unit_diagonal
+from ..structure.eigen import elastic_modes
+from ..structure.factor import dense
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray, Matrix, Value, real_array
 
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
-_PROPORTIONAL = 1e-9
+PROPORTIONAL = 1e-9
 #: damping rate of a rigid-body motion, relative to the first elastic frequency, that is let pass
 _RIGID_DRAG = 1e-4
 #: eigenvalues closer than this (relative) have no eigenvectors of their own
@@ -86,11 +87,11 @@ def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> No
     if D is None:
         return NormalForm(np.concatenate([zero, 1j * omega]), shapes, r)
     D = dense(D)
-    _check_drag(rigid, D, omega)
+    check_drag(rigid, D, omega)
     C = phi.T @ D @ phi
     rate = np.diag(C)
     coupling = float(np.abs(C - np.diag(rate)).max(initial=0.0))
-    if coupling <= _PROPORTIONAL * float(np.abs(rate).max(initial=0.0)):
+    if coupling <= PROPORTIONAL * float(np.abs(rate).max(initial=0.0)):
         root = omega**2 - 0.25 * rate**2
         _check_oscillating(root > 0, omega)
         poles = -0.5 * rate + 1j * np.sqrt(np.maximum(root, 0.0))
@@ -99,76 +100,11 @@ def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> No
     return NormalForm(np.concatenate([zero, poles]), np.hstack([rigid, phi @ mix]), r)
 
 
-def elastic_modes(
-    M: FloatArray, K: FloatArray, rigid: FloatArray, count: int | None = None
-) -> tuple[FloatArray, FloatArray]:
-    """Return the elastic frequencies (k,) [rad/s] and M-orthonormal shapes (n, k), ascending.
-
-    The eigenvalue problem is solved in the M-orthogonal complement of the rigid-body motions.
-
-    Raises
-    ------
-    ModelError
-        When M is not positive definite or an elastic mode has no stiffness.
-    """
-    n, r = rigid.shape
-    scaled, scale = unit_diagonal(M)
-    try:
-        lower = la.cholesky(dense(scaled), lower=True)
-    except la.LinAlgError as error:
-        raise ModelError(
-            "M is not positive definite: some motion would have no inertia."
-        ) from error
-    reach = la.solve_triangular(lower, np.diag(scale), lower=True)  # reach^T q: M becomes I
-    stiffness = reach @ K @ reach.T
-    top = float(np.abs(stiffness).max(initial=0.0))
-    elastic = np.eye(n)
-    if r:
-        whitened = lower.T @ (rigid / scale[:, None])
-        elastic = la.qr(whitened)[0][:, r:]
-        stiffness = elastic.T @ stiffness @ elastic
-    stiffness = 0.5 * (stiffness + stiffness.T)
-    kept = n - r if count is None else min(count, n - r)
-    if kept <= 0:
-        return np.zeros(0), np.zeros((n, 0))
-    subset = None if kept > (n - r) // 4 else (0, kept - 1)
-    squares, vectors = la.eigh(
-        stiffness, subset_by_index=subset, driver="evd" if subset is None else "evr"
-    )
-    squares, vectors = squares[:kept], vectors[:, :kept]
-    if squares[0] <= 1e-13 * top:
-        raise ModelError(
-            f"an elastic mode has no stiffness (omega^2 = {squares[0]:.3g}, rounding is about "
-            f"{1e-13 * top:.1g}): K is indefinite, or has a zero-energy motion that the {r} "
-            "rigid-body motions of the geometry do not hold: a mechanism, wrong coordinates."
-        )
-    phi = polished(M, reach.T @ (elastic @ vectors), rigid)
-    return np.sqrt(squares), signed(phi)
-
-
-def polished(M: Matrix, phi: FloatArray, rigid: FloatArray) -> FloatArray:
-    """Return shapes made M-orthonormal, and M-orthogonal to the rigid ones, to rounding.
-
-    The shapes are nearly so already; the step is symmetric and mixes only what overlaps.
-    """
-    phi = phi - rigid @ (rigid.T @ np.asarray(M @ phi))
-    for _ in range(2):
-        gram = phi.T @ np.asarray(M @ phi)
-        phi = phi @ (1.5 * np.eye(phi.shape[1]) - 0.5 * gram)
-    return phi
-
-
-def signed(phi: FloatArray) -> FloatArray:
-    """Return shapes with the first of their largest entries positive: repeatable signs."""
-    size = np.abs(phi)
-    first = np.argmax(size >= (1 - 1e-6) * size.max(axis=0), axis=0)
-    return phi * np.where(phi[first, np.arange(phi.shape[1])] < 0, -1.0, 1.0)
-
-
-def _check_drag(rigid: FloatArray, D: FloatArray, omega: FloatArray) -> None:
+def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
+    """Raise ModelError when D damps rigid-body motion too much to leave it at 0."""
     if not rigid.shape[1] or not omega.size:
         return
-    drag = float(np.abs(rigid.T @ D @ rigid).max())
+    drag = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max())
     if drag > _RIGID_DRAG * omega[0]:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {_RIGID_DRAG:g} of the first "

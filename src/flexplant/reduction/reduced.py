@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..labels import DofSet, Place
-from ..values import FloatArray, Value, positive, real_array
+from ..values import ComplexArray, FloatArray, Value, positive, real_array
 from .modes import Modes
 from .normal_form import normal_form
 
@@ -90,7 +90,7 @@ class ReducedModel(Value):
         zeta = np.concatenate([np.zeros(r), -form.poles[r:].real / omega[r:]])
         return Modes(omega, zeta, form.phi, self.dofs, n_rigid=r)
 
-    def expand(self, q: FloatArray) -> FloatArray:
+    def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
         """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the desired ones.
 
         Shapes may be complex.
@@ -102,7 +102,7 @@ class ReducedModel(Value):
         """
         if np.iscomplexobj(q):
             parts = np.asarray(q)
-            return self.expand(parts.real) + 1j * self.expand(parts.imag)  # type: ignore[return-value]
+            return np.asarray(self.expand(parts.real) + 1j * self.expand(parts.imag))
         shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
         return np.asarray(self.T @ real_array(q, "q", shape))
 

@@ -12,16 +12,19 @@ import scipy.sparse.linalg as spla
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
+from ..structure.eigen import check_stiffness, elastic_modes, polished, signed
 from ..structure.factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
 from ..values import FloatArray, positive
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
-from .normal_form import elastic_modes, normal_form, polished, signed
+from .normal_form import PROPORTIONAL, check_drag, normal_form
 
 #: M-orthonormality that is asked of every answer
 _ORTHONORMAL = 1e-12
 #: residual ||K phi - omega^2 M phi||, of omega^2 and of the largest eigenvalue of the model
 _RESIDUAL = (1e-8, 1e-12)
+#: part of the largest omega^2 below which an elastic one is rounding
+_ROUNDING = 1e-14
 #: frequencies closer than this (relative, squared) belong together
 _GAP = 1e-6
 
@@ -47,7 +50,7 @@ def solve_modes(
     below : float [Hz], optional
         Keep modes up to this frequency. With neither, all modes (of a model that is not large).
     damping : ModalDamping or Rayleigh, optional
-        None: the model's D, and no damping when it has none.
+        In place of the model's D. None: its D, and no damping when it has none.
     compliance_at : place or sequence of places
         DOF labels, points (motion z) or mappings at which the static compliance of the truncated
         modes is kept, by residual attachment vectors.
@@ -57,7 +60,8 @@ def solve_modes(
     Returns
     -------
     Modes
-        Checked: residuals, M-orthonormality, and that no mode was left out.
+        Complex where the model's own D is not proportional. Checked: residuals,
+        M-orthonormality, and that no mode was left out.
 
     Raises
     ------
@@ -76,7 +80,7 @@ def solve_modes(
     ...                         youngs_modulus=70e9, poisson_ratio=0.35)
     >>> modes = solve_modes(plate, count=24, damping=ModalDamping(0.01), compliance_at="1:z")
     >>> modes
-    <Modes: 24 (3 rigid-body and 21 elastic at 245.8 to 3768 Hz) of 243 DOFs, attachment vectors at 1:z>
+    <Modes: 24 of 243 DOFs (3 rigid-body, 21 elastic at 245.8 to 3768 Hz), vectors at 1:z>
     >>> modes.freq[3:6].round(2)
     array([245.75, 359.31, 463.13])
     """
@@ -93,32 +97,27 @@ def solve_modes(
     kept, top = _asked(model, count, below)
     at = places(compliance_at)
     names = labels_of(at, model.dofs)
-    if damping is None and model.D is not None and (found := _damped(model, kept, top, names)):
-        return found
     omega, phi = _undamped(model, kept, top)
     _check(model, omega, phi)
+    if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
+        return _complex_modes(model, kept, top, names)
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
     if at:
         vectors, vector_omega = attachment_vectors(model, omega, phi, at)
+    r = model.rigid_body.shape[1]
     if damping is None:
-        zeta = np.zeros(omega.size)
-        elastic = omega > 0
-        zeta[elastic] = projected_zeta(model.D, phi[:, elastic], omega[elastic])
-        vector_zeta = projected_zeta(model.D, vectors, vector_omega)
+        zeta = np.concatenate([np.zeros(r), projected_zeta(model.D, phi[:, r:], omega[r:])])
     else:
         zeta = damping.zeta(omega)
-        vector_zeta = np.zeros(0)
-    if at and (compliance_damping is not None or damping is not None):
-        vector_zeta = _vector_damping(damping, compliance_damping).zeta(vector_omega)
     return Modes(
         omega,
         zeta,
         phi,
         model.dofs,
-        n_rigid=model.rigid_body.shape[1],
+        n_rigid=r,
         vectors=vectors,
         vector_omega=vector_omega,
-        vector_zeta=vector_zeta,
+        vector_zeta=_vector_zeta(model, vectors, vector_omega, damping, compliance_damping),
         vector_dofs=names,
     )
 
@@ -138,18 +137,25 @@ def _asked(model: FEModel, count: int | None, below: float | None) -> tuple[int,
     return int(count), top
 
 
-def _vector_damping(damping: Damping | None, given: Damping | float | None) -> Damping:
-    if isinstance(given, Damping):
-        return given
+def _vector_zeta(
+    model: FEModel,
+    vectors: FloatArray,
+    omega: FloatArray,
+    damping: Damping | None,
+    given: Damping | float | None,
+) -> FloatArray:
+    if not omega.size:
+        return np.zeros(0)
     if given is not None:
-        return ModalDamping(given)
-    assert damping is not None  # noqa: S101
+        return (given if isinstance(given, Damping) else ModalDamping(given)).zeta(omega)
+    if damping is None:
+        return projected_zeta(model.D, vectors, omega)
     if isinstance(damping, ModalDamping) and not isinstance(damping.ratio, float):
         raise ModelError(
             "damping is given mode by mode, so that the attachment vectors have none: "
             "pass compliance_damping=, a ratio."
         )
-    return damping
+    return damping.zeta(omega)
 
 
 def _undamped(model: FEModel, count: int, top: float) -> tuple[FloatArray, FloatArray]:
@@ -165,10 +171,9 @@ def _undamped(model: FEModel, count: int, top: float) -> tuple[FloatArray, Float
 
 def _sparse_modes(model: FEModel, count: int, top: float) -> tuple[FloatArray, FloatArray]:
     """Return the lowest elastic modes by shift-invert Lanczos, complete by a Sturm count."""
-    M, K, rigid = model.M, model.K, model.rigid_body
+    M, rigid = model.M, model.rigid_body
+    K: Any = model.K
     n, r = rigid.shape
-    if count <= 0:
-        return np.zeros(0), np.zeros((n, 0))
     # far below the first elastic mode, yet K - shift M is well away from singular; what rounding
     # leaves in the rigid-body directions is projected out
     shift = -1e-12 * _largest(model)
@@ -179,10 +184,11 @@ def _sparse_modes(model: FEModel, count: int, top: float) -> tuple[FloatArray, F
             "for a sign in K."
         )
     if np.isfinite(top):
-        inside = negative_pivots(symmetric_lu(K - top * M)) - r
-        count = min(count, inside)
-        if count <= 0:
-            return np.zeros(0), np.zeros((n, 0))
+        count = min(count, negative_pivots(symmetric_lu(K - top * M)) - r)
+    if count <= 0:
+        return np.zeros(0), np.zeros((n, 0))
+    if count > n // 10:
+        return elastic_modes(dense(M), dense(K), rigid, count)
     loaded = np.asarray(M @ rigid)
 
     def solve(force: FloatArray) -> FloatArray:
@@ -193,16 +199,15 @@ def _sparse_modes(model: FEModel, count: int, top: float) -> tuple[FloatArray, F
     for attempt in range(3):
         # repeated pairs may lose a partner: over-ask, count, and try again from elsewhere
         asked = min(count + max(8, count // 4) * (attempt + 1), n - r - 1)
-        start = np.random.default_rng(attempt).standard_normal(n)
-        start -= rigid @ (loaded.T @ start)
+        start: Any = np.random.default_rng(attempt).standard_normal(n)
+        start = start - rigid @ (loaded.T @ start)
         try:
-            squares, phi = spla.eigsh(
-                K, asked, M, sigma=shift, OPinv=inverse, v0=start, ncv=min(3 * asked + 20, n)
-            )
+            found: Any = spla.eigsh(K, asked, M, shift, v0=start, ncv=3 * asked + 20, OPinv=inverse)
         except spla.ArpackNoConvergence as error:
             raise SolverError(f"Lanczos did not converge for {asked} modes: {error}.") from error
-        order = np.argsort(squares)
-        squares, phi = squares[order], phi[:, order]
+        order = np.argsort(found[0])
+        squares, phi = found[0][order], found[1][:, order]
+        check_stiffness(squares, _ROUNDING * _largest(model), r)
         gaps = np.flatnonzero(np.diff(squares) > _GAP * squares[1:]) + 1
         gaps = gaps[gaps >= count]
         if not gaps.size:
@@ -243,18 +248,21 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> None:
         )
 
 
-def _damped(model: FEModel, count: int, top: float, names: tuple[str, ...]) -> Modes | None:
-    """Return the complex modes of a model with its own D; None when D is proportional."""
-    omega, phi = _undamped(model, count, top)
-    damped: Any = np.asarray(model.D @ phi)
-    rate = np.sum(phi * damped, axis=0)
-    # of the whole D phi, not only its part in the kept modes: D may couple to truncated ones
-    weight = np.sqrt(diagonal(model.M))[:, None]
-    coupling = np.linalg.norm((damped - np.asarray(model.M @ phi) * rate) / weight, axis=0)
-    largest = float(np.max(np.abs(diagonal(model.D)) / diagonal(model.M), initial=0.0))
+def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:
+    """Return whether the kept modes are modes of the damped model too."""
+    D: Any = model.D
     r = model.rigid_body.shape[1]
-    if np.all(coupling[r:] <= 1e-9 * largest) and not np.any(rate[:r] > 1e-9 * largest):
-        return None
+    check_drag(phi[:, :r], D, omega[r:])
+    forces = np.asarray(D @ phi[:, r:])
+    rate = np.sum(phi[:, r:] * forces, axis=0)
+    # all of D phi, not only its part in the kept modes: D may couple to truncated ones
+    stray = forces - np.asarray(model.M @ phi[:, r:]) * rate
+    coupling = np.linalg.norm(stray / np.sqrt(diagonal(model.M))[:, None], axis=0)
+    largest = float(np.max(diagonal(D) / diagonal(model.M), initial=0.0))
+    return bool(np.all(coupling <= PROPORTIONAL * largest))
+
+
+def _complex_modes(model: FEModel, count: int, top: float, names: tuple[str, ...]) -> Modes:
     if model.n_dof > DENSE_LIMIT:
         raise ModelError(
             f"the damping D of this model of {model.n_dof} DOFs is not proportional: its complex "
@@ -270,5 +278,5 @@ def _damped(model: FEModel, count: int, top: float, names: tuple[str, ...]) -> M
     size = np.abs(form.poles)
     keep = np.flatnonzero(size**2 <= top)[:count]
     zeta = np.zeros(keep.size)
-    zeta[r:] = -form.poles[keep[r:]].real / size[keep[r:]]
-    return Modes(size[keep], zeta, form.phi[:, keep], model.dofs, n_rigid=r)
+    zeta[form.n_rigid :] = -form.poles[keep].real[form.n_rigid :] / size[keep][form.n_rigid :]
+    return Modes(size[keep], zeta, form.phi[:, keep], model.dofs, n_rigid=form.n_rigid)

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
-import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet
 from ..values import FloatArray, Matrix, Value, real_array
 from .damping import Damping, Rayleigh
+from .eigen import elastic_modes
 from .factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
 from .rigid import rigid_body_basis
 
@@ -161,23 +161,20 @@ def _full_damping(model: FEModel, damping: Damping) -> FloatArray:
     loaded = M @ rigid
     if isinstance(damping, Rayleigh):
         return damping.alpha * (M - loaded @ loaded.T) + damping.beta * K
-    scaled, scale = unit_diagonal(M)
-    squares, phi = la.eigh(scale[:, None] * K * scale, dense(scaled))
+    elastic, phi = elastic_modes(M, K, rigid)
     r = rigid.shape[1]
-    elastic = scale[:, None] * phi[:, r:]
-    elastic = elastic - rigid @ (loaded.T @ elastic)
-    omega = np.concatenate([np.zeros(r), np.sqrt(np.maximum(squares[r:], 0.0))])
-    rate = 2 * damping.zeta(omega)[r:] * omega[r:]
-    shapes = M @ elastic
-    D = (shapes * rate) @ shapes.T
-    return 0.5 * (D + D.T)
+    zeta = damping.zeta(np.concatenate([np.zeros(r), elastic]))[r:]
+    forces = M @ phi
+    D = (forces * (2 * zeta * elastic)) @ forces.T
+    return np.asarray(0.5 * (D + D.T), dtype=np.float64)
 
 
-def _symmetric(value: Any, name: str, n: int) -> Matrix:
-    if sp.issparse(value):
+def _symmetric(given: Any, name: str, n: int) -> Matrix:
+    value, matrix = given, cast(Any, None)
+    if sp.issparse(given):
         if value.shape != (n, n):
             raise ShapeError(f"{name} must have shape ({n}, {n}), got {value.shape}.")
-        matrix: Any = sp.csc_array(value)
+        matrix = sp.csc_array(value)
         matrix = sp.csc_array(
             (real_array(matrix.data, f"stored entries of {name}"), matrix.indices, matrix.indptr),
             shape=(n, n),
@@ -194,7 +191,7 @@ def _symmetric(value: Any, name: str, n: int) -> Matrix:
             f"{matrix[j, i]:.6g} (counted from 0). Reciprocity would not hold. Symmetrise it, "
             f"0.5 * ({name} + {name}.T), when the difference is only rounding."
         )
-    return matrix  # type: ignore[no-any-return]
+    return cast(Matrix, matrix)
 
 
 def _is_semidefinite(matrix: Matrix) -> bool:
@@ -211,5 +208,5 @@ def _lowest(matrix: Matrix) -> str:
         return f"its diagonal entry {i} (from 0) is {entries[i]:.3g}"
     if matrix.shape[0] > DENSE_LIMIT:
         return "its factorisation has negative pivots"
-    lowest = la.eigvalsh(dense(unit_diagonal(matrix)[0]))[0]
+    lowest = np.linalg.eigvalsh(dense(unit_diagonal(matrix)[0]))[0]
     return f"scaled to a unit diagonal its lowest eigenvalue is {lowest:.3g}"

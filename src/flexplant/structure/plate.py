@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from typing import cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -100,9 +101,7 @@ def kirchhoff_plate(
     }
     # not through the checks of the door: sums of definite elements are definite, and at 1e5
     # elements the factorisation that proves it again takes longer than everything here
-    model = rebuild(FEModel, fields)
-    assert isinstance(model, FEModel)  # noqa: S101
-    return model
+    return cast(FEModel, rebuild(FEModel, fields))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -213,7 +212,7 @@ def _unit_coefficients() -> FloatArray:
 
 def _coefficients(a: float, b: float) -> FloatArray:
     """Return the coefficients (12, 12) of unit DOFs z, rx, ry of an element a x b."""
-    return _unit_coefficients() * np.tile([1.0, b, a], 4)
+    return np.asarray(_unit_coefficients() * np.tile([1.0, b, a], 4), dtype=np.float64)
 
 
 def _product(first: tuple[int, int], second: tuple[int, int]) -> FloatArray:

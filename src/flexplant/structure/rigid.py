@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg as la
 
@@ -10,7 +12,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray, Matrix
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
-_ENERGY_TOLERANCE = 1e-9
+_ENERGY_TOLERANCE = 1e-10
 
 
 def rigid_motions(dofs: DofSet, centre: FloatArray | None = None) -> FloatArray:
@@ -41,20 +43,23 @@ def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     n = len(dofs)
     motions = rigid_motions(dofs, dofs.xyz.mean(axis=0) if n else None)
     size = np.linalg.norm(motions, axis=0)
-    extent = float(np.ptp(dofs.xyz, axis=0).max(initial=0.0))
+    extent = float(np.ptp(dofs.xyz, axis=0).max())
     present = size > 1e-12 * np.where(np.arange(6) < 3, 1.0, max(extent, 1e-300)) * np.sqrt(n)
-    motions = motions[:, present]
+    # independent ones only: with few DOFs some of the six coincide
+    motions = orthonormalised(M, motions[:, present], dependent="drop")
     # K and |K| |r|, row by row: forces of rounding size say that no energy is stored
-    scale = np.linalg.norm(abs(K) @ np.abs(motions), axis=0)
+    size_of_K: Any = abs(K)
+    scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
     force = np.asarray(K @ motions) / np.where(scale > 0, scale, 1.0)
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
-    basis = motions[:, free]
-    if not np.all(free):
-        _, values, right = la.svd(force, full_matrices=False)
-        null = right[values < _ENERGY_TOLERANCE].T
-        if null.shape[1] > basis.shape[1]:
-            basis = motions @ (null / np.where(scale > 0, scale, 1.0)[:, None])
-    return orthonormalised(M, basis, dependent="drop")
+    if np.all(free):
+        return motions
+    right, values = la.svd(force)[2], np.zeros(scale.size)
+    values[: min(force.shape)] = la.svdvals(force)
+    null = right[values < _ENERGY_TOLERANCE].T
+    if null.shape[1] > np.count_nonzero(free):
+        return orthonormalised(M, motions @ (null / np.where(scale > 0, scale, 1.0)[:, None]))
+    return motions[:, free]
 
 
 def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:
@@ -87,4 +92,4 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
 
 
 def _length(M: Matrix, vector: FloatArray) -> float:
-    return float(np.sqrt(max(vector @ (M @ vector), 0.0)))
+    return float(np.sqrt(np.vdot(vector, np.asarray(M @ vector))))
