@@ -1,1 +1,3 @@
-"""To be written."""
+"""What the hardware says: measured poles and mode shapes."""
+
+from .measured import MeasuredModes as MeasuredModes

@@ -1,0 +1,157 @@
+"""Poles that were measured, and which modes they belong to."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import LabelError, ModelError, ShapeError
+from ..values import ComplexArray, FloatArray, Value, real_array
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MeasuredModes(Value):
+    """Complex eigenvalues of a real structure, ``lambda = -zeta omega + i omega sqrt(1-zeta^2)``.
+
+    Parameters
+    ----------
+    poles : (m,) complex array [rad/s]
+        One of each conjugate pair, with either sign of the imaginary part (the paper prints the
+        negative one); stored with the positive one.
+    modes : sequence of m int, optional
+        The number of each mode in the model, from 1, rigid-body modes included. Updating needs
+        them.
+    covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
+        Variance E|d lambda|^2 of each pole, its real and imaginary parts equally uncertain and
+        independent, or the covariance matrix of [Re lambda; Im lambda]; stored as the latter.
+
+    Raises
+    ------
+    ShapeError
+        When lengths differ.
+    ModelError
+        When poles are not finite, real (overdamped or rigid) or unstable, or the covariance is
+        not positive definite.
+    LabelError
+        When mode numbers are not whole numbers from 1 or appear twice.
+
+    Examples
+    --------
+    >>> MeasuredModes([-28.5 - 2870j, -39.3 - 3970j], modes=[6, 7])
+    <MeasuredModes: 2 poles, modes 6, 7 at 456.8, 631.9 Hz>
+    """
+
+    poles: ComplexArray
+    modes: tuple[int, ...] | None = field(default=None, kw_only=True)
+    covariance: FloatArray | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        poles = _checked_poles(self.poles)
+        numbers = None if self.modes is None else _checked_numbers(self.modes, poles.size)
+        covariance = self.covariance
+        if covariance is not None:
+            covariance = _checked_covariance(covariance, poles.size)
+            # a conjugated pole carries the opposite error in its imaginary part
+            signs = np.concatenate([np.ones(poles.size), np.sign(poles.imag)])
+            covariance = covariance * np.outer(signs, signs)
+        self._set(poles=poles.real + 1j * np.abs(poles.imag), modes=numbers, covariance=covariance)
+
+    def __len__(self) -> int:
+        return int(self.poles.size)
+
+    def __repr__(self) -> str:
+        known = "" if self.modes is None else ", modes " + _listed(self.modes, "d")
+        doubt = "" if self.covariance is None else ", with covariance"
+        plural = "" if len(self) == 1 else "s"
+        return (
+            f"<MeasuredModes: {len(self)} pole{plural}{known} at "
+            f"{_listed(self.freq, '.1f')} Hz{doubt}>"
+        )
+
+    @property
+    def freq(self) -> FloatArray:
+        """Undamped natural frequencies |lambda|/(2 pi) [Hz]."""
+        return np.abs(self.poles) / (2 * np.pi)
+
+    @property
+    def zeta(self) -> FloatArray:
+        """Modal damping ratios -Re lambda / |lambda|."""
+        return np.asarray(-self.poles.real / np.abs(self.poles), dtype=np.float64)
+
+
+def _listed(numbers: Iterable[float], form: str) -> str:
+    items = list(numbers)
+    shown = ", ".join(format(item, form) for item in items[:6])
+    return shown + (", ..." if len(items) > 6 else "")
+
+
+def _checked_poles(value: Any) -> ComplexArray:
+    try:
+        poles = np.array(value, dtype=np.complex128)
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"poles must be complex numbers, got {value!r:.80}.") from error
+    if poles.ndim != 1 or not poles.size:
+        raise ShapeError(
+            f"poles must have shape (m,) with m of at least one, got {poles.shape}: give one "
+            "eigenvalue of each conjugate pair."
+        )
+    for i, pole in enumerate(poles.tolist()):
+        if not np.isfinite(pole):
+            raise ModelError(
+                f"pole {i} is {pole}: no result could be trusted. Remove it at its source."
+            )
+        if pole.imag == 0:
+            raise ModelError(
+                f"pole {i} is {pole:g}, a real one (overdamped, or of a rigid-body mode): a mode "
+                "with an oscillation is needed to compare. Give poles in rad/s with their "
+                "imaginary part, or leave this one out."
+            )
+        if pole.real > 0:
+            raise ModelError(
+                f"pole {i} is {pole:g}, unstable: a passive structure's poles have a real part "
+                "of at most zero. Check the sign convention (exp(lambda t)) or the fit."
+            )
+    return poles
+
+
+def _checked_numbers(value: Any, count: int) -> tuple[int, ...]:
+    numbers = np.asarray(value)
+    if numbers.ndim != 1 or numbers.size != count:
+        raise ShapeError(
+            f"{count} poles need {count} mode numbers, got modes of shape {numbers.shape}."
+        )
+    if numbers.dtype.kind not in "iu" or numbers.min() < 1:
+        raise LabelError(
+            f"modes must be whole numbers from 1 (rigid-body modes included), got "
+            f"{numbers.tolist()!r:.80}."
+        )
+    listed = tuple(int(number) for number in numbers)
+    twice = sorted({number for number in listed if listed.count(number) > 1})
+    if twice:
+        raise LabelError(
+            f"modes {twice} have more than one pole each: a mode has one. Average repeated "
+            "measurements, or give each its own MeasuredModes."
+        )
+    return listed
+
+
+def _checked_covariance(value: Any, count: int) -> FloatArray:
+    if np.ndim(value) == 1:
+        variance = real_array(value, "covariance", (count,))
+        matrix = np.diag(np.concatenate([variance, variance]) / 2)
+    else:
+        matrix = real_array(value, "covariance", (2 * count, 2 * count))
+    if not np.allclose(matrix, matrix.T, rtol=1e-9, atol=0.0):
+        raise ModelError("covariance must be symmetric: pass (C + C.T)/2 if that is meant.")
+    try:
+        la.cholesky(matrix)
+    except la.LinAlgError:
+        raise ModelError(
+            "covariance must be positive definite: a pole without doubt would get infinite "
+            "weight. Give every pole a positive variance in (rad/s)^2."
+        ) from None
+    return (matrix + matrix.T) / 2

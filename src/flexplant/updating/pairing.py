@@ -1,0 +1,70 @@
+"""Which mode of the changed model is which of the one before: by shape, close modes by order."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components
+
+from ..values import ComplexArray, FloatArray, IntArray
+from .sensitivity import groups
+
+#: modes closer than this, relatively, are a cluster: their shapes mix at the least change
+CLUSTER = 0.02
+#: MAC below which two shapes of a cluster have nothing of each other
+FOREIGN = 1e-4
+
+
+def mac(X: ComplexArray, Y: ComplexArray) -> FloatArray:
+    """Return the modal assurance criterion of each column of X with each of Y, from 0 to 1."""
+    product = np.abs(X.conj().T @ Y) ** 2
+    sizes = np.outer(np.sum(np.abs(X) ** 2, axis=0), np.sum(np.abs(Y) ** 2, axis=0))
+    return np.asarray(product / sizes, dtype=np.float64)
+
+
+def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntArray:
+    """Return for each old mode the column of the new mode that continues it, -1 for none.
+
+    A one-to-one assignment of largest MAC. Modes of a cluster (a gap under 2 %) are found
+    together, by what of each new shape lies in their subspace; inside it, shapes that have
+    nothing of each other keep to themselves and may cross, all others keep their order of
+    frequency, since two modes that couple veer instead of crossing.
+
+    Parameters
+    ----------
+    old_poles : (m,) complex array
+        Eigenvalues, by rising frequency.
+    old_X, X : (k, m), (k, m') complex arrays
+        Shapes by rising frequency, in coordinates where the mass matrix is about the unit matrix.
+    """
+    shapes = mac(old_X, X)
+    score = shapes.copy()
+    clusters = groups(old_poles, gap=CLUSTER)
+    for cluster in clusters:
+        basis = np.linalg.qr(old_X[:, cluster])[0]
+        inside = np.sum(np.abs(basis.conj().T @ X) ** 2, axis=0) / np.sum(np.abs(X) ** 2, axis=0)
+        score[cluster] = inside
+    found = np.full(old_poles.size, -1, dtype=np.int64)
+    rows, columns = linear_sum_assignment(-score)
+    found[rows] = columns
+    for cluster in clusters:
+        members = np.array([i for i in cluster if found[i] >= 0], dtype=np.int64)
+        found[members] = _inside(shapes, members, found[members])
+    return found
+
+
+def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
+    """Return the new modes of a cluster in the order of its old ones."""
+    s = old.size
+    new = np.sort(new)
+    graph = np.zeros((2 * s, 2 * s), dtype=np.int8)
+    graph[:s, s:] = shapes[np.ix_(old, new)] > FOREIGN
+    count, part = connected_components(csr_array(graph), directed=False)
+    sides = [(np.flatnonzero(part[:s] == c), np.flatnonzero(part[s:] == c)) for c in range(count)]
+    if any(a.size != b.size for a, b in sides):
+        return new
+    found = new.copy()
+    for a, b in sides:
+        found[a] = new[b]
+    return found

@@ -1,0 +1,188 @@
+"""What may differ between the model and the machine: parameters of M, D and K."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, TypeAlias
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..labels import DIRECTIONS, Place
+from ..values import FloatArray, Value, real_array
+
+#: derivatives of M, D and K to one parameter, None where zero
+Derivatives: TypeAlias = "tuple[FloatArray | None, FloatArray | None, FloatArray | None]"
+
+
+class Parameter(Value):
+    """One unknown p on which M, D and K depend affinely: M(p) = M + p dM, and so on.
+
+    A subclass has a unique `name`, a `unit` and says its matrices.
+    """
+
+    name: str
+    unit: ClassVar[str] = ""
+
+    def matrices(self, model: Any) -> Derivatives:
+        """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero.
+
+        Raises
+        ------
+        LabelError
+            When the model does not know the place.
+        """
+        raise NotImplementedError
+
+    def text(self, value: float) -> str:
+        """Return name, value and unit in one phrase."""
+        return f"{self.name} = {value:.6g} {self.unit}"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PointParameter(Parameter):
+    """A parameter that acts at one place r on one of the matrices, as p r r^T.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        DOF label, point (interpolated between nodes) or {label: weight}.
+    direction : str
+        Of the motion at a point; labels carry their own.
+    name : str, optional
+        For results; made from the place when not given.
+
+    Raises
+    ------
+    LabelError
+        When the direction is unknown or `at` is no place.
+    """
+
+    at: Place
+    direction: str = field(default="z", kw_only=True)
+    name: str = field(default="", kw_only=True)
+
+    quantity: ClassVar[str] = ""
+    acts_on: ClassVar[int] = 0
+
+    def __post_init__(self) -> None:
+        if self.direction not in DIRECTIONS:
+            raise unknown_label("direction", self.direction, DIRECTIONS)
+        place, text = _checked_place(self.at, self.direction)
+        name = str(self.name or f"{self.quantity} at {text}")
+        self._set(at=place, direction=self.direction, name=name)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__}: {self.name} [{self.unit}]>"
+
+    def matrices(self, model: Any) -> Derivatives:
+        """Return (dM, dD, dK) of the model, r r^T in the place of this quantity.
+
+        Parameters
+        ----------
+        model : ReducedModel or FEModel
+            Anything with `row(at, direction)`, or `dofs` with it.
+        """
+        rows = model if hasattr(model, "row") else model.dofs
+        row = np.asarray(rows.row(self.at, self.direction), dtype=np.float64)
+        if not np.any(row):
+            raise ModelError(
+                f"{self.name} acts on nothing: its weights are all zero. Give a place with motion."
+            )
+        parts: list[FloatArray | None] = [None, None, None]
+        parts[self.acts_on] = np.outer(row, row)
+        return parts[0], parts[1], parts[2]
+
+
+class AddedMass(PointParameter):
+    """A point mass [kg] (about a rotation: inertia [kg m^2]) added at a place: M + p r r^T.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        DOF label, point (interpolated between nodes) or {label: weight}; the mass moves in this
+        direction only.
+    direction : str
+        Of the motion at a point; labels carry their own.
+    name : str, optional
+        For results; made from the place when not given.
+
+    Examples
+    --------
+    >>> AddedMass("14:z")
+    <AddedMass: mass at 14:z [kg]>
+    """
+
+    quantity = "mass"
+    unit = "kg"
+    acts_on = 0
+
+
+class AddedDamping(PointParameter):
+    """A viscous damper [N s/m] between a place and the ground: D + p r r^T.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        DOF label, point (interpolated between nodes) or {label: weight}; a mapping
+        {a: 1, b: -1} is a damper between two DOFs.
+    direction : str
+        Of the motion at a point; labels carry their own.
+    name : str, optional
+        For results; made from the place when not given.
+
+    Examples
+    --------
+    >>> AddedDamping((0.3, 0.15, 0.0))
+    <AddedDamping: damping at (0.3, 0.15, 0) z [N s/m]>
+    """
+
+    quantity = "damping"
+    unit = "N s/m"
+    acts_on = 1
+
+
+class AddedStiffness(PointParameter):
+    """A spring [N/m] between a place and the ground: K + p r r^T.
+
+    On a free structure a spring to the ground takes away the rigid-body modes that move it; they
+    become suspension modes, with sqrt(p) as frequency, so they can only be fitted from a start
+    that is not zero.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        DOF label, point (interpolated between nodes) or {label: weight}; a mapping
+        {a: 1, b: -1} is a spring between two DOFs.
+    direction : str
+        Of the motion at a point; labels carry their own.
+    name : str, optional
+        For results; made from the place when not given.
+
+    Examples
+    --------
+    >>> AddedStiffness({"14:z": 1.0, "15:z": -1.0}, name="crack")
+    <AddedStiffness: crack [N/m]>
+    """
+
+    quantity = "stiffness"
+    unit = "N/m"
+    acts_on = 2
+
+
+def _checked_place(at: Any, direction: str) -> tuple[Place, str]:
+    if isinstance(at, str):
+        if not at:
+            raise LabelError("at='' is no place: give a DOF label such as '41:z', or a point.")
+        return at, at
+    if isinstance(at, Mapping):
+        if not at:
+            raise LabelError("at={} is no place: give {DOF label: weight}.")
+        weights = {
+            str(label): float(real_array(weight, f"weight of {label!r}", ()))
+            for label, weight in at.items()
+        }
+        return weights, " ".join(f"{weight:+g}*{label}" for label, weight in weights.items())
+    point = tuple(real_array(at, "at", (3,)).tolist())
+    return point, "(" + ", ".join(f"{x:g}" for x in point) + f") {direction}"

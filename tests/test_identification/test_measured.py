@@ -1,0 +1,109 @@
+"""MeasuredModes: what is stored, and what is refused."""
+
+import pickle
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.identification import MeasuredModes
+from flexplant.store import load
+
+POLES = [-28.5 - 2870j, -39.3 + 3970j]
+
+
+def test_either_sign_of_the_imaginary_part_is_stored_positive():
+    measured = MeasuredModes(POLES, modes=[6, 7])
+    assert measured.poles.tolist() == [-28.5 + 2870j, -39.3 + 3970j]
+    assert measured.modes == (6, 7)
+    assert len(measured) == 2
+    assert not measured.poles.flags.writeable
+
+
+def test_frequency_and_damping_are_those_of_the_pole():
+    omega, zeta = 2 * np.pi * 455.0, 0.013
+    pole = -zeta * omega + 1j * omega * np.sqrt(1 - zeta**2)
+    measured = MeasuredModes([pole])
+    assert measured.freq[0] == pytest.approx(455.0, rel=1e-14)
+    assert measured.zeta[0] == pytest.approx(0.013, rel=1e-12)
+
+
+def test_conjugating_a_pole_conjugates_its_covariance():
+    C = np.array([[4.0, 1.0], [1.0, 2.0]])
+    plus = MeasuredModes([-1 + 10j], covariance=C)
+    minus = MeasuredModes([-1 - 10j], covariance=C)
+    assert plus.covariance.tolist() == C.tolist()
+    assert minus.covariance.tolist() == [[4.0, -1.0], [-1.0, 2.0]]
+
+
+def test_variances_are_shared_by_real_and_imaginary_parts():
+    measured = MeasuredModes(POLES, covariance=[2.0, 8.0])
+    assert np.array_equal(measured.covariance, np.diag([1.0, 4.0, 1.0, 4.0]))
+
+
+def test_value_survives_file_and_pickle(tmp_path):
+    measured = MeasuredModes(POLES, modes=[6, 7], covariance=[2.0, 8.0])
+    measured.save(tmp_path / "m.npz")
+    for again in (load(tmp_path / "m.npz"), pickle.loads(pickle.dumps(measured))):
+        assert again.modes == (6, 7)
+        assert np.array_equal(again.poles, measured.poles)
+        assert np.array_equal(again.covariance, measured.covariance)
+        assert not again.poles.flags.writeable
+
+
+def test_repr_is_one_line_without_arrays():
+    text = repr(MeasuredModes([-1 + 100j * k for k in range(1, 10)], modes=range(4, 13)))
+    assert text.startswith("<MeasuredModes: 9 poles, modes 4, 5, 6, 7, 8, 9, ... at 15.9")
+    assert "\n" not in text
+    assert "array" not in text
+
+
+@pytest.mark.parametrize(
+    ("poles", "error", "text"),
+    [
+        ([], ShapeError, "at least one"),
+        ([[-1 + 1j]], ShapeError, "shape"),
+        (-1 + 1j, ShapeError, "shape"),
+        (["a"], ModelError, "complex numbers"),
+        ([-1 + 10j, complex(np.nan, 1)], ModelError, "pole 1"),
+        ([complex(-1, np.inf)], ModelError, "pole 0"),
+        ([-5.0], ModelError, "overdamped"),
+        ([0.0], ModelError, "rigid-body"),
+        ([0.1 + 10j], ModelError, "unstable"),
+    ],
+)
+def test_bad_poles_are_refused(poles, error, text):
+    with pytest.raises(error, match=text):
+        MeasuredModes(poles)
+
+
+@pytest.mark.parametrize(
+    ("modes", "error", "text"),
+    [
+        ([6], ShapeError, "2 poles need 2"),
+        (6, ShapeError, "2 poles need 2"),
+        ([0, 6], LabelError, "from 1"),
+        ([6.0, 7.0], LabelError, "whole numbers"),
+        ([True, False], LabelError, "whole numbers"),
+        ([6, 6], LabelError, r"modes \[6\] have more than one"),
+    ],
+)
+def test_bad_mode_numbers_are_refused(modes, error, text):
+    with pytest.raises(error, match=text):
+        MeasuredModes(POLES, modes=modes)
+
+
+@pytest.mark.parametrize(
+    ("covariance", "error", "text"),
+    [
+        ([1.0], ShapeError, "covariance"),
+        (np.eye(3), ShapeError, "covariance"),
+        ([1.0, np.nan], ModelError, "NaN"),
+        ([1.0, 0.0], ModelError, "positive definite"),
+        (np.eye(4) + np.eye(4, k=1), ModelError, "symmetric"),
+        (-np.eye(4), ModelError, "positive definite"),
+    ],
+)
+def test_bad_covariance_is_refused(covariance, error, text):
+    with pytest.raises(error, match=text):
+        MeasuredModes(POLES, covariance=covariance)

@@ -1,0 +1,76 @@
+"""What a parameter adds to M, D and K."""
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.store import load
+from flexplant.updating import AddedDamping, AddedMass, AddedStiffness
+
+KINDS = [(AddedMass, 0, "kg"), (AddedDamping, 1, "N s/m"), (AddedStiffness, 2, "N/m")]
+
+
+@pytest.mark.parametrize(("kind", "place", "unit"), KINDS)
+def test_a_dof_gives_one_entry_of_one_matrix(plate, kind, place, unit):
+    rom = plate.reduced(0.01, False)
+    parts = kind(plate.z8).matrices(rom)
+    assert [part is None for part in parts] == [i != place for i in range(3)]
+    expected = np.zeros((24, 24))
+    at = rom.dofs.index(plate.z8)
+    expected[at, at] = 1.0
+    np.testing.assert_allclose(parts[place], expected, atol=1e-12)
+    assert repr(kind(plate.z8)).endswith(f"at {plate.z8} [{unit}]>")
+
+
+def test_a_point_between_nodes_uses_the_shape_functions(plate):
+    rom = plate.reduced(0.01, True)
+    point = (0.311, 0.137, 0.0)
+    row = plate.model.dofs.row(point) @ rom.T
+    dM, _, _ = AddedMass(point).matrices(rom)
+    np.testing.assert_allclose(dM, np.outer(row, row), rtol=1e-13, atol=1e-15)
+    row = plate.model.dofs.row(point, "rx")
+    _, _, dK = AddedStiffness(point, direction="rx").matrices(plate.model)
+    np.testing.assert_allclose(dK, np.outer(row, row), atol=1e-12)
+
+
+def test_a_mapping_acts_between_dofs(make):
+    model = make([1, 1, 1], [(0, 1, 1.0), (1, 2, 1.0)])
+    _, _, dK = AddedStiffness({"1:z": 1, "3:z": -1}).matrices(model)
+    assert dK.tolist() == [[1, 0, -1], [0, 0, 0], [-1, 0, 1]]
+
+
+def test_names_say_what_and_where():
+    assert AddedMass("14:z").name == "mass at 14:z"
+    assert AddedDamping((0.3, 0.15, 0)).name == "damping at (0.3, 0.15, 0) z"
+    assert AddedStiffness({"1:z": 1, "2:z": -1}).name == "stiffness at +1*1:z -1*2:z"
+    assert AddedMass("14:z", name="actuator").name == "actuator"
+
+
+def test_a_parameter_survives_a_file(tmp_path):
+    AddedStiffness({"1:z": 1, "2:z": -1}, name="crack").save(tmp_path / "p.npz")
+    again = load(tmp_path / "p.npz")
+    assert isinstance(again, AddedStiffness)
+    assert again.name == "crack"
+    assert dict(again.at) == {"1:z": 1.0, "2:z": -1.0}
+
+
+@pytest.mark.parametrize("kind", [AddedMass, AddedDamping, AddedStiffness])
+def test_bad_places_are_refused(kind, plate):
+    for at, error in [
+        ("", LabelError),
+        ({}, LabelError),
+        ((0.1, 0.2), ShapeError),
+        ((0.1, 0.2, np.nan), ModelError),
+        ({"1:z": np.inf}, ModelError),
+    ]:
+        with pytest.raises(error):
+            kind(at)
+    with pytest.raises(LabelError, match="direction"):
+        kind("1:z", direction="up")
+    rom = plate.reduced(0.01, False)
+    with pytest.raises(LabelError, match="999:z"):
+        kind("999:z").matrices(rom)
+    with pytest.raises(LabelError):
+        kind((0.7, 0.1, 0.0)).matrices(rom)
+    with pytest.raises(ModelError, match="acts on nothing"):
+        kind({plate.z8: 0.0}).matrices(rom)
