@@ -1,1 +1,10 @@
-"""To be written."""
+"""Closing the loop by names, and how well it then stands: sensitivities and margins."""
+
+from .closed import ClosedLoop as ClosedLoop
+from .closed import close_loop as close_loop
+from .margins import bandwidth as bandwidth
+from .margins import modulus_margin as modulus_margin
+from .sensitivity import complementary_sensitivity as complementary_sensitivity
+from .sensitivity import control_sensitivity as control_sensitivity
+from .sensitivity import loop_gain as loop_gain
+from .sensitivity import sensitivity as sensitivity

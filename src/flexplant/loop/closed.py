@@ -1,0 +1,294 @@
+"""close_loop: a plant and its controller blocks, connected by name."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..lti.interconnection import connect, lft
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import Value
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ClosedLoop(Value):
+    """A plant with its controller: ``u = K y``, everything known by name.
+
+    Made by `close_loop`.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        The plant, open.
+    blocks : sequence of StateSpace
+        What was connected; `close_loop(other_plant, *loop.blocks)` closes the same controller
+        around another machine.
+    controller : StateSpace
+        All blocks as one system: plant.y -> the driven actuators, then the other outputs of the
+        blocks (an observer's estimates, say), which are monitored.
+    idle : sequence of str
+        Actuators that nothing drives.
+    """
+
+    plant: StandardPlant
+    blocks: tuple[StateSpace, ...]
+    controller: StateSpace
+    idle: tuple[str, ...] = ()
+
+    def __repr__(self) -> str:
+        kind = f"dt {self.plant.dt:g} s" if self.plant.dt else "continuous"
+        plant, controller = self.plant.system.n_states, self.controller.n_states
+        lines = [f"<ClosedLoop: plant {plant} states, controller {controller} states, {kind}>"]
+        lines.append(f"  driven: {' '.join(self.driven)}")
+        if self.watched:
+            shown = " ".join(self.watched[:8]) + (" ..." if len(self.watched) > 8 else "")
+            lines.append(f"  monitored: {shown}")
+        return "\n".join(lines)
+
+    @property
+    def driven(self) -> tuple[str, ...]:
+        """The actuators that the controller drives."""
+        return tuple(name for name in self.plant.u if name not in self.idle)
+
+    @property
+    def watched(self) -> tuple[str, ...]:
+        """The outputs of blocks that drive no actuator, such as `die:hat`."""
+        return tuple(name for name in self.controller.outputs if name not in self.driven)
+
+    @cached_property
+    def fed_back(self) -> tuple[str, ...]:
+        """The channels of y that u can move; references are not among them."""
+        moves = _moved(self.plant, self.driven)
+        return tuple(name for name, moved in zip(self.plant.y, moves, strict=True) if moved)
+
+    @cached_property
+    def monitored(self) -> StateSpace:
+        """The closed loop from w to z, y, the driven u and the monitored outputs of blocks."""
+        g, watched = self.plant.system, self.watched
+        shown = [*self.plant.z, *self.plant.y, *self.driven, *watched]
+        rows = g.output_index([*self.plant.z, *self.plant.y])
+        tapped = [*self.driven, *watched]  # inputs of the tapped plant, and outputs unchanged
+        columns = g.input_index([*self.plant.w, *self.driven])
+        extra = np.zeros((g.n_states, len(watched)))
+        fed = g.output_index(self.plant.y)
+        D = np.zeros((len(shown) + fed.size, columns.size + len(watched)))
+        D[: rows.size, : columns.size] = g.D[np.ix_(rows, columns)]
+        D[rows.size : len(shown), len(self.plant.w) :] = np.eye(len(tapped))
+        D[len(shown) :, : columns.size] = g.D[np.ix_(fed, columns)]
+        C = np.vstack([g.C[rows], np.zeros((len(tapped), g.n_states)), g.C[fed]])
+        ear = [f"{name}|loop" for name in self.plant.y]
+        opened = StateSpace(
+            g.A,
+            np.hstack([g.B[:, columns], extra]),
+            C,
+            D,
+            g.dt,
+            inputs=[*self.plant.w, *tapped],
+            outputs=[*shown, *ear],
+            states=g.states,
+            name=g.name,
+        )
+        return lft(opened, self.controller.replace(inputs=ear))
+
+    @cached_property
+    def system(self) -> StateSpace:
+        """The closed loop from w to z; states of the plant, then of the controller."""
+        return self.monitored.select(outputs=self.plant.z)
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest magnitude of the closed loop's eigenvalues; stable below 1.
+
+        Raises
+        ------
+        ModelError
+            In continuous time, where the `spectral_abscissa` decides.
+        """
+        if not self.plant.dt:
+            raise ModelError(
+                "the spectral radius belongs to sampled loops; this one is continuous: "
+                "use spectral_abscissa, or close the loop around plant.discretized(rate)."
+            )
+        return float(np.max(np.abs(self.monitored.poles()), initial=0.0))
+
+    @property
+    def spectral_abscissa(self) -> float:
+        """Largest real part of the closed loop's eigenvalues [rad/s]; stable below 0.
+
+        For a sampled loop the decay rate ``log(spectral_radius) / dt``.
+        """
+        if self.plant.dt:
+            with np.errstate(divide="ignore"):
+                return float(np.log(self.spectral_radius) / self.plant.dt)
+        return float(np.max(self.monitored.poles().real, initial=-np.inf))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether all eigenvalues of the closed loop are strictly inside the stability region."""
+        return self.monitored.is_stable
+
+    @cached_property
+    def modulus_margin(self) -> float:
+        """Smallest distance of the loop gain to the critical point, broken at u.
+
+        ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
+        loop's resonances. An unstable loop has none: 0.
+        """
+        from .margins import modulus_margin
+
+        return modulus_margin(self)
+
+
+def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> ClosedLoop:
+    """Return the closed loop of a plant with controller blocks, connected by name.
+
+    An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
+    applied command of an actuator (plant.u), or an output of another block. An output of a block
+    that has an actuator's name drives it, and several such outputs add; every other output is
+    monitored.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        The plant.
+    *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
+        The controller in any number of parts. Sampled at the plant's rate, or static gains.
+    idle : iterable of str
+        Actuators that stay without a drive on purpose.
+
+    Returns
+    -------
+    ClosedLoop
+        Stable or not: see `is_stable`, `spectral_radius`, `modulus_margin`.
+
+    Raises
+    ------
+    LabelError
+        When an input is connected to nothing, an actuator is driven by nothing (and not idle), or
+        a name other than an actuator's is driven twice.
+    ModelError
+        When there is no block, a block is no system, sampling times differ, or the algebraic loop
+        is ill-posed.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from flexplant.plant import StandardPlant
+    >>> mass = StateSpace([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0], [1, 0], [0, 1]],
+    ...     np.zeros((3, 2)), inputs=["f", "u"], outputs=["z", "y", "v"])
+    >>> plant = StandardPlant.from_statespace(mass, u=["u"], y=["y", "v"])
+    >>> pd = StateSpace([], [], [], [[-100.0, -20.0]], inputs=["y", "v"], outputs=["u"])
+    >>> loop = close_loop(plant, pd)
+    >>> loop.is_stable, round(loop.spectral_abscissa, 6)
+    (True, -10.0)
+    """
+    if not isinstance(plant, StandardPlant):
+        raise ModelError(
+            f"close_loop needs a StandardPlant first, got {type(plant).__name__}. Use "
+            "assemble_plant(model, ports), or StandardPlant.from_statespace(sys, u=, y=)."
+        )
+    systems = tuple(_block(block, i, plant.dt) for i, block in enumerate(blocks, 1))
+    if not systems:
+        raise ModelError(
+            "close_loop needs at least one block that drives an actuator: pass a StateSpace, "
+            "a Controller, or an observer and a servo."
+        )
+    resting = (idle,) if isinstance(idle, str) else tuple(idle)
+    for name in resting:
+        if name not in plant.u:
+            raise unknown_label("actuator to leave idle", name, plant.u)
+    driven, watched = _drives(plant, systems, resting)
+    _check_inputs(plant, systems)
+    silent = [name for name in resting if any(name in sys.inputs for sys in systems)]
+    none = np.zeros((0, 0))
+    zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
+    controller = connect(
+        [*systems, zero] if silent else systems,
+        inputs=plant.y,
+        outputs=[*driven, *watched],
+        adding=driven,
+    )
+    return ClosedLoop(plant, systems, controller.replace(dt=plant.dt), resting)
+
+
+def _block(block: Any, place: int, dt: float) -> StateSpace:
+    """Return a block as a StateSpace of the plant's dt."""
+    inner = getattr(block, "system", block)
+    if isinstance(block, StandardPlant) or not (
+        isinstance(inner, StateSpace) or hasattr(inner, "input_labels")
+    ):
+        raise ModelError(
+            f"block {place} is a {type(block).__name__}, not a system with named channels. Pass a "
+            "StateSpace with inputs= and outputs=, or a value with such a .system."
+        )
+    sys = inner if isinstance(inner, StateSpace) else StateSpace.from_control(inner)
+    if sys.n_states and not np.isclose(sys.dt, dt, rtol=1e-9, atol=0.0):
+        raise ModelError(
+            f"block {place} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
+            "Design it on plant.discretized(rate), or discretise it at the plant's rate."
+        )
+    return sys.replace(dt=dt)
+
+
+def _drives(
+    plant: StandardPlant, systems: Sequence[StateSpace], idle: tuple[str, ...]
+) -> tuple[list[str], list[str]]:
+    """Return driven actuators and monitored outputs; refuse what is driven twice or not at all."""
+    produced = [name for sys in systems for name in sys.outputs]
+    taken = {name: side for side in "wzy" for name in getattr(plant, side)}
+    for name in produced:
+        if name in taken:
+            raise LabelError(
+                f"a block drives {name!r}, which the plant has in {taken[name]}: the name would be "
+                "driven twice. Rename the block's output: system.renamed(outputs={...})."
+            )
+        if name in idle:
+            raise LabelError(f"actuator {name!r} is driven by a block, so it cannot be idle.")
+        if produced.count(name) > 1 and name not in plant.u:
+            raise LabelError(
+                f"{name!r} is an output of {produced.count(name)} blocks: only outputs to "
+                "actuators add. Rename one: system.renamed(outputs={...})."
+            )
+    for name in plant.u:
+        if name not in produced and name not in idle:
+            error = unknown_label("block output", name, produced)
+            raise LabelError(
+                f"nothing drives actuator {name!r}: {error} Rename the block's output, or pass "
+                f"idle=[{name!r}] if it rests on purpose."
+            )
+    watched = [name for name in produced if name not in plant.u]
+    return [name for name in plant.u if name in produced], watched
+
+
+def _check_inputs(plant: StandardPlant, systems: Sequence[StateSpace]) -> None:
+    produced = [name for sys in systems for name in sys.outputs]
+    known = [*plant.y, *plant.u, *produced]
+    clash = sorted({*plant.y, *plant.z} & set(plant.u))
+    if clash:
+        raise LabelError(f"{clash} name both an output and an actuator: rename one of them.")
+    for place, sys in enumerate(systems, 1):
+        for name in sys.inputs:
+            if name in known:
+                continue
+            owner = f"what can drive block {place}: plant.y, plant.u and outputs of blocks"
+            error = unknown_label("signal", name, known, owner)
+            hidden = next((side for side in "zw" if name in getattr(plant, side)), None)
+            why = (
+                f" It is in the plant's {hidden}, which no controller can read: estimate it."
+                if hidden
+                else ""
+            )
+            raise LabelError(f"{error}{why}")
+
+
+def _moved(plant: StandardPlant, driven: Sequence[str]) -> npt.NDArray[np.bool_]:
+    """Return which y can move with u: their rows see a state or an actuator."""
+    g = plant.system.select(plant.y, driven)
+    return np.asarray(np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1))

@@ -1,0 +1,111 @@
+"""How far a loop is from instability, and how fast it is."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import AssumptionError
+from ..values import ComplexArray, FloatArray
+from .closed import ClosedLoop
+from .grid import refined
+from .sensitivity import Loop, Pieces, checked_grid, inverted, open_gain, taken_apart
+
+
+def modulus_margin(loop: Loop) -> float:
+    """Return ``1 / max_f sigma_max(S_u)``, the smallest distance to the critical point at u.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        As for `loop_gain`. A ClosedLoop that is unstable has no margin: 0. For a measured plant
+        the peak is that over its frequencies, and its stability is not known.
+
+    Returns
+    -------
+    float
+        At most 1 for sampled loops; |S| below 6 dB is a margin above 0.5.
+
+    Raises
+    ------
+    LabelError, ModelError
+        When channels do not match, or `loop` is of another type.
+    """
+    if isinstance(loop, ClosedLoop) and not loop.is_stable:
+        return 0.0
+    parts = taken_apart(loop)
+    grid = checked_grid(parts, None)
+    values = _largest(inverted(open_gain(parts, grid, "u")))
+    peak = float(values.max())
+    for _ in range(8 if parts.measured is None else 0):
+        fresh = refined(grid, values)
+        if not fresh.size:
+            break
+        more = _largest(inverted(open_gain(parts, fresh, "u")))
+        order = np.argsort(np.concatenate([grid, fresh]))
+        grid = np.concatenate([grid, fresh])[order]
+        values = np.concatenate([values, more])[order]
+        before, peak = peak, float(values.max())
+        if peak <= before * (1.0 + 1e-10):
+            break
+    return 1.0 / peak
+
+
+def bandwidth(loop: Loop) -> float:
+    """Return the frequency [Hz] at which |S| first crosses 0 dB from below.
+
+    |S| is the largest singular value of S broken at u, among the directions of u that the
+    controller drives: with more actuators than controlled motions the rest of them has S = 1 at
+    any frequency.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        As for `loop_gain`.
+
+    Returns
+    -------
+    float [Hz]
+        Infinite when |S| stays below 0 dB.
+
+    Raises
+    ------
+    AssumptionError
+        When |S| is nowhere below 0 dB.
+    LabelError, ModelError
+        When channels do not match, or `loop` is of another type.
+    """
+    parts = taken_apart(loop)
+    grid = checked_grid(parts, None)
+    values = _driven_sensitivity(parts, grid)
+    below = np.flatnonzero(values < 1.0)
+    if not below.size:
+        raise AssumptionError(
+            f"|S| is nowhere below 0 dB (least {values.min():.4g}): this feedback suppresses "
+            "nothing, so it has no bandwidth. Check the sign of the controller, u = K y."
+        )
+    above = np.flatnonzero(values[below[0] :] >= 1.0)
+    if not above.size:
+        return float("inf")
+    right = int(below[0] + above[0])
+    low, high = float(grid[right - 1]), float(grid[right])
+    for _ in range(6 if parts.measured is None else 0):
+        inner = np.linspace(low, high, 17)
+        first = int(np.argmax(_driven_sensitivity(parts, inner[1:]) >= 1.0))
+        low, high = float(inner[first]), float(inner[first + 1])
+    return high
+
+
+def _largest(S: ComplexArray) -> FloatArray:
+    """Return the largest singular value at each frequency."""
+    return np.asarray(np.linalg.svd(S, compute_uv=False)[:, 0])
+
+
+def _driven_sensitivity(parts: Pieces, grid: FloatArray) -> FloatArray:
+    """Return sigma_max of S_u within the range of K, which L = K P leaves invariant."""
+    K, P = parts.respond(grid)
+    flat = np.moveaxis(K / np.abs(K).max(axis=(1, 2), keepdims=True), 0, 1).reshape(
+        len(parts.u), -1
+    )
+    vectors, sizes, _ = np.linalg.svd(np.hstack([flat.real, flat.imag]), full_matrices=False)
+    U = vectors[:, sizes > 1e-9 * sizes[0]]
+    return _largest(inverted(U.T @ K @ P @ U))

@@ -1,0 +1,288 @@
+"""Sensitivities S, T, KS of a loop, for a model or a measured frequency response as plant."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..lti.frequency import Frf, frequency_response
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray, real_array
+from .closed import ClosedLoop
+from .grid import resonance_grid
+
+#: a closed loop, or a plant (StandardPlant, StateSpace or measured Frf) and a controller
+Loop: TypeAlias = "ClosedLoop | tuple[Any, Any]"
+
+
+class Pieces(NamedTuple):
+    """A loop taken apart: y = P u, u = K y; `respond` gives K (f, nu, ny) and P (f, ny, nu)."""
+
+    u: tuple[str, ...]
+    y: tuple[str, ...]
+    respond: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]]
+    poles: Callable[[], ComplexArray]
+    dt: float
+    measured: FloatArray | None  # the frequencies of a measured plant
+
+
+def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u") -> Frf:
+    """Return the loop gain L = K P (broken at u) or P K (broken at y); the critical point is +1.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        The plant a StandardPlant, a StateSpace or a measured Frf; the controller y -> u with the
+        sign of the feedback in it.
+    freq : (n_freq,) array, optional [Hz]
+        A grid refined at resonances when not given; those of the Frf for a measured plant.
+    at : {"u", "y"}
+        Where the loop is broken.
+
+    Returns
+    -------
+    Frf
+        From the channels of `at` to themselves.
+
+    Raises
+    ------
+    LabelError
+        When channels of plant and controller do not match.
+    ModelError, ShapeError
+        When `freq` is not an array of positive frequencies.
+    """
+    parts, grid = _prepared(loop, freq)
+    return _frf(grid, open_gain(parts, grid, at), parts, at, at)
+
+
+def sensitivity(
+    loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u"
+) -> Frf:
+    """Return the sensitivity S = (I - L)^-1: what feedback leaves of a disturbance at u or y.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        As for `loop_gain`.
+    freq : (n_freq,) array, optional [Hz]
+        As for `loop_gain`.
+    at : {"u", "y"}
+        Where the loop is broken.
+
+    Returns
+    -------
+    Frf
+        From the channels of `at` to themselves.
+
+    Raises
+    ------
+    LabelError
+        When channels of plant and controller do not match.
+    ModelError, ShapeError
+        When `freq` is not an array of positive frequencies.
+    """
+    parts, grid = _prepared(loop, freq)
+    return _frf(grid, inverted(open_gain(parts, grid, at)), parts, at, at)
+
+
+def complementary_sensitivity(
+    loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u"
+) -> Frf:
+    """Return the complementary sensitivity T = I - S = -L (I - L)^-1.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        As for `loop_gain`.
+    freq : (n_freq,) array, optional [Hz]
+        As for `loop_gain`.
+    at : {"u", "y"}
+        Where the loop is broken.
+
+    Returns
+    -------
+    Frf
+        From the channels of `at` to themselves.
+
+    Raises
+    ------
+    LabelError
+        When channels of plant and controller do not match.
+    ModelError, ShapeError
+        When `freq` is not an array of positive frequencies.
+    """
+    parts, grid = _prepared(loop, freq)
+    L = open_gain(parts, grid, at)
+    return _frf(grid, -L @ inverted(L), parts, at, at)
+
+
+def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf:
+    """Return K S: from noise on the measurements y to the commands u.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        As for `loop_gain`.
+    freq : (n_freq,) array, optional [Hz]
+        As for `loop_gain`.
+
+    Returns
+    -------
+    Frf
+        From y to u: ``(I - K P)^-1 K``.
+
+    Raises
+    ------
+    LabelError
+        When channels of plant and controller do not match.
+    ModelError, ShapeError
+        When `freq` is not an array of positive frequencies.
+    """
+    parts, grid = _prepared(loop, freq)
+    K, P = parts.respond(grid)
+    return _frf(grid, inverted(K @ P) @ K, parts, "u", "y")
+
+
+def taken_apart(loop: Loop) -> Pieces:
+    """Return plant and controller between u and y.
+
+    Raises
+    ------
+    LabelError
+        When channels of plant and controller do not match.
+    ModelError
+        When `loop` is of another type.
+    """
+    if isinstance(loop, ClosedLoop):
+        plant: Any = loop.plant.system.select(loop.fed_back, loop.driven)
+        controller = loop.controller.select(loop.driven, loop.fed_back)
+        return _modelled(plant, controller, loop.monitored.poles)
+    if not isinstance(loop, tuple) or len(loop) != 2:
+        raise ModelError(
+            f"need a ClosedLoop or a tuple (plant, controller), got {type(loop).__name__}."
+        )
+    plant, law = loop[0], getattr(loop[1], "system", loop[1])
+    controller = law if isinstance(law, StateSpace) else StateSpace.from_control(law)
+    if isinstance(plant, Frf):
+        return _measured(plant, controller)
+    if isinstance(plant, StandardPlant):
+        unread = [name for name in controller.inputs if name not in plant.y]
+        if unread:
+            raise unknown_label("y for the controller", unread[0], plant.y, "the plant")
+        driven = [name for name in controller.outputs if name in plant.u]
+        fed = ClosedLoop(plant, (controller,), controller, _idle(plant, driven)).fed_back
+        read = [name for name in controller.inputs if name in fed]
+        plant, controller = plant.system.select(read, driven), controller.select(driven, read)
+    elif not isinstance(plant, StateSpace):
+        plant = StateSpace.from_control(plant)
+    driven = [name for name in controller.outputs if name in plant.inputs]
+    if not driven:
+        raise unknown_label("actuator", controller.outputs[0], plant.inputs, "the plant")
+    controller = controller.select(driven)
+    plant = plant.select(controller.inputs, driven)
+    return _modelled(plant, controller, lambda: np.concatenate([plant.poles(), controller.poles()]))
+
+
+def open_gain(parts: Pieces, grid: FloatArray, at: str) -> ComplexArray:
+    """Return K P or P K on a grid, frequency first."""
+    if at not in ("u", "y"):
+        raise LabelError(f"a loop is broken at 'u' or 'y', got {at!r}.")
+    K, P = parts.respond(grid)
+    return K @ P if at == "u" else P @ K
+
+
+def inverted(L: ComplexArray) -> ComplexArray:
+    """Return (I - L)^-1, frequency first."""
+    return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) - L))
+
+
+def _idle(plant: StandardPlant, driven: Sequence[str]) -> tuple[str, ...]:
+    return tuple(name for name in plant.u if name not in driven)
+
+
+def _modelled(
+    plant: StateSpace, controller: StateSpace, poles: Callable[[], ComplexArray]
+) -> Pieces:
+    dt = plant.dt or controller.dt
+    if (
+        plant.n_states
+        and controller.n_states
+        and not np.isclose(plant.dt, controller.dt, rtol=1e-9)
+    ):
+        raise ModelError(
+            f"plant and controller have dt {plant.dt:g} and {controller.dt:g} s: discretise one."
+        )
+    plant, controller = plant.replace(dt=dt), controller.replace(dt=dt)
+
+    def respond(freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        return _stack(frequency_response(controller, freq)), _stack(frequency_response(plant, freq))
+
+    return Pieces(tuple(plant.inputs), tuple(plant.outputs), respond, poles, dt, None)
+
+
+def _measured(plant: Frf, controller: StateSpace) -> Pieces:
+    for name in controller.inputs:
+        if name not in plant.outputs:
+            error = unknown_label("measured output", name, plant.outputs, "the Frf")
+            raise LabelError(
+                f"{error} Select what was measured: controller.select(inputs=[...]); references "
+                "are no part of the loop."
+            )
+    driven = [name for name in controller.outputs if name in plant.inputs]
+    if not driven:
+        raise unknown_label("measured input", controller.outputs[0], plant.inputs, "the Frf")
+    controller = controller.select(driven)
+    P = _stack(plant.select(controller.inputs, driven))
+
+    def respond(freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        place = np.searchsorted(plant.freq, freq)
+        return _stack(frequency_response(controller, freq)), P[place]
+
+    return Pieces(
+        tuple(driven), tuple(controller.inputs), respond, controller.poles, controller.dt,
+        np.array(plant.freq),
+    )  # fmt: skip
+
+
+def _prepared(loop: Loop, freq: npt.ArrayLike | None) -> tuple[Pieces, FloatArray]:
+    parts = taken_apart(loop)
+    return parts, checked_grid(parts, freq)
+
+
+def checked_grid(parts: Pieces, freq: npt.ArrayLike | None) -> FloatArray:
+    """Return the asked frequencies, or a grid of our own.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When they are no array of positive frequencies, or were not measured.
+    """
+    if freq is None:
+        if parts.measured is not None:
+            return parts.measured
+        return resonance_grid(parts.poles(), parts.dt)
+    grid = real_array(freq, "freq")
+    if grid.ndim != 1 or not grid.size:
+        raise ShapeError(f"freq must be a one-dimensional array [Hz], got shape {grid.shape}.")
+    if np.any(grid <= 0):
+        raise ModelError("freq must be positive: integrators and free bodies are infinite at 0.")
+    if parts.measured is not None and not np.all(np.isin(grid, parts.measured)):
+        raise ModelError(
+            "the plant is a measured Frf, known only at its own frequencies: leave freq out."
+        )
+    return grid
+
+
+def _stack(frf: Frf) -> ComplexArray:
+    """Return the data with frequency first, for stacked matrix products."""
+    return np.ascontiguousarray(np.moveaxis(np.asarray(frf.data, dtype=np.complex128), -1, 0))
+
+
+def _frf(freq: FloatArray, data: ComplexArray, parts: Pieces, to: str, fro: str) -> Frf:
+    names = {"u": parts.u, "y": parts.y}
+    return Frf(freq, np.moveaxis(data, 0, -1), inputs=names[fro], outputs=names[to])

@@ -1,0 +1,298 @@
+"""What a run recorded, and the servo metrics of it: RMS, moving average, moving deviation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..values import FloatArray, IntArray, Value, check_names, positive, real_array
+
+#: one number, or one per run
+Numbers: TypeAlias = "float | FloatArray"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Response(Value, Mapping[str, FloatArray]):
+    """Sampled signals of one run or of several, by name.
+
+    `response["die:error"]` is an array over time, (n_time,) for one run; when runs were asked for
+    by number, (n_runs, n_time), also for one. A Mapping: `dict(response)` feeds a data frame.
+
+    Parameters
+    ----------
+    time : (n_time,) array [s]
+        Equidistant sampling instants.
+    data : (n_channel, n_time) or (n_runs, n_channel, n_time) array
+        The signals, in SI units.
+    names : sequence of str
+        The channels.
+
+    Raises
+    ------
+    ShapeError
+        When sizes differ.
+    ModelError
+        When time is not equidistant or entries are not finite.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> run = Response(np.arange(4) * 0.5, [[1.0, -1.0, 1.0, -1.0]], ["e"])
+    >>> run.rms("e"), run.peak("e"), run["e"].shape
+    (1.0, 1.0, (4,))
+    """
+
+    time: FloatArray
+    data: FloatArray
+    names: Sequence[str]
+
+    # values are compared by identity; Mapping's == would compare arrays
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def __post_init__(self) -> None:
+        names = tuple(str(name) for name in self.names)
+        check_names(names, "channels")
+        time = real_array(self.time, "time", (None,))
+        steps = np.diff(time)
+        if steps.size and (steps.min() <= 0 or np.ptp(steps) > 1e-6 * steps.mean()):
+            raise ModelError("time must increase in equal steps: moving windows count samples.")
+        data = real_array(self.data, "data")
+        if data.ndim not in (2, 3) or data.shape[-2:] != (len(names), time.size):
+            raise ShapeError(
+                f"data of {len(names)} channels at {time.size} times must have shape "
+                f"({len(names)}, {time.size}), runs before that, got {data.shape}."
+            )
+        self._set(time=time, data=data, names=names)
+
+    def __repr__(self) -> str:
+        runs = "" if self.data.ndim == 2 else f"{self.data.shape[0]} runs, "
+        shown = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
+        span = self.time.size * self.dt
+        return (
+            f"<Response {runs}{self.time.size} samples over {span:.6g} s, "
+            f"{len(self.names)} channels: {shown}>"
+        )
+
+    def __getitem__(self, channel: str) -> FloatArray:
+        if channel not in self.names:
+            raise ChannelError(str(unknown_label("channel", channel, self.names)))
+        signal: FloatArray = self.data[..., self.names.index(channel), :]
+        return signal
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]."""
+        if self.time.size < 2:
+            return 0.0
+        return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
+
+    def rms(self, channel: str, *, start: float = 0.0) -> Numbers:
+        """Return the root mean square of a channel, about zero.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        start : float [s]
+            Samples before this time are left out: transients.
+
+        Returns
+        -------
+        float, or (n_runs,) array
+            In the channel's unit.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When nothing is left after `start`.
+        """
+        return _numbers(np.sqrt(np.mean(self._from(channel, start) ** 2, axis=-1)))
+
+    def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
+        """Return the largest magnitude of a channel.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        start : float [s]
+            Samples before this time are left out.
+
+        Returns
+        -------
+        float, or (n_runs,) array
+            In the channel's unit.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When nothing is left after `start`.
+        """
+        return _numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
+
+    def moving_average(self, channel: str, *, window: float = 5e-3) -> FloatArray:
+        """Return the mean of a channel over a window centred at each time (MA).
+
+        In lithography the window is the exposure time of a point: the MA of the error is overlay.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        window : float [s]
+            Length; rounded to whole samples. An even number of samples reaches one sample further
+            back than ahead. At both ends of the record the window is cut off by it.
+
+        Returns
+        -------
+        (n_time,) or (n_runs, n_time) array
+            At the times of the response.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When the window is shorter than one sample or longer than the record.
+        """
+        signal = self[channel]
+        return moving_moments(signal, self._count(window))[0]
+
+    def moving_std(self, channel: str, *, window: float = 5e-3) -> FloatArray:
+        """Return the standard deviation of a channel in a window centred at each time (MSD).
+
+        In lithography the MSD of the error is fading: how much the image is smeared out.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        window : float [s]
+            As for `moving_average`.
+
+        Returns
+        -------
+        (n_time,) or (n_runs, n_time) array
+            Root of the mean squared deviation from the window's own mean.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When the window is shorter than one sample or longer than the record.
+        """
+        signal = self[channel]
+        return moving_moments(signal, self._count(window))[1]
+
+    def to_sep005(self) -> list[dict[str, object]]:
+        """Return the channels of a single run as SDyPy's time series (SEP 5).
+
+        Raises
+        ------
+        ModelError
+            When the response holds several runs: take one of them first.
+        """
+        if self.data.ndim != 2:
+            raise ModelError(
+                f"SEP 5 holds single series, this response has {self.data.shape[0]} runs: take one "
+                "with response.replace(data=response.data[0])."
+            )
+        return [
+            {"name": name, "data": np.array(self[name]), "fs": 1.0 / self.dt, "unit_str": ""}
+            for name in self.names
+        ]
+
+    def _from(self, channel: str, start: float) -> FloatArray:
+        first = float(real_array(start, "start", ()))
+        signal = self[channel]
+        # half a sample of slack: start=0.1 means the sample at 0.1 s, however that was rounded
+        keep = self.time >= first - 0.5 * self.dt
+        if not np.any(keep):
+            raise ModelError(
+                f"start={first:g} s leaves nothing: the response ends at {self.time[-1]:g} s."
+            )
+        return signal[..., keep]
+
+    def _count(self, window: float) -> int:
+        length = positive(window, "window")
+        count = round(length / self.dt) if self.dt else 0
+        if not 1 <= count <= self.time.size:
+            raise ModelError(
+                f"a window of {length:g} s is {count} samples of {self.dt:g} s, but the response "
+                f"has {self.time.size}: choose a window of 1 to {self.time.size} samples."
+            )
+        return count
+
+
+class ChannelError(LabelError, KeyError):
+    """A response has no such channel; a KeyError too, as of any Mapping."""
+
+    __str__ = Exception.__str__
+
+
+def moving_moments(signal: FloatArray, count: int) -> tuple[FloatArray, FloatArray]:
+    """Return mean and standard deviation (..., n) over `count` samples around each sample.
+
+    Cumulative sums restart at every multiple of `count`, and each window spans exactly one such
+    edge: it is the tail of one stretch and the head of the next. Both are taken relative to the
+    sample at the edge, which the window holds, so that an offset or a far-away motion, however
+    large, costs no digits.
+
+    Parameters
+    ----------
+    signal : (..., n) array
+        Equidistant samples.
+    count : int
+        1 to n; windows are cut off at the ends of the record.
+    """
+    n = signal.shape[-1]
+    before = count // 2
+    lead = count  # a stretch of no weight before the record, so that every window has its edge
+    stretches = -(-(lead + n + count) // count) + 1
+    tail = stretches * count - lead - n
+    edge = [(0, 0)] * (signal.ndim - 1) + [(lead, tail)]
+    shape = (*signal.shape[:-1], stretches, count)
+    values = np.pad(signal, edge, mode="edge").reshape(shape)
+    inside = np.pad(np.ones(n), (lead, tail)).reshape(stretches, count)
+    edges = values[..., :1]
+    ahead = (values - edges) * inside
+    behind = (values[..., :-1, :] - edges[..., 1:, :]) * inside[:-1]
+    first: IntArray = lead + np.arange(n) - before
+    stretch, offset = np.divmod(first, count)
+    stretch, offset = np.where(offset, stretch, stretch - 1), np.where(offset, offset, count)
+    weight = np.minimum(np.arange(n) - before + count, n) - np.maximum(np.arange(n) - before, 0)
+    means = []
+    for power in (1, 2):
+        # heads[..., s, k]: the first k of stretch s + 1; tails[..., s, k]: those of s from k on
+        heads = _cumulative(ahead[..., 1:, :] ** power)
+        tails = _cumulative(behind[..., ::-1] ** power)[..., ::-1]
+        means.append((tails[..., stretch, offset] + heads[..., stretch, offset]) / weight)
+    centre = edges[..., 1:, 0][..., stretch] + means[0]
+    return centre, np.sqrt(np.maximum(means[1] - means[0] ** 2, 0.0))
+
+
+def _cumulative(parts: FloatArray) -> FloatArray:
+    """Return sums of the first 0, 1, ..., count entries along the last axis."""
+    out = np.zeros((*parts.shape[:-1], parts.shape[-1] + 1))
+    np.cumsum(parts, axis=-1, out=out[..., 1:])
+    return out
+
+
+def _numbers(values: FloatArray) -> Numbers:
+    return float(values) if np.ndim(values) == 0 else values

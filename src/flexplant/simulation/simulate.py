@@ -1,0 +1,329 @@
+"""simulate: a sampled closed loop with its noises and set-points, run after run."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import AssumptionError, LabelError, ModelError, unknown_label
+from ..loop import ClosedLoop
+from ..plant import StandardPlant
+from ..values import FloatArray, IntArray, positive, real_array
+from .response import Response
+from .setpoint import SetPoint
+from .stepping import Buffers, Machine, machine, step_through
+
+#: a signal over time: a set-point, one value per sample, a constant, or a function of time
+Signal: TypeAlias = "SetPoint | npt.ArrayLike | Callable[[FloatArray], npt.ArrayLike]"
+
+#: samples per stretch and runs side by side: what fits the cache of one core
+STRETCH, ABREAST = 128, 16
+
+
+class _Noise(NamedTuple):
+    """How white samples enter: `factor` (n, r) into x, `deviation` at the columns of w."""
+
+    factor: FloatArray
+    columns: IntArray
+    deviation: FloatArray
+
+
+def simulate(
+    loop: ClosedLoop,
+    *,
+    duration: float,
+    reference: Signal | Mapping[str, Signal] | None = None,
+    disturbance: Mapping[str, Signal] | None = None,
+    noise: bool = True,
+    rng: Any = None,
+    runs: int | Sequence[int] | None = None,
+    start: npt.ArrayLike | None = None,
+    progress: bool | None = None,
+) -> Response:
+    """Return what a sampled closed loop does in time.
+
+    Within a sample: the sensors are read, the blocks update, the commands go out and are held
+    until the next sample (after the plant's delay). White disturbances act on the plant with the
+    exact covariance `plant.process_noise` per sample, that of `design_kalman`; sensors have the
+    variance asd^2 rate / 2.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        Around a sampled plant, stable or not.
+    duration : float [s]
+        Of the run; round(duration * rate) samples, the first at 0.
+    reference : signal or mapping {name: signal}, optional
+        For references such as `die:ref`; one signal where the plant has one reference. A signal is
+        a SetPoint, an array of one value per sample, a number, or a function of the times [s].
+    disturbance : mapping {name: signal}, optional
+        For other channels of w, held over each sample, in addition to their noise.
+    noise : bool
+        Whether the white noises of the plant act.
+    rng : int, SeedSequence, Generator or None
+        Seed of the noises. Run i draws from the i-th child of it, so it is the same to the last
+        bit whichever other runs are computed with it.
+    runs : int or sequence of int, optional
+        How many runs, or which ones (numbered from 0); the response then has an axis for them.
+        One run without that axis when not given.
+    start : (n,) array, optional
+        State of the plant, or of plant and controller, at time 0; rest when not given.
+    progress : bool, optional
+        Show a progress bar; on a terminal, after two seconds, when not given.
+
+    Returns
+    -------
+    Response
+        All z, y, driven u and monitored outputs of blocks.
+
+    Raises
+    ------
+    AssumptionError
+        When the plant is continuous or weighted, when u reaches y within a sample, or when white
+        noise would reach an output directly (its variance would be infinite).
+    LabelError
+        When a reference or disturbance is unknown, or it is not clear which is meant.
+    ModelError, ShapeError
+        When a signal or the state has the wrong length, or the loop diverges beyond all numbers.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from flexplant.loop import close_loop
+    >>> from flexplant.lti import StateSpace
+    >>> g = StateSpace([[1.0]], [[0.0, 0.1]], [[-1.0], [1.0], [0.0]], [[1, 0], [0, 0], [1, 0]],
+    ...     0.1, inputs=["r", "u"], outputs=["e", "y", "r"])
+    >>> plant = StandardPlant.from_statespace(g, u=["u"], y=["y", "r"])
+    >>> law = StateSpace([], [], [], [[-5.0, 5.0]], inputs=["y", "r"], outputs=["u"])
+    >>> simulate(close_loop(plant, law), reference=1.0, duration=0.5)["e"]
+    array([1.    , 0.5   , 0.25  , 0.125 , 0.0625])
+    """
+    if not isinstance(loop, ClosedLoop):
+        raise ModelError(
+            f"simulate needs a ClosedLoop, got {type(loop).__name__}: close_loop(plant, *blocks)."
+        )
+    plant = loop.plant
+    _check_sampled(loop)
+    steps = round(positive(duration, "duration") / plant.dt)
+    if not steps:
+        raise ModelError(
+            f"duration {float(duration):g} s is less than half a sample ({plant.dt:g} s)."
+        )
+    time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
+    given = _given(plant, reference, disturbance, time)
+    white = _noise(plant, noise)
+    numbers = _run_numbers(runs)
+    state = _start(loop, start)
+    generators = _generators(rng, numbers)
+    shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
+    data = np.zeros((len(numbers), len(shown), steps))
+    parts = machine(loop)
+    groups = [slice(i, i + ABREAST) for i in range(0, len(numbers), ABREAST)]
+    total = len(groups) * -(-steps // STRETCH)
+    with np.errstate(over="ignore", invalid="ignore"), _Bar(total, progress) as bar:
+        for group in groups:
+            run = _Group(loop, parts, white, generators[group], state)
+            for first in range(0, steps, STRETCH):
+                stretch = slice(first, min(first + STRETCH, steps))
+                run.fill(given[stretch], data[group, :, stretch])
+                if not np.all(np.isfinite(run.x)):
+                    raise ModelError(
+                        f"the loop diverged beyond all numbers before {time[stretch][-1]:g} s: "
+                        f"it is unstable (spectral radius {loop.spectral_radius:.6g}). Look at "
+                        "loop.is_stable first, or simulate a shorter time."
+                    )
+                bar.advance()
+    return Response(time, data[0] if runs is None else data, shown)
+
+
+class _Group:
+    """Some runs side by side, stretch after stretch."""
+
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        parts: Machine,
+        noise: _Noise,
+        generators: list[np.random.Generator],
+        start: FloatArray,
+    ) -> None:
+        plant = loop.plant
+        n, count = plant.system.n_states, len(generators)
+        self.parts, self.noise, self.generators, self.n_z = parts, noise, generators, len(plant.z)
+        self.x = np.tile(start[:n], (count, 1))
+        self.controller = np.tile(start[n:], (count, 1))
+        u = [plant.u.index(name) for name in loop.driven]
+        self.B1, self.D21 = plant.B1, plant.D21
+        self.C1, self.D11, self.D12 = plant.C1, plant.D11, plant.D12[:, u]
+        self.buffers = Buffers(
+            np.zeros((STRETCH + 1, count, n)),
+            np.zeros((STRETCH, count, len(plant.y))),
+            np.zeros((STRETCH, count, parts.law.shape[0])),
+        )
+        self.w = np.zeros((count, STRETCH, len(plant.w)))
+
+    def fill(self, given: FloatArray, data: FloatArray) -> None:
+        """Run one stretch: w as `given` (k, nw) plus noise, the channels into `data`."""
+        states, y, out = self.buffers
+        k, rank = given.shape[0], self.noise.factor.shape[1]
+        states[0] = self.x
+        self.w[:, :k], self.w[:, k:] = given, 0.0
+        for r, generator in enumerate(self.generators):
+            # always a whole stretch: a longer run begins with the shorter one, bit by bit
+            white = generator.standard_normal((STRETCH, rank + self.noise.columns.size))
+            w = self.w[r]
+            w[:, self.noise.columns] += white[:, rank:] * self.noise.deviation
+            states[1:, r] = white[:, :rank] @ self.noise.factor.T + w @ self.B1.T
+            y[:, r] = w @ self.D21.T
+        part = Buffers(states[: k + 1], y[:k], out[:k])
+        self.controller = step_through(self.parts, self.controller, part)
+        self.x = states[k].copy()
+        nc, nu = self.parts.n_controller, self.parts.n_driven
+        for r in range(len(self.generators)):
+            x, u = np.ascontiguousarray(states[:-1, r]), out[:, r, nc : nc + nu]
+            z = x @ self.C1.T + u @ self.D12.T + self.w[r] @ self.D11.T
+            data[r] = np.hstack([z[:k], y[:k, r], out[:k, r, nc:]]).T
+
+
+def _check_sampled(loop: ClosedLoop) -> None:
+    plant = loop.plant
+    if not plant.dt:
+        raise AssumptionError(
+            "simulate runs sampled loops, this one is continuous: close the loop around "
+            "plant.discretized(rate, delay=) with blocks designed on it."
+        )
+    if plant.unweighted is not None:
+        raise AssumptionError(
+            "the plant is weighted, so its z and w are not physical signals: close the loop "
+            "around plant.unweighted with the same blocks."
+        )
+    D = plant.system.select(plant.y, loop.driven).D
+    if np.any(D):
+        i, j = np.argwhere(D)[0]
+        raise AssumptionError(
+            f"{loop.driven[j]!r} reaches {plant.y[i]!r} within the sample (D22 = {D[i, j]:.3g}), "
+            "but a measurement is taken before its command goes out. Sample the plant with a "
+            "delay: plant.discretized(rate, delay=1)."
+        )
+
+
+def _given(
+    plant: StandardPlant,
+    reference: Signal | Mapping[str, Signal] | None,
+    disturbance: Mapping[str, Signal] | None,
+    time: FloatArray,
+) -> FloatArray:
+    """Return the known part of w (n_time, nw)."""
+    references = [name for name in plant.w if name in plant.y]
+    others = [name for name in plant.w if name not in references]
+    if reference is None:
+        reference = {}
+    elif not isinstance(reference, Mapping):
+        if len(references) != 1:
+            raise LabelError(
+                f"the plant has {len(references)} references {references}: say which one is meant, "
+                "reference={name: signal}; Ports(references=[Reference(poi)]) adds one."
+            )
+        reference = {references[0]: reference}
+    given = np.zeros((time.size, len(plant.w)))
+    for kind, known, signals in (
+        ("reference", references, reference),
+        ("disturbance", others, disturbance or {}),
+    ):
+        for name, signal in signals.items():
+            if name not in known:
+                raise unknown_label(kind, name, known, "the plant's w")
+            given[:, plant.w.index(name)] = _sampled(signal, f"{kind} {name!r}", time)
+    return given
+
+
+def _sampled(signal: Any, name: str, time: FloatArray) -> FloatArray:
+    """Return a signal at the sampling instants."""
+    if isinstance(signal, SetPoint):
+        return signal.at(time).position
+    values = real_array(signal(time) if callable(signal) else signal, name)
+    return values if values.ndim == 0 else real_array(values, name, time.shape)
+
+
+def _noise(plant: StandardPlant, wanted: bool) -> _Noise:
+    none = np.zeros((plant.system.n_states, 0))
+    asd = {name: level for name, level in plant.asd.items() if level > 0} if wanted else {}
+    sensors = [name for name in asd if name.removesuffix(":noise") in plant.y]
+    white = [name for name in asd if name not in sensors]
+    direct = plant.system.select(inputs=white).D
+    if np.any(direct):
+        i, j = np.argwhere(direct)[0]
+        raise AssumptionError(
+            f"white noise {white[j]!r} reaches {plant.system.outputs[i]!r} directly: a sample of "
+            "it would have infinite variance. Give the disturbance a coloured spectrum, or sense "
+            "a displacement or velocity."
+        )
+    if white and plant.noise_factor is None:
+        _ = plant.process_noise  # says why it is not known
+    columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
+    deviation = np.array([asd[name] for name in sensors]) * np.sqrt(0.5 / plant.dt)
+    factor = plant.noise_factor if white and plant.noise_factor is not None else none
+    return _Noise(factor, columns, deviation)
+
+
+def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:
+    if runs is None:
+        return [0]
+    numbers = range(runs) if isinstance(runs, int | np.integer) else runs
+    listed = [int(i) for i in numbers]
+    if not listed or min(listed) < 0:
+        raise ModelError(
+            f"runs must be at least 1, or a list of run numbers from 0, got {runs!r:.80}."
+        )
+    return listed
+
+
+def _generators(rng: Any, numbers: Iterable[int]) -> list[np.random.Generator]:
+    """Return the generator of each run, from the child of the seed with the run's number."""
+    if isinstance(rng, np.random.Generator):
+        rng = np.random.SeedSequence(rng.integers(0, 2**32, size=4).tolist())
+    seed = rng if isinstance(rng, np.random.SeedSequence) else np.random.SeedSequence(rng)
+    return [
+        np.random.default_rng(
+            np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number))
+        )
+        for number in numbers
+    ]
+
+
+def _start(loop: ClosedLoop, start: npt.ArrayLike | None) -> FloatArray:
+    plant = loop.plant.system.n_states
+    total = plant + loop.controller.n_states
+    state = np.zeros(total)
+    if start is not None:
+        values = real_array(start, "start")
+        size = plant if values.shape == (plant,) else total
+        state[:size] = real_array(values, "start (plant, or plant and controller)", (size,))
+    return state
+
+
+class _Bar:
+    """A tqdm bar, or nothing."""
+
+    def __init__(self, total: int, progress: bool | None) -> None:
+        self.bar: Any = None
+        if progress or (progress is None and sys.stderr.isatty()):
+            from tqdm import tqdm
+
+            self.bar = tqdm(total=total, desc="simulate", delay=0.0 if progress else 2.0)
+
+    def __enter__(self) -> _Bar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def advance(self) -> None:
+        """Count one stretch."""
+        if self.bar is not None:
+            self.bar.update()

@@ -1,0 +1,117 @@
+"""The inner loop of a simulation: all runs at once, each step linear in the plant's states."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..loop import ClosedLoop
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, IntArray
+
+
+class Machine(NamedTuple):
+    """The matrices of one sample, arranged for speed.
+
+    ``x+ = diagonal x + coupling x[partner] + inflow [x[columns]; u] + noise`` is the plant,
+    ``[c+; u; watched] = law [c; y]`` the controller.
+    """
+
+    diagonal: FloatArray
+    coupling: FloatArray
+    partner: IntArray
+    columns: IntArray
+    inflow: FloatArray
+    sense: FloatArray
+    law: FloatArray
+    n_controller: int
+    n_driven: int
+
+
+class Buffers(NamedTuple):
+    """A stretch of samples: states (k + 1, runs, n), y (k, runs, ny), out (k, runs, ...).
+
+    On entry `states[0]` is the state now, `states[1:]` and `y` hold what noise and references add.
+    """
+
+    states: FloatArray
+    y: FloatArray
+    out: FloatArray
+
+
+def machine(loop: ClosedLoop) -> Machine:
+    """Return the matrices of one sample of a closed loop without feedthrough from u to y."""
+    plant, law = loop.plant.system, loop.controller
+    diagonal, coupling, partner, rest = _split(plant)
+    columns = np.flatnonzero(np.any(rest != 0, axis=0))
+    B = plant.B[:, plant.input_index(loop.driven)]
+    return Machine(
+        diagonal,
+        coupling,
+        partner,
+        columns,
+        np.asfortranarray(np.hstack([rest[:, columns], B])),
+        np.ascontiguousarray(plant.C[plant.output_index(loop.plant.y)]),
+        np.ascontiguousarray(np.block([[law.A, law.B], [law.C, law.D]])),
+        law.n_states,
+        len(loop.driven),
+    )
+
+
+def step_through(m: Machine, controller: FloatArray, buffers: Buffers) -> FloatArray:
+    """Fill `buffers` sample by sample and return the controller's states (runs, n) after them.
+
+    Every product is one matrix-vector product per run, never a matrix-matrix product over runs:
+    its rounding, and so a run, does not depend on how many runs go side by side.
+    """
+    states, y, out = buffers
+    runs, n = states.shape[1:]
+    nc, split = m.n_controller, m.n_controller + m.n_driven
+    nj = m.columns.size
+    law_in = np.zeros((runs, m.law.shape[1], 1))
+    law_in[:, :nc, 0] = controller
+    flow_in = np.zeros((runs, nj + m.n_driven, 1))
+    measured = np.zeros((runs, y.shape[2], 1))
+    change = np.zeros((runs, n))
+    flow = np.zeros((runs, n, 1))
+    paired = bool(np.any(m.coupling))
+    for k in range(y.shape[0]):
+        x, following = states[k], states[k + 1]
+        np.matmul(m.sense, x[:, :, None], out=measured)
+        y[k] += measured[:, :, 0]
+        law_in[:, nc:, 0] = y[k]
+        answer = out[k]
+        np.matmul(m.law, law_in, out=answer[:, :, None])
+        law_in[:, :nc, 0] = answer[:, :nc]
+        if nj:
+            flow_in[:, :nj, 0] = x[:, m.columns]
+        flow_in[:, nj:, 0] = answer[:, nc:split]
+        np.matmul(m.inflow, flow_in, out=flow)
+        following += flow[:, :, 0]
+        np.multiply(m.diagonal, x, out=change)
+        following += change
+        if paired:
+            np.take(x, m.partner, axis=1, out=change, mode="clip")
+            change *= m.coupling
+            following += change
+    return law_in[:, :nc, 0].copy()
+
+
+def _split(g: StateSpace) -> tuple[FloatArray, FloatArray, IntArray, FloatArray]:
+    """Split A into a diagonal, a coupling to each state's partner, and the rest."""
+    n = g.n_states
+    blocks = g.blocks if g.blocks is not None else (n,) if n else ()
+    sizes = np.asarray(blocks, dtype=np.int64)
+    starts = np.concatenate([[0], np.cumsum(sizes)[:-1]]).astype(np.int64)
+    twos = starts[sizes == 2]
+    partner = np.arange(n)
+    partner[twos], partner[twos + 1] = twos + 1, twos
+    rest = g.A.copy()
+    index = np.arange(n)
+    diagonal = rest[index, index]
+    rest[index, index] = 0.0
+    paired = partner != index
+    coupling = np.where(paired, rest[index, partner], 0.0)
+    rest[index[paired], partner[paired]] = 0.0
+    return diagonal, coupling, partner, rest
