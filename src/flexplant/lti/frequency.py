@@ -1,0 +1,250 @@
+"""Frequency responses: exact, by the blocks of A where it has them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError, unknown_label
+from ..values import ComplexArray, FloatArray, Value, real_array, signal_names
+from .responses import continuous_poles, responses
+from .statespace import System, as_statespace
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
+    """Frequency response functions between named channels, computed or measured.
+
+    Parameters
+    ----------
+    freq : (n_freq,) array [Hz]
+        Increasing, not negative.
+    data : (n_out, n_in, n_freq) complex array [output unit / input unit]
+        The responses.
+    inputs, outputs : sequences of str, optional
+        Names; `u1`..., `y1`... when not given.
+    quantity : str, optional
+        Of a measurement: displacement, velocity or acceleration.
+    coherence : (n_out, n_in, n_freq) array, optional
+        Of a measurement, between 0 and 1.
+
+    Raises
+    ------
+    ShapeError, ModelError, LabelError
+        When sizes do not match, entries are not finite, freq does not increase, or names are
+        doubled.
+
+    Examples
+    --------
+    >>> frf = Frf([1.0, 2.0], [[[1.0, 0.5j]]], inputs=["f"], outputs=["x"])
+    >>> frf
+    <Frf: f -> x, 2 frequencies 1 .. 2 Hz>
+    >>> complex(frf["x", "f"][1])
+    0.5j
+    """
+
+    freq: FloatArray
+    data: ComplexArray
+    inputs: Sequence[str] = ()
+    outputs: Sequence[str] = ()
+    quantity: str | None = None
+    coherence: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        freq = checked_freq(self.freq)
+        if np.any(np.diff(freq) <= 0):
+            raise ModelError("freq must increase strictly: sort the measurement and merge doubles.")
+        data = np.array(self.data, dtype=np.complex128)
+        if data.ndim != 3 or data.shape[2] != freq.size:
+            raise ShapeError(
+                f"data must have shape (n_out, n_in, {freq.size}) like freq, got {data.shape}."
+            )
+        if not np.all(np.isfinite(data)):
+            raise ModelError("data has NaN or infinite entries: leave those frequencies out.")
+        coherence = self.coherence
+        if coherence is not None:
+            coherence = real_array(coherence, "coherence", data.shape)
+            if coherence.size and (coherence.min() < 0 or coherence.max() > 1 + 1e-9):
+                raise ModelError("coherence must lie between 0 and 1.")
+        self._set(
+            freq=freq,
+            data=data,
+            inputs=signal_names(self.inputs, data.shape[1], "u", "inputs"),
+            outputs=signal_names(self.outputs, data.shape[0], "y", "outputs"),
+            coherence=coherence,
+        )
+
+    def __repr__(self) -> str:
+        sides = f"{_listed(self.inputs)} -> {_listed(self.outputs)}"
+        span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""
+        return f"<Frf: {sides}, {self.freq.size} frequencies {span}>"
+
+    def __getitem__(self, key: tuple[str, str]) -> ComplexArray:
+        """Return the response (n_freq,) of `frf["output", "input"]`."""
+        row, column = self._place(key)
+        return np.asarray(self.data[row, column])
+
+    def __iter__(self) -> Iterator[tuple[str, str]]:
+        return ((output, name) for output in self.outputs for name in self.inputs)
+
+    def __len__(self) -> int:
+        return len(self.outputs) * len(self.inputs)
+
+    def select(
+        self, outputs: Sequence[str] | None = None, inputs: Sequence[str] | None = None
+    ) -> Frf:
+        """Return the responses between some channels, in the order given.
+
+        Raises
+        ------
+        LabelError
+            When a name is unknown.
+        """
+        chosen_out = list(self.outputs if outputs is None else outputs)
+        chosen_in = list(self.inputs if inputs is None else inputs)
+        rows = [_index(self.outputs, name, "output") for name in chosen_out]
+        columns = [_index(self.inputs, name, "input") for name in chosen_in]
+        picked = np.ix_(rows, columns)
+        return self.replace(
+            data=self.data[picked],
+            inputs=chosen_in,
+            outputs=chosen_out,
+            coherence=None if self.coherence is None else self.coherence[picked],
+        )
+
+    def _place(self, key: tuple[str, str]) -> tuple[int, int]:
+        if not isinstance(key, tuple) or len(key) != 2:
+            raise unknown_label("channel", key, [f"{a}, {b}" for a, b in self])
+        return _index(self.outputs, key[0], "output"), _index(self.inputs, key[1], "input")
+
+
+def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
+    """Return the frequency response ``C (s I - A)^-1 B + D``.
+
+    s = 2 pi i f, or exp(2 pi i f dt) when sampled. Where A has 1 x 1 and 2 x 2 diagonal blocks
+    each is solved in closed form, so that a frequency costs O(n) when A is block diagonal;
+    otherwise A is brought to Schur form once.
+
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Continuous or sampled, stable or not.
+    freq : (n_freq,) array [Hz], optional
+        Increasing. When not given: a grid refined at resonances and antiresonances
+        (`default_freq`).
+
+    Returns
+    -------
+    Frf
+        data (n_out, n_in, n_freq).
+
+    Raises
+    ------
+    ModelError
+        When a frequency is negative, lies above half the sampling rate, or on an undamped pole.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from flexplant.lti import StateSpace
+    >>> g = StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
+    >>> gain = abs(frequency_response(g, np.array([1 / (2 * np.pi)]))["y1", "u1"][0])
+    >>> print(f"{gain:.6f}")
+    0.707107
+    """
+    g = as_statespace(sys)
+    if freq is None:
+        freq = default_freq(g)
+    freq = checked_freq(freq)
+    if g.dt and freq.size and freq[-1] > 0.5 / g.dt * (1 + 1e-12):
+        raise ModelError(
+            f"frequency {freq[-1]:g} Hz lies above half the sampling rate ({0.5 / g.dt:g} Hz), "
+            "where a sampled system has no response of its own. Stay below."
+        )
+    return Frf(freq, responses(g, freq), inputs=g.inputs, outputs=g.outputs)
+
+
+def checked_freq(freq: FloatArray) -> FloatArray:
+    """Return frequencies as a finite array (n,) that is not negative."""
+    freq = real_array(freq, "freq", (None,))
+    if freq.size and freq.min() < 0:
+        raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
+    return freq
+
+
+def default_freq(sys: System, *, points: int = 3000, tolerance: float = 0.05) -> FloatArray:
+    """Return a grid [Hz] that follows the resonances and antiresonances of a system.
+
+    From a decade below the slowest pole to a decade above the fastest (or half the sampling rate),
+    with points through every resonance; then intervals are halved where a response differs from
+    the line between its neighbours by more than `tolerance` of its own size, the worst first.
+
+    Parameters
+    ----------
+    sys : StateSpace
+        The system.
+    points : int
+        Most points.
+    tolerance : float
+        Relative.
+
+    Returns
+    -------
+    (n_freq,) array [Hz]
+        Increasing, positive.
+    """
+    g = as_statespace(sys)
+    poles = continuous_poles(g)
+    size = np.abs(poles) / (2 * np.pi)
+    top = 0.5 / g.dt if g.dt else np.inf
+    moving = size[(size > 1e-12 * size.max(initial=0.0)) & (size < top)]
+    low, high = (0.1 * moving.min(), 10 * moving.max()) if moving.size else (0.01, 100.0)
+    high = min(high, top)
+    low = min(low, 1e-3 * high)
+    freq = [np.geomspace(low, high, 200)]
+    zeta = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
+    around = np.sinh(np.linspace(-4.0, 4.0, 9)) / np.sinh(1.0)
+    for f, z in zip(np.abs(poles.imag) / (2 * np.pi), zeta, strict=True):
+        if low < f < high and z < 0.3:
+            freq.append(f * (1 + max(z, 1e-6) * around))
+    grid = np.unique(np.concatenate(freq))
+    grid = grid[(grid >= low) & (grid <= high)]
+    data = responses(g, grid)
+    while grid.size < points:
+        worst = _crooked(grid, data)
+        order = np.argsort(worst)[::-1]
+        bent = order[worst[order] > tolerance][: max(1, (points - grid.size) // 2)] + 1
+        if not bent.size:
+            break
+        halves = np.unique(np.concatenate([bent - 1, bent]))[: points - grid.size]
+        fresh = 0.5 * (grid[halves] + grid[halves + 1])
+        fresh = fresh[(fresh > grid[halves]) & (fresh < grid[halves + 1])]
+        if not fresh.size:
+            break
+        data = np.concatenate([data, responses(g, fresh)], axis=2)
+        grid = np.concatenate([grid, fresh])
+        order = np.argsort(grid)
+        grid, data = grid[order], data[:, :, order]
+    return grid
+
+
+def _crooked(grid: FloatArray, data: ComplexArray) -> FloatArray:
+    """Return how far inner points (n_freq - 2,) lie off the line of their neighbours, relative."""
+    weight = (grid[1:-1] - grid[:-2]) / (grid[2:] - grid[:-2])
+    line = data[:, :, :-2] * (1 - weight) + data[:, :, 2:] * weight
+    off = np.abs(data[:, :, 1:-1] - line)
+    floor = 1e-9 * np.max(np.abs(data), axis=2, initial=0.0)[:, :, None]
+    relative = off / np.maximum(np.abs(data[:, :, 1:-1]), floor + 1e-300)
+    return np.asarray(relative.max(axis=(0, 1), initial=0.0))
+
+
+def _index(known: Sequence[str], name: str, side: str) -> int:
+    if name not in known:
+        raise unknown_label(side, name, known)
+    return list(known).index(name)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, ... {names[-1]} ({len(names)})"

@@ -1,0 +1,255 @@
+"""Stein and Lyapunov equations by doubling, and the Gramians that follow from them."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError, SolverError
+from ..values import FloatArray, real_array
+from .statespace import StateSpace, System, as_statespace
+
+#: doublings: 2^60 terms of the series; a slower decay is not told from none
+DOUBLINGS = 60
+#: largest accepted residual, relative to X, states scaled
+TOLERANCE = 1e-10
+
+
+def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
+
+    By doubling (squared Smith): ``X <- X + A X A'``, ``A <- A A``; states are scaled inside.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        Spectral radius below one.
+    Q : (n, n) array
+        Symmetric.
+
+    Returns
+    -------
+    (n, n) array
+        Symmetric.
+
+    Raises
+    ------
+    ShapeError
+        When the sizes differ.
+    ModelError
+        When entries are not finite or Q is not symmetric.
+    SolverError
+        When A is not strictly stable, so that the series does not end, or the residual is bad.
+
+    References
+    ----------
+    Smith, Matrix equation XA + BX = C, SIAM J. Appl. Math. 16, 1968.
+    """
+    A = real_array(A, "A", (None, None))
+    A = real_array(A, "A", (A.shape[0], A.shape[0]))
+    Q = symmetric(Q, "Q", A.shape[0])
+    if not A.size:
+        return Q
+    d = scale_of(accumulated(A, Q))
+    As, Qs = A * d / d[:, None], Q / d / d[:, None]
+    X = doubled(As, Qs)
+    # one correction with its own residual: the series alone loses digits when A is far from normal
+    X = X + doubled(As, residual := As @ X @ As.T + Qs - X)
+    residual = As @ X @ As.T + Qs - X
+    _check(residual, X, "X = A X A' + Q")
+    return X * d * d[:, None]
+
+
+def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of the Lyapunov equation ``A X + X A' + Q = 0``.
+
+    By Schur form (Bartels-Stewart) in scaled states, with one step of correction.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        All eigenvalues with negative real parts.
+    Q : (n, n) array
+        Symmetric.
+
+    Returns
+    -------
+    (n, n) array
+        Symmetric.
+
+    Raises
+    ------
+    ShapeError
+        When the sizes differ.
+    ModelError
+        When entries are not finite or Q is not symmetric.
+    SolverError
+        When A is not strictly stable or the residual is bad.
+    """
+    A = real_array(A, "A", (None, None))
+    A = real_array(A, "A", (A.shape[0], A.shape[0]))
+    Q = symmetric(Q, "Q", A.shape[0])
+    if not A.size:
+        return Q
+    _, (d, _) = la.matrix_balance(A, permute=False, separate=True)
+    As, Qs = A * d / d[:, None], Q / d / d[:, None]
+    X = solve_continuous(As, Qs)
+    _check((As @ X + X @ As.T + Qs) / (2 * np.linalg.norm(As)), X, "A X + X A' + Q = 0")
+    return X * d * d[:, None]
+
+
+def controllability_gramian(sys: System) -> FloatArray:
+    """Return P (n, n): ``A P + P A' + B B' = 0``, or ``P = A P A' + B B'`` when sampled.
+
+    Where A is block diagonal with 1 x 1 and 2 x 2 blocks each block of P is a closed form.
+
+    Raises
+    ------
+    SolverError
+        When the system is not strictly stable.
+    """
+    g = as_statespace(sys)
+    return _gramian(g, g.A, g.B)
+
+
+def observability_gramian(sys: System) -> FloatArray:
+    """Return Q (n, n): ``A' Q + Q A + C' C = 0``, or ``Q = A' Q A + C' C`` when sampled.
+
+    Raises
+    ------
+    SolverError
+        When the system is not strictly stable.
+    """
+    g = as_statespace(sys)
+    return _gramian(g, g.A.T, g.C.T)
+
+
+def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
+    if g.n_states and not g.is_stable:
+        raise SolverError(
+            f"{g!r} is not strictly stable, so its Gramian is infinite. Take rigid-body and "
+            "unstable modes out, or close a loop first."
+        )
+    if g.blocks is not None and set(g.blocks) <= {1, 2} and _block_diagonal(g):
+        return _modal_gramian(A, B, g.blocks, bool(g.dt))
+    return solve_stein(A, B @ B.T) if g.dt else solve_lyapunov(A, B @ B.T)
+
+
+def _block_diagonal(g: StateSpace) -> bool:
+    owner = np.repeat(np.arange(len(g.blocks or ())), g.blocks or ())
+    return not np.any(g.A[owner[:, None] != owner[None, :]])
+
+
+def _modal_gramian(
+    A: FloatArray, B: FloatArray, blocks: tuple[int, ...] | object, discrete: bool
+) -> FloatArray:
+    """Solve block by block: ``A_i X_ij + X_ij A_j' + B_i B_j' = 0``, all pairs (i, j) at once.
+
+    1 x 1 blocks are padded to 2 x 2 with a decoupled stable state that nothing drives.
+    """
+    sizes = np.asarray(blocks)
+    starts = np.cumsum(sizes) - sizes
+    b = sizes.size
+    slots = np.stack([starts, np.where(sizes == 2, starts + 1, -1)], axis=1)  # (b, 2)
+    real = slots >= 0
+    pairs = A[slots[:, :, None], slots[:, None, :]] * (real[:, :, None] & real[:, None, :])
+    pairs[~real[:, 1], 1, 1] = 0.0 if discrete else -1.0
+    drive = B[slots] * real[:, :, None]  # (b, 2, m)
+    right = np.einsum("iam,jcm->ijac", drive, drive).reshape(b, b, 4, 1)
+    eye = np.eye(2)
+    if discrete:
+        kron = np.eye(4) - np.einsum("iab,jcd->ijacbd", pairs, pairs).reshape(b, b, 4, 4)
+    else:
+        left = np.einsum("iab,cd->iacbd", pairs, eye).reshape(b, 1, 4, 4)
+        kron = -(left + np.einsum("ab,jcd->jacbd", eye, pairs).reshape(1, b, 4, 4))
+    X = np.linalg.solve(kron, right).reshape(b, b, 2, 2)
+    padded = X.transpose(0, 2, 1, 3).reshape(2 * b, 2 * b)
+    keep = np.flatnonzero(real.reshape(-1))
+    return _sym(padded[np.ix_(keep, keep)])
+
+
+def doubled(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return the sum of ``A^k Q A'^k``, k = 0, 1, ..., by doubling (scaled inputs)."""
+    X, A = Q, A.copy()
+    for _ in range(DOUBLINGS):
+        step = A @ X @ A.T
+        X = _sym(X + step)
+        size, change = np.linalg.norm(X), np.linalg.norm(step)
+        if not np.isfinite(size):
+            break
+        if change <= 1e-17 * size:
+            return X
+        A = A @ A
+    raise SolverError(
+        "the Stein series does not end: A is not strictly stable (an eigenvalue on or outside the "
+        "unit circle, such as a rigid-body mode that is left open)."
+    )
+
+
+def solve_continuous(A: FloatArray, Q: FloatArray) -> FloatArray:
+    """Return X of ``A X + X A' + Q = 0`` by Schur form and one correction (scaled inputs)."""
+    schur, U = la.schur(A, output="complex")
+    if (largest := float(np.max(schur.diagonal().real))) >= 0:
+        raise SolverError(
+            f"A is not strictly stable (largest real part {largest:.2e} rad/s): "
+            "A X + X A' + Q = 0 has no solution of meaning. Take rigid-body modes out."
+        )
+
+    def solved(right: FloatArray) -> FloatArray:
+        X, scale, _ = la.lapack.ztrsyl(schur, schur, -(U.conj().T @ right @ U), tranb="C")
+        return _sym((U @ (X / scale) @ U.conj().T).real)
+
+    X = solved(Q)
+    return X + solved(A @ X + X @ A.T + Q)
+
+
+def accumulated(A: FloatArray, Q: FloatArray, doublings: int = 8) -> FloatArray:
+    """Return the diagonal of ``sum |A^k Q A'^k|`` over 2^doublings steps (fewer when it grows)."""
+    X = Q.copy()
+    size = max(float(np.linalg.norm(A)), 1.0)
+    for _ in range(doublings):
+        X = X + A @ X @ A.T
+        A = A @ A
+        if not np.isfinite(A).all() or np.linalg.norm(A) > 1e6 * size:
+            break
+    return np.abs(X.diagonal())
+
+
+def scale_of(variance: FloatArray) -> FloatArray:
+    """Return the square roots as powers of two, which scale without rounding; 1 for zeros."""
+    safe = np.where((variance > 0) & np.isfinite(variance), variance, 1.0)
+    return np.asarray(np.exp2(np.round(0.5 * np.log2(safe))))
+
+
+def symmetric(value: FloatArray, name: str, n: int) -> FloatArray:
+    """Return `value` as a symmetric (n, n) array.
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When it has another shape, is not finite or not symmetric to 1e-8 of its diagonal scale.
+    """
+    array = real_array(value, name, (n, n))
+    scale = np.sqrt(np.abs(array.diagonal()))
+    bound = 1e-8 * (np.outer(scale, scale) + 1e-4 * np.max(np.abs(array), initial=0.0))
+    if np.any(np.abs(array - array.T) > bound):
+        worst = np.unravel_index(np.argmax(np.abs(array - array.T)), array.shape)
+        raise ModelError(
+            f"{name} must be symmetric, entries {tuple(int(i) for i in worst)} and its mirror are "
+            f"{array[worst]:.6g} and {array.T[worst]:.6g}. Symmetrise it where it is made."
+        )
+    return _sym(array)
+
+
+def _sym(X: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (X + X.T))
+
+
+def _check(residual: FloatArray, X: FloatArray, equation: str) -> None:
+    size = float(np.linalg.norm(X))
+    relative = float(np.linalg.norm(residual)) / size if size else 0.0
+    if not np.isfinite(size) or relative > TOLERANCE:
+        raise SolverError(
+            f"{equation}: the residual is {relative:.1e} of X, more than {TOLERANCE:.0e}. A is "
+            "too close to instability, or too badly conditioned, for double precision."
+        )
