@@ -1,12 +1,90 @@
-"""flexplant: from finite-element matrices to the closed-loop error at a point of interest."""
+"""flexplant: standard plants for flexible machines.
 
+From finite-element matrices and a measurement to the closed-loop error at a point of interest::
+
+    FEModel --solve_modes--> Modes --reduce--> ReducedModel --update--> UpdateResult.model
+        --assemble_plant--> StandardPlant --design_...--> blocks --close_loop--> --simulate-->
+"""
+
+from typing import Any
+
+from . import errors as errors
+from . import testbeds as testbeds
+from .errors import FlexplantError as FlexplantError
+from .errors import FlexplantWarning as FlexplantWarning
+from .estimation import KalmanEstimator as KalmanEstimator
+from .estimation import StaticEstimator as StaticEstimator
+from .estimation import design_kalman as design_kalman
+from .estimation import design_static as design_static
+from .identification import MeasuredModes as MeasuredModes
 from .labels import DofSet as DofSet
+from .loop import ClosedLoop as ClosedLoop
+from .loop import bandwidth as bandwidth
+from .loop import close_loop as close_loop
+from .loop import complementary_sensitivity as complementary_sensitivity
+from .loop import control_sensitivity as control_sensitivity
+from .loop import loop_gain as loop_gain
+from .loop import modulus_margin as modulus_margin
+from .loop import sensitivity as sensitivity
+from .lti import Frf as Frf
 from .lti import StateSpace as StateSpace
 from .lti import append as append
+from .lti import connect as connect
+from .lti import discretized as discretized
 from .lti import feedback as feedback
+from .lti import frequency_response as frequency_response
+from .lti import h2_norm as h2_norm
+from .lti import hinf_norm as hinf_norm
 from .lti import lft as lft
 from .lti import parallel as parallel
+from .lti import peak_gain as peak_gain
 from .lti import series as series
+from .lti import tustin as tustin
+from .plant import Actuator as Actuator
+from .plant import AssumptionReport as AssumptionReport
+from .plant import Disturbance as Disturbance
+from .plant import Poi as Poi
+from .plant import Ports as Ports
+from .plant import Reference as Reference
+from .plant import Sensor as Sensor
+from .plant import StandardPlant as StandardPlant
+from .plant import assemble_plant as assemble_plant
+from .plant import highpass as highpass
+from .plant import inverse_sensitivity as inverse_sensitivity
+from .plant import leadlag as leadlag
+from .plant import lowpass as lowpass
+from .plant import notch as notch
+from .reduction import DesiredDofs as DesiredDofs
+from .reduction import Modes as Modes
+from .reduction import ReducedModel as ReducedModel
+from .reduction import reduce as reduce
+from .reduction import select_dofs as select_dofs
+from .reduction import solve_modes as solve_modes
+from .simulation import Response as Response
+from .simulation import SetPoint as SetPoint
+from .simulation import setpoint as setpoint
+from .simulation import simulate as simulate
 from .store import load as load
+from .structure import FEModel as FEModel
+from .structure import ModalDamping as ModalDamping
+from .structure import Rayleigh as Rayleigh
+from .structure import kirchhoff_plate as kirchhoff_plate
+from .synthesis import Controller as Controller
+from .synthesis import design_servo as design_servo
+from .updating import AddedDamping as AddedDamping
+from .updating import AddedMass as AddedMass
+from .updating import AddedStiffness as AddedStiffness
+from .updating import Eigenvalues as Eigenvalues
+from .updating import UpdateResult as UpdateResult
+from .updating import update as update
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """Import the pictures only when they are asked for: they need matplotlib."""
+    if name == "plot":
+        import importlib
+
+        return importlib.import_module(".plot", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -82,7 +82,8 @@ def _encode(item: Any, arrays: dict[str, Any]) -> Any:
     if isinstance(item, np.ndarray):
         return {"array": _keep(item, arrays)}
     if sp.issparse(item):
-        coo: Any = sp.coo_array(item)
+        sparse: Any = item
+        coo = sparse.tocoo()
         parts = [_keep(np.asarray(part), arrays) for part in (coo.data, *coo.coords)]
         return {"sparse": parts, "shape": list(coo.shape)}
     if isinstance(item, Value):

@@ -3,6 +3,8 @@
 from .frequency import Frf as Frf
 from .frequency import default_freq as default_freq
 from .frequency import frequency_response as frequency_response
+from .discretisation import discretized as discretized
+from .discretisation import tustin as tustin
 from .interconnection import append as append
 from .interconnection import connect as connect
 from .interconnection import feedback as feedback

@@ -180,3 +180,53 @@ def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
     odd = np.where(root > 0, odd, h)
     scale = np.exp(mean * h)
     return np.asarray((scale * even)[:, None, None] * np.eye(2) + (scale * odd)[:, None, None] * N)
+
+
+def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSpace:
+    """Return the bilinear (Tustin) equivalent of a filter at a rate.
+
+    ``s = a (z - 1) / (z + 1)`` with a = 2 rate, or a = w / tan(w / (2 rate)) so that the response
+    at one frequency w is kept exactly.
+
+    Parameters
+    ----------
+    sys : StateSpace
+        A continuous system: a weight or a controller; for a plant use `discretized`.
+    rate : float [Hz]
+        Sampling rate.
+    prewarp : float [Hz], optional
+        The frequency at which the response is kept.
+
+    Returns
+    -------
+    StateSpace
+        With dt = 1 / rate, the same names.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is sampled already, prewarp is not below half the rate, or a pole lies at a.
+    """
+    g = as_statespace(sys)
+    if g.dt and g.n_states:
+        raise ModelError(f"{g!r} is sampled already. Pass the continuous system.")
+    a = 2.0 * positive(rate, "rate")
+    if prewarp is not None:
+        if not 0.0 < prewarp < 0.5 * rate:
+            raise ModelError(f"prewarp must lie between 0 and {0.5 * rate:g} Hz, got {prewarp:g}.")
+        w = 2.0 * np.pi * prewarp
+        a = w / np.tan(w / a)
+    n = g.n_states
+    left = a * np.eye(n) - g.A
+    if n and np.linalg.cond(left) > 1e14:
+        raise ModelError(f"{g!r} has a pole at {a:g} rad/s, which Tustin maps to infinity.")
+    inverse = np.linalg.inv(left)
+    # x is replaced by the trapezoidal state, scaled so that B and C keep their sizes
+    root = np.sqrt(2.0 * a)
+    return g.replace(
+        A=(a * np.eye(n) + g.A) @ inverse,
+        B=root * inverse @ g.B,
+        C=root * g.C @ inverse,
+        D=g.D + g.C @ inverse @ g.B,
+        dt=1.0 / rate,
+    )

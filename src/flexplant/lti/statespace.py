@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg as la
 
 from ..errors import ModelError, ShapeError, unknown_label
@@ -74,6 +75,22 @@ class StateSpace(Value):
     states: Sequence[str] = ()
     name: str | None = None
     blocks: Sequence[int] | None = None
+
+    if TYPE_CHECKING:  # arrays come in as anything array-like, and are held as float64
+
+        def __init__(
+            self,
+            A: npt.ArrayLike,
+            B: npt.ArrayLike,
+            C: npt.ArrayLike,
+            D: npt.ArrayLike,
+            dt: float = 0.0,
+            inputs: Sequence[str] = (),
+            outputs: Sequence[str] = (),
+            states: Sequence[str] = (),
+            name: str | None = None,
+            blocks: Sequence[int] | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         D = real_array(self.D, "D", (None, None))

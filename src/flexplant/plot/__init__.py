@@ -1,1 +1,10 @@
-"""To be written."""
+"""All pictures: functions that take values and `ax=`, and return the axes they drew on."""
+
+from .frequency import frf as frf
+from .frequency import sensitivity as sensitivity
+from .response import response as response
+from .structure import layout as layout
+from .structure import mode_shape as mode_shape
+from .updating import eigenvalues as eigenvalues
+from .updating import parameters as parameters
+from .updating import residual as residual

@@ -1,0 +1,173 @@
+"""From modes to states: the one place where (M, D, K) becomes (A, B, C, D)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+
+from ..errors import ModelError
+from ..labels import Place
+from ..lti.discretisation import block_diagonal
+from ..reduction import Modes, ReducedModel, normal_form
+from ..structure import FEModel
+from ..values import ComplexArray, FloatArray, Value
+
+#: what a plant can be assembled from
+Structure: TypeAlias = "FEModel | Modes | ReducedModel"
+
+#: a dense eigenproblem of more DOFs than this is refused: reduce first
+LARGEST_DENSE = 2500
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModalRealisation(Value):
+    """A structure's modes as first-order blocks, with maps from and to its DOFs.
+
+    ``dx/dt = A x + N' f, q = S x`` with forces f and displacements q at the model's DOFs; each mode
+    is one 2 x 2 block of A. A rigid-body mode has the states (omega_r q, dq/dt), where omega_r is
+    the first elastic frequency, so that both have similar size.
+
+    Parameters
+    ----------
+    model : FEModel, Modes or ReducedModel
+        The structure.
+    pairs : (b, 2, 2) array [rad/s]
+        Diagonal blocks of A.
+    inputs : (n, 2 b) array
+        N, states' response to unit forces at the DOFs.
+    outputs : (n, 2 b) array
+        S, displacements at the DOFs per unit state.
+    names : sequence of str
+        Of the states.
+    n_rigid : int
+        The first blocks are rigid-body modes.
+    """
+
+    model: Structure
+    pairs: FloatArray
+    inputs: FloatArray
+    outputs: FloatArray
+    names: tuple[str, ...]
+    n_rigid: int
+
+    def __post_init__(self) -> None:
+        self._set(pairs=self.pairs, inputs=self.inputs, outputs=self.outputs)
+
+    @property
+    def A(self) -> FloatArray:
+        """The block-diagonal (2 b, 2 b) matrix of all pairs."""
+        return block_diagonal(self.pairs)
+
+    def row(self, at: Place, direction: str) -> FloatArray:
+        """Return the row over the model's DOFs for a place."""
+        if isinstance(self.model, ReducedModel):
+            return np.asarray(self.model.row(at, direction))
+        return np.asarray(self.model.dofs.row(at, direction))
+
+    def force(self, row: FloatArray) -> FloatArray:
+        """Return the column (2 b,) of B for a unit force along a row of DOFs."""
+        return np.asarray(row @ self.inputs)
+
+    def motion(self, row: FloatArray, derivative: int) -> FloatArray:
+        """Return the row (2 b,) of C for a displacement's 0th, 1st or 2nd derivative."""
+        C = np.asarray(row @ self.outputs).reshape(-1, 1, 2)
+        for _ in range(derivative):
+            C = C @ self.pairs
+        return C.reshape(-1)
+
+
+def realised(model: Structure | ModalRealisation) -> ModalRealisation:
+    """Return the modal realisation of a structure; one that is given passes through.
+
+    Raises
+    ------
+    ModelError
+        When `model` is of another type, or too large for a dense eigenproblem.
+    """
+    if isinstance(model, ModalRealisation):
+        return model
+    if isinstance(model, Modes):
+        if np.iscomplexobj(model.phi):
+            return _complex(model, model.poles, np.asarray(model.phi), model.n_rigid)
+        return _real(
+            model, model.basis_omega, model.basis_zeta, model.basis, model.n_rigid, model.omega.size
+        )
+    if isinstance(model, FEModel | ReducedModel):
+        if model.M.shape[0] > LARGEST_DENSE:
+            raise ModelError(
+                f"a plant of all {model.M.shape[0]} DOFs needs a dense eigenproblem of that size. "
+                "Pass solve_modes(model, count=...) or a reduced model instead."
+            )
+        form = normal_form(model.M, model.D, model.K, model.rigid_body)
+        if np.iscomplexobj(form.phi):
+            return _complex(model, form.poles, np.asarray(form.phi), form.n_rigid)
+        omega = np.abs(form.poles)
+        zeta = np.where(omega > 0, -form.poles.real / np.where(omega > 0, omega, 1.0), 0.0)
+        return _real(model, omega, zeta, form.phi, form.n_rigid, omega.size)
+    raise ModelError(
+        f"a plant is assembled from an FEModel, Modes or ReducedModel, got {type(model).__name__}. "
+        "A state-space model made elsewhere comes in through StandardPlant.from_statespace."
+    )
+
+
+def _real(
+    model: Structure, omega: FloatArray, zeta: FloatArray, phi: FloatArray, rigid: int, modes: int
+) -> ModalRealisation:
+    """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes."""
+    n, b = phi.shape
+    elastic = omega[rigid:]
+    scale = np.where(omega > 0, omega, elastic.min() if elastic.size else 1.0)
+    pairs = np.zeros((b, 2, 2))
+    pairs[:, 0, 1] = scale
+    pairs[:, 1, 0] = -(omega**2) / scale
+    pairs[:, 1, 1] = -2.0 * zeta * omega
+    inputs, outputs = np.zeros((n, b, 2)), np.zeros((n, b, 2))
+    inputs[:, :, 1] = phi
+    outputs[:, :, 0] = phi / scale
+    return ModalRealisation(
+        model,
+        pairs,
+        inputs.reshape(n, -1),
+        outputs.reshape(n, -1),
+        _state_names(b, modes),
+        rigid,
+    )
+
+
+def _complex(
+    model: Structure, poles: ComplexArray, phi: ComplexArray, rigid: int
+) -> ModalRealisation:
+    """Real 2 x 2 blocks [[s, w], [-w, s]] of complex modes lambda = s + i w.
+
+    With ``phi' (2 lambda M + D) phi = 2 i w`` the displacement per force is the sum of
+    ``phi phi' / (2 i w (s - lambda))`` and its conjugate; the states are scaled like those of a
+    real mode (omega q, dq/dt).
+    """
+    real = _real(model, np.zeros(rigid), np.zeros(rigid), phi[:, :rigid].real, rigid, rigid)
+    n, elastic = phi.shape[0], poles[rigid:]
+    omega, swing = np.abs(elastic), elastic.imag
+    first = float(omega.min()) if omega.size else 1.0
+    pairs = np.zeros((elastic.size, 2, 2))
+    pairs[:, 0, 0] = pairs[:, 1, 1] = elastic.real
+    pairs[:, 0, 1], pairs[:, 1, 0] = swing, -swing
+    driven = -1j * phi[:, rigid:] * (omega / swing)
+    inputs = np.stack([driven.real, -driven.imag], axis=2)
+    outputs = np.stack([phi[:, rigid:].real, phi[:, rigid:].imag], axis=2) / omega[:, None]
+    rigid_pairs = real.pairs * first
+    rigid_outputs = real.outputs / first
+    return ModalRealisation(
+        model,
+        np.concatenate([rigid_pairs, pairs]),
+        np.hstack([real.inputs, inputs.reshape(n, -1)]),
+        np.hstack([rigid_outputs, outputs.reshape(n, -1)]),
+        _state_names(poles.size, poles.size),
+        rigid,
+    )
+
+
+def _state_names(blocks: int, modes: int) -> tuple[str, ...]:
+    names = [f"mode{i}" for i in range(1, modes + 1)]
+    names += [f"residual{i}" for i in range(1, blocks - modes + 1)]
+    return tuple(f"{name}:{part}" for name in names for part in ("q", "v"))

@@ -1,0 +1,327 @@
+"""The standard plant: one StateSpace and the names of w, u, z, y in it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..labels import Place
+from ..lti.statespace import StateSpace, System, as_statespace
+from ..values import FloatArray, Value
+from .ports import Ports
+from .realisation import ModalRealisation
+
+if TYPE_CHECKING:
+    from .check import AssumptionReport
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StandardPlant(Value):
+    """A plant with disturbances w, inputs u, performance z and measurements y.
+
+    ::
+
+                +-----------+
+          z <---|           |<--- w      inputs  [w; u], outputs [z; y], in this order
+                |     P     |
+          y <---|           |<--- u      u = K y: the sign of the feedback is in K
+                +-----------+
+
+    Made by `assemble_plant` from a structure, or by `StandardPlant.from_statespace`.
+
+    Parameters
+    ----------
+    system : StateSpace
+        ``[w; u] -> [z; y]``.
+    w, u, z, y : sequences of str
+        Names of its channels.
+    asd : mapping {str: float}
+        One-sided amplitude spectral density of the w channels that are white noise.
+    ports : Ports, optional
+        Where the channels are.
+    realisation : ModalRealisation, optional
+        The structure's modes.
+    physical : StateSpace, optional
+        Forces to motions, before noise, references and efforts are wired to it.
+    continuous : StandardPlant, optional
+        The plant before sampling.
+    delay : float [samples]
+        Of the inputs u.
+    noise_factor : (n, r) array, optional
+        G with G G' the covariance of x that disturbances add in one sample.
+    unweighted : StandardPlant, optional
+        The plant before `weighted`.
+
+    Raises
+    ------
+    LabelError
+        When the names are not those of the system's channels, in this order.
+    """
+
+    system: StateSpace
+    w: tuple[str, ...]
+    u: tuple[str, ...]
+    z: tuple[str, ...]
+    y: tuple[str, ...]
+    asd: Mapping[str, float]
+    ports: Ports | None = None
+    realisation: ModalRealisation | None = None
+    physical: StateSpace | None = None
+    continuous: StandardPlant | None = None
+    delay: float = 0.0
+    noise_factor: FloatArray | None = None
+    unweighted: StandardPlant | None = None
+
+    def __post_init__(self) -> None:
+        for side in "wuzy":
+            self._set(**{side: tuple(getattr(self, side))})
+        if (*self.w, *self.u) != tuple(self.system.inputs):
+            raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
+        if (*self.z, *self.y) != tuple(self.system.outputs):
+            raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
+        for name in self.asd:
+            if name not in self.w:
+                raise unknown_label("w channel with an asd", name, self.w)
+        self._set(asd=self.asd, noise_factor=self.noise_factor)
+
+    def __repr__(self) -> str:
+        kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
+        named = f" {self.system.name!r}" if self.system.name else ""
+        lines = [f"<StandardPlant{named}: {self.system.n_states} states, {kind}>"]
+        for side in "wuzy":
+            names = getattr(self, side)
+            shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
+            lines.append(f"  {side} ({len(names)}) {shown}")
+        return "\n".join(lines)
+
+    @classmethod
+    def from_statespace(
+        cls,
+        sys: System,
+        *,
+        u: Sequence[str],
+        y: Sequence[str],
+        w: Sequence[str] | None = None,
+        z: Sequence[str] | None = None,
+        asd: Mapping[str, float] | None = None,
+    ) -> StandardPlant:
+        """Return the standard plant of a system made elsewhere.
+
+        Parameters
+        ----------
+        sys : StateSpace or control.StateSpace
+            With named channels.
+        u, y : sequences of str
+            Inputs that the controller drives, outputs that it reads.
+        w, z : sequences of str, optional
+            Disturbances and performance; the remaining channels when not given.
+        asd : mapping, optional
+            One-sided amplitude spectral densities of white w channels.
+
+        Returns
+        -------
+        StandardPlant
+            With inputs [w; u] and outputs [z; y].
+
+        Raises
+        ------
+        LabelError
+            When a name is unknown or on two sides.
+        """
+        g = as_statespace(sys)
+        w = [n for n in g.inputs if n not in u] if w is None else list(w)
+        z = [n for n in g.outputs if n not in y] if z is None else list(z)
+        ordered = g.select([*z, *y], [*w, *u])
+        return cls(ordered, tuple(w), tuple(u), tuple(z), tuple(y), dict(asd or {}))
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]; 0 when continuous."""
+        return self.system.dt
+
+    @property
+    def n_rigid(self) -> int:
+        """Number of rigid-body modes."""
+        return self.realisation.n_rigid if self.realisation is not None else 0
+
+    @property
+    def model(self) -> Any:
+        """The structural model that the plant was assembled from, or None."""
+        return self.realisation.model if self.realisation is not None else None
+
+    @property
+    def process_noise(self) -> FloatArray:
+        """Covariance (n, n) that white disturbances add to x in one sample."""
+        if self.noise_factor is None:
+            raise ModelError(
+                "process noise per sample is known only for a plant that was assembled from a "
+                "structure and sampled: use assemble_plant(model, ports).discretized(rate)."
+            )
+        return self.noise_factor @ self.noise_factor.T
+
+    @property
+    def sensor_noise(self) -> FloatArray:
+        """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor."""
+        if not self.dt:
+            raise ModelError("sensor noise per sample needs a sampled plant: discretized(rate).")
+        variance = [0.5 * self.asd.get(f"{name}:noise", 0.0) ** 2 / self.dt for name in self.y]
+        return np.diag(variance)
+
+    B1 = property(lambda self: self.Gzw.B, doc="w to dx/dt.")
+    B2 = property(lambda self: self.Gzu.B, doc="u to dx/dt.")
+    C1 = property(lambda self: self.Gzw.C, doc="x to z.")
+    C2 = property(lambda self: self.Gyw.C, doc="x to y.")
+    D11 = property(lambda self: self.Gzw.D, doc="w to z.")
+    D12 = property(lambda self: self.Gzu.D, doc="u to z.")
+    D21 = property(lambda self: self.Gyw.D, doc="w to y.")
+    D22 = property(lambda self: self.Gyu.D, doc="u to y.")
+
+    @property
+    def Gzw(self) -> StateSpace:
+        """The system w -> z."""
+        return self.system.select(self.z, self.w)
+
+    @property
+    def Gzu(self) -> StateSpace:
+        """The system u -> z."""
+        return self.system.select(self.z, self.u)
+
+    @property
+    def Gyw(self) -> StateSpace:
+        """The system w -> y."""
+        return self.system.select(self.y, self.w)
+
+    @property
+    def Gyu(self) -> StateSpace:
+        """The system u -> y."""
+        return self.system.select(self.y, self.u)
+
+    def channel(self, name: str, side: str = "z") -> str:
+        """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
+
+        Raises
+        ------
+        LabelError
+            When it means none.
+        """
+        names: tuple[str, ...] = getattr(self, side)
+        if name in names:
+            return name
+        for poi in self.ports.z if self.ports is not None else ():
+            for axis in poi.axes:
+                aliases = (poi.derived(axis, "hat"), poi.derived(axis, "error"))
+                if name in aliases or (name == poi.name and axis == poi.axes[0]):
+                    return poi.channel(axis)
+        raise unknown_label(f"channel of {side}", name, names)
+
+    def discretized(self, rate: float, *, delay: float = 0.0) -> StandardPlant:
+        """Return the plant sampled at a rate: exact zero-order hold, mode by mode.
+
+        Parameters
+        ----------
+        rate : float [Hz]
+            Sampling rate.
+        delay : float [samples]
+            From a measurement to the moment the actuators answer it; any fraction. A delay of at
+            least one sample leaves the controller the whole interval to compute.
+
+        Returns
+        -------
+        StandardPlant
+            Efforts are the commands (not delayed); sensor noises and references act as sample
+            values; `process_noise` and `sensor_noise` hold the exact covariances.
+
+        Raises
+        ------
+        ModelError
+            When the plant is sampled already, is weighted, or rate or delay is not positive.
+        """
+        from .assembly import sampled
+
+        return sampled(self, rate, delay)
+
+    def weighted(
+        self,
+        *,
+        z: Mapping[str, Any] | None = None,
+        w: Mapping[str, Any] | None = None,
+    ) -> StandardPlant:
+        """Return the plant with weights on z and w absorbed into its states; names stay.
+
+        Parameters
+        ----------
+        z, w : mapping {name: weight}
+            A weight is a number or a system with one input and one output, of this plant's dt.
+            None leaves the channel out; a channel that is not named is kept as it is.
+
+        Returns
+        -------
+        StandardPlant
+            `W_z P W_w`; its `unweighted` is this plant.
+
+        Raises
+        ------
+        LabelError
+            When a name is unknown.
+        ModelError
+            When a weight is not one by one, or of another sampling time.
+        """
+        from .weighting import weighted
+
+        return weighted(self, dict(z or {}), dict(w or {}))
+
+    def with_ports(self, ports: Ports) -> StandardPlant:
+        """Return the plant of the same structure, sampled alike, with other ports.
+
+        The modes are not solved again: this is what placement calls.
+
+        Raises
+        ------
+        ModelError
+            When the plant was not assembled from a structure.
+        """
+        from .assembly import reassembled
+
+        return reassembled(self, ports)
+
+    def at(self, poi: Place | Mapping[str, Place]) -> StandardPlant:
+        """Return the plant with the POI moved; only rows of C change.
+
+        Parameters
+        ----------
+        poi : (3,) array [m] or mapping {POI name: place}
+            The new point; a mapping when there are several POIs.
+
+        Raises
+        ------
+        LabelError
+            When a POI is unknown, or the plant has several and none is named.
+        """
+        ports = self.ports
+        if ports is None:
+            raise ModelError("this plant has no ports: its POIs have no places to move.")
+        if not isinstance(poi, Mapping):
+            if len(ports.z) != 1:
+                raise LabelError(
+                    f"the plant has {len(ports.z)} POIs: say which moves, at({{name: point}})."
+                )
+            poi = {ports.z[0].name: poi}
+        places: dict[str, Any] = dict(poi)
+        for name in places:
+            ports.poi(name)
+        moved = [replace(p, at=places.get(p.name, p.at)) for p in ports.z]
+        return self.with_ports(ports.replace(z=moved))
+
+    def to_control(self) -> Any:
+        """Return the whole system as a `control.StateSpace` with the same names."""
+        return self.system.to_control()
+
+    def check(self) -> AssumptionReport:
+        """Return which standard assumptions hold, in physical words, rigid-body modes first."""
+        from .check import report
+
+        return report(self)

@@ -1,0 +1,66 @@
+"""Weights absorbed into a plant: W_z P W_w, names kept."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, unknown_label
+from ..lti.interconnection import append, series
+from ..lti.statespace import StateSpace, as_statespace
+from .standard import StandardPlant
+
+
+def weighted(plant: StandardPlant, z: Mapping[str, Any], w: Mapping[str, Any]) -> StandardPlant:
+    """Return ``W_z P W_w``; a weight None drops its channel."""
+    for side, weights in (("z", z), ("w", w)):
+        for name in weights:
+            if name not in getattr(plant, side):
+                raise unknown_label(f"channel of {side}", name, getattr(plant, side))
+    keep_z = [name for name in plant.z if name not in z or z[name] is not None]
+    keep_w = [name for name in plant.w if name not in w or w[name] is not None]
+    if not keep_z or not keep_w:
+        raise ModelError("all of z or w was left out: keep at least one channel of each.")
+    inner = plant.system.select([*keep_z, *plant.y], [*keep_w, *plant.u])
+    before = append(
+        *(_weight(plant, w.get(name, 1.0), name) for name in keep_w), _through(plant, plant.u)
+    )
+    after = append(
+        *(_weight(plant, z.get(name, 1.0), name) for name in keep_z), _through(plant, plant.y)
+    )
+    system = series(series(before, inner), after)
+    return StandardPlant(
+        system.replace(name=plant.system.name),
+        tuple(keep_w),
+        plant.u,
+        tuple(keep_z),
+        plant.y,
+        {},
+        ports=plant.ports,
+        realisation=plant.realisation,
+        delay=plant.delay,
+        unweighted=plant,
+    )
+
+
+def _weight(plant: StandardPlant, weight: Any, name: str) -> StateSpace:
+    sys = as_statespace(weight)
+    if len(sys.inputs) != 1 or len(sys.outputs) != 1:
+        raise ModelError(
+            f"the weight of {name!r} must have one input and one output, got {sys!r}. "
+            "Weight channels one by one."
+        )
+    if sys.n_states and not np.isclose(sys.dt, plant.dt, rtol=1e-9, atol=0.0):
+        raise ModelError(
+            f"the weight of {name!r} has dt {sys.dt:g} s, the plant {plant.dt:g} s. "
+            "Discretise the weight at the plant's rate."
+        )
+    states = [f"{name}|{state}" for state in sys.states]
+    return sys.replace(dt=plant.dt, inputs=[name], outputs=[name], states=states)
+
+
+def _through(plant: StandardPlant, names: tuple[str, ...]) -> StateSpace:
+    gain = as_statespace(np.eye(len(names)))
+    return gain.replace(dt=plant.dt, inputs=names, outputs=names)

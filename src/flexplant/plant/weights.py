@@ -1,0 +1,182 @@
+"""Filters for weights and controllers, one input and one output, as state space.
+
+All are continuous; `flexplant.tustin(weight, rate)` samples them for a sampled plant.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import ModelError
+from ..lti.interconnection import series
+from ..lti.statespace import StateSpace
+from ..values import positive
+
+
+def first_order(b1: float, b0: float, omega: float) -> StateSpace:
+    """Return ``(b1 s / w + b0) / (s / w + 1)``."""
+    return StateSpace([[-omega]], [[omega]], [[b0 - b1]], [[b1]], inputs=["in"], outputs=["out"])
+
+
+def second_order(b2: float, b1: float, b0: float, omega: float, zeta: float) -> StateSpace:
+    """Return ``(b2 p^2 + b1 p + b0) / (p^2 + 2 zeta p + 1)`` with p = s / omega."""
+    return StateSpace(
+        [[0.0, omega], [-omega, -2.0 * zeta * omega]],
+        [[0.0], [omega]],
+        [[b0 - b2, b1 - 2.0 * zeta * b2]],
+        [[b2]],
+        inputs=["in"],
+        outputs=["out"],
+        blocks=[2],
+    )
+
+
+def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
+    """Return a low-pass filter, Butterworth for order 2.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Corner frequency.
+    order : {1, 2}
+        Slope at high frequencies.
+    gain : float
+        At low frequencies.
+
+    Returns
+    -------
+    StateSpace
+        ``gain / (s/w + 1)`` or ``gain / (p^2 + sqrt(2) p + 1)``, p = s / w.
+
+    Raises
+    ------
+    ModelError
+        When freq is not positive or the order is neither 1 nor 2.
+    """
+    omega = 2.0 * np.pi * positive(freq, "freq")
+    if order == 1:
+        return first_order(0.0, gain, omega)
+    if order == 2:
+        return second_order(0.0, 0.0, gain, omega, np.sqrt(0.5))
+    raise ModelError(f"order must be 1 or 2, got {order!r}. Put filters in series for more.")
+
+
+def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
+    """Return a high-pass filter, Butterworth for order 2.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Corner frequency.
+    order : {1, 2}
+        Slope at low frequencies.
+    gain : float
+        At high frequencies.
+
+    Returns
+    -------
+    StateSpace
+        ``gain (s/w) / (s/w + 1)`` or ``gain p^2 / (p^2 + sqrt(2) p + 1)``, p = s / w.
+
+    Raises
+    ------
+    ModelError
+        When freq is not positive or the order is neither 1 nor 2.
+    """
+    omega = 2.0 * np.pi * positive(freq, "freq")
+    if order == 1:
+        return first_order(gain, 0.0, omega)
+    if order == 2:
+        return second_order(gain, 0.0, 0.0, omega, np.sqrt(0.5))
+    raise ModelError(f"order must be 1 or 2, got {order!r}. Put filters in series for more.")
+
+
+def notch(freq: float, *, depth: float = 0.05, width: float = 0.5) -> StateSpace:
+    """Return a notch filter.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Centre.
+    depth : float
+        Gain at the centre, below 1 (above 1 it is a resonance).
+    width : float
+        Damping ratio of the poles: half the relative width.
+
+    Returns
+    -------
+    StateSpace
+        ``(p^2 + 2 depth width p + 1) / (p^2 + 2 width p + 1)``, p = s / w.
+
+    Raises
+    ------
+    ModelError
+        When an argument is not positive.
+    """
+    omega = 2.0 * np.pi * positive(freq, "freq")
+    zeta = positive(width, "width")
+    return second_order(1.0, 2.0 * positive(depth, "depth", zero=True) * zeta, 1.0, omega, zeta)
+
+
+def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
+    """Return a lead (zero below pole) or lag filter.
+
+    Parameters
+    ----------
+    zero, pole : float [Hz]
+        Corner frequencies.
+    gain : float
+        At low frequencies.
+
+    Returns
+    -------
+    StateSpace
+        ``gain (s / w_zero + 1) / (s / w_pole + 1)``.
+
+    Raises
+    ------
+    ModelError
+        When a frequency is not positive.
+    """
+    ratio = positive(pole, "pole") / positive(zero, "zero")
+    return first_order(gain * ratio, gain, 2.0 * np.pi * pole)
+
+
+def inverse_sensitivity(
+    bandwidth: float, *, peak: float = 2.0, floor: float = 1e-3, slope: int = 1
+) -> StateSpace:
+    """Return a weight W with ``|W S| <= 1`` where S is as wanted: 1 / |W| bounds S.
+
+    Parameters
+    ----------
+    bandwidth : float [Hz]
+        Where the bound on |S| crosses 1.
+    peak : float
+        Bound on |S| at high frequencies.
+    floor : float
+        Bound on |S| at frequency zero; above 0, so that the weight is stable.
+    slope : {1, 2}
+        Of the bound below the bandwidth, in decades per decade.
+
+    Returns
+    -------
+    StateSpace
+        ``((s / peak^(1/k) + w) / (s + w floor^(1/k)))^k``, k the slope, with the crossing at the
+        bandwidth exactly.
+
+    Raises
+    ------
+    ModelError
+        Unless floor < 1 < peak, bandwidth > 0 and slope is 1 or 2.
+    """
+    if slope not in (1, 2):
+        raise ModelError(f"slope must be 1 or 2, got {slope!r}.")
+    if not 0.0 < floor < 1.0 < peak:
+        raise ModelError(f"need 0 < floor < 1 < peak, got floor {floor:g} and peak {peak:g}.")
+    high, low = peak ** (-1.0 / slope), floor ** (1.0 / slope)
+    # |W| = 1 at the bandwidth w_b: (w_b high)^2 + w^2 = w_b^2 + (w low)^2
+    omega = 2.0 * np.pi * positive(bandwidth, "bandwidth") * np.sqrt((1 - high**2) / (1 - low**2))
+    section = first_order(high, 1.0 / low, omega * low)
+    if slope == 1:
+        return section
+    return series(section, section.replace(inputs=["mid"], outputs=["out"], states=["x2"]))

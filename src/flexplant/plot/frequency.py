@@ -1,0 +1,73 @@
+"""Pictures over frequency."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..lti.frequency import Frf
+from ._axes import CYCLE, axes, finish
+
+
+def frf(
+    responses: Mapping[str, Frf],
+    output: str,
+    input: str,
+    *,
+    colors: Mapping[str, str] | None = None,
+    unit: str = "m/N",
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the magnitude of one channel of several FRFs (paper, Figs. 4, 10 and 11).
+
+    Parameters
+    ----------
+    responses : mapping {label: Frf}
+        What to compare.
+    output, input : str
+        The channel.
+    colors : mapping {label: color}, optional
+        Of some lines.
+    unit : str
+        Of the gain; 0 dB is one of it.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+    """
+    ax = axes(ax, figsize=(8.0, 4.5))
+    for i, (label, response) in enumerate(responses.items()):
+        color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
+        gain = 20.0 * np.log10(np.abs(response[output, input]))
+        ax.semilogx(response.freq, gain, color=color, label=label, linewidth=1.1)
+    ax.legend(frameon=False)
+    return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [dB, 0 dB = 1 {unit}]")
+
+
+def sensitivity(
+    curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None
+) -> Axes:
+    """Draw the largest singular value of sensitivities over frequency, with 0 and 6 dB.
+
+    Parameters
+    ----------
+    curves : mapping {label: (freq [Hz], size)}
+        What to compare.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+    """
+    ax = axes(ax, figsize=(8.0, 4.5))
+    for i, (label, (freq, size)) in enumerate(curves.items()):
+        ax.semilogx(freq, 20.0 * np.log10(size), color=CYCLE[i % len(CYCLE)], label=label)
+    for level, style in ((0.0, "-"), (6.0, "--")):
+        ax.axhline(level, color="0.4", linestyle=style, linewidth=0.8)
+    ax.legend(frameon=False)
+    return finish(ax, x="frequency [Hz]", y="largest singular value of S [dB]")

@@ -1,0 +1,194 @@
+"""design_servo: a rigid-body decoupled PID with roll-off, on the estimated point of interest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import AssumptionError, LabelError, ModelError, SolverError
+from ..lti.discretisation import discretized, tustin
+from ..lti.interconnection import append, lft, series
+from ..lti.statespace import StateSpace, as_statespace
+from ..plant import Poi, StandardPlant
+from ..plant.weights import leadlag, lowpass, notch
+from ..values import FloatArray, positive
+from .controller import Controller
+
+#: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body
+#: then peaks near 4 dB with the roll-off and integrator below
+_LEAD = 4.0
+
+
+def design_servo(
+    plant: StandardPlant,
+    *,
+    bandwidth: float,
+    poi: str | None = None,
+    rolloff: float | None = None,
+    integrator: float | None = None,
+    notches: Sequence[float] = (),
+) -> Controller:
+    """Return a decoupled PID controller of the rigid-body motion at a POI.
+
+    Each axis of the POI is a double integrator of the acceleration a commanded there;
+    ``u = T_u a`` with T_u the least-force right inverse of the rigid-body gain. Each axis gets
+    ``a = k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s) (ref - hat)``, where F is a
+    second-order roll-off and the notches, and k makes the open loop of the rigid body cross 1 at
+    the bandwidth.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, with a POI whose axes span its rigid-body modes.
+    bandwidth : float [Hz]
+        Where the open loop of each axis crosses 1.
+    poi : str, optional
+        Which POI, when the plant has several.
+    rolloff : float [Hz], optional
+        Corner of the second-order low-pass; 8 bandwidths unless given.
+    integrator : float [Hz], optional
+        Corner of the integral action; a tenth of the bandwidth unless given.
+    notches : sequence of float [Hz]
+        Frequencies of resonances to notch.
+
+    Returns
+    -------
+    Controller
+        Inputs: the reference `die:ref` where there is one and the estimates `die:hat`,
+        `die:rx:hat`, ...; outputs: the actuators. The certificate holds the spectral radius and the
+        modulus margin of the sampled, delayed loop of the rigid body.
+
+    Raises
+    ------
+    AssumptionError
+        When the plant is continuous, or the axes or actuators do not span the rigid-body modes.
+    LabelError
+        When the POI is unknown.
+    SolverError
+        When the rigid-body loop is unstable: the bandwidth is too high for rate and delay.
+    """
+    poi_port = _poi(plant, poi)
+    if not plant.dt:
+        raise AssumptionError(
+            "a servo is designed at its sampling rate: pass plant.discretized(rate, delay=...)."
+        )
+    rate = 1.0 / plant.dt
+    if not 0.0 < positive(bandwidth, "bandwidth") < 0.2 * rate:
+        raise ModelError(f"bandwidth {bandwidth:g} Hz is not well below the rate, {rate:g} Hz.")
+    decoupling = _decoupling(plant, poi_port)
+    axis = _axis_controller(
+        bandwidth, rolloff or 8.0 * bandwidth, integrator or 0.1 * bandwidth, notches, rate
+    )
+    certificate = _certified(axis, rate, plant.delay, bandwidth)
+    return Controller(
+        _joined(plant, poi_port, axis, decoupling),
+        f"servo {bandwidth:g} Hz on {poi_port.name!r}",
+        certificate=certificate,
+    )
+
+
+def _poi(plant: StandardPlant, name: str | None) -> Poi:
+    if plant.ports is None or not plant.ports.z:
+        raise AssumptionError("a servo needs a plant assembled from ports with a POI.")
+    if name is None and len(plant.ports.z) > 1:
+        raise LabelError(f"the plant has {len(plant.ports.z)} POIs: say which, poi=...")
+    return plant.ports.poi(name if name is not None else plant.ports.z[0].name)
+
+
+def _decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
+    """Return T_u: accelerations of the POI's axes to actuator forces, of least norm."""
+    continuous = plant.continuous or plant
+    system, r = continuous.system, continuous.n_rigid
+    if not r:
+        raise AssumptionError(
+            "the plant has no rigid-body modes to servo: it is constrained. Use design_hinf."
+        )
+    continuous.check().require(("stabilisable",), "a servo of the rigid body")
+    rows = system.output_index([poi.channel(axis) for axis in poi.axes])
+    columns = system.input_index(plant.u)
+    # displacement rows see omega_r q, forces drive dq/dt: their product over the pair's gain
+    position, velocity = np.arange(r) * 2, np.arange(r) * 2 + 1
+    pair = system.A[position, velocity]
+    gain = (system.C[np.ix_(rows, position)] * pair) @ system.B[np.ix_(velocity, columns)]
+    size = np.linalg.norm(gain, axis=1, keepdims=True)
+    if len(poi.axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
+        raise AssumptionError(
+            f"POI {poi.name!r} has axes {poi.axes}, the plant {r} rigid-body modes: the servo "
+            "needs axes that span them, one each (for a plate z, rx, ry). Give the POI these axes."
+        )
+    return np.asarray(np.linalg.pinv(gain))
+
+
+def _axis_controller(
+    bandwidth: float, rolloff: float, integrator: float, notches: Sequence[float], rate: float
+) -> StateSpace:
+    """Return error -> acceleration of one axis, sampled, of unit open-loop gain at bandwidth."""
+    omega_i = 2.0 * np.pi * positive(integrator, "integrator")
+    parts = [
+        StateSpace([[0.0]], [[omega_i]], [[1.0]], [[1.0]]),
+        leadlag(bandwidth / _LEAD, _LEAD * bandwidth),
+        lowpass(rolloff, order=2),
+        *(notch(freq, width=0.3) for freq in notches),
+    ]
+    joined = tustin(parts[0], rate)
+    for part in parts[1:]:
+        joined = series(joined, tustin(part, rate))
+    z = np.exp(2j * np.pi * bandwidth / rate)
+    gain = (2.0 * np.pi * bandwidth) ** 2 / abs(joined.evaluated(z)[0, 0])
+    return joined.replace(
+        C=gain * joined.C, D=gain * joined.D, inputs=["error"], outputs=["acceleration"]
+    )
+
+
+def _certified(axis: StateSpace, rate: float, delay: float, bandwidth: float) -> dict[str, float]:
+    """Check the loop of one axis with the sampled, delayed double integrator."""
+    body = StateSpace(
+        [[0.0, 1.0], [0.0, 0.0]],
+        [[0.0], [1.0]],
+        [[-1.0, 0.0]],
+        [[0.0]],
+        inputs=["acceleration"],
+        outputs=["error"],
+        blocks=[2],
+    )
+    sampled = discretized(body, rate, delay=delay)
+    loop = lft(sampled, axis)
+    radius = float(np.max(np.abs(loop.poles())))
+    freq = np.geomspace(1e-2 * bandwidth, 0.5 * rate, 2000)
+    margin = min(
+        abs(1.0 - (sampled.evaluated(z) @ axis.evaluated(z))[0, 0])
+        for z in np.exp(2j * np.pi * freq / rate)
+    )
+    if not radius < 1.0:
+        raise SolverError(
+            f"the rigid-body loop at {bandwidth:g} Hz is unstable (spectral radius {radius:.6f}): "
+            f"rate {rate:g} Hz and a delay of {delay:g} samples leave too little phase. "
+            "Lower the bandwidth or the delay, or raise the rate or the roll-off."
+        )
+    return {"rigid-body spectral radius": radius, "rigid-body modulus margin": float(margin)}
+
+
+def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:
+    """Return [ref, hats] -> u: errors, one controller an axis, decoupling."""
+    first = poi.axes[0]
+    reference = poi.derived(first, "ref")
+    inputs = [reference] if reference in plant.y else []
+    hats = [poi.derived(name, "hat") for name in poi.axes]
+    errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
+    errors[0, : len(inputs)] = 1.0
+    comparison = as_statespace(errors).replace(
+        dt=plant.dt, inputs=[*inputs, *hats], outputs=[f"{name}:e" for name in hats]
+    )
+    bank = append(
+        *(
+            axis.replace(
+                inputs=[f"{name}:e"],
+                outputs=[f"{name}:a"],
+                states=[f"{name}|{state}" for state in axis.states],
+            )
+            for name in hats
+        )
+    )
+    forces = as_statespace(decoupling).replace(dt=plant.dt, inputs=bank.outputs, outputs=plant.u)
+    return series(series(comparison, bank), forces).replace(name="servo", blocks=None)
