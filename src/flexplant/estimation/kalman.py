@@ -1,264 +1,314 @@
-"""design_kalman: the discrete steady-state filter of the points of interest."""
+"""The stationary Kalman filter of the POI: a point that no sensor sees, from those elsewhere."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, CertificateError, ModelError
+from ..errors import AssumptionError, CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import solve_stein
-from ..lti.riccati import RiccatiSolution, solve_dare
+from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, real_array
+from .channels import checked_plant, estimates, poi_channels, row_of, sensors
 
-#: the predicted error and the one from an independent Stein equation agree to this part
+#: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this
 AGREEMENT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanCertificate(Value):
+    """What was checked about a Kalman filter after it was computed.
+
+    Parameters
+    ----------
+    spectral_radius : float
+        Of the estimation error, below 1.
+    residual : float
+        Of the Riccati equation, relative, in states of unit variance.
+    difference : float
+        Largest relative difference between the predicted POI variances and those of the gain by a
+        Stein equation of its own: at most 1e-6.
+    """
+
+    spectral_radius: float
+    residual: float
+    difference: float
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class KalmanEstimator(Value):
-    """A stationary Kalman filter: y and the applied u to the estimates of the POIs.
+    """A stationary Kalman filter of the motions at the POIs.
 
     ::
 
-        x[k|k]   = x[k|k-1] + L (y[k] - C2 x[k|k-1] - D22 u[k]),   hat[k] = C_poi x[k|k]
-        x[k+1|k] = A x[k|k-1] + B2 u[k] + K (y[k] - C2 x[k|k-1] - D22 u[k])
+        x[k|k] = x[k|k-1] + L (y[k] - C2 x[k|k-1] - D22 u[k]),  hat[k] = C1 x[k|k]
+        x[k+1|k] = A x[k|k] + B2 u[k]
 
     Parameters
     ----------
     system : StateSpace
-        From the sensors and actuators to `die:hat`, `die:rx:hat`, ...
+        From the sensors and the applied u to the estimates `die:hat`, `die:rx:hat`, ...; states
+        x[k|k-1].
     plant : StandardPlant
-        The sampled plant it was designed on.
+        What it was designed on.
     gain : (n, ny) array
-        L, of the measurement update.
+        L, per sensor.
     covariance : (n, n) array
-        Of x - x[k|k], predicted.
-    solution : RiccatiSolution
-        Of the filter's Riccati equation, for the physical states.
-    certificate : mapping {str: float}
-        Residual, spectral radius, and how far the prediction is from the error of this gain by an
-        independent Stein equation.
+        Of the error of x[k|k], after the measurement.
+    certificate : KalmanCertificate
+        What was checked.
     """
 
     system: StateSpace
     plant: StandardPlant
     gain: FloatArray
     covariance: FloatArray
-    solution: RiccatiSolution
-    certificate: Mapping[str, float]
+    certificate: KalmanCertificate
 
     def __post_init__(self) -> None:
-        self._set(gain=self.gain, covariance=self.covariance, certificate=self.certificate)
+        self._set(gain=self.gain, covariance=self.covariance)
 
     def __repr__(self) -> str:
-        head = f"<KalmanEstimator: {self.system.n_states} states, {1 / self.plant.dt:g} Hz>"
-        rms = [f"{name} {self.rms(name):.3g} rms" for name in _estimated(self.plant)]
-        return "\n".join([head, f"  predicted error: {', '.join(rms)}"])
+        channels = poi_channels(self.plant)
+        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in channels[:4])
+        return (
+            f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
+            f"spectral radius {self.certificate.spectral_radius:.6f}; rms error {rms}>"
+        )
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors, in the order of the columns of `gain`."""
+        return sensors(self.plant)
 
     def rms(self, channel: str) -> float:
-        """Return the predicted rms error of an estimate at the sampling instants.
+        """Return the predicted rms of the estimation error at the sample instants.
 
         Parameters
         ----------
         channel : str
-            `die:z`, `die:rx`, ..., or `die` or `die:hat` for the POI's first axis.
+            A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
+
+        Returns
+        -------
+        float [m or rad]
+            Square root of ``C1 P C1'``, P the covariance after the measurement.
 
         Raises
         ------
         LabelError
-            When there is no such POI channel.
+            When it is no motion of a POI.
         """
-        row = _row(self.plant, channel)
-        return float(np.sqrt(row @ self.covariance @ row))
+        channels = poi_channels(self.plant)
+        row = self.plant.system.C[self.plant.system.output_index(channels)]
+        row = row[row_of(channels, channel)]
+        return float(np.sqrt(max(row @ self.covariance @ row, 0.0)))
 
     def to_filterpy(self) -> Any:
-        """Return a `filterpy.kalman.KalmanFilter` with this model, at its stationary covariance."""
+        """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
+
+        Call `update(y)` and then `predict(u)`; y without references, u all actuators.
+        """
         from filterpy.kalman import KalmanFilter
 
-        noise = _noise(self.plant)
-        rows = self.plant.system.output_index(_sensors(self.plant))
-        n = self.plant.system.n_states
-        kalman = KalmanFilter(dim_x=n, dim_z=rows.size, dim_u=len(self.plant.u))
-        kalman.F, kalman.B = self.plant.system.A.copy(), self.plant.B2.copy()
-        kalman.H, kalman.R = self.plant.system.C[rows].copy(), noise.R
-        kalman.Q, kalman.P = noise.Q, self.covariance.copy()
-        return kalman
+        g, noise = _model(self.plant), _noises(self.plant)
+        if np.any(g.D):
+            raise ModelError(
+                "filterpy's filter has no feedthrough from u to y, this plant has one. Sample it "
+                "with a delay: plant.continuous.discretized(rate, delay=1)."
+            )
+        n, m = g.B.shape
+        twin = KalmanFilter(dim_x=n, dim_z=g.C.shape[0], dim_u=m)
+        twin.F, twin.B, twin.H = g.A.copy(), g.B.copy(), g.C.copy()
+        twin.Q, twin.R = noise.process.copy(), noise.sensors.copy()
+        twin.P = g.A @ self.covariance @ g.A.T + noise.process
+        twin.x = np.zeros((n, 1))
+        return twin
 
 
 def design_kalman(plant: StandardPlant) -> KalmanEstimator:
-    """Return the stationary Kalman filter of a sampled plant's POIs.
+    """Return the stationary Kalman filter of the POIs on a sampled plant.
 
-    The process noise is the exact covariance of the plant's white disturbances over a sample; the
-    sensors have the variance asd^2 rate / 2. Its Riccati equation is solved by doubling, with
-    states and outputs scaled inside, and the answer is checked by a Stein equation.
+    The noise model is that of `simulate`: `plant.process_noise` per sample into x and
+    `plant.sensor_noise` on a sample of y. The filter reads the sensors (not the references) and the
+    applied u; delays of u are known exactly. The Riccati equation is solved scaled inside, in any
+    units (`flexplant.lti.solve_dare`).
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, with noisy disturbances and sensors.
+        Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`.
 
     Returns
     -------
     KalmanEstimator
-        Its `system` takes the sensors and the applied u and gives `die:hat`, ...
+        With a certificate: the gain's own error by a Stein equation agrees with the prediction.
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous or weighted, a sensor has no noise, a white disturbance
-        reaches a sensor directly, or a rigid-body mode is not excited by w or not seen by y.
+        When the plant is continuous, a sensor has no noise, a disturbance reaches a sensor
+        directly, w does not excite a rigid-body mode or y does not see it.
+    ModelError
+        When the plant is weighted or its noise is not known.
     SolverError
-        When the Riccati equation has no stabilising solution.
+        When no strictly stable filter exists for another reason.
     CertificateError
-        When the prediction fails its check.
+        When the check by the other route fails.
+
+    References
+    ----------
+    Anderson, Moore, Optimal Filtering, 1979, ch. 4.
     """
-    _require(plant)
-    noise = _noise(plant)
-    sensors = _sensors(plant)
-    system = plant.system
-    C, D22 = system.C[system.output_index(sensors)], _feedthrough(plant, sensors)
-    # delay lines hold commands that are known: the filter's covariance is that of the rest
-    n = system.n_states
-    physical = slice(0, plant.continuous.system.n_states if plant.continuous is not None else n)
-    A, Cp = system.A[physical, physical], C[:, physical]
-    Q, S = noise.Q[physical, physical], noise.S[physical]
-    solution = solve_dare(A, Cp, Q=Q, R=noise.R, S=S)
-    innovation = Cp @ solution.P @ Cp.T + noise.R
-    L, K = np.zeros((n, len(sensors))), np.zeros((n, len(sensors)))
-    L[physical] = np.linalg.solve(innovation, Cp @ solution.P).T
-    K[physical] = solution.gain
-    covariance = np.zeros((n, n))
-    covariance[physical, physical] = _updated(solution.P, L[physical], Cp, noise.R)
-    poi = system.C[system.output_index(_estimated(plant))]
-    estimator = StateSpace(
-        system.A - K @ C,
-        np.hstack([K, plant.B2 - K @ D22]),
-        poi - poi @ L @ C,
-        np.hstack([poi @ L, -poi @ L @ D22]),
-        plant.dt,
-        inputs=[*sensors, *plant.u],
-        outputs=_hats(plant),
-        states=system.states,
-        name="kalman",
-    )
-    spread = _by_stein(A, Cp, K[physical], L[physical], Q, noise.R, S)
-    gap = _largest_gap(poi[:, physical], covariance[physical, physical], spread)
-    if gap > AGREEMENT:
-        raise CertificateError(
-            f"the predicted POI error is off by {gap:.1e} from that of an independent Stein "
-            f"equation (allowed {AGREEMENT:.0e}): the filter cannot be trusted. Check the noise "
-            "densities for extreme ratios."
-        )
-    certificate = {
-        "riccati residual": solution.residual,
-        "spectral radius": solution.spectral_radius,
-        "prediction gap": gap,
-    }
-    return KalmanEstimator(estimator, plant, L, covariance, solution, certificate)
-
-
-class _Noise(NamedTuple):
-    Q: FloatArray
-    R: FloatArray
-    S: FloatArray
-
-
-def _noise(plant: StandardPlant) -> _Noise:
-    """Return covariances per sample of x, of y, and across."""
-    rows = plant.system.output_index(_sensors(plant)) - len(plant.z)
-    if plant.noise_factor is not None:
-        R = plant.sensor_noise[np.ix_(rows, rows)]
-        return _Noise(plant.process_noise, R, np.zeros((plant.system.n_states, rows.size)))
-    # a plant made elsewhere: its w are sample values of white noise
-    variance = np.array([0.5 * plant.asd.get(name, 0.0) ** 2 / plant.dt for name in plant.w])
-    B, D = plant.B1 * variance, plant.D21[rows]
-    return _Noise(B @ plant.B1.T, (D * variance) @ D.T, B @ D.T)
-
-
-def _require(plant: StandardPlant) -> None:
+    plant = checked_plant(plant)
     if not plant.dt:
         raise AssumptionError(
-            "a Kalman filter runs at a rate: pass plant.discretized(rate, delay=...)."
+            "the plant is continuous, this filter runs at samples: use "
+            "plant.discretized(rate, delay=1)."
         )
-    if plant.unweighted is not None:
-        raise AssumptionError("a Kalman filter reads noise densities, not weights: pass plant.unweighted.")
-    if not _hats(plant):
-        raise AssumptionError("there is nothing to estimate: add a Poi to the ports.")
-    if plant.ports is not None:
-        silent = [sensor.name for sensor in plant.ports.y if not sensor.asd]
-        if silent or not plant.ports.y:
-            raise AssumptionError(
-                f"sensors {silent} have no noise: a Kalman filter would trust them without limit. "
-                "Give each Sensor an asd."
-            )
-        direct = plant.system.select(_sensors(plant), [d.name for d in plant.ports.w if d.asd])
-        if np.any(direct.D):
-            raise AssumptionError(
-                "white disturbances reach an acceleration sensor directly: a sample of it would "
-                "have infinite variance. Shape the disturbance, or filter the sensor."
-            )
+    _check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
+    g, noise = _model(plant), _noises(plant)
+    solution = solve_dare(g.A, g.C, Q=noise.process, R=noise.sensors)
+    innovation = g.C @ solution.P @ g.C.T + noise.sensors
+    scale = np.sqrt(innovation.diagonal())
+    unit = innovation / scale / scale[:, None]
+    gain = np.linalg.solve(unit, g.C @ solution.P / scale[:, None]).T / scale
+    covariance = _updated(solution.P, gain, g.C, noise.sensors)
+    radius, difference = _error_of(plant, gain, covariance)
+    certificate = KalmanCertificate(radius, solution.residual, difference)
+    return KalmanEstimator(_observer(plant, gain), plant, gain, covariance, certificate)
 
 
-def _sensors(plant: StandardPlant) -> list[str]:
-    if plant.ports is not None:
-        return [sensor.name for sensor in plant.ports.y]
-    return list(plant.y)
+def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -> float:
+    """Return how far the POI variances of a gain are from those that a covariance claims.
+
+    The error's covariance follows from the gain alone:
+    ``P = F P F' + A L R L' A' + Q``, F = A (I - L C2), a Stein equation.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled.
+    gain : (n, ny) array
+        L.
+    covariance : (n, n) array
+        Claimed, after the measurement.
+
+    Returns
+    -------
+    float
+        Largest relative difference over the POI channels.
+
+    Raises
+    ------
+    ShapeError
+        When sizes do not match.
+    CertificateError
+        When the error is not stable or the difference exceeds 1e-6.
+    """
+    n, p = plant.system.n_states, len(sensors(plant))
+    gain = real_array(gain, "gain", (n, p))
+    return _error_of(plant, gain, real_array(covariance, "covariance", (n, n)))[1]
 
 
-def _estimated(plant: StandardPlant) -> list[str]:
-    if plant.ports is not None:
-        return [poi.channel(axis) for poi in plant.ports.z for axis in poi.axes]
-    return list(plant.z)
+def _error_of(
+    plant: StandardPlant, gain: FloatArray, covariance: FloatArray
+) -> tuple[float, float]:
+    """Return spectral radius and difference, refusing bad ones."""
+    g, noise = _model(plant), _noises(plant)
+    moved = g.A @ gain
+    closed = g.A - moved @ g.C
+    radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
+    if radius >= 1:
+        raise CertificateError(
+            f"the estimation error is not stable: spectral radius {radius:.9f}. The gain is not "
+            "that of a Kalman filter of this plant."
+        )
+    try:
+        P = solve_stein(closed, moved @ noise.sensors @ moved.T + noise.process)
+    except SolverError as error:
+        raise CertificateError(f"the estimation error could not be checked: {error}") from error
+    found = _updated(P, gain, g.C, noise.sensors)
+    C1 = plant.system.C[plant.system.output_index(poi_channels(plant))]
+    truth = np.einsum("ij,jk,ik->i", C1, found, C1)
+    claim = np.einsum("ij,jk,ik->i", C1, covariance, C1)
+    size = np.where(truth > 0, truth, 1.0)
+    difference = float(np.max(np.abs(claim - truth) / size))
+    if not difference <= AGREEMENT:
+        raise CertificateError(
+            f"the gain gives POI variances that differ from the predicted ones by {difference:.1e} "
+            f"(allowed {AGREEMENT:.0e}). The prediction cannot be trusted."
+        )
+    return radius, difference
 
 
-def _hats(plant: StandardPlant) -> list[str]:
-    if plant.ports is not None:
-        return [poi.derived(axis, "hat") for poi in plant.ports.z for axis in poi.axes]
-    return [f"{name}:hat" for name in plant.z]
+def _updated(P: FloatArray, gain: FloatArray, C: FloatArray, R: FloatArray) -> FloatArray:
+    """Return the covariance after the measurement, in Joseph's form: right for any gain."""
+    left = np.eye(P.shape[0]) - gain @ C
+    updated = left @ P @ left.T + gain @ R @ gain.T
+    return np.asarray(0.5 * (updated + updated.T))
 
 
-def _row(plant: StandardPlant, channel: str) -> FloatArray:
-    name = plant.channel(channel)
-    if name not in _estimated(plant):
-        from ..errors import unknown_label
-
-        raise unknown_label("estimated channel", channel, _estimated(plant))
-    return np.asarray(plant.system.C[plant.system.output_index([name])[0]])
-
-
-def _feedthrough(plant: StandardPlant, sensors: list[str]) -> FloatArray:
-    return plant.system.select(sensors, plant.u).D
-
-
-def _updated(P: FloatArray, L: FloatArray, C: FloatArray, R: FloatArray) -> FloatArray:
-    """Return the covariance after the measurement, in Joseph's form (a sum of squares)."""
-    rest = np.eye(P.shape[0]) - L @ C
-    return np.asarray(rest @ P @ rest.T + L @ R @ L.T)
-
-
-def _by_stein(
-    A: FloatArray,
-    C: FloatArray,
-    K: FloatArray,
-    L: FloatArray,
-    Q: FloatArray,
-    R: FloatArray,
-    S: FloatArray,
-) -> FloatArray:
-    """Return the covariance of x - x[k|k] under given gains, without the Riccati equation."""
-    cross = K @ S.T
-    predicted = solve_stein(A - K @ C, Q + K @ R @ K.T - cross - cross.T)
-    return _updated(predicted, L, C, R)
+def _observer(plant: StandardPlant, gain: FloatArray) -> StateSpace:
+    g, inner = _model(plant), plant.system
+    channels = poi_channels(plant)
+    rows = inner.output_index(channels)
+    C1, D12 = inner.C[rows], inner.D[np.ix_(rows, inner.input_index(plant.u))]
+    corrected = np.eye(inner.n_states) - gain @ g.C
+    through = -gain @ g.D  # from u to x[k|k]
+    return StateSpace(
+        g.A @ corrected,
+        np.hstack([g.A @ gain, g.B + g.A @ through]),
+        C1 @ corrected,
+        np.hstack([C1 @ gain, D12 + C1 @ through]),
+        plant.dt,
+        inputs=[*sensors(plant), *plant.u],
+        outputs=estimates(channels),
+        states=inner.states,
+        name="kalman",
+    )
 
 
-def _largest_gap(rows: FloatArray, first: FloatArray, second: FloatArray) -> float:
-    a, b = (np.sqrt(np.einsum("ij,jk,ik->i", rows, X, rows)) for X in (first, second))
-    if not np.all(np.isfinite(a) & np.isfinite(b)):
-        raise ModelError("the predicted POI error is not a number: check the noise densities.")
-    return float(np.max(np.abs(a - b) / np.where(b > 0, b, 1.0)))
+def _model(plant: StandardPlant) -> StateSpace:
+    """Return u -> sensors."""
+    return plant.system.select(sensors(plant), plant.u)
+
+
+@dataclass(frozen=True, eq=False)
+class _Noises(Value):
+    process: FloatArray
+    sensors: FloatArray
+
+
+def _noises(plant: StandardPlant) -> _Noises:
+    rows = [plant.y.index(name) for name in sensors(plant)]
+    return _Noises(plant.process_noise, plant.sensor_noise[np.ix_(rows, rows)])
+
+
+def _check_noises(plant: StandardPlant) -> None:
+    names, noise = sensors(plant), _noises(plant)
+    n = plant.system.n_states
+    if noise.process.shape != (n, n):
+        raise ShapeError(f"process_noise must be ({n}, {n}), got {noise.process.shape}.")
+    silent = [name for name, v in zip(names, noise.sensors.diagonal(), strict=True) if v <= 0]
+    if silent:
+        raise AssumptionError(
+            f"sensors {', '.join(silent)} have no noise (asd 0): the filter would trust them "
+            "without limit and differentiate them. Give Sensor(..., asd=) what the data sheet "
+            "says, in m/sqrt(Hz)."
+        )
+    inner = plant.system
+    loud = [name for name in plant.w if plant.asd.get(name, 0.0) > 0 and ":noise" not in name]
+    direct = inner.D[np.ix_(inner.output_index(names), inner.input_index(loud))]
+    if np.any(direct):
+        row, column = (int(i) for i in np.argwhere(direct)[0])
+        raise AssumptionError(
+            f"white noise of {loud[column]!r} reaches {names[row]!r} at once (an acceleration "
+            "sensor, say), so a sample of it would have infinite variance. Measure displacement or "
+            "velocity, or shape the disturbance."
+        )

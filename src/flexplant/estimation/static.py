@@ -1,4 +1,4 @@
-"""design_static: the static geometric relation, which every better estimator has to beat."""
+"""The static geometric relation: the POI from the sensors as if the structure were rigid."""
 
 from __future__ import annotations
 
@@ -7,110 +7,162 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import AssumptionError
-from ..lti.lyapunov import solve_stein
+from ..lti.lyapunov import controllability_gramian
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray, Value
+from .channels import checked_plant, estimates, poi_channels, row_of, sensors
+
+#: a POI motion that the sensors miss by this relative part is not determined by them
+_MISSED = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StaticEstimator(Value):
-    """The POI as if the structure were rigid: ``hat = C_poi,r C_y,r^+ y``.
+    """The rigid-body least-squares estimate of the motions at the POIs, a matrix of gains.
 
     Parameters
     ----------
     system : StateSpace
-        A static gain from the displacement sensors to `die:hat`, ...
+        From the displacement sensors to `die:hat`, ...; no states.
     plant : StandardPlant
-        The sampled plant it was designed on.
-    covariance : (n_poi, n_poi) array [m^2, rad^2]
-        Of the estimation error that the model predicts: elastic motion and sensor noise.
+        Whose geometry it uses.
     """
 
     system: StateSpace
     plant: StandardPlant
-    covariance: FloatArray
-
-    def __post_init__(self) -> None:
-        self._set(covariance=self.covariance)
 
     def __repr__(self) -> str:
-        return f"<StaticEstimator: {len(self.system.inputs)} sensors -> {list(self.system.outputs)}>"
+        g = self.system
+        return f"<StaticEstimator: {', '.join(g.inputs)} -> {', '.join(g.outputs)}>"
+
+    @property
+    def gain(self) -> FloatArray:
+        """The gains (n_poi, n_sensors)."""
+        return self.system.D
 
     def rms(self, channel: str) -> float:
-        """Return the rms error of an estimate at the sampling instants that the model predicts.
+        """Return the predicted rms of the error at sample instants, with u at rest.
+
+        What the disturbances bend, by the Gramian of the elastic modes, and the sensor noise; the
+        rigid-body motion has no error.
 
         Parameters
         ----------
         channel : str
-            `die:z`, `die:rx`, ..., or `die` or `die:hat` for the POI's first axis.
+            A POI's motion: `die`, `die:z`, `die:hat` or `die:error`.
 
         Raises
         ------
         LabelError
-            When there is no such POI channel.
+            When it is no motion of a POI.
+        AssumptionError
+            When the plant is continuous: a sample of white sensor noise has no variance then.
+        SolverError
+            When an elastic mode is not damped.
         """
-        position = self.plant.z.index(self.plant.channel(channel))
-        return float(np.sqrt(self.covariance[position, position]))
+        plant = self.plant
+        row = row_of(poi_channels(plant), channel)
+        if not plant.dt:
+            raise AssumptionError(
+                "the rms needs a sampled plant: design_static(plant.discretized(rate))."
+            )
+        g = plant.system
+        weights = self.gain[row]
+        rows = [plant.y.index(name) for name in self.system.inputs]
+        noise = weights @ plant.sensor_noise[np.ix_(rows, rows)] @ weights
+        elastic = _elastic(plant)
+        missed = (
+            g.C[g.output_index(poi_channels(plant))[row]]
+            - weights @ (g.C[g.output_index(self.system.inputs)])
+        )
+        missed = missed[elastic]
+        if plant.noise_factor is None:
+            raise AssumptionError(
+                "the rms needs the process noise of a plant that was assembled and sampled: "
+                "assemble_plant(model, ports).discretized(rate)."
+            )
+        factor = plant.noise_factor[elastic]
+        bending = StateSpace(
+            g.A[np.ix_(elastic, elastic)],
+            factor,
+            missed[None],
+            np.zeros((1, factor.shape[1])),
+            plant.dt,
+            blocks=[2] * (len(elastic) // 2),
+        )
+        return float(np.sqrt(noise + missed @ controllability_gramian(bending) @ missed))
 
 
 def design_static(plant: StandardPlant) -> StaticEstimator:
-    """Return the rigid-body least-squares estimate of the POIs from the displacement sensors.
+    """Return the static geometric relation between the displacement sensors and the POIs.
 
-    The assumption of traditional wafer stages (paper, section 1): measured and performance
-    variables are related by geometry alone.
+    ``hat = R_z R_y^+ y`` with R_y and R_z the rigid-body modes at the sensors and the POIs: the
+    least-squares rigid-body motion that the sensors show, at the POI. Usual practice, and the
+    baseline for anything that knows that the structure bends.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, assembled from a free structure.
+        Assembled from a structure with rigid-body modes, continuous or sampled.
 
     Returns
     -------
     StaticEstimator
-        With the error that the model predicts for it in open loop.
+        Exact for rigid-body motion.
 
     Raises
     ------
     AssumptionError
-        When the plant is not sampled, has no rigid-body modes or POIs, or its displacement sensors
-        do not see all rigid-body modes.
+        When the structure has no rigid-body mode, or the displacement sensors do not determine
+        the POI's rigid-body motion.
+    ModelError
+        When the plant is weighted.
+
+    References
+    ----------
+    The paper, section 5: "the static geometric relation".
     """
-    if not plant.dt or plant.noise_factor is None or plant.ports is None or not plant.ports.z:
+    plant = checked_plant(plant)
+    if not plant.n_rigid or plant.realisation is None:
         raise AssumptionError(
-            "the static relation needs a plant with POIs, assembled from a structure and sampled: "
-            "assemble_plant(model, ports).discretized(rate)."
+            "the static geometric relation needs the rigid-body modes of a free structure, and "
+            "this plant has none. Use design_kalman(plant)."
         )
-    r = plant.n_rigid
-    if not r:
-        raise AssumptionError("the structure is held: it has no rigid-body motion to follow.")
-    plant.check().require(("detectable",), "a static estimate")
-    system = plant.system
-    sensors = [s.name for s in plant.ports.y if s.quantity == "displacement"]
-    pois = [poi.channel(axis) for poi in plant.ports.z for axis in poi.axes]
-    seen, wanted = (system.C[system.output_index(names)] for names in (sensors, pois))
-    positions = np.arange(r) * 2
-    gain = wanted[:, positions] @ np.linalg.pinv(seen[:, positions])
-    static = StateSpace(
-        [],
-        [],
-        [],
-        gain,
-        plant.dt,
-        inputs=sensors,
-        outputs=[poi.derived(axis, "hat") for poi in plant.ports.z for axis in poi.axes],
-        name="static",
+    ports = plant.ports
+    kinds = {s.name: s.quantity for s in ports.y} if ports is not None else {}
+    used = [name for name in sensors(plant) if kinds.get(name) == "displacement"]
+    channels = poi_channels(plant)
+    g = (plant.continuous or plant).system
+    positions = np.arange(plant.n_rigid) * 2
+    R_y = g.C[np.ix_(g.output_index(used), positions)]
+    R_z = g.C[np.ix_(g.output_index(channels), positions)]
+    gain = R_z @ np.linalg.pinv(R_y, rcond=_MISSED)
+    missed = np.linalg.norm(R_z - gain @ R_y, axis=1)
+    bad = missed > 1e-6 * np.linalg.norm(R_z, axis=1)
+    if np.any(bad):
+        raise AssumptionError(
+            f"the displacement sensors ({', '.join(used) or 'none'}) do not determine the "
+            f"rigid-body motion at {channels[int(np.argmax(bad))]!r}. Add or move sensors: three "
+            "that are not on one line see z, rx and ry."
+        )
+    n = np.zeros((0, 0))
+    return StaticEstimator(
+        StateSpace(
+            n,
+            np.zeros((0, len(used))),
+            np.zeros((len(channels), 0)),
+            gain,
+            plant.dt,
+            inputs=used,
+            outputs=estimates(channels),
+            name="static",
+        ),
+        plant,
     )
-    return StaticEstimator(static, plant, _error(plant, wanted - gain @ seen, gain, sensors))
 
 
-def _error(
-    plant: StandardPlant, left: FloatArray, gain: FloatArray, sensors: list[str]
-) -> FloatArray:
-    """Return the covariance of the error: the rigid part cancels, elastic modes and noise stay."""
-    structural = 2 * plant.realisation.pairs.shape[0] if plant.realisation is not None else 0
-    elastic = slice(2 * plant.n_rigid, structural)
-    motion = solve_stein(plant.system.A[elastic, elastic], plant.process_noise[elastic, elastic])
-    rows = [plant.y.index(name) for name in sensors]
-    noise = plant.sensor_noise[np.ix_(rows, rows)]
-    return np.asarray(left[:, elastic] @ motion @ left[:, elastic].T + gain @ noise @ gain.T)
+def _elastic(plant: StandardPlant) -> list[int]:
+    """Return the states of elastic modes; delay lines of u come after all modes."""
+    modes = (plant.continuous or plant).system.n_states
+    return list(range(2 * plant.n_rigid, modes))
