@@ -8,7 +8,7 @@ from scipy.sparse import csr_array
 from scipy.sparse.csgraph import connected_components
 
 from ..values import ComplexArray, FloatArray, IntArray
-from .sensitivity import groups
+from .pencil import groups
 
 #: modes closer than this, relatively, are a cluster: their shapes mix at the least change
 CLUSTER = 0.02

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from ..errors import LabelError, ModelError
 from ..identification import MeasuredModes
-from ..values import FloatArray, Value, real_array
+from ..values import ComplexArray, FloatArray, Value, real_array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,3 +86,52 @@ class Eigenvalues(Value):
             return np.ones(m)
         variance = np.diag(self.measured.covariance)
         return np.asarray(1 / (variance[:m] + variance[m:]), dtype=np.float64)
+
+
+@dataclass(frozen=True)
+class Data:
+    """All residuals, stacked."""
+
+    target: ComplexArray
+    modes: tuple[int, ...]
+    W: FloatArray
+    covariance: FloatArray | None
+
+    def error(self, poles: ComplexArray) -> float:
+        """Return e of (12)."""
+        return float(np.sum(self.W * np.abs(self.target - poles) ** 2))
+
+    def stacked(self, rows: ComplexArray) -> FloatArray:
+        """Return W^(1/2) [Re; Im] of complex rows."""
+        root = np.sqrt(self.W).reshape(-1, *[1] * (rows.ndim - 1))
+        return np.concatenate([root * rows.real, root * rows.imag])
+
+
+def checked_data(residuals: Any) -> Data:
+    """Return all residuals stacked, checked."""
+    listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
+    for residual in listed:
+        if not isinstance(residual, Eigenvalues):
+            raise ModelError(
+                f"residuals must be a list of Eigenvalues, got {type(residual).__name__}: wrap "
+                "the measurement, [Eigenvalues(measured)]."
+            )
+    if not listed:
+        raise ModelError("residuals is empty: nothing was measured to update from.")
+    parts = [residual.measured.covariance for residual in listed]
+    known = [part for part in parts if part is not None]
+    m = [len(residual.measured) for residual in listed]
+    covariance = None
+    if len(known) == len(parts):
+        covariance = np.zeros((2 * sum(m), 2 * sum(m)))
+        first = 0
+        for part, size in zip(known, m, strict=True):
+            at = np.r_[first : first + size, sum(m) + first : sum(m) + first + size]
+            covariance[np.ix_(at, at)] = part
+            first += size
+    return Data(
+        target=np.concatenate([residual.measured.poles for residual in listed]),
+        modes=tuple(n for residual in listed for n in residual.measured.modes or ()),
+        W=np.concatenate([residual.W for residual in listed]),
+        covariance=covariance,
+    )
