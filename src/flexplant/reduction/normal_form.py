@@ -40,6 +40,9 @@ class NormalForm(Value):
     phi: FloatArray | ComplexArray
     n_rigid: int
 
+    def __post_init__(self) -> None:
+        self._set(poles=self.poles, phi=self.phi)
+
     def __repr__(self) -> str:
         kind = "real" if self.is_real else "complex"
         return f"<NormalForm: {self.poles.size} modes, {self.n_rigid} rigid-body, {kind} shapes>"

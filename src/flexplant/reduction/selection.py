@@ -84,8 +84,8 @@ def select_dofs(
         pool = [label for label in modes.dofs.labels if ":r" not in label]
     else:
         pool = [candidates] if isinstance(candidates, str) else list(dict.fromkeys(candidates))
-    rows = modes.dofs.indices(kept)
     pool = [label for label in pool if label not in set(kept)]
+    rows, open_rows = modes.dofs.indices(kept), modes.dofs.indices(pool)
     k = basis.shape[1]
     if isinstance(count, bool) or int(count) != count or not max(1, len(kept)) <= count <= k:
         raise ShapeError(
@@ -97,9 +97,7 @@ def select_dofs(
         raise ShapeError(
             f"{missing} DOFs are to be chosen from {len(pool)} candidates: name more of them."
         )
-    chosen = kept + [
-        pool[i] for i in _pivots(basis[rows], basis[modes.dofs.indices(pool)], missing)
-    ]
+    chosen = kept + [pool[i] for i in _pivots(basis[rows], basis[open_rows], missing)]
     singular = la.svdvals(basis[modes.dofs.indices(chosen)])
     if not singular[-1] > 1e-12 * singular[0]:
         raise ModelError(

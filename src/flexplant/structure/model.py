@@ -69,6 +69,8 @@ class FEModel(Value):
                 "M and K are. DofSet(nodes, directions, xyz) or DofSet.from_table(...)."
             )
         n = len(self.dofs)
+        if not n:
+            raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         M, K = _symmetric(self.M, "M", n), _symmetric(self.K, "K", n)
         D = None if self.D is None else _symmetric(self.D, "D", n)
         if not is_positive_definite(M):

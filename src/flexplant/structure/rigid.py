@@ -68,7 +68,8 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
     Raises
     ------
     ModelError
-        When a vector depends on those before it, unless `dependent` is "drop".
+        When a vector depends on those before it, unless `dependent` is "drop"; when M is not
+        positive definite.
     """
     done = np.zeros((basis.shape[0], 0))
     for i in range(basis.shape[1]):
@@ -92,4 +93,10 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
 
 
 def _length(M: Matrix, vector: FloatArray) -> float:
-    return float(np.sqrt(np.vdot(vector, np.asarray(M @ vector))))
+    square = float(vector @ np.asarray(M @ vector))
+    if square < 0:
+        raise ModelError(
+            f"M is not positive definite: a rigid-body motion has the inertia {square:.3g}. Look "
+            "for a sign, or for a negative added mass that is larger than what it is added to."
+        )
+    return float(np.sqrt(square))

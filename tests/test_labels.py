@@ -1,0 +1,163 @@
+"""DofSet: labels, places, tables."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.labels import DIRECTIONS, DofSet, Interpolation
+from flexplant.store import load
+
+DOFS = DofSet(
+    [7, 7, 3, 3],
+    ["z", "rx", "z", "rx"],
+    [[0, 0, 0], [0, 0, 0], [1, 2, 0], [1, 2, 0]],
+)
+
+
+@st.composite
+def dofsets(draw):
+    nodes = draw(st.lists(st.integers(1, 999), min_size=1, max_size=8, unique=True))
+    kinds = draw(st.lists(st.sampled_from(DIRECTIONS), min_size=1, max_size=6, unique=True))
+    xyz = [[float(i), 2.0 * i, 0.5 * i] for i in range(len(nodes))]
+    return DofSet(
+        np.repeat(nodes, len(kinds)), kinds * len(nodes), np.repeat(xyz, len(kinds), axis=0)
+    )
+
+
+@given(dofsets())
+def test_labels_and_rows_are_each_other_s_inverse(dofs):
+    assert [dofs.index(label) for label in dofs] == list(range(len(dofs)))
+    assert list(dofs) == list(dofs.labels)
+    assert len(set(dofs.labels)) == len(dofs)
+    assert all(label in dofs for label in dofs)
+    np.testing.assert_array_equal([dofs.row(label) for label in dofs], np.eye(len(dofs)))
+    for label, xyz in zip(dofs, dofs.xyz, strict=True):
+        assert dofs.nearest(xyz, label.split(":")[1]) == label
+        assert dofs.row(xyz, label.split(":")[1])[dofs.index(label)] == 1
+
+
+@given(dofsets(), st.randoms())
+def test_select_keeps_the_order_given(dofs, random):
+    labels = list(dofs)
+    random.shuffle(labels)
+    chosen = dofs.select(labels)
+    assert list(chosen) == labels
+    np.testing.assert_array_equal(chosen.xyz, dofs.xyz[dofs.indices(labels)])
+
+
+def test_where():
+    assert DOFS.where(directions="z").labels == ("7:z", "3:z")
+    assert DOFS.where(nodes=3).labels == ("3:z", "3:rx")
+    assert DOFS.where(nodes=[3, 7], directions=["rx"]).labels == ("7:rx", "3:rx")
+    assert DOFS.where().labels == DOFS.labels
+    with pytest.raises(LabelError, match=r"nodes \[4\]"):
+        DOFS.where(nodes=[3, 4])
+    with pytest.raises(LabelError, match="ry"):
+        DOFS.where(directions="ry")
+
+
+def test_nearest():
+    assert DOFS.nearest((0.9, 1.9, 0.3), "rx") == "3:rx"
+    with pytest.raises(LabelError, match="'x'"):
+        DOFS.nearest((0, 0, 0), "x")
+    with pytest.raises(ShapeError):
+        DOFS.nearest((0, 0), "z")
+    with pytest.raises(ModelError):
+        DOFS.nearest((0, 0, np.nan), "z")
+
+
+def test_unknown_labels_name_close_ones():
+    with pytest.raises(LabelError, match=r"no DOF '7:zz' \(4 known\).*'7:z'"):
+        DOFS.index("7:zz")
+    with pytest.raises(LabelError):
+        DOFS.index(7)
+    with pytest.raises(LabelError):
+        DOFS.index(["7:z"])
+    with pytest.raises(LabelError):
+        DOFS.indices(["7:z", "8:z"])
+    assert "8:z" not in DOFS
+    assert DOFS.indices("3:z").tolist() == [2]
+
+
+def test_rows_of_places():
+    np.testing.assert_array_equal(DOFS.row({"7:z": 0.5, "3:z": -2}), [0.5, 0, -2, 0])
+    np.testing.assert_array_equal(DOFS.row((1, 2, 0)), [0, 0, 1, 0])
+    np.testing.assert_array_equal(DOFS.row((1, 2, 1e-12), "rx"), [0, 0, 0, 1])
+    with pytest.raises(LabelError, match="no shape functions"):
+        DOFS.row((0.5, 1, 0))
+    with pytest.raises(LabelError, match="'u'"):
+        DOFS.row((0, 0, 0), "u")
+    with pytest.raises(LabelError):
+        DOFS.row({"9:z": 1.0})
+    with pytest.raises(ModelError, match="weight of '7:z'"):
+        DOFS.row({"7:z": np.nan})
+    with pytest.raises(ShapeError):
+        DOFS.row((1, 2))
+
+
+def test_an_interpolation_must_say_how():
+    with pytest.raises(NotImplementedError):
+        Interpolation().row(np.zeros(3), "z")
+
+
+@pytest.mark.parametrize(
+    ("nodes", "directions", "xyz", "error"),
+    [
+        ([1, 2], ["z"], [[0, 0, 0]] * 2, ShapeError),
+        ([[1, 2]], ["z", "z"], [[0, 0, 0]] * 2, ShapeError),
+        ([1, 2], ["z", "z"], [[0, 0]] * 2, ShapeError),
+        ([1, 2], ["z", "z"], [[0, 0, np.inf]] * 2, ModelError),
+        ([1, 2], ["z", "w"], [[0, 0, 0]] * 2, LabelError),
+        ([1, 1], ["z", "z"], [[0, 0, 0]] * 2, LabelError),
+    ],
+)
+def test_bad_sets(nodes, directions, xyz, error):
+    with pytest.raises(error):
+        DofSet(nodes, directions, xyz)
+
+
+def test_repr_is_short():
+    assert repr(DOFS) == "<DofSet 4 DOFs at 2 nodes: 2 z, 2 rx>"
+
+
+def test_from_table(tmp_path):
+    rows = [
+        {"node": 4, "direction": "z", "x": 0.1, "y": 0.2, "z": 0},
+        {"node": "5", "direction": " rx ", "x": "1e-1", "y": "0", "z": "0"},
+    ]
+    dofs = DofSet.from_table(rows)
+    assert dofs.labels == ("4:z", "5:rx")
+    np.testing.assert_array_equal(dofs.xyz, [[0.1, 0.2, 0], [0.1, 0, 0]])
+    path = tmp_path / "dofs.csv"
+    path.write_text("node,direction,x,y,z,remark\n4,z,0.1,0.2,0,corner\n5,rx,0.1,0,0,\n")
+    for source in (path, str(path)):
+        read = DofSet.from_table(source)
+        assert read.labels == dofs.labels
+        np.testing.assert_array_equal(read.xyz, dofs.xyz)
+    with pytest.raises(LabelError, match=r"missing: \['direction'\]"):
+        DofSet.from_table([{"node": 4, "x": 0, "y": 0, "z": 0}])
+    with pytest.raises(LabelError, match="needs rows"):
+        DofSet.from_table([])
+
+
+def test_travels_read_only(tmp_path):
+    DOFS.save(tmp_path / "dofs.npz")
+    for other in (DOFS, pickle.loads(pickle.dumps(DOFS)), load(tmp_path / "dofs.npz")):
+        assert other.labels == DOFS.labels
+        assert other.index("3:rx") == 3
+        with pytest.raises(ValueError, match="read-only"):
+            other.nodes[0] = 1
+        with pytest.raises(ValueError, match="read-only"):
+            other.xyz[0, 0] = 1
+
+
+def test_the_caller_s_arrays_stay_the_caller_s():
+    nodes, xyz = np.array([1]), np.zeros((1, 3))
+    dofs = DofSet(nodes, ["z"], xyz)
+    nodes[0], xyz[0, 0] = 9, 9
+    assert dofs.labels == ("1:z",)
+    assert dofs.xyz[0, 0] == 0
