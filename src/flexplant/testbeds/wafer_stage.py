@@ -259,9 +259,9 @@ class WaferStage(Value):
 
 def _holding(ports: Ports, rate: float, delay: int) -> tuple[Any, ...]:
     """Return the slow controller that keeps the machine in place, made from its drawing."""
-    drawing = kirchhoff_plate(elements=(4, 4), **DRAWING)
+    drawing = kirchhoff_plate(elements=(4, 4), **DRAWING).with_damping(ModalDamping(0.01))
     plant = assemble_plant(drawing, ports).discretized(rate, delay=delay)
-    return design_static(plant), design_servo(plant, bandwidth=8.0, rolloff=30.0)
+    return design_static(plant), design_servo(plant, bandwidth=8.0, rolloff=40.0)
 
 
 def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:
