@@ -206,16 +206,45 @@ def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> 
             raise unknown_label("actuator to leave idle", name, plant.u)
     driven, watched = _drives(plant, systems, resting)
     _check_inputs(plant, systems)
-    silent = [name for name in resting if any(name in sys.inputs for sys in systems)]
+    controller = _joined(plant, systems, driven, watched)
+    return ClosedLoop(plant, systems, controller, resting)
+
+
+def _joined(
+    plant: StandardPlant, systems: Sequence[StateSpace], driven: list[str], watched: list[str]
+) -> StateSpace:
+    """Return the blocks as one system from y to the driven actuators and what is watched."""
+    heard = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
     none = np.zeros((0, 0))
+    silent = [name for name in heard if name not in driven]
     zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
-    controller = connect(
-        [*systems, zero] if silent else systems,
+    # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: commands are
+    # joined in units of a size like that of y, powers of two so that no digit changes
+    units = {name: _unit(systems, name) for name in driven}
+    scaled = [_in_units(sys, units) for sys in systems]
+    joined = connect(
+        [*scaled, zero] if silent else scaled,
         inputs=plant.y,
         outputs=[*driven, *watched],
         adding=driven,
     )
-    return ClosedLoop(plant, systems, controller.replace(dt=plant.dt), resting)
+    row = np.array([*units.values(), *np.ones(len(watched))])[:, None]
+    return joined.replace(C=joined.C * row, D=joined.D * row, dt=plant.dt)
+
+
+def _unit(systems: Sequence[StateSpace], name: str) -> float:
+    largest = max(
+        (float(np.abs(sys.D[sys.outputs.index(name)]).max(initial=0.0)))
+        for sys in systems
+        if name in sys.outputs
+    )
+    return float(2.0 ** np.ceil(np.log2(largest))) if largest else 1.0
+
+
+def _in_units(sys: StateSpace, units: dict[str, float]) -> StateSpace:
+    row = np.array([units.get(name, 1.0) for name in sys.outputs])[:, None]
+    column = np.array([units.get(name, 1.0) for name in sys.inputs])
+    return sys.replace(B=sys.B * column, C=sys.C / row, D=sys.D / row * column)
 
 
 def _block(block: Any, place: int, dt: float) -> StateSpace:

@@ -10,7 +10,7 @@ from ..values import ComplexArray, FloatArray
 _AROUND = np.array([0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0])
 
 
-def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 500) -> FloatArray:
+def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 600) -> FloatArray:
     """Return frequencies [Hz], log-spaced over all poles and dense around each resonance.
 
     Parameters
@@ -32,7 +32,7 @@ def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 500) -> Floa
     if not size_seen.size:
         size_seen = np.array([0.01 * nyquist if dt else 1.0])
     high = nyquist if dt else 100.0 * float(size_seen.max())
-    low = min(0.01 * float(size_seen.min()), 0.01 * high)
+    low = min(1e-3 * float(size_seen.min()), 0.01 * high)
     base = np.geomspace(low, high, points)
     swing = s.imag > 0
     centre, width = s.imag[swing] / (2 * np.pi), np.abs(s.real[swing]) / (2 * np.pi)

@@ -6,7 +6,6 @@ import numpy as np
 
 from ..errors import AssumptionError
 from ..values import ComplexArray, FloatArray
-from .closed import ClosedLoop
 from .grid import refined
 from .sensitivity import Loop, Pieces, checked_grid, inverted, open_gain, taken_apart
 
@@ -17,8 +16,8 @@ def modulus_margin(loop: Loop) -> float:
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`. A ClosedLoop that is unstable has no margin: 0. For a measured plant
-        the peak is that over its frequencies, and its stability is not known.
+        As for `loop_gain`. An unstable loop has no margin: 0. For a measured plant the peak is
+        that over its frequencies, and stability is not known.
 
     Returns
     -------
@@ -30,24 +29,18 @@ def modulus_margin(loop: Loop) -> float:
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
     """
-    if isinstance(loop, ClosedLoop) and not loop.is_stable:
-        return 0.0
     parts = taken_apart(loop)
+    if parts.measured is None and not _stable(parts):
+        return 0.0
     grid = checked_grid(parts, None)
     values = _largest(inverted(open_gain(parts, grid, "u")))
-    peak = float(values.max())
-    for _ in range(8 if parts.measured is None else 0):
+    for _ in range(6 if parts.measured is None else 0):
         fresh = refined(grid, values)
-        if not fresh.size:
-            break
         more = _largest(inverted(open_gain(parts, fresh, "u")))
         order = np.argsort(np.concatenate([grid, fresh]))
         grid = np.concatenate([grid, fresh])[order]
         values = np.concatenate([values, more])[order]
-        before, peak = peak, float(values.max())
-        if peak <= before * (1.0 + 1e-10):
-            break
-    return 1.0 / peak
+    return 1.0 / float(values.max())
 
 
 def bandwidth(loop: Loop) -> float:
@@ -93,6 +86,12 @@ def bandwidth(loop: Loop) -> float:
         first = int(np.argmax(_driven_sensitivity(parts, inner[1:]) >= 1.0))
         low, high = float(inner[first]), float(inner[first + 1])
     return high
+
+
+def _stable(parts: Pieces) -> bool:
+    poles = parts.poles()
+    edge = np.abs(poles) - 1.0 if parts.dt else poles.real
+    return bool(np.max(edge, initial=-1.0) < 0)
 
 
 def _largest(S: ComplexArray) -> FloatArray:

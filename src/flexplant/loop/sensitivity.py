@@ -10,6 +10,7 @@ import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf, frequency_response
+from ..lti.interconnection import lft
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, real_array
@@ -21,7 +22,10 @@ Loop: TypeAlias = "ClosedLoop | tuple[Any, Any]"
 
 
 class Pieces(NamedTuple):
-    """A loop taken apart: y = P u, u = K y; `respond` gives K (f, nu, ny) and P (f, ny, nu)."""
+    """A loop taken apart: y = P u, u = K y; `respond` gives K (f, nu, ny) and P (f, ny, nu).
+
+    `poles` gives those of the closed loop, or of the controller when the plant was measured.
+    """
 
     u: tuple[str, ...]
     y: tuple[str, ...]
@@ -185,7 +189,8 @@ def taken_apart(loop: Loop) -> Pieces:
         raise unknown_label("actuator", controller.outputs[0], plant.inputs, "the plant")
     controller = controller.select(driven)
     plant = plant.select(controller.inputs, driven)
-    return _modelled(plant, controller, lambda: np.concatenate([plant.poles(), controller.poles()]))
+    # the peaks of S are at the poles of the closed loop, not at those of its parts
+    return _modelled(plant, controller, lambda: lft(plant, controller).poles())
 
 
 def open_gain(parts: Pieces, grid: FloatArray, at: str) -> ComplexArray:

@@ -148,10 +148,13 @@ def setpoint(
     start: float = 0.0,
     rest: float = 0.0,
 ) -> SetPoint:
-    """Return the fastest symmetric motion from rest to rest within the bounds.
+    """Return the fastest motion from rest to rest within the bounds, in closed form.
 
     Third order (bounded jerk, piecewise constant) or, with `snap`, fourth order. Bounds that the
-    distance is too short to reach are not reached.
+    distance is too short to reach are not reached. The third order is time-optimal; so is the
+    fourth where the velocity bound is reached. Where it is not, acceleration and jerk still
+    return to zero between speeding up and slowing down, which takes at most 7.5 % longer than
+    the optimum.
 
     Parameters
     ----------

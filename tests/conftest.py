@@ -1,0 +1,22 @@
+"""Profiles of hypothesis, a backend without windows, and the oracles on the path."""
+
+import os
+import sys
+from pathlib import Path
+
+from hypothesis import HealthCheck, settings
+
+os.environ.setdefault("MPLBACKEND", "Agg")
+
+# oracles and small machines live here; tests in the folders below import them by name
+sys.path.insert(0, str(Path(__file__).parent))
+
+settings.register_profile(
+    "dev",
+    max_examples=20,
+    derandomize=True,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
+)
+settings.register_profile("nightly", max_examples=1000, deadline=None)
+settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))

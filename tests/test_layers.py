@@ -1,0 +1,167 @@
+"""The house: rooms import only from rooms above, stay small, and load nothing heavy."""
+
+import ast
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import flexplant
+
+ROOT = Path(flexplant.__file__).parent
+#: in import order; the first entry is the foundation, whose modules may use each other
+ROOMS = (
+    ("errors", "values", "labels", "store", "parallel"),
+    "lti",
+    "structure",
+    "reduction",
+    "identification",
+    "updating",
+    "plant",
+    "loop",
+    "estimation",
+    "synthesis",
+    "placement",
+    "simulation",
+    "testbeds",
+    "io",
+    "plot",
+)
+LEVEL = {
+    name: i for i, room in enumerate(ROOMS) for name in ([room] if isinstance(room, str) else room)
+}
+HEAVY = {"matplotlib", "control", "cvxpy", "clarabel", "filterpy", "tqdm"}
+MODULES = sorted(ROOT.rglob("*.py"))
+LONGEST = 500
+
+
+def name_of(path):
+    return str(path.relative_to(ROOT))
+
+
+def room_of(path):
+    part = path.relative_to(ROOT).parts[0]
+    return part.removesuffix(".py")
+
+
+def imported(tree, package):
+    """Return (line, absolute dotted name) of every import, those inside functions too."""
+    found = []
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            found += [(node.lineno, alias.name) for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else ()
+            module = (*base, *(node.module.split(".") if node.module else ()))
+            if module == ("flexplant",):
+                found += [(node.lineno, f"flexplant.{alias.name}") for alias in node.names]
+            else:
+                found.append((node.lineno, ".".join(module)))
+    return found
+
+
+def package_of(path):
+    parts = ("flexplant", *path.relative_to(ROOT).with_suffix("").parts)
+    return parts[:-1]
+
+
+def test_every_module_is_in_a_room():
+    rooms = {room_of(path) for path in MODULES} - {"__init__"}
+    assert rooms <= set(LEVEL), f"no place in the import order for {sorted(rooms - set(LEVEL))}"
+
+
+def test_rooms_import_only_from_rooms_above():
+    wrong = []
+    for path in MODULES:
+        room = room_of(path)
+        if room == "__init__":
+            continue
+        for line, module in imported(ast.parse(path.read_text()), package_of(path)):
+            parts = module.split(".")
+            if parts[0] != "flexplant":
+                continue
+            if len(parts) == 1 or parts[1] not in LEVEL:
+                wrong.append(f"{name_of(path)}:{line} imports {module}, which is no room")
+            elif parts[1] != room and LEVEL[parts[1]] > LEVEL[room]:
+                wrong.append(f"{name_of(path)}:{line} imports {module} from below")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_the_order_is_checked():
+    """The walk sees an import from below, at any depth and in any spelling."""
+    code = "def f():\n    from ..plant import x\nfrom flexplant import loop\nfrom . import y\n"
+    found = imported(ast.parse(code), ("flexplant", "lti"))
+    assert found == [(3, "flexplant.loop"), (4, "flexplant.lti"), (2, "flexplant.plant")]
+
+
+def test_modules_are_short():
+    long = {name_of(p): n for p in MODULES if (n := len(p.read_text().splitlines())) > LONGEST}
+    assert not long, f"split these, they have more than {LONGEST} lines: {long}"
+
+
+def at_module_level(tree):
+    """Return the top packages imported when the module is loaded."""
+    found, stack = set(), list(tree.body)
+    while stack:
+        node = stack.pop()
+        if isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            found.add(node.module.split(".")[0])
+        elif isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test):
+            stack += node.orelse
+        elif not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda):
+            stack += [child for child in ast.iter_child_nodes(node) if isinstance(child, ast.stmt)]
+    return found
+
+
+@pytest.mark.parametrize("path", MODULES, ids=name_of)
+def test_heavy_packages_are_imported_where_they_are_needed(path):
+    allowed = {"matplotlib"} if room_of(path) == "plot" else set()
+    found = at_module_level(ast.parse(path.read_text())) & HEAVY
+    assert found <= allowed, f"import {sorted(found - allowed)} inside the functions that need them"
+
+
+@pytest.mark.parametrize("path", [p for p in MODULES if p.name == "__init__.py"], ids=name_of)
+def test_package_files_only_re_export(path):
+    root = path.parent == ROOT
+    for node in ast.parse(path.read_text()).body:
+        docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+        names = [ast.unparse(t) for t in node.targets] if isinstance(node, ast.Assign) else []
+        lazy = (
+            root and isinstance(node, ast.FunctionDef) and node.name in ("__getattr__", "__dir__")
+        )
+        checking = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+        assert (
+            docstring
+            or lazy
+            or checking
+            or isinstance(node, ast.Import | ast.ImportFrom)
+            or names in (["__version__"], ["__all__"])
+        ), f"line {node.lineno}: {ast.unparse(node)[:80]}"
+
+
+PROBE = """
+import json, sys, warnings
+import numpy, scipy.linalg, scipy.sparse.linalg, scipy.optimize, scipy.signal
+before = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
+import flexplant
+after = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
+heavy = "matplotlib control cvxpy clarabel filterpy tqdm slycot pandas".split()
+print(json.dumps({
+    "heavy": [name for name in heavy if name in sys.modules],
+    "same": [a == b for a, b in zip(before, after)],
+    "numpy": "numpy" in sys.modules and "scipy" in sys.modules,
+}))
+"""
+
+
+def test_importing_it_is_light_and_changes_nothing():
+    answer = subprocess.run(
+        [sys.executable, "-c", PROBE], capture_output=True, text=True, check=True, timeout=60
+    )
+    found = json.loads(answer.stdout)
+    assert found == {"heavy": [], "same": [True, True, True], "numpy": True}
+    assert not answer.stderr

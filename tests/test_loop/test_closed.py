@@ -1,0 +1,255 @@
+"""close_loop against python-control's interconnect, dense formulas, and wrong connections."""
+
+import control as ct
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import oracles_loop as oracle
+from flexplant.errors import LabelError, ModelError
+from flexplant.loop import ClosedLoop, close_loop
+from flexplant.lti import StateSpace
+from flexplant.plant import StandardPlant
+from flexplant.store import load
+from machines import RATE, block, matrices, observer, servo, stage
+
+DT = 1.0 / RATE
+
+
+@pytest.fixture(scope="module")
+def loop():
+    return close_loop(stage(), observer(), servo())
+
+
+def by_interconnect(loop, outputs):
+    """Return the loop by python-control; its names on both sides must differ from ours of w."""
+    plant = loop.plant
+    outer = [f"{name}|in" for name in plant.w]
+    g = plant.system.to_control()
+    g.input_labels = [*outer, *plant.u]
+    parts = [g, *(b.to_control() for b in loop.blocks)]
+    for i, part in enumerate(parts):
+        part.name = f"part{i}"
+    return ct.interconnect(parts, inputs=outer, outputs=list(outputs))
+
+
+def test_closed_loop_is_that_of_interconnect(loop):
+    outputs = [*loop.plant.z, *loop.plant.y, *loop.driven, *loop.watched]
+    # interconnect adds doubled outputs of one name only through sums, so one block per name here
+    reference = by_interconnect(loop, outputs)
+    assert loop.monitored.inputs == loop.plant.w
+    assert loop.monitored.outputs == tuple(outputs)
+    for z in (np.exp(2j * np.pi * f * DT) for f in (0.7, 9.0, 61.0, 640.0)):
+        ours = loop.monitored.evaluated(z)
+        np.testing.assert_allclose(ours, reference(z), rtol=1e-9, atol=1e-12 * abs(ours).max())
+    poles = np.sort(np.abs(np.linalg.eigvals(np.asarray(reference.A))))
+    assert loop.spectral_radius == pytest.approx(poles[-1], rel=1e-12)
+    assert loop.is_stable == (poles[-1] < 1)
+    assert loop.spectral_abscissa == pytest.approx(np.log(poles[-1]) / DT, rel=1e-9)
+
+
+def test_system_is_w_to_z_with_plant_states_first(loop):
+    assert loop.system.inputs == loop.plant.w
+    assert loop.system.outputs == loop.plant.z
+    assert loop.system.states[: loop.plant.system.n_states] == tuple(loop.plant.system.states)
+    np.testing.assert_array_equal(loop.system.A, loop.monitored.A)
+
+
+def test_one_block_or_many_is_the_same_controller(loop):
+    whole = close_loop(loop.plant, loop.controller)
+    assert whole.watched == ("die:hat",)
+    np.testing.assert_allclose(whole.system.A, loop.system.A, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(whole.system.D, loop.system.D, rtol=1e-13)
+
+
+def test_outputs_to_one_actuator_add(loop):
+    half = servo().replace(C=0.25 * servo().C, D=0.25 * servo().D, name="quarter")
+    rest = servo().replace(C=0.75 * servo().C, D=0.75 * servo().D, name="rest")
+    twice = close_loop(loop.plant, observer(), half, rest)
+    z = np.exp(2j * np.pi * 11.0 * DT)
+    np.testing.assert_allclose(twice.system.evaluated(z), loop.system.evaluated(z), rtol=1e-10)
+
+
+def test_observer_is_given_the_applied_command(loop):
+    """The observer's inputs u1, u2 hold the sum of what all blocks drive."""
+    hat = loop.monitored.select(["die:hat", "y1", "y2", "u1", "u2"])
+    z = np.exp(2j * np.pi * 30.0 * DT)
+    row = observer().evaluated(z)
+    from_loop = hat.evaluated(z)
+    np.testing.assert_allclose(from_loop[:1], row @ from_loop[1:], rtol=1e-9)
+    assert np.abs(row[:, 2:] @ from_loop[3:]).max() > 1e-4 * np.abs(from_loop[0]).max()
+
+
+def test_idle_actuator_rests(loop):
+    one = servo().select(["u1"])
+    resting = close_loop(loop.plant, observer(), one, idle=["u2"])
+    assert resting.driven == ("u1",)
+    zero = servo().replace(C=servo().C * [[1.0], [0.0]], D=servo().D * [[1.0], [0.0]])
+    both = close_loop(loop.plant, observer(), zero)
+    z = np.exp(2j * np.pi * 5.0 * DT)
+    np.testing.assert_allclose(
+        resting.system.evaluated(z), both.system.evaluated(z), rtol=1e-9, atol=1e-14
+    )
+
+
+def test_unstable_loop_is_reported_not_refused():
+    bad = close_loop(stage(), observer(), servo(sign=-1.0))
+    assert not bad.is_stable
+    assert bad.spectral_radius > 1
+    assert bad.modulus_margin == 0.0
+
+
+def test_same_blocks_on_another_machine(loop):
+    truth = close_loop(stage(stiffer=0.6), *loop.blocks)
+    assert truth.is_stable
+    assert truth.controller.outputs == loop.controller.outputs
+    assert truth.modulus_margin < loop.modulus_margin - 0.1
+
+
+def test_stiff_servos_are_not_taken_for_algebraic_loops(loop):
+    """A gain of 1e10 N/m is a unit, not an ill-posed loop."""
+    stiff = servo(sign=1e6)
+    joined = close_loop(loop.plant, observer(), stiff).controller
+    np.testing.assert_allclose(
+        joined.select(["u1", "u2"]).C / 1e6, loop.controller.select(["u1", "u2"]).C, rtol=1e-12
+    )
+    np.testing.assert_allclose(
+        joined.select(["u1", "u2"]).D / 1e6, loop.controller.select(["u1", "u2"]).D, rtol=1e-12
+    )
+
+
+def test_references_are_not_fed_back(loop):
+    assert loop.fed_back == ("y1", "y2")
+
+
+def test_blocks_may_be_values_with_a_system(loop):
+    class Estimator:
+        system = observer()
+
+    again = close_loop(loop.plant, Estimator(), servo().to_control())
+    np.testing.assert_allclose(again.system.A, loop.system.A, rtol=0, atol=1e-13)
+
+
+def test_static_gain_fits_any_rate():
+    mass = StateSpace(
+        [[0, 1], [0, 0]],
+        [[0, 0], [1, 1]],
+        [[1, 0], [1, 0], [0, 1]],
+        np.zeros((3, 2)),
+        inputs=["f", "u"],
+        outputs=["z", "y", "v"],
+    )
+    plant = StandardPlant.from_statespace(mass, u=["u"], y=["y", "v"])
+    loop = close_loop(
+        plant, StateSpace([], [], [], [[-9.0, -0.6]], inputs=["y", "v"], outputs=["u"])
+    )
+    # s^2 + 0.6 s + 9: real part -0.3
+    assert loop.spectral_abscissa == pytest.approx(-0.3, rel=1e-12)
+    assert loop.is_stable
+    with pytest.raises(ModelError, match="spectral_abscissa"):
+        _ = loop.spectral_radius
+
+
+@given(st.lists(st.floats(0.1, 1.0), min_size=1, max_size=4), st.integers(0, 3))
+def test_closed_form_of_a_chain_of_gains(gains, seed):
+    """u = (prod gains) y through blocks in any order."""
+    rng = np.random.default_rng(seed)
+    names = ["y", *(f"v{i}" for i in range(1, len(gains))), "u"]
+    parts = [
+        StateSpace([], [], [], [[g]], inputs=[names[i]], outputs=[names[i + 1]])
+        for i, g in enumerate(gains)
+    ]
+    plant = StandardPlant.from_statespace(
+        StateSpace(
+            [[0.0]], [[1.0, -0.5]], [[1.0], [1.0]], np.zeros((2, 2)), 1.0,
+            inputs=["w", "u"], outputs=["z", "y"],
+        ),
+        u=["u"],
+        y=["y"],
+    )  # fmt: skip
+    loop = close_loop(plant, *[parts[i] for i in rng.permutation(len(parts))])
+    assert loop.spectral_radius == pytest.approx(0.5 * np.prod(gains), rel=1e-12)
+    assert loop.watched == () if len(gains) == 1 else set(loop.watched) == set(names[1:-1])
+
+
+def test_saved_and_loaded(loop, tmp_path):
+    loop.save(tmp_path / "loop.npz")
+    again = load(tmp_path / "loop.npz")
+    assert isinstance(again, ClosedLoop)
+    np.testing.assert_array_equal(again.monitored.A, loop.monitored.A)
+
+
+def test_repr_is_short(loop):
+    assert repr(loop).splitlines() == [
+        "<ClosedLoop: plant 10 states, controller 2 states, dt 0.0005 s>",
+        "  driven: u1 u2",
+        "  monitored: die:hat",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("blocks", "error", "message"),
+    [
+        (list, ModelError, "at least one block"),
+        (lambda: [np.eye(2)], ModelError, "named channels"),
+        (lambda: [stage()], ModelError, "block 1 is a StandardPlant"),
+        (lambda: [servo()], LabelError, r"no signal 'die:hat'.*Close matches: 'die:ref'"),
+        (
+            lambda: [servo().renamed(inputs={"die:hat": "die:z"})],
+            LabelError,
+            "no controller can read",
+        ),
+        (lambda: [observer()], LabelError, "nothing drives actuator 'u1'"),
+        (
+            lambda: [observer(), servo(), observer()],
+            LabelError,
+            "'die:hat' is an output of 2 blocks",
+        ),
+        (
+            lambda: [observer().renamed(outputs={"die:hat": "y1"}), servo()],
+            LabelError,
+            "'y1', which the plant has in y",
+        ),
+        (lambda: [observer(dt=1e-3), servo()], ModelError, "block 1 .* dt 0.001 s"),
+        (lambda: [observer().replace(dt=0.0), servo()], ModelError, "0 is continuous"),
+    ],
+)
+def test_wrong_connections_are_refused(blocks, error, message):
+    with pytest.raises(error, match=message):
+        close_loop(stage(), *blocks())
+
+
+def test_idle_must_be_true():
+    with pytest.raises(LabelError, match="cannot be idle"):
+        close_loop(stage(), observer(), servo(), idle="u1")
+    with pytest.raises(LabelError, match="actuator to leave idle 'u9'"):
+        close_loop(stage(), observer(), servo(), idle=["u9"])
+
+
+def test_only_a_standard_plant_can_be_closed():
+    with pytest.raises(ModelError, match="from_statespace"):
+        close_loop(stage().system, observer(), servo())
+
+
+def test_the_recursion_itself(loop):
+    """The lft's impulse responses against the loop run by hand, sample by sample."""
+    for name in loop.plant.w:
+        impulse = np.zeros(60)
+        impulse[0] = 1.0
+        by_hand = oracle.run_sample_by_sample(
+            matrices(loop.plant), [block(b) for b in loop.blocks], {name: impulse}
+        )
+        g = loop.monitored
+        x, column = g.B[:, g.inputs.index(name)], g.inputs.index(name)
+        rows = [g.D[:, column]]
+        for _ in range(59):
+            rows.append(g.C @ x)
+            x = g.A @ x
+        for i, output in enumerate(g.outputs):
+            np.testing.assert_allclose(
+                np.array(rows)[:, i],
+                by_hand[output],
+                rtol=1e-8,
+                atol=1e-12 * np.abs(by_hand[output]).max(initial=1e-300),
+            )

@@ -1,0 +1,123 @@
+"""Response: servo metrics against exact arithmetic, and what it refuses."""
+
+import pickle
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import oracles_loop as oracle
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.simulation import Response
+from flexplant.store import load
+
+
+def response(signal, dt=1e-3):
+    signal = np.asarray(signal)
+    return Response(np.arange(signal.shape[-1]) * dt, signal[None], ["e"])
+
+
+@given(
+    st.integers(1, 60).flatmap(
+        lambda n: st.tuples(st.integers(1, n), st.lists(st.floats(-1, 1), min_size=n, max_size=n))
+    )
+)
+def test_moving_windows_are_exact(drawn):
+    count, signal = drawn
+    run = response(signal)
+    if run.time.size < 2:
+        return
+    mean, deviation = oracle.moving_moments(signal, count)
+    np.testing.assert_allclose(run.moving_average("e", window=count * 1e-3), mean, atol=1e-15)
+    # squares lose half the digits of a deviation that is small beside the window's spread
+    np.testing.assert_allclose(run.moving_std("e", window=count * 1e-3), deviation, atol=3e-8)
+
+
+def test_nanometres_on_top_of_decimetres_keep_their_digits():
+    rng = np.random.default_rng(1)
+    still = 1e-9 * rng.standard_normal(400)
+    signal = np.concatenate([0.1 + still, np.linspace(0.1, -0.1, 300), -0.1 + still])
+    run = response(signal)
+    mean, deviation = oracle.moving_moments(signal, 20)
+    np.testing.assert_allclose(run.moving_std("e", window=0.02), deviation, rtol=1e-12)
+    # the mean is right to the spacing of doubles at 0.1
+    np.testing.assert_allclose(run.moving_average("e", window=0.02), mean, rtol=0, atol=2.8e-17)
+
+
+def test_a_constant_has_no_deviation():
+    assert np.all(response(np.full(100, 0.1)).moving_std("e", window=0.007) == 0.0)
+
+
+def test_sine_over_its_period():
+    """Over one period MA = 0 and MSD = amplitude / sqrt 2."""
+    t = np.arange(1000) * 1e-3
+    run = response(3.0 * np.sin(2 * np.pi * 50 * t))
+    inner = slice(20, -20)
+    np.testing.assert_allclose(run.moving_average("e", window=0.02)[inner], 0.0, atol=1e-13)
+    np.testing.assert_allclose(
+        run.moving_std("e", window=0.02)[inner], 3.0 / np.sqrt(2.0), rtol=1e-12
+    )
+
+
+def test_rms_and_peak_from_a_start():
+    run = response([9.0, 9.0, 3.0, -4.0])
+    assert run.rms("e", start=2e-3) == pytest.approx(np.sqrt(12.5), rel=1e-15)
+    assert run.peak("e", start=2e-3) == 4.0
+    assert run.peak("e") == 9.0
+
+
+def test_runs_keep_their_axis():
+    data = np.random.default_rng(0).standard_normal((3, 2, 50))
+    run = Response(np.arange(50) * 0.1, data, ["a", "b"])
+    assert run["b"].shape == (3, 50)
+    np.testing.assert_allclose(run.rms("b"), np.sqrt((data[:, 1] ** 2).mean(axis=1)))
+    assert run.moving_std("b", window=1.0).shape == (3, 50)
+    one = Response(run.time, data[1], ["a", "b"])
+    np.testing.assert_array_equal(
+        one.moving_std("b", window=1.0), run.moving_std("b", window=1.0)[1]
+    )
+    with pytest.raises(ModelError, match="3 runs"):
+        run.to_sep005()
+    first, second = one.to_sep005()
+    assert (first["name"], second["name"]) == ("a", "b")
+    assert first["fs"] == pytest.approx(10.0)
+
+
+def test_is_a_mapping_and_a_value(tmp_path):
+    run = response([1.0, 2.0, 3.0])
+    assert list(run) == ["e"] and "e" in run and len(run) == 1
+    assert dict(run)["e"].tolist() == [1.0, 2.0, 3.0]
+    assert run == run and run != response([1.0, 2.0, 3.0])
+    for again in (pickle.loads(pickle.dumps(run)),):
+        assert again["e"].tolist() == [1.0, 2.0, 3.0]
+        with pytest.raises(ValueError, match="read-only"):
+            again["e"][0] = 5.0
+    run.save(tmp_path / "run.npz")
+    assert load(tmp_path / "run.npz")["e"].tolist() == [1.0, 2.0, 3.0]
+    assert repr(run) == "<Response 3 samples over 0.003 s, 1 channels: e>"
+
+
+def test_bad_input():
+    run = response(np.zeros(10))
+    with pytest.raises(LabelError, match="no channel 'f'"):
+        run["f"]
+    assert run.get("f") is None
+    with pytest.raises(LabelError, match="no channel"):
+        run.rms("f")
+    with pytest.raises(ModelError, match="choose a window of 1 to 10 samples"):
+        run.moving_average("e", window=0.1)
+    with pytest.raises(ModelError, match="0 samples"):
+        run.moving_std("e", window=1e-4)
+    with pytest.raises(ModelError, match="window must be positive"):
+        run.moving_std("e", window=0.0)
+    with pytest.raises(ModelError, match="leaves nothing"):
+        run.rms("e", start=1.0)
+    with pytest.raises(ModelError, match="equal steps"):
+        Response([0.0, 1.0, 3.0], np.zeros((1, 3)), ["e"])
+    with pytest.raises(ShapeError, match=r"\(1, 3\)"):
+        Response([0.0, 1.0, 2.0], np.zeros((2, 3)), ["e"])
+    with pytest.raises(LabelError, match="more than once"):
+        Response([0.0], np.zeros((2, 1)), ["e", "e"])
+    with pytest.raises(ModelError, match="NaN"):
+        Response([0.0], [[np.nan]], ["e"])
