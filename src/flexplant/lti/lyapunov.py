@@ -168,6 +168,7 @@ def _modal_gramian(
     return _sym(padded[np.ix_(keep, keep)])
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def doubled(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return the sum of ``A^k Q A'^k``, k = 0, 1, ..., by doubling (scaled inputs)."""
     X, A = Q, A.copy()
@@ -203,6 +204,7 @@ def solve_continuous(A: FloatArray, Q: FloatArray) -> FloatArray:
     return X + solved(A @ X + X @ A.T + Q)
 
 
+@np.errstate(over="ignore", invalid="ignore")
 def accumulated(A: FloatArray, Q: FloatArray, doublings: int = 8) -> FloatArray:
     """Return the diagonal of ``sum |A^k Q A'^k|`` over 2^doublings steps (fewer when it grows)."""
     X = Q.copy()

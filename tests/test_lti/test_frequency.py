@@ -1,0 +1,207 @@
+"""Frequency responses against one dense solve per frequency, and python-control."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.lti import Frf, StateSpace, frequency_response, series
+from flexplant.lti.discretisation import discretized
+from flexplant.lti.frequency import default_freq
+from oracles_lti import sweep
+
+
+def machine(n_rigid=3, n_elastic=21, *, zeta=1e-3, m=4, p=5, seed=0):
+    """Modes in plain (q, dq/dt) states and SI units."""
+    rng = np.random.default_rng(seed)
+    omega = np.concatenate([np.zeros(n_rigid), 2 * np.pi * np.linspace(245.0, 3700.0, n_elastic)])
+    n = 2 * omega.size
+    A, B, C = np.zeros((n, n)), np.zeros((n, m)), np.zeros((p, n))
+    k = np.arange(omega.size)
+    A[2 * k, 2 * k + 1], A[2 * k + 1, 2 * k] = 1.0, -(omega**2)
+    A[2 * k + 1, 2 * k + 1] = -2 * zeta * omega
+    B[1::2], C[:, ::2] = rng.standard_normal((k.size, m)) / 5, rng.standard_normal((p, k.size)) / 5
+    return StateSpace(A, B, C, np.zeros((p, m)), blocks=[2] * k.size)
+
+
+FREQ = np.unique(np.concatenate([np.geomspace(1.0, 4900.0, 150), np.linspace(245.0, 3700.0, 21)]))
+
+
+def assert_same(g, freq, rtol=1e-10):
+    found = frequency_response(g, freq).data
+    expected = sweep(g.A, g.B, g.C, g.D, g.dt, freq)
+    size = np.abs(expected).max(axis=(0, 1))
+    np.testing.assert_array_less(np.abs(found - expected).max(axis=(0, 1)), rtol * size)
+
+
+@pytest.mark.parametrize("delay", [None, 0.0, 1.0, 2.5])
+@pytest.mark.parametrize("blocks", [True, False])
+def test_lightly_damped_machine_is_exact(delay, blocks):
+    g = machine()
+    if delay is not None:
+        g = discretized(g, 1e4, delay=delay)
+    assert_same(g if blocks else g.replace(blocks=None), FREQ)
+
+
+@given(st.integers(0, 10_000))
+def test_block_upper_triangular_systems(seed):
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(1, 3, rng.integers(1, 7))
+    n = int(sizes.sum())
+    owner = np.repeat(np.arange(sizes.size), sizes)
+    A = rng.standard_normal((n, n)) * (owner[:, None] <= owner[None, :])
+    A = np.where((rng.random((n, n)) < 0.5) & (owner[:, None] < owner[None, :]), 0.0, A)
+    A -= 3 * np.eye(n)
+    g = StateSpace(
+        A, rng.standard_normal((n, 2)), rng.standard_normal((3, n)), rng.standard_normal((3, 2)),
+        blocks=sizes,
+    )  # fmt: skip
+    freq = np.geomspace(1e-3, 10.0, 30)
+    assert_same(g, freq)
+    assert_same(g.replace(dt=0.04, A=A / 20), freq)
+
+
+@given(st.integers(0, 10_000))
+def test_dense_systems(seed):
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 9))
+    g = StateSpace(
+        rng.standard_normal((n, n)), rng.standard_normal((n, 2)), rng.standard_normal((1, n)),
+        rng.standard_normal((1, 2)),
+    )  # fmt: skip
+    assert_same(g, np.geomspace(1e-3, 10.0, 30), rtol=1e-8)
+
+
+def test_series_of_two_machines_uses_its_blocks():
+    first, second = machine(0, 5, m=2, p=3, seed=1), machine(0, 4, m=3, p=2, seed=2)
+    both = series(first.replace(outputs=["a", "b", "c"]), second)
+    assert set(both.blocks) == {2}
+    assert_same(both, FREQ)
+
+
+def test_names_static_gain_and_empty_grid():
+    gain = StateSpace(
+        *(np.zeros(s) for s in ((0, 0), (0, 2), (1, 0))), [[1.0, 2.0]], inputs=["a", "b"]
+    )
+    frf = frequency_response(gain, np.array([0.0, 3.0]))
+    np.testing.assert_array_equal(frf["y1", "b"], [2.0, 2.0])
+    assert frf.inputs == ("a", "b")
+    assert frequency_response(machine(), np.zeros(0)).data.shape == (5, 4, 0)
+
+
+def test_takes_a_control_system():
+    import control
+
+    g = machine(0, 3, m=1, p=1)
+    twin = control.StateSpace(g.A, g.B, g.C, g.D, inputs=["f"], outputs=["x"])
+    frf = frequency_response(twin, FREQ)
+    expected = control.frequency_response(twin, 2 * np.pi * FREQ).complex
+    np.testing.assert_allclose(frf["x", "f"], expected, rtol=1e-8)
+
+
+def test_first_order_gain_in_closed_form():
+    g = StateSpace([[-10.0]], [[10.0]], [[1.0]], [[0.0]])
+    corner = 10 / (2 * np.pi)
+    assert frequency_response(g, np.array([corner]))["y1", "u1"][0] == pytest.approx(0.5 - 0.5j)
+    held = discretized(g, 100.0)
+    z = np.exp(2j * np.pi * corner / 100)
+    pole = np.exp(-0.1)
+    value = frequency_response(held, np.array([corner]))["y1", "u1"][0]
+    assert value == pytest.approx((1 - pole) / (z - pole), rel=1e-12, abs=0)
+
+
+def test_default_grid_finds_resonances_and_antiresonances():
+    g = machine(0, 3, m=1, p=1, seed=4)
+    freq = default_freq(g)
+    gain = np.abs(frequency_response(g, freq)["y1", "u1"])
+    dense = np.linspace(200, 4000, 400_001)
+    reference = np.abs(sweep_fast(g, dense))
+    assert gain.max() == pytest.approx(reference.max(), rel=1e-2, abs=0)
+    inside = (freq > 200) & (freq < 4000)
+    zero = reference.min()
+    assert gain[inside].min() < 3 * zero
+    assert freq.size <= 3000
+    assert np.all(np.diff(freq) > 0)
+    assert frequency_response(g).freq.size == freq.size
+
+
+def sweep_fast(g, freq):
+    """Residues of the modes: sum of c b / (omega^2 - w^2 + 2 i zeta omega w)."""
+    omega2, damping = -g.A[1::2, ::2].diagonal(), -g.A[1::2, 1::2].diagonal()
+    w = 2 * np.pi * freq
+    residues = g.C[0, ::2] * g.B[1::2, 0]
+    return sum(
+        r / (o - w**2 + 1j * d * w) for r, o, d in zip(residues, omega2, damping, strict=True)
+    )
+
+
+def test_default_grid_of_a_sampled_system_stays_below_half_the_rate():
+    freq = default_freq(discretized(machine(3, 5, m=1, p=1), 1e4, delay=1))
+    assert freq[-1] <= 5000.0
+    assert freq[0] > 0
+
+
+def test_frf_is_a_mapping_and_selects():
+    data = np.arange(12).reshape(2, 3, 2) * (1 + 1j)
+    frf = Frf(
+        [1.0, 2.0], data, inputs=["a", "b", "c"], outputs=["x", "y"], coherence=np.ones((2, 3, 2))
+    )
+    assert len(frf) == 6
+    assert list(dict(frf)) == [(o, i) for o in "xy" for i in "abc"]
+    np.testing.assert_array_equal(frf["y", "c"], data[1, 2])
+    part = frf.select(inputs=["c", "a"])
+    np.testing.assert_array_equal(part.data, data[:, [2, 0]])
+    assert part.coherence.shape == (2, 2, 2)
+    assert repr(frf) == "<Frf: a, b, c -> x, y, 2 frequencies 1 .. 2 Hz>"
+    with pytest.raises(ValueError, match="read-only"):
+        frf.data[0, 0, 0] = 1.0
+
+
+def test_frf_saves_and_loads(tmp_path):
+    from flexplant.store import load
+
+    frf = frequency_response(machine(0, 2, m=1, p=1), FREQ)
+    frf.save(tmp_path / "frf.npz")
+    again = load(tmp_path / "frf.npz")
+    np.testing.assert_array_equal(again.data, frf.data)
+    assert again.inputs == frf.inputs
+
+
+@pytest.mark.parametrize(
+    ("fields", "error", "message"),
+    [
+        ({"freq": [2.0, 1.0]}, ModelError, "increase"),
+        ({"freq": [-1.0, 1.0]}, ModelError, "negative"),
+        ({"freq": [1.0]}, ShapeError, "data must have shape"),
+        ({"data": np.ones((2, 1))}, ShapeError, "data must have shape"),
+        ({"data": np.full((1, 1, 2), np.nan)}, ModelError, "NaN"),
+        ({"inputs": ["a", "b"]}, ShapeError, "names"),
+        ({"outputs": ["a.b"]}, LabelError, "cannot name"),
+        ({"coherence": np.full((1, 1, 2), 2.0)}, ModelError, "coherence"),
+        ({"coherence": np.ones((1, 2))}, ShapeError, "coherence"),
+    ],
+)
+def test_frf_bad_input(fields, error, message):
+    with pytest.raises(error, match=message):
+        Frf(**({"freq": [1.0, 2.0], "data": np.ones((1, 1, 2))} | fields))
+
+
+def test_bad_frequencies():
+    g = machine()
+    with pytest.raises(ModelError, match="negative"):
+        frequency_response(g, np.array([-1.0]))
+    with pytest.raises(ModelError, match="half the sampling rate"):
+        frequency_response(discretized(g, 1e4), np.array([5001.0]))
+    with pytest.raises(ModelError, match="undamped pole"):
+        frequency_response(g, np.array([0.0, 1.0]))
+    with pytest.raises(ModelError, match="increase"):
+        frequency_response(g, np.array([2.0, 1.0]))
+    with pytest.raises(LabelError, match="no output 'y9'"):
+        frequency_response(g, FREQ)["y9", "u1"]
+    with pytest.raises(LabelError, match="no input 'z'"):
+        frequency_response(g, FREQ).select(inputs=["z"])
+    with pytest.raises(LabelError):
+        frequency_response(g, FREQ)["y1"]
+    assert la.norm(frequency_response(machine(0, 2), np.array([0.0])).data) > 0

@@ -1,0 +1,137 @@
+"""Stein and Lyapunov equations and Gramians, against one linear system of n^2 unknowns."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexplant.errors import ModelError, ShapeError, SolverError
+from flexplant.lti import (
+    StateSpace,
+    controllability_gramian,
+    observability_gramian,
+    solve_lyapunov,
+    solve_stein,
+)
+from oracles_lti import lyapunov, stein
+
+
+def stable(seed, n=6, *, discrete):
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n))
+    if discrete:
+        A *= rng.uniform(0.1, 0.999) / np.abs(la.eigvals(A)).max()
+    else:
+        A -= np.eye(n) * (la.eigvals(A).real.max() + rng.uniform(0.01, 2.0))
+    G = rng.standard_normal((n, n))
+    return A, G + G.T, rng
+
+
+@given(st.integers(0, 10_000))
+def test_stein_is_the_linear_system(seed):
+    A, Q, _ = stable(seed, discrete=True)
+    X = solve_stein(A, Q)
+    np.testing.assert_allclose(X, stein(A, Q), atol=1e-9 * np.abs(X).max())
+    np.testing.assert_array_equal(X, X.T)
+
+
+@given(st.integers(0, 10_000))
+def test_lyapunov_is_the_linear_system(seed):
+    A, Q, _ = stable(seed, discrete=False)
+    X = solve_lyapunov(A, Q)
+    np.testing.assert_allclose(X, lyapunov(A, Q), atol=1e-9 * np.abs(X).max())
+    np.testing.assert_array_equal(X, X.T)
+
+
+def test_scalar_values():
+    assert solve_stein(np.array([[0.5]]), np.array([[3.0]]))[0, 0] == pytest.approx(
+        4.0, rel=1e-15, abs=0
+    )
+    assert solve_lyapunov(np.array([[-2.0]]), np.array([[8.0]]))[0, 0] == pytest.approx(2.0)
+    assert solve_stein(np.zeros((0, 0)), np.zeros((0, 0))).shape == (0, 0)
+    assert solve_lyapunov(np.zeros((0, 0)), np.zeros((0, 0))).shape == (0, 0)
+    assert not solve_stein(0.5 * np.eye(2), np.zeros((2, 2))).any()
+
+
+@given(st.lists(st.integers(-30, 30), min_size=6, max_size=6))
+def test_units_do_not_matter(powers):
+    d = 2.0 ** np.array(powers)
+    for solve, discrete in ((solve_stein, True), (solve_lyapunov, False)):
+        A, Q, _ = stable(3, discrete=discrete)
+        Q = Q @ Q
+        X, moved = solve(A, Q), solve(A * d[:, None] / d, Q * d * d[:, None])
+        scale = np.sqrt(np.diag(X))
+        error = (moved / d / d[:, None] - X) / scale / scale[:, None]
+        assert np.abs(error).max() < 1e-9
+
+
+def modal(blocks_seed, *, sampled):
+    rng = np.random.default_rng(blocks_seed)
+    sizes, parts = rng.integers(1, 3, 7), []
+    for size in sizes:
+        w, z = 10 ** rng.uniform(0, 4), 10 ** rng.uniform(-4, 0)
+        pair = np.array([[0.0, w], [-w, -2 * z * w]]) if size == 2 else np.array([[-w]])
+        parts.append(la.expm(pair * 1e-4) if sampled else pair)
+    A = la.block_diag(*parts)
+    n = A.shape[0]
+    return StateSpace(
+        A,
+        rng.standard_normal((n, 2)),
+        rng.standard_normal((3, n)),
+        np.zeros((3, 2)),
+        1e-4 if sampled else 0.0,
+        blocks=sizes,
+    )
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+@pytest.mark.parametrize("seed", range(5))
+def test_modal_gramians_are_those_of_the_dense_system(seed, sampled):
+    g = modal(seed, sampled=sampled)
+    oracle = stein if sampled else lyapunov
+    P, Q = controllability_gramian(g), observability_gramian(g)
+    for found, expected in ((P, oracle(g.A, g.B @ g.B.T)), (Q, oracle(g.A.T, g.C.T @ g.C))):
+        scale = np.sqrt(np.diag(expected))
+        np.testing.assert_allclose(
+            found / scale / scale[:, None], expected / scale / scale[:, None], atol=1e-8
+        )
+    dense = controllability_gramian(g.replace(blocks=None))
+    scale = np.sqrt(np.diag(P))
+    np.testing.assert_allclose(
+        P / scale / scale[:, None], dense / scale / scale[:, None], atol=1e-8
+    )
+
+
+def test_gramian_of_coupled_blocks_takes_the_dense_way():
+    g = StateSpace(
+        [[-1.0, 5.0], [0.0, -2.0]], [[0.0], [1.0]], np.eye(2), np.zeros((2, 1)), blocks=[1, 1]
+    )
+    np.testing.assert_allclose(controllability_gramian(g), lyapunov(g.A, g.B @ g.B.T), atol=1e-12)
+
+
+def test_marginal_systems_are_refused():
+    integrator = np.array([[0.0, 1.0], [0.0, 0.0]])
+    with pytest.raises(SolverError, match="not strictly stable"):
+        solve_stein(np.eye(2), np.eye(2))
+    with pytest.raises(SolverError, match="not strictly stable"):
+        solve_stein(1.5 * np.eye(2), np.eye(2))
+    with pytest.raises(SolverError, match="not strictly stable"):
+        solve_lyapunov(integrator, np.eye(2))
+    with pytest.raises(SolverError, match="rigid-body"):
+        controllability_gramian(StateSpace(integrator, np.eye(2), np.eye(2), np.zeros((2, 2))))
+
+
+@pytest.mark.parametrize("solve", [solve_stein, solve_lyapunov])
+@pytest.mark.parametrize(
+    ("A", "Q", "error"),
+    [
+        (np.ones((2, 3)), np.eye(2), ShapeError),
+        (0.5 * np.eye(2), np.eye(3), ShapeError),
+        (0.5 * np.eye(2), np.array([[1.0, 2.0], [0.0, 1.0]]), ModelError),
+        (np.array([[np.inf]]), np.eye(1), ModelError),
+    ],
+)
+def test_bad_input(solve, A, Q, error):
+    with pytest.raises(error):
+        solve(A, Q)

@@ -1,0 +1,187 @@
+"""Norms: closed forms, SLICOT's data and routine, dense sweeps; in SI units and lightly damped."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from hypothesis import given
+from hypothesis import strategies as st
+from test_frequency import machine
+
+from flexplant.errors import ModelError
+from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, peak_gain
+from flexplant.lti.discretisation import discretized
+from oracles_lti import largest_gain, lyapunov, stein
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "norms"
+
+
+def resonance(omega=2e3, zeta=1e-3, scale=1.0):
+    return StateSpace([[0, 1], [-(omega**2), -2 * zeta * omega]], [[0], [scale]], [[1, 0]], [[0]])
+
+
+@pytest.mark.parametrize("zeta", [0.5, 1e-2, 1e-3, 1e-5])
+@pytest.mark.parametrize("omega", [1e-2, 1.0, 2e3, 1e6])
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_single_resonance_in_closed_form(omega, zeta, scale):
+    g = resonance(omega, zeta, scale)
+    gain, freq = peak_gain(g)
+    assert gain == pytest.approx(
+        scale / (2 * zeta * np.sqrt(1 - zeta**2) * omega**2), rel=1e-8, abs=0
+    )
+    assert freq == pytest.approx(omega * np.sqrt(1 - 2 * zeta**2) / (2 * np.pi), rel=1e-4, abs=0)
+    assert h2_norm(g) == pytest.approx(scale / np.sqrt(4 * zeta * omega**3), rel=1e-9, abs=0)
+
+
+@pytest.mark.parametrize(
+    ("name", "hinf", "omega", "h2"),
+    [("build", 0.0052763338, 5.20608, 0.0045300605), ("CDplayer", 2319821, 22.5682, 1102128.9)],
+)
+def test_slicot_collection(name, hinf, omega, h2):
+    path = DATA / f"{name}.mat"
+    if not path.exists():
+        pytest.skip("the SLICOT data are not here")
+    import scipy.io
+
+    found = scipy.io.loadmat(path)
+    A, B, C = (_dense(found[k]) for k in "ABC")
+    g = StateSpace(A, B, C, np.zeros((C.shape[0], B.shape[1])))
+    gain, freq = peak_gain(g)
+    assert gain == pytest.approx(hinf, rel=2e-8 if name == "build" else 3e-7, abs=0)
+    assert 2 * np.pi * freq == pytest.approx(omega, rel=2e-6, abs=0)
+    assert h2_norm(g) == pytest.approx(h2, rel=5e-8, abs=0)
+
+
+def _dense(matrix):
+    return matrix.toarray() if hasattr(matrix, "toarray") else matrix
+
+
+def slycot_norm(g):
+    slycot = pytest.importorskip("slycot")
+    n, m, p = g.n_states, len(g.inputs), len(g.outputs)
+    kind = "D" if g.dt else "C"
+    parts = (g.A.copy(), np.eye(n), g.B.copy(), g.C.copy(), g.D.copy())
+    return slycot.ab13dd(kind, "I", "S", "D", n, m, p, *parts, 1e-10)[0]
+
+
+@pytest.mark.parametrize("blocks", [True, False])
+@pytest.mark.parametrize("zeta", [1e-2, 1e-3])
+@pytest.mark.parametrize("delay", [None, 1.0])
+def test_machine_in_si_units_equals_slycot(blocks, zeta, delay):
+    g = machine(0, 24, zeta=zeta, m=3, p=5)
+    g = g if delay is None else discretized(g, 1e4, delay=delay)
+    assert hinf_norm(g if blocks else g.replace(blocks=None)) == pytest.approx(
+        slycot_norm(g), rel=1e-8
+    )
+
+
+@given(st.integers(0, 10_000))
+def test_random_systems(seed):
+    rng = np.random.default_rng(seed)
+    n, m, p = (int(k) for k in rng.integers(1, 7, 3))
+    A = rng.standard_normal((n, n))
+    A -= np.eye(n) * (la.eigvals(A).real.max() + 10 ** rng.uniform(-3, 0))
+    D = rng.standard_normal((p, m)) * rng.integers(0, 2)
+    g = StateSpace(A, rng.standard_normal((n, m)), rng.standard_normal((p, n)), D)
+    sampled = g.replace(A=la.expm(A), dt=0.5)
+    for sys in (g, sampled):
+        gain, freq = peak_gain(sys)
+        assert gain == pytest.approx(slycot_norm(sys), rel=1e-7, abs=0)
+        grid = (
+            np.linspace(0, 1.0, 300)
+            if sys.dt
+            else np.concatenate([[0], np.geomspace(1e-4, 10, 300)])
+        )
+        assert largest_gain(sys.A, sys.B, sys.C, sys.D, sys.dt, grid) <= gain * (1 + 1e-8)
+        if np.isfinite(freq):
+            there = largest_gain(sys.A, sys.B, sys.C, sys.D, sys.dt, np.array([freq]))
+            assert there == pytest.approx(gain, rel=1e-9, abs=0)
+        else:
+            assert gain == pytest.approx(np.linalg.norm(sys.D, 2))
+    square = stein(sampled.A, g.B @ g.B.T)
+    expected = np.sqrt(np.trace(g.C @ square @ g.C.T) + np.sum(D**2))
+    assert h2_norm(sampled) == pytest.approx(expected, rel=1e-8, abs=0)
+    expected = np.sqrt(np.trace(g.C @ lyapunov(A, g.B @ g.B.T) @ g.C.T))
+    assert h2_norm(g.replace(D=0 * D)) == pytest.approx(expected, rel=1e-8, abs=0)
+
+
+def test_a_peak_between_the_poles_is_found_by_the_level_set():
+    # the feedthrough cancels at the resonances and the peak lies elsewhere
+    g = machine(0, 6, zeta=1e-2, m=2, p=2)
+    g = g.replace(D=np.array([[3e-6, 1e-6], [-2e-6, 2e-6]]))
+    grid = np.linspace(0.0, 8000.0, 200_001)
+    assert hinf_norm(g) == pytest.approx(slycot_norm(g), rel=1e-8, abs=0)
+    found = largest_gain(g.A, g.B, g.C, g.D, 0.0, grid[::20])
+    assert found <= hinf_norm(g) * (1 + 1e-9)
+
+
+def test_a_narrow_peak_of_a_closed_loop_is_found():
+    # a loop whose poles differ from the plant's: dense A, one very light mode
+    g = machine(0, 8, zeta=1e-4, m=1, p=1, seed=3)
+    K = StateSpace([[-1e4]], [[1e4]], [[-1e5]], [[0.0]], inputs=["y1"], outputs=["u"])
+    P = StateSpace(
+        g.A,
+        np.hstack([g.B, g.B]),
+        np.vstack([g.C, g.C]),
+        np.zeros((2, 2)),
+        inputs=["w", "u"],
+        outputs=["z", "y1"],
+    )
+    loop = lft(P, K)
+    assert loop.poles().real.max() == pytest.approx(-0.5, rel=1e-2, abs=0)
+    gain, freq = peak_gain(loop)
+    parts = loop.A, loop.B, loop.C, loop.D, 0.0
+    assert largest_gain(*parts, np.array([freq])) == pytest.approx(gain, rel=1e-9, abs=0)
+    # SLICOT stops 7e-8 below, so a sweep around each pole is the upper bound
+    assert slycot_norm(loop) == pytest.approx(gain, rel=1e-7, abs=0)
+    for pole in loop.poles():
+        around = np.abs(pole.imag - pole.real * np.linspace(-5, 5, 201)) / (2 * np.pi)
+        assert largest_gain(*parts, around) <= gain * (1 + 1e-9)
+    assert hinf_norm(loop) < 0.5 * hinf_norm(g)
+
+
+def test_units_scale_the_norm():
+    g = machine(0, 10, m=2, p=3)
+    assert hinf_norm(g.replace(B=g.B * 2.0**40)) == pytest.approx(
+        hinf_norm(g) * 2.0**40, rel=1e-12, abs=0
+    )
+    d = 2.0 ** np.random.default_rng(0).integers(-20, 20, 20)
+    moved = g.replace(A=g.A * d[:, None] / d, B=g.B * d[:, None], C=g.C / d)
+    assert hinf_norm(moved) == pytest.approx(hinf_norm(g), rel=1e-9, abs=0)
+    assert h2_norm(moved) == pytest.approx(h2_norm(g), rel=1e-9, abs=0)
+
+
+def test_all_pass_has_norm_one():
+    g = StateSpace([[-3.0]], [[1.0]], [[-6.0]], [[1.0]])
+    assert hinf_norm(g) == pytest.approx(1.0, rel=1e-8, abs=0)
+
+
+def test_marginal_and_unstable_systems_are_infinite():
+    rigid = machine(3, 2)
+    assert peak_gain(rigid) == (np.inf, 0.0)
+    assert h2_norm(rigid) == np.inf
+    assert hinf_norm(discretized(rigid, 1e4)) == np.inf
+    unstable = StateSpace([[0.1, 5.0], [-5.0, 0.1]], np.eye(2), np.eye(2), np.zeros((2, 2)))
+    gain, freq = peak_gain(unstable)
+    assert gain == np.inf
+    assert freq == pytest.approx(5 / (2 * np.pi))
+
+
+def test_static_gains_and_feedthrough():
+    n = np.zeros((0, 0))
+    gain = StateSpace(n, np.zeros((0, 2)), np.zeros((1, 0)), [[3.0, 4.0]])
+    assert peak_gain(gain) == (5.0, 0.0)
+    assert h2_norm(gain) == np.inf
+    assert h2_norm(gain.replace(dt=0.1)) == 5.0
+    assert h2_norm(StateSpace([[-1.0]], [[1.0]], [[1.0]], [[1.0]])) == np.inf
+    silent = StateSpace([[-1.0]], [[0.0]], [[1.0]], [[0.0]])
+    assert (hinf_norm(silent), h2_norm(silent)) == (0.0, 0.0)
+    highpass = StateSpace([[-1.0]], [[1.0]], [[-1.0]], [[1.0]])
+    assert peak_gain(highpass) == (pytest.approx(1.0, rel=1e-8, abs=0), np.inf)
+
+
+@pytest.mark.parametrize("norm", [hinf_norm, h2_norm, peak_gain])
+def test_bad_input(norm):
+    with pytest.raises(ModelError, match="StateSpace"):
+        norm("plant")
