@@ -1,0 +1,262 @@
+"""The Kalman filter of the POI on the paper's plate: prediction, closed form, a run, refusals."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, ShapeError
+from flexplant.estimation import check_gain, design_kalman
+from flexplant.lti import StateSpace
+from flexplant.plant import (
+    Actuator,
+    Disturbance,
+    Poi,
+    Ports,
+    Reference,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+)
+from flexplant.reduction import solve_modes
+from flexplant.structure import ModalDamping, kirchhoff_plate
+from machines import stage
+from oracles_estimation import mean_square_and_its_error, observer_error, run
+
+L = 0.6
+CORNERS = [(0, 0, 0), (L, 0, 0), (0, L, 0), (L, L, 0)]
+INSET = [(0.075, 0.075, 0), (0.525, 0.075, 0), (0.075, 0.525, 0), (0.525, 0.525, 0)]
+
+
+def ports(asd=1e-3, sensor_asd=1e-12, **changes):
+    fields = {
+        "w": [Disturbance(f"amp{i}", at=p, asd=asd) for i, p in enumerate(INSET, 1)],
+        "u": [Actuator(f"u{i}", at=p) for i, p in enumerate(INSET, 1)],
+        "z": [Poi("die", at=(0.31, 0.26, 0.0), axes=("z", "rx", "ry"))],
+        "y": [Sensor(f"y{i}", at=p, asd=sensor_asd) for i, p in enumerate(CORNERS, 1)],
+        "references": [Reference("die")],
+    }
+    return Ports(**(fields | changes))
+
+
+@cache
+def modes(zeta=1e-3, count=24):
+    plate = kirchhoff_plate(
+        size=(L, L),
+        thickness=0.0272,
+        elements=(8, 8),
+        density=2702,
+        youngs_modulus=70e9,
+        poisson_ratio=0.35,
+    )
+    return solve_modes(plate, count=count, damping=ModalDamping(zeta))
+
+
+def plate_plant(zeta=1e-3, *, delay=1.0, count=24, **changes):
+    return assemble_plant(modes(zeta, count), ports(**changes)).discretized(1e4, delay=delay)
+
+
+def dictionaries(plant, estimator):
+    g = plant.system
+    y = [name for name in plant.y if name not in plant.w]
+    z = [name for name in plant.z if not name.endswith((":error", ":effort"))]
+    rows = [plant.y.index(name) for name in y]
+    o = estimator.system
+    truth = {
+        "A": g.A,
+        "C1": g.C[g.output_index(z)],
+        "C2": g.C[g.output_index(y)],
+        "Q": plant.process_noise,
+        "R": plant.sensor_noise[np.ix_(rows, rows)],
+        "factor": plant.noise_factor,
+    }
+    k = len(y)
+    assert tuple(o.inputs) == (*y, *plant.u)
+    return truth, {"A": o.A, "By": o.B[:, :k], "Bu": o.B[:, k:], "C": o.C, "Dy": o.D[:, :k]}
+
+
+PLANTS = {
+    "1 %": lambda: plate_plant(1e-2),
+    "0.1 %": lambda: plate_plant(1e-3),
+    "0.1 %, loud sensors": lambda: plate_plant(1e-3, sensor_asd=1e-9),
+    "0.1 %, loud forces": lambda: plate_plant(1e-3, asd=0.1, sensor_asd=1e-12),
+    "fractional delay": lambda: plate_plant(1e-3, delay=1.6),
+    "velocity too": lambda: plate_plant(
+        1e-3,
+        y=[
+            *ports().y,
+            Sensor("v", at=(0.3, 0.3, 0), quantity="velocity", asd=1e-8),
+        ],
+    ),
+    "by hand": stage,
+}
+
+
+@pytest.mark.parametrize("kind", PLANTS)
+def test_closed_form_error_is_the_prediction(kind):
+    plant = PLANTS[kind]()
+    estimator = design_kalman(plant)
+    variance = observer_error(*dictionaries(plant, estimator))
+    channels = [name for name in plant.z if not name.endswith((":error", ":effort"))]
+    predicted = np.array([estimator.rms(name) for name in channels])
+    np.testing.assert_allclose(np.sqrt(variance), predicted, rtol=1e-6)
+    assert estimator.certificate.difference < 1e-9
+    assert estimator.certificate.residual < 1e-11
+    radius = np.abs(np.linalg.eigvals(estimator.system.A)).max()
+    assert estimator.certificate.spectral_radius == pytest.approx(radius, rel=1e-6)
+    assert radius < 1
+
+
+@pytest.mark.parametrize("column", [0, 2])
+def test_any_other_gain_is_worse(column):
+    plant = plate_plant(1e-2, count=8)
+    estimator = design_kalman(plant)
+    truth, observer = dictionaries(plant, estimator)
+    best = observer_error(truth, observer)[0]
+    rng = np.random.default_rng(column)
+    for size in (1e-2, 1e-1):
+        L_other = estimator.gain * (1 + size * rng.standard_normal(estimator.gain.shape))
+        moved = truth["A"] @ L_other
+        other = {
+            "A": truth["A"] - moved @ truth["C2"],
+            "By": moved,
+            "C": truth["C1"] - truth["C1"] @ L_other @ truth["C2"],
+            "Dy": truth["C1"] @ L_other,
+        }
+        assert observer_error(truth, other)[0] > best * (1 + 1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("zeta", [1e-2, 1e-3])
+def test_a_run_agrees_within_three_standard_errors(zeta):
+    plant = plate_plant(zeta)
+    estimator = design_kalman(plant)
+    truth, observer = dictionaries(plant, estimator)
+    rng = np.random.default_rng(5)
+    steps = 20_000
+    u = 0.1 * rng.standard_normal((steps, 4))
+    errors = run(truth, observer, plant.B2, u, steps, rng, count=32)[steps // 4 :]
+    for i, channel in enumerate(("die:z", "die:rx", "die:ry")):
+        square, deviation = mean_square_and_its_error(errors[:, i])
+        assert deviation < 0.05 * square
+        assert abs(square - estimator.rms(channel) ** 2) < 3 * deviation
+
+
+def test_filterpy_in_its_stationary_state_gives_the_same_estimates():
+    plant = stage()
+    estimator = design_kalman(plant)
+    twin = estimator.to_filterpy()
+    truth, observer = dictionaries(plant, estimator)
+    rng = np.random.default_rng(1)
+    x = np.zeros(plant.system.n_states)
+    for _ in range(50):
+        y, u = rng.standard_normal(2) * 1e-9, rng.standard_normal(2)
+        twin.update(y)
+        hat = observer["C"] @ x + observer["Dy"] @ y
+        np.testing.assert_allclose(truth["C1"] @ twin.x[:, 0], hat, rtol=1e-6, atol=1e-16)
+        x = observer["A"] @ x + observer["By"] @ y + observer["Bu"] @ u
+        twin.predict(u[:, None])
+
+
+def test_delays_of_u_cost_nothing():
+    plain, late = (design_kalman(plate_plant(delay=d)) for d in (0.0, 2.5))
+    assert late.rms("die") == pytest.approx(plain.rms("die"), rel=1e-9, abs=0)
+    lines = [i for i, name in enumerate(late.system.states) if "delay" in name]
+    assert len(lines) == 12
+    assert not late.gain[lines].any()
+    assert not late.covariance[lines].any()
+
+
+def test_units_of_forces_and_motions():
+    one = design_kalman(plate_plant())
+    other = design_kalman(plate_plant(asd=1e6, sensor_asd=1e-3))
+    assert other.rms("die") == pytest.approx(1e9 * one.rms("die"), rel=1e-9, abs=0)
+    scale = np.abs(one.gain).max()
+    np.testing.assert_allclose(other.gain, one.gain, atol=1e-9 * scale)
+
+
+def test_more_noise_is_worse_and_a_sensor_more_is_better():
+    base = design_kalman(plate_plant()).rms("die")
+    assert design_kalman(plate_plant(sensor_asd=2e-12)).rms("die") > base
+    assert design_kalman(plate_plant(asd=2e-3)).rms("die") > base
+    more = [*ports().y, Sensor("y5", at=(0.3, 0.15, 0), asd=1e-12)]
+    assert design_kalman(plate_plant(y=more)).rms("die") < base
+
+
+def test_names():
+    estimator = design_kalman(plate_plant())
+    assert estimator.system.outputs == ("die:hat", "die:rx:hat", "die:ry:hat")
+    assert estimator.system.inputs == ("y1", "y2", "y3", "y4", "u1", "u2", "u3", "u4")
+    assert estimator.sensors == ("y1", "y2", "y3", "y4")
+    assert len({estimator.rms(n) for n in ("die", "die:z", "die:hat", "die:error")}) == 1
+    assert len({estimator.rms(n) for n in ("die:rx", "die:rx:hat", "die:rx:error")}) == 1
+    assert estimator.rms("die:rx") != estimator.rms("die")
+    for name in ("u1:effort", "dye", "y1"):
+        with pytest.raises(LabelError, match="no POI channel"):
+            estimator.rms(name)
+    text = repr(estimator)
+    assert "4 sensors" in text
+    assert len(text.splitlines()) == 1
+
+
+def test_saves_and_loads(tmp_path):
+    from flexplant.store import load
+
+    estimator = design_kalman(stage())
+    estimator.save(tmp_path / "k.npz")
+    again = load(tmp_path / "k.npz")
+    np.testing.assert_array_equal(again.gain, estimator.gain)
+    assert again.rms("die") == estimator.rms("die")
+
+
+def test_certificate_refuses_a_wrong_gain():
+    plant = plate_plant(1e-2)
+    estimator = design_kalman(plant)
+    assert check_gain(plant, estimator.gain, estimator.covariance) < 1e-9
+    flipped = estimator.gain.copy()
+    flipped[:, 1] *= -1
+    with pytest.raises(CertificateError, match="not stable"):
+        check_gain(plant, flipped, estimator.covariance)
+    with pytest.raises(CertificateError, match="differ"):
+        check_gain(plant, 0.99 * estimator.gain, estimator.covariance)
+    with pytest.raises(CertificateError, match="differ"):
+        check_gain(plant, estimator.gain, estimator.covariance * (1 + 1e-5))
+    with pytest.raises(ShapeError, match="gain must have shape"):
+        check_gain(plant, estimator.gain[:, :2], estimator.covariance)
+
+
+def test_one_disturbance_leaves_rigid_body_modes_unexcited():
+    with pytest.raises(AssumptionError, match="does not excite the rigid-body"):
+        design_kalman(plate_plant(w=ports().w[:1]))
+
+
+def test_too_few_sensors_do_not_see_the_rigid_body():
+    with pytest.raises(AssumptionError, match="does not see the rigid-body"):
+        design_kalman(plate_plant(y=ports().y[:2]))
+    line = [Sensor(f"y{i}", at=(0.1 * i, 0.3, 0), asd=1e-12) for i in range(1, 5)]
+    with pytest.raises(AssumptionError, match="does not see the rigid-body"):
+        design_kalman(plate_plant(y=line))
+
+
+def test_bad_plants_are_refused():
+    with pytest.raises(AssumptionError, match=r"discretized\(rate"):
+        design_kalman(assemble_plant(modes(), ports()))
+    silent = [*ports().y[:3], Sensor("y4", at=CORNERS[3])]
+    with pytest.raises(AssumptionError, match="sensors y4 have no noise"):
+        design_kalman(plate_plant(y=silent))
+    hammer = Sensor("a", at=(0.3, 0.3, 0), quantity="acceleration", asd=1e-4)
+    with pytest.raises(AssumptionError, match="reaches 'a' at once"):
+        design_kalman(plate_plant(y=[*ports().y, hammer]))
+    with pytest.raises(AssumptionError, match="no POI"):
+        design_kalman(plate_plant(z=[], references=[]))
+    with pytest.raises(ModelError, match="weighted"):
+        design_kalman(plate_plant().weighted(z={"die:z": 1e9}))
+    with pytest.raises(ModelError, match="StandardPlant"):
+        design_kalman(modes())
+    bare = StandardPlant.from_statespace(
+        StateSpace([[0.5]], np.ones((1, 2)), np.ones((2, 1)), np.zeros((2, 2)), 0.1,
+                   inputs=["w", "u"], outputs=["z", "y"]),
+        u=["u"], y=["y"],
+    )  # fmt: skip
+    with pytest.raises((ModelError, AssumptionError), match="noise"):
+        design_kalman(bare)
