@@ -230,3 +230,31 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
         D=g.D + g.C @ inverse @ g.B,
         dt=1.0 / rate,
     )
+
+
+def bilinear(sys: System, rate: float) -> StateSpace:
+    """Return the continuous system that `tustin` would sample to this one.
+
+    ``z = (a + s) / (a - s)`` with a = 2 rate: stability, norms and (with w = a tan(theta / 2))
+    frequency responses are the same, so that continuous methods solve sampled problems exactly.
+
+    Raises
+    ------
+    ModelError
+        When the system has a pole at z = -1.
+    """
+    g = as_statespace(sys)
+    a = 2.0 * positive(rate, "rate")
+    plus = np.eye(g.n_states) + g.A
+    if g.n_states and np.linalg.cond(plus) > 1e14:
+        raise ModelError(f"{g!r} has a pole at z = -1, which the bilinear map sends to infinity.")
+    inverse = np.linalg.inv(plus)
+    root = np.sqrt(2.0 * a)
+    return g.replace(
+        A=a * inverse @ (g.A - np.eye(g.n_states)),
+        B=root * inverse @ g.B,
+        C=root * g.C @ inverse,
+        D=g.D - g.C @ inverse @ g.B,
+        dt=0.0,
+        blocks=None,
+    )

@@ -148,7 +148,7 @@ def _described(plant: StandardPlant, combination: FloatArray) -> str:
         return "motion"
     dofs = realisation.model.dofs
     shape = realisation.outputs[:, 0 : 2 * plant.n_rigid : 2] @ combination
-    motions = rigid_motions(dofs, dofs.xyz.mean(axis=0))
+    motions = rigid_motions(dofs.replace(xyz=dofs.xyz - dofs.xyz.mean(axis=0)))
     part = np.linalg.lstsq(motions, shape, rcond=None)[0] * np.linalg.norm(motions, axis=0)
     size = np.abs(part) / max(float(np.abs(part).max()), 1e-300)
     kinds = {True: "rotation", False: "translation"}

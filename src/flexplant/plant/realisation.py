@@ -92,7 +92,12 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
         if np.iscomplexobj(model.phi):
             return _complex(model, model.poles, np.asarray(model.phi), model.n_rigid)
         return _real(
-            model, model.basis_omega, model.basis_zeta, model.basis, model.n_rigid, model.omega.size
+            model,
+            model.basis_omega,
+            model.basis_zeta,
+            np.real(model.basis),
+            model.n_rigid,
+            model.omega.size,
         )
     if isinstance(model, FEModel | ReducedModel):
         if model.M.shape[0] > LARGEST_DENSE:
@@ -105,7 +110,7 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
             return _complex(model, form.poles, np.asarray(form.phi), form.n_rigid)
         omega = np.abs(form.poles)
         zeta = np.where(omega > 0, -form.poles.real / np.where(omega > 0, omega, 1.0), 0.0)
-        return _real(model, omega, zeta, form.phi, form.n_rigid, omega.size)
+        return _real(model, omega, zeta, np.real(form.phi), form.n_rigid, omega.size)
     raise ModelError(
         f"a plant is assembled from an FEModel, Modes or ReducedModel, got {type(model).__name__}. "
         "A state-space model made elsewhere comes in through StandardPlant.from_statespace."

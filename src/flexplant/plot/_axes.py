@@ -16,7 +16,8 @@ def axes(ax: Axes | None, **figure: Any) -> Axes:
     """Return the given axes, or those of a new figure."""
     if ax is not None:
         return ax
-    return plt.subplots(layout="constrained", **figure)[1]
+    drawn: Axes = plt.subplots(layout="constrained", **figure)[1]
+    return drawn
 
 
 def finish(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -51,18 +51,12 @@ def layout(
         xyz = dofs.xyz[dofs.indices(wanted)]
         ax.plot(xyz[:, 0], xyz[:, 1], "x", color="tab:purple", label=f"{len(wanted)} desired DOFs")
     if ports is not None:
-        for kind, listed, style in (
-            ("actuators u", ports.u, {"marker": "o", "color": FULL, "markersize": 12}),
-            ("sensors y", ports.y, {"marker": "P", "color": REDUCED, "markersize": 9}),
-            ("points of interest", ports.z, {"marker": "*", "color": UPDATED, "markersize": 15}),
+        for kind, listed, marker, color, size in (
+            ("actuators u", ports.u, "o", FULL, 12),
+            ("sensors y", ports.y, "P", REDUCED, 9),
+            ("points of interest", ports.z, "*", UPDATED, 15),
         ):
-            points = [_point(dofs, port.at) for port in listed]
-            if points:
-                ax.plot(
-                    *np.array(points).T[:2], linestyle="", fillstyle="none", label=kind, **style
-                )
-                for port, point in zip(listed, points, strict=True):
-                    ax.annotate(port.name, (point[0], point[1]), (7, 7), textcoords="offset points")
+            _mark(ax, dofs, kind, listed, marker=marker, color=color, markersize=size)
     for text, place in (marked or {}).items():
         point = _point(dofs, place)
         ax.plot(point[0], point[1], "s", color="black", fillstyle="none", markersize=11)
@@ -70,6 +64,16 @@ def layout(
     ax.set_aspect("equal")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
     return finish(ax, x="x [m]", y="y [m]")
+
+
+def _mark(ax: Axes, dofs: DofSet, kind: str, listed: Sequence[Any], **style: Any) -> None:
+    """Draw and name the ports of one kind."""
+    points = [_point(dofs, port.at) for port in listed]
+    if not points:
+        return
+    ax.plot(*np.array(points).T[:2], linestyle="", fillstyle="none", label=kind, **style)
+    for port, point in zip(listed, points, strict=True):
+        ax.annotate(port.name, (point[0], point[1]), (7, 7), textcoords="offset points")
 
 
 def _point(dofs: DofSet, at: Any) -> Any:

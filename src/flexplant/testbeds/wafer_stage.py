@@ -127,7 +127,7 @@ class WaferStage(Value):
                 raise unknown_label("elastic mode", mode, map(str, known))
             values = np.linalg.eigvals(pairs[mode - 1])
             found.append(values[np.argmax(values.imag)])
-        return MeasuredModes(poles=found, modes=list(modes))
+        return MeasuredModes(poles=np.array(found, dtype=np.complex128), modes=tuple(modes))
 
     def loop(self, ports: Ports, *blocks: Any) -> ClosedLoop:
         """Return the machine's own closed loop, for its margins.
@@ -252,8 +252,8 @@ class WaferStage(Value):
         return Frf(
             lines / period,
             data.transpose(2, 1, 0),
-            inputs=[port.name for port in ports.u],
-            outputs=[port.name for port in ports.y],
+            inputs=tuple(port.name for port in ports.u),
+            outputs=tuple(port.name for port in ports.y),
         )
 
 

@@ -1,0 +1,93 @@
+"""What is checked after every synthesis: stability, and the norm by two routes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import CertificateError
+from ..lti.frequency import frequency_response
+from ..lti.interconnection import lft
+from ..lti.norms import peak_gain
+from ..lti.statespace import StateSpace
+from ..values import FloatArray
+
+#: the two norms agree to this part, and the claim holds to it
+AGREEMENT = 1e-3
+
+
+def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
+    """Return what was verified of the loop lft(P, K): its norm by two routes, and its stability.
+
+    Parameters
+    ----------
+    P, K : StateSpace
+        The standard plant and its controller, in the user's units.
+    claim : float
+        The norm that the synthesis promised.
+
+    Returns
+    -------
+    dict
+        `norm` by level sets on a Hamiltonian, `swept norm` by a sweep refined at the resonances,
+        `stability` (spectral radius when sampled, else the largest real part) and `claim`.
+
+    Raises
+    ------
+    CertificateError
+        When the loop is unstable, the norms differ by more than 1e-3, or exceed the claim.
+    """
+    loop = lft(P, K)
+    poles = loop.poles()
+    stability = float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real))
+    if not stability < (1.0 if loop.dt else 0.0):
+        kind = "spectral radius" if loop.dt else "largest real part"
+        raise CertificateError(
+            f"the closed loop is not stable ({kind} {stability:.6g}): the controller is refused. "
+            "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
+        )
+    norm, _ = peak_gain(loop)
+    swept = swept_norm(loop)
+    if not abs(norm - swept) <= AGREEMENT * norm:
+        raise CertificateError(
+            f"two routes to the norm disagree: {norm:.6g} by level sets, {swept:.6g} by a sweep. "
+            "The loop is too badly conditioned to trust; loosen the weights."
+        )
+    if norm > claim * (1.0 + AGREEMENT):
+        raise CertificateError(
+            f"the closed loop has the norm {norm:.6g}, but {claim:.6g} was claimed: "
+            "the controller is refused."
+        )
+    return {"norm": norm, "swept norm": swept, "stability": stability, "claim": claim}
+
+
+def swept_norm(loop: StateSpace) -> float:
+    """Return the largest gain over a grid that is refined at resonances and at its own peak."""
+    poles = loop.poles()
+    if loop.dt:
+        poles = np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt
+    nyquist = 0.5 / loop.dt if loop.dt else np.inf
+    speeds = np.abs(poles.imag[np.abs(poles.imag) > 0]) / (2 * np.pi)
+    sizes = np.abs(poles) / (2 * np.pi)
+    low, high = (
+        (0.01 * float(sizes[sizes > 0].min()), min(100.0 * float(sizes.max()), nyquist))
+        if np.any(sizes > 0)
+        else (1e-3, min(1e3, nyquist))
+    )
+    width = np.abs(poles.real[np.abs(poles.imag) > 0]) / (2 * np.pi)
+    offsets = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 24)])
+    near = (speeds[:, None] + width[:, None] * np.concatenate([-offsets, offsets])).ravel()
+    freq = np.concatenate([[0.0], np.geomspace(min(low, 0.5 * high), high, 600), near])
+    freq = np.unique(freq[(freq >= 0) & (freq <= nyquist)])
+    best = float(np.linalg.norm(loop.D, 2)) if not loop.dt and loop.D.size else 0.0
+    for _ in range(6):
+        gains = _largest(loop, freq)
+        peak = int(np.argmax(gains))
+        best = max(best, float(gains[peak]))
+        bracket = freq[max(peak - 1, 0)], freq[min(peak + 1, freq.size - 1)]
+        freq = np.linspace(*bracket, 40)
+    return best
+
+
+def _largest(loop: StateSpace, freq: FloatArray) -> FloatArray:
+    gain = frequency_response(loop, freq).data.transpose(2, 0, 1)
+    return np.asarray(np.linalg.svd(gain, compute_uv=False)[:, 0])
