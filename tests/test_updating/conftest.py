@@ -1,31 +1,19 @@
 """The paper's plate, its reductions, and small machines to update."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-# oracles live one folder up
-sys.path.insert(0, str(Path(__file__).parents[1]))
-
 from flexplant.labels import DofSet
 from flexplant.reduction import DesiredDofs, ReducedModel, reduce, solve_modes
-from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
+from flexplant.structure import FEModel, ModalDamping
+from plates import PLATE, make_plate
 
 
 class Plate:
     """The paper's plate with its grid of desired DOFs."""
 
-    def __init__(self, thickness=0.0272):
-        self.model = kirchhoff_plate(
-            size=(0.6, 0.6),
-            thickness=thickness,
-            elements=(8, 8),
-            density=2702,
-            youngs_modulus=70e9,
-            poisson_ratio=0.35,
-        )
+    def __init__(self, thicker=1.0):
+        self.model = make_plate(thickness=thicker * PLATE["thickness"])
         nearest = self.model.dofs.nearest
         self.z8 = nearest((0.3, 0.15, 0.0), "z")
         self.grid = [nearest((0.15 * i, 0.15 * j, 0.0), "z") for j in range(5) for i in range(5)]
@@ -48,7 +36,7 @@ def plate():
 
 @pytest.fixture(scope="session")
 def thicker_plate():
-    return Plate(0.0272 * 1.01)
+    return Plate(thicker=1.01)
 
 
 def line(count):

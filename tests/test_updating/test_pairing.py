@@ -64,3 +64,18 @@ def test_modes_that_vanish_have_no_successor():
     X = np.eye(3)
     assert pair(poles, X, X[:, [0, 2]]).tolist() == [0, -1, 1]
     assert pair(poles[:2], X[:, :2], X[:, [2, 1, 0]]).tolist() == [2, 1]
+
+
+def test_a_cluster_is_found_by_its_subspace_not_by_single_shapes():
+    # the first new shape is nearer to one old shape than any other is, but not to both together
+    poles = 1j * np.array([10.0, 10.1])
+    leak = np.sqrt(1 - 2 * 0.3)
+    new = np.array(
+        [
+            [np.sqrt(0.35), np.sqrt(0.3), np.sqrt(0.3)],
+            [0.0, np.sqrt(0.3), -np.sqrt(0.3)],
+            [np.sqrt(0.65), 0.0, 0.0],
+            [0.0, leak, leak],
+        ]
+    )
+    assert pair(poles, np.eye(4)[:, :2], new).tolist() == [1, 2]

@@ -41,8 +41,8 @@ class Iterate:
 def slopes(family: Family, data: Data, now: Iterate) -> tuple[ComplexArray, Iterate]:
     """Return S of (11), and the iterate with repeated modes turned to the split of its step.
 
-    How repeated modes split depends on the step and the step on how they split: iterate from
-    both directions of every parameter, and keep the step that fits best.
+    How repeated modes split depends on the step, and the step on how they split: try both
+    directions of every parameter, and keep the step that fits best by the split it causes itself.
     """
     S = family.sensitivity(now.eigen, now.columns)
     repeated = {i for group in repeated_groups(now.eigen.poles) for i in group}
@@ -51,20 +51,15 @@ def slopes(family: Family, data: Data, now: Iterate) -> tuple[ComplexArray, Iter
     gap = data.target - now.poles
     scale = family.strength(float(np.median(np.abs(data.target))))
     best = (np.inf, S, now.eigen)
-    for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]):
-        for _ in range(20):
-            S, eigen = _along(family, now, S, way / scale)
-            scaled, *_ = np.linalg.lstsq(data.stacked(S) / scale, data.stacked(gap), rcond=SINGULAR)
-            length = np.linalg.norm(scaled)
-            if length:
-                # judged by how the modes really split along this step
-                S, eigen = _along(family, now, S, scaled / scale)
-            left = data.error(now.poles + S @ (scaled / scale))
-            if left < best[0]:
-                best = (left, S, eigen)
-            if not length or np.linalg.norm(scaled / length - way / np.linalg.norm(way)) < 1e-12:
-                break
-            way = scaled
+    for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
+        S, eigen = _along(family, now, S, way)
+        scaled, *_ = np.linalg.lstsq(data.stacked(S) / scale, data.stacked(gap), rcond=SINGULAR)
+        step = scaled / scale
+        if np.any(step):
+            S, eigen = _along(family, now, S, step)
+        left = data.error(now.poles + S @ step)
+        if left < best[0]:
+            best = (left, S, eigen)
     return best[1], replace(now, eigen=best[2])
 
 

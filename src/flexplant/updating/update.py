@@ -98,9 +98,7 @@ def update(
         accepted = advance(family, data, now, step)
         if accepted is None:
             converged = size < enough
-            reason = (
-                "step below the tolerance" if converged else "no part of a step lowers the error"
-            )
+            reason = "step below the tolerance" if converged else "no part of a step helps"
             break
         now, fraction = accepted
         trail.append((now.p, now.poles, data.error(now.poles), fraction))
