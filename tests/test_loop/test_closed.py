@@ -119,6 +119,17 @@ def test_stiff_servos_are_not_taken_for_algebraic_loops(loop):
     )
 
 
+def test_a_block_may_pass_the_command_on_directly(loop):
+    """A meter of the applied force is exact, whatever the size of that force."""
+    meter = StateSpace([], [], [], [[3.0, 0.5]], inputs=["u1", "u2"], outputs=["meter"])
+    stiff = servo(sign=1e6)
+    g = close_loop(loop.plant, observer(), stiff, meter).controller
+    z = np.exp(2j * np.pi * 30.0 * DT)
+    gain = g.evaluated(z)
+    assert g.outputs == ("u1", "u2", "die:hat", "meter")
+    np.testing.assert_allclose(gain[3], 3.0 * gain[0] + 0.5 * gain[1], rtol=1e-12)
+
+
 def test_references_are_not_fed_back(loop):
     assert loop.fed_back == ("y1", "y2")
 

@@ -77,6 +77,7 @@ def test_textbook_third_order():
         (0.1, (0.05, 10.0, 1000.0)),  # acceleration not reached, velocity is
         (0.1, (0.5, 10.0, 1000.0, 2e5)),
         (0.1, (0.05, 10.0, 1000.0, 2e5)),
+        (1e-4, (0.005, 10.0, 1000.0, 2e5)),  # snap and velocity
     ],
 )
 def test_nothing_goes_farther_in_the_same_time(distance, bounds):
@@ -84,8 +85,12 @@ def test_nothing_goes_farther_in_the_same_time(distance, bounds):
         distance, **dict(zip(("velocity", "acceleration", "jerk", "snap"), bounds, strict=False))
     )
     reach = oracle.farthest(move.duration, bounds)
-    assert reach <= distance * (1 + 1e-6)
+    # the program holds the velocity only at its 120 instants, and may overstep in between
+    assert reach <= distance * (1 + 5e-4)
     assert reach >= distance * 0.97
+    assert np.abs(move.at(np.linspace(0, move.duration, 999)).velocity).max() <= bounds[0] * (
+        1 + 1e-12
+    )
 
 
 @pytest.mark.parametrize("distance", [0.01, 1e-5, 1e-4])
@@ -96,6 +101,13 @@ def test_fourth_order_without_cruise_is_near_the_optimum(distance):
     reach = oracle.farthest(move.duration, bounds)
     assert distance < reach < distance * 1.0746**4
     assert oracle.farthest(move.duration / 1.0746, bounds) < distance
+
+
+def test_a_long_cruise_keeps_its_digits():
+    """Eight powers of ten between the ramps and the cruise, and the halves still meet."""
+    move = setpoint(5303.0, velocity=1e-4, acceleration=0.04, jerk=0.036, snap=150.0)
+    before = move.at(np.nextafter(0.5 * move.duration, 0.0)).position
+    assert float(before) == pytest.approx(0.5 * 5303.0, rel=1e-14)
 
 
 def test_rest_shifts_the_motion():

@@ -218,9 +218,9 @@ def _joined(
     none = np.zeros((0, 0))
     silent = [name for name in heard if name not in driven]
     zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
-    # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: commands are
-    # joined in units of a size like that of y, powers of two so that no digit changes
-    units = {name: _unit(systems, name) for name in driven}
+    # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: signals are
+    # joined in units in which direct gains are at most one, powers of two so that no digit changes
+    units = _units(systems)
     scaled = [_in_units(sys, units) for sys in systems]
     joined = connect(
         [*scaled, zero] if silent else scaled,
@@ -228,17 +228,21 @@ def _joined(
         outputs=[*driven, *watched],
         adding=driven,
     )
-    row = np.array([*units.values(), *np.ones(len(watched))])[:, None]
+    row = np.array([units[name] for name in (*driven, *watched)])[:, None]
     return joined.replace(C=joined.C * row, D=joined.D * row, dt=plant.dt)
 
 
-def _unit(systems: Sequence[StateSpace], name: str) -> float:
-    largest = max(
-        (float(np.abs(sys.D[sys.outputs.index(name)]).max(initial=0.0)))
-        for sys in systems
-        if name in sys.outputs
-    )
-    return float(2.0 ** np.ceil(np.log2(largest))) if largest else 1.0
+def _units(systems: Sequence[StateSpace]) -> dict[str, float]:
+    """Return a size for each output of a block: its largest direct gain from outside."""
+    units = {name: 1.0 for sys in systems for name in sys.outputs}
+    for _ in systems:  # along chains of blocks, which are no longer than there are blocks
+        sizes = dict.fromkeys(units, 0.0)
+        for sys in systems:
+            gains = np.abs(sys.D) * [units.get(name, 1.0) for name in sys.inputs]
+            for name, gain in zip(sys.outputs, gains.max(axis=1, initial=0.0), strict=True):
+                sizes[name] = max(sizes[name], float(gain))
+        units = {n: float(2.0 ** np.ceil(np.log2(s))) if s else 1.0 for n, s in sizes.items()}
+    return units
 
 
 def _in_units(sys: StateSpace, units: dict[str, float]) -> StateSpace:
