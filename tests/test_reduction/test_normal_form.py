@@ -73,6 +73,20 @@ def test_repeated_poles_with_a_full_set_of_vectors():
     np.testing.assert_allclose(receptance(form, s), exact, atol=1e-11)
 
 
+def test_repeated_complex_poles():
+    # two equal oscillators of two masses, damped non-proportionally, in rotated coordinates:
+    # each complex pole twice, its vectors mixed at will by the eigenvalue solver
+    Q = np.linalg.qr(np.random.default_rng(0).standard_normal((4, 4)))[0]
+    K = Q @ np.kron([[300.0, -100], [-100, 900]], np.eye(2)) @ Q.T
+    D = Q @ np.kron([[3.0, 0.5], [0.5, 0.2]], np.eye(2)) @ Q.T
+    form = normal_form(np.eye(4), D, K, np.zeros((4, 0)))
+    assert not form.is_real
+    np.testing.assert_allclose(form.poles[::2], form.poles[1::2], rtol=1e-10)
+    for s in (17j, 30j):
+        exact = np.linalg.inv(s**2 * np.eye(4) + s * D + K)
+        np.testing.assert_allclose(receptance(form, s), exact, atol=1e-11)
+
+
 def test_a_damper_on_one_of_a_repeated_pair():
     D = np.array([[0.5, 0.5], [0.5, 0.5]])
     form = normal_form(np.eye(2), D, 100 * np.eye(2), np.zeros((2, 0)))

@@ -97,6 +97,14 @@ def test_six_motions_of_a_solid_body():
     )
 
 
+def test_rigid_body_motions_far_from_the_origin(plate):
+    xyz = plate.dofs.xyz + np.array([300.0, -200, 5])
+    far = FEModel(
+        plate.M, plate.K, dofs=DofSet(plate.dofs.nodes, plate.dofs.directions, xyz)
+    ).rigid_body
+    np.testing.assert_allclose(far, plate.rigid_body, atol=1e-11)
+
+
 def test_fewer_dofs_than_motions():
     dofs = DofSet([1, 2], ["z", "z"], [[0, 0, 0], [1, 0, 0]])
     assert FEModel(np.eye(2), np.zeros((2, 2)), dofs=dofs).rigid_body.shape == (2, 2)

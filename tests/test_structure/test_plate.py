@@ -122,6 +122,22 @@ def test_numbering(plate):
     assert plate.dofs.nearest((0.3, 0.15, 0), "z") == "23:z"
 
 
+@pytest.mark.parametrize(("count", "length"), [(8, 0.6), (11, 0.1), (35, 0.7), (37, 0.6)])
+def test_the_last_node_is_at_the_corner(count, length):
+    # count * (length / count) is not length for the last three
+    plate = make_plate(elements=(count, count), size=(length, length))
+    np.testing.assert_array_equal(plate.dofs.xyz.max(axis=0), [length, length, 0])
+
+
+def test_rounding_of_a_point_does_not_choose_the_element(plate):
+    on_edge = plate.dofs.row((0.225, 0.1, 0), "ry")
+    for x in (0.225 - 1e-12, 0.225 + 1e-12):
+        np.testing.assert_allclose(plate.dofs.row((x, 0.1, 0), "ry"), on_edge, atol=1e-9)
+    # the slope does jump there
+    beside = plate.dofs.row((0.225 - 1e-6, 0.1, 0), "ry")
+    assert np.abs(beside - on_edge).max() > 0.1
+
+
 def test_interpolation_is_exact_at_nodes():
     model = make_plate(elements=(7, 3), size=(0.7, 0.1))
     for label, xyz, direction in zip(

@@ -12,7 +12,7 @@ import scipy.sparse.linalg as spla
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
-from ..structure.eigen import check_stiffness, elastic_modes, polished, signed
+from ..structure.eigen import check_stiffness, elastic_modes, signed
 from ..structure.factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
 from ..values import FloatArray, positive
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
@@ -215,7 +215,6 @@ def _sparse_modes(model: FEModel, count: int, top: float) -> tuple[FloatArray, F
         sure = int(gaps[0])
         between = 0.5 * (squares[sure - 1] + squares[sure])
         if negative_pivots(symmetric_lu(K - between * M)) - r == sure:
-            phi = polished(M, phi[:, :sure], rigid)
             return np.sqrt(squares[:count]), signed(phi[:, :count])
     raise SolverError(
         f"Lanczos left out some of the {count} lowest elastic modes three times over (a Sturm "

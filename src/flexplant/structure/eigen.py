@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError
-from ..values import FloatArray, Matrix
+from ..values import FloatArray
 from .factor import dense, unit_diagonal
 
 #: eigenvalues below this part of the largest one are rounding
@@ -54,7 +54,7 @@ def elastic_modes(
     )
     squares, vectors = squares[:kept], vectors[:, :kept]
     check_stiffness(squares, _ROUNDING * largest, r)
-    return np.sqrt(squares), signed(polished(M, reach.T @ (elastic @ vectors), rigid))
+    return np.sqrt(squares), signed(reach.T @ (elastic @ vectors))
 
 
 def check_stiffness(squares: FloatArray, rounding: float, n_rigid: int) -> None:
@@ -66,18 +66,6 @@ def check_stiffness(squares: FloatArray, rounding: float, n_rigid: int) -> None:
             f"{n_rigid} rigid-body motions of the geometry. Look for a sign, a mechanism or wrong "
             "coordinates."
         )
-
-
-def polished(M: Matrix, phi: FloatArray, rigid: FloatArray) -> FloatArray:
-    """Return shapes made M-orthonormal, and M-orthogonal to the rigid ones, to rounding.
-
-    The shapes are nearly so already; the step is symmetric and mixes only what overlaps.
-    """
-    phi = phi - rigid @ (rigid.T @ np.asarray(M @ phi))
-    for _ in range(2):
-        gram = phi.T @ np.asarray(M @ phi)
-        phi = phi @ (1.5 * np.eye(phi.shape[1]) - 0.5 * gram)
-    return phi
 
 
 def signed(phi: FloatArray) -> FloatArray:

@@ -15,19 +15,18 @@ from ..values import FloatArray, Matrix
 _ENERGY_TOLERANCE = 1e-10
 
 
-def rigid_motions(dofs: DofSet, centre: FloatArray | None = None) -> FloatArray:
+def rigid_motions(dofs: DofSet) -> FloatArray:
     """Return the six rigid-body motions (n, 6) of the DOFs: x, y, z, rx, ry, rz.
 
-    Rotations are small ones about `centre` (the origin when None): a rotation by rx moves a point
-    at height z and width y by ``-z rx`` in y and ``y rx`` in z; a plate's rx = dz/dy, ry = -dz/dx.
+    Rotations are small ones about the origin: rx moves a point by ``y rx`` in z and ``-z rx`` in y,
+    hence a plate's rx = dz/dy and ry = -dz/dx.
     """
     n = len(dofs)
-    arm = dofs.xyz - (np.zeros(3) if centre is None else centre)
     kind = np.array([DIRECTIONS.index(direction) for direction in dofs.directions], dtype=np.int64)
     motions = np.zeros((n, 6))
     motions[np.arange(n), kind] = 1.0
     for axis in range(3):
-        turn = np.cross(np.eye(3)[axis], arm)
+        turn = np.cross(np.eye(3)[axis], dofs.xyz)
         moved = kind < 3
         motions[moved, 3 + axis] = turn[moved, kind[moved]]
     return motions
@@ -40,13 +39,8 @@ def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     Translations come first, then rotations about the centre of gravity. Partly held structures
     (a hinge, say) keep the combinations of the six motions that cost no energy.
     """
-    n = len(dofs)
-    motions = rigid_motions(dofs, dofs.xyz.mean(axis=0) if n else None)
-    size = np.linalg.norm(motions, axis=0)
-    extent = float(np.ptp(dofs.xyz, axis=0).max())
-    present = size > 1e-12 * np.where(np.arange(6) < 3, 1.0, max(extent, 1e-300)) * np.sqrt(n)
-    # independent ones only: with few DOFs some of the six coincide
-    motions = orthonormalised(M, motions[:, present], dependent="drop")
+    # independent ones only: some are absent, and with few DOFs some of the six coincide
+    motions = orthonormalised(M, rigid_motions(dofs), dependent="drop")
     # K and |K| |r|, row by row: forces of rounding size say that no energy is stored
     size_of_K: Any = abs(K)
     scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
