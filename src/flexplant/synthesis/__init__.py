@@ -1,4 +1,6 @@
-"""Controllers: the servo on the estimated point of interest."""
+"""Controllers: the servo on the estimated point of interest, and H-infinity."""
 
 from .controller import Controller as Controller
+from .hinf import design_hinf as design_hinf
+from .riccati import Riccati as Riccati
 from .servo import design_servo as design_servo
