@@ -145,6 +145,21 @@ def test_bandwidth_looks_only_where_the_controller_acts(loop):
     assert np.linalg.matrix_rank(K @ P, tol=1e-9 * abs(K @ P).max()) == 1
 
 
+def test_bandwidth_is_not_fooled_by_a_controller_that_vanishes_at_nyquist(loop):
+    """There the directions of K are rounding: they must not count as driven."""
+    mixed = StateSpace(
+        [], [], [], [[0.3, 0.3], [0.7, 0.7]], inputs=["a1", "a2"], outputs=["m1", "m2"]
+    )
+    mean = StateSpace(
+        np.zeros((2, 2)), np.eye(2), 0.5 * np.eye(2), 0.5 * np.eye(2), 1 / RATE,
+        inputs=["m1", "m2"], outputs=["u1", "u2"],
+    )  # fmt: skip
+    slow = servo(hz=4.0).renamed(outputs={"u1": "a1", "u2": "a2"})
+    smooth = close_loop(loop.plant, observer(), slow, mixed, mean)
+    assert smooth.is_stable
+    assert 3.0 < bandwidth(smooth) < 8.0
+
+
 def test_bandwidth_needs_some_suppression(loop):
     wrong = StateSpace([], [], [], [[0.3]], inputs=["y1"], outputs=["u1"])
     lag = StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])

@@ -46,9 +46,8 @@ def modulus_margin(loop: Loop) -> float:
 def bandwidth(loop: Loop) -> float:
     """Return the frequency [Hz] at which |S| first crosses 0 dB from below.
 
-    |S| is the largest singular value of S broken at u, among the directions of u that the
-    controller drives: with more actuators than controlled motions the rest of them has S = 1 at
-    any frequency.
+    |S| is the largest singular value of S broken at u, among the directions of u in which the loop
+    acts at low frequency: with more actuators than controlled motions S = 1 in the others.
 
     Parameters
     ----------
@@ -69,7 +68,10 @@ def bandwidth(loop: Loop) -> float:
     """
     parts = taken_apart(loop)
     grid = checked_grid(parts, None)
-    values = _driven_sensitivity(parts, grid)
+    loop_low = open_gain(parts, grid[:1], "u")[0]
+    vectors, gains, _ = np.linalg.svd(loop_low)
+    acting = np.asarray(vectors[:, gains >= 1e-6 * gains[0]], dtype=np.complex128)
+    values = _sensitivity_along(acting, parts, grid)
     below = np.flatnonzero(values < 1.0)
     if not below.size:
         raise AssumptionError(
@@ -83,7 +85,7 @@ def bandwidth(loop: Loop) -> float:
     low, high = float(grid[right - 1]), float(grid[right])
     for _ in range(6 if parts.measured is None else 0):
         inner = np.linspace(low, high, 17)
-        first = int(np.argmax(_driven_sensitivity(parts, inner[1:]) >= 1.0))
+        first = int(np.argmax(_sensitivity_along(acting, parts, inner[1:]) >= 1.0))
         low, high = float(inner[first]), float(inner[first + 1])
     return high
 
@@ -99,12 +101,6 @@ def _largest(S: ComplexArray) -> FloatArray:
     return np.asarray(np.linalg.svd(S, compute_uv=False)[:, 0])
 
 
-def _driven_sensitivity(parts: Pieces, grid: FloatArray) -> FloatArray:
-    """Return sigma_max of S_u within the range of K, which L = K P leaves invariant."""
-    K, P = parts.respond(grid)
-    flat = np.moveaxis(K / np.abs(K).max(axis=(1, 2), keepdims=True), 0, 1).reshape(
-        len(parts.u), -1
-    )
-    vectors, sizes, _ = np.linalg.svd(np.hstack([flat.real, flat.imag]), full_matrices=False)
-    U = vectors[:, sizes > 1e-9 * sizes[0]]
-    return _largest(inverted(U.T @ K @ P @ U))
+def _sensitivity_along(acting: ComplexArray, parts: Pieces, grid: FloatArray) -> FloatArray:
+    """Return sigma_max of S_u in the space of some orthonormal directions of u (columns)."""
+    return _largest(inverted(acting.conj().T @ open_gain(parts, grid, "u") @ acting))
