@@ -142,6 +142,28 @@ def test_a_run_agrees_within_three_standard_errors(zeta):
         assert abs(square - estimator.rms(channel) ** 2) < 3 * deviation
 
 
+def test_without_noise_the_estimate_is_exact_also_with_feedthrough_of_u():
+    plant = stage(delay=0.0)
+    D = plant.system.D.copy()
+    rows = plant.system.output_index(["y1", "y2"])
+    D[np.ix_(rows, plant.system.input_index(plant.u))] = [[3e-9, 1e-9], [0.0, 2e-9]]
+    plant = plant.replace(system=plant.system.replace(D=D))
+    truth, o = dictionaries(plant, design_kalman(plant))
+    Du = design_kalman(plant).system.D[:, 2:]
+    rng = np.random.default_rng(0)
+    x, xo = np.zeros(plant.system.n_states), np.zeros(plant.system.n_states)
+    for _ in range(200):
+        u = rng.standard_normal(2)
+        y = truth["C2"] @ x + plant.D22[:2] @ u
+        hat = o["C"] @ xo + o["Dy"] @ y + Du @ u
+        np.testing.assert_allclose(hat, truth["C1"] @ x, atol=1e-18)
+        xo = o["A"] @ xo + o["By"] @ y + o["Bu"] @ u
+        x = truth["A"] @ x + plant.B2 @ u
+    assert np.abs(truth["C1"] @ x).max() > 1e-9
+    with pytest.raises(ModelError, match="feedthrough"):
+        design_kalman(plant).to_filterpy()
+
+
 def test_filterpy_in_its_stationary_state_gives_the_same_estimates():
     plant = stage()
     estimator = design_kalman(plant)

@@ -115,13 +115,14 @@ def test_first_order_gain_in_closed_form():
 def test_default_grid_finds_resonances_and_antiresonances():
     g = machine(0, 3, m=1, p=1, seed=4)
     freq = default_freq(g)
-    gain = np.abs(frequency_response(g, freq)["y1", "u1"])
+    found = frequency_response(g, freq)["y1", "u1"]
+    # whatever lies between two points is close to the line between them, also in the dips
+    middle = 0.5 * (freq[1:] + freq[:-1])
+    line = 0.5 * (found[1:] + found[:-1])
+    truth = sweep_fast(g, middle)
+    assert np.max(np.abs(line - truth) / np.abs(truth)) < 0.1
     dense = np.linspace(200, 4000, 400_001)
-    reference = np.abs(sweep_fast(g, dense))
-    assert gain.max() == pytest.approx(reference.max(), rel=1e-2, abs=0)
-    inside = (freq > 200) & (freq < 4000)
-    zero = reference.min()
-    assert gain[inside].min() < 3 * zero
+    assert np.abs(found).max() == pytest.approx(np.abs(sweep_fast(g, dense)).max(), rel=1e-2, abs=0)
     assert freq.size <= 3000
     assert np.all(np.diff(freq) > 0)
     assert frequency_response(g).freq.size == freq.size

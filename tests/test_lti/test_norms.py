@@ -10,9 +10,9 @@ from hypothesis import strategies as st
 from test_frequency import machine
 
 from flexplant.errors import ModelError
-from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, peak_gain
+from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain
 from flexplant.lti.discretisation import discretized
-from oracles_lti import largest_gain, lyapunov, stein
+from oracles_lti import largest_gain, lyapunov, stein, sweep
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "norms"
 
@@ -139,6 +139,40 @@ def test_a_narrow_peak_of_a_closed_loop_is_found():
         around = np.abs(pole.imag - pole.real * np.linspace(-5, 5, 201)) / (2 * np.pi)
         assert largest_gain(*parts, around) <= gain * (1 + 1e-9)
     assert hinf_norm(loop) < 0.5 * hinf_norm(g)
+
+
+@pytest.mark.parametrize("start", [0.0, 700.0])
+@pytest.mark.parametrize("feedthrough", [0.0, 2e-7])
+@pytest.mark.parametrize("delay", [None, 1.0])
+def test_the_level_set_alone_finds_the_peak(monkeypatch, start, feedthrough, delay):
+    g = machine(0, 12, zeta=1e-2, m=2, p=3)
+    g = g.replace(D=feedthrough * np.arange(6.0).reshape(3, 2))
+    g = g if delay is None else discretized(g, 1e4, delay=delay)
+    expected = hinf_norm(g)
+
+    def poor(g, top):
+        return largest_gain(g.A, g.B, g.C, g.D, g.dt, np.array([start])), start
+
+    monkeypatch.setattr(norms, "_searched", poor)
+    assert hinf_norm(g) == pytest.approx(expected, rel=1e-8, abs=0)
+
+
+@pytest.mark.parametrize("delay", [None, 1.0])
+@pytest.mark.parametrize("part", [0.02, 0.3, 0.9])
+def test_crossings_of_a_level_are_where_a_singular_value_equals_it(part, delay):
+    g = machine(0, 6, zeta=1e-2, m=2, p=3)
+    g = g.replace(D=5e-9 * np.arange(6.0).reshape(3, 2))
+    g = g if delay is None else discretized(g, 1e4, delay=delay)
+    level = part * hinf_norm(g)
+
+    def values(freq):
+        H = np.moveaxis(sweep(g.A, g.B, g.C, g.D, g.dt, freq), 2, 0)
+        return np.linalg.svd(H, compute_uv=False)
+
+    crossings = norms._Level(g).crossings(level)
+    np.testing.assert_allclose(np.abs(values(crossings) - level).min(axis=1), 0, atol=1e-6 * level)
+    above = values(np.linspace(0.0, 5000.0, 20_001)) > level
+    assert np.count_nonzero(above[1:] != above[:-1]) == crossings.size > 0
 
 
 def test_units_scale_the_norm():

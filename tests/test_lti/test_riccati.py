@@ -212,6 +212,19 @@ def test_noise_that_misses_a_rigid_body_mode_is_named():
         solve_dare(A, C, Q=Q, R=R)
 
 
+def test_two_rigid_body_modes_excited_as_one_but_for_rounding_are_refused():
+    A, C, _, R = machine(2, 2)
+    for apart, refused in ((1e-3, False), (1e-8, True)):
+        B = np.zeros((8, 2))
+        B[1::2] = [[1, 1], [1, 1 + apart], [1, 0], [0, 1]]
+        Q = B @ B.T * 1e-12
+        if refused:
+            with pytest.raises(SolverError, match="not excited"):
+                solve_dare(A, C, Q=Q, R=R)
+        else:
+            assert solve_dare(A, C, Q=Q, R=R).spectral_radius < 1
+
+
 def test_outputs_that_miss_a_rigid_body_mode_are_named():
     A, C, Q, R = machine(3, 4)
     with pytest.raises(SolverError, match=r"cannot be seen"):

@@ -1,10 +1,10 @@
 """Linear time-invariant systems: the control side's one type and what is done with it."""
 
+from .discretisation import discretized as discretized
+from .discretisation import tustin as tustin
 from .frequency import Frf as Frf
 from .frequency import default_freq as default_freq
 from .frequency import frequency_response as frequency_response
-from .discretisation import discretized as discretized
-from .discretisation import tustin as tustin
 from .interconnection import append as append
 from .interconnection import connect as connect
 from .interconnection import feedback as feedback

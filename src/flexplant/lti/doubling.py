@@ -295,4 +295,5 @@ def _unseen(shifted: ComplexArray, weight: FloatArray) -> int:
     if np.any(spread == 0):
         return int(np.count_nonzero(spread == 0))
     values = la.eigvalsh(form / spread / spread[:, None])
-    return int(np.count_nonzero(np.abs(values) < 1e-9))
+    # as a covariance: 3e-7 of an amplitude; below that it is rounding
+    return int(np.count_nonzero(np.abs(values) < 1e-13))

@@ -103,6 +103,16 @@ def controllability_gramian(sys: System) -> FloatArray:
 
     Where A is block diagonal with 1 x 1 and 2 x 2 blocks each block of P is a closed form.
 
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Strictly stable.
+
+    Returns
+    -------
+    (n, n) array
+        Symmetric.
+
     Raises
     ------
     SolverError
@@ -114,6 +124,16 @@ def controllability_gramian(sys: System) -> FloatArray:
 
 def observability_gramian(sys: System) -> FloatArray:
     """Return Q (n, n): ``A' Q + Q A + C' C = 0``, or ``Q = A' Q A + C' C`` when sampled.
+
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Strictly stable.
+
+    Returns
+    -------
+    (n, n) array
+        Symmetric.
 
     Raises
     ------

@@ -33,6 +33,13 @@ def h2_norm(sys: System) -> float:
         Infinite when the system is not strictly stable (rigid-body modes are not), or continuous
         with feedthrough.
 
+    Raises
+    ------
+    ModelError
+        When `sys` is no system.
+    SolverError
+        When the Gramian is too badly conditioned for its residual.
+
     Examples
     --------
     >>> print(f"{h2_norm(StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])):.3f}")
@@ -62,6 +69,11 @@ def hinf_norm(sys: System) -> float:
     -------
     float
         Infinite when the system is not strictly stable.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is no system.
 
     Examples
     --------
@@ -95,6 +107,8 @@ def peak_gain(sys: System) -> tuple[float, float]:
 
     Raises
     ------
+    ModelError
+        When `sys` is no system.
     SolverError
         When the level set does not settle (not seen so far).
 

@@ -170,6 +170,31 @@ def control_dare(
     """Return X of ``X = A' X A - (A' X B + S) (B' X B + R)^-1 (A' X B + S)' + Q``.
 
     The dual of `solve_dare`: `gain` is F with u = -F x, closed loop A - B F.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        May have eigenvalues that are not stable.
+    B : (n, m) array
+        Inputs.
+    Q : (n, n) array
+        Symmetric; cost of x.
+    R : (m, m) array
+        Symmetric, non-singular, possibly indefinite; cost of u.
+    S : (n, m) array, optional
+        Cross term; zero when not given.
+
+    Returns
+    -------
+    RiccatiSolution
+        X as `P`, and the gain (m, n).
+
+    Raises
+    ------
+    ShapeError, ModelError
+        For bad sizes, entries that are not finite, a singular R.
+    SolverError
+        When no strictly stabilising solution exists or the residual stays bad.
     """
     return _dual(solve_dare(_transposed(A), _transposed(B), Q=Q, R=R, S=S))
 
@@ -185,6 +210,31 @@ def control_care(
     """Return X of ``0 = A' X + X A - (X B + S) R^-1 (X B + S)' + Q``.
 
     The dual of `solve_care`: `gain` is F with u = -F x, closed loop A - B F.
+
+    Parameters
+    ----------
+    A : (n, n) array
+        May have eigenvalues that are not stable.
+    B : (n, m) array
+        Inputs.
+    Q : (n, n) array
+        Symmetric; cost of x.
+    R : (m, m) array
+        Symmetric, non-singular, possibly indefinite; cost of u.
+    S : (n, m) array, optional
+        Cross term; zero when not given.
+
+    Returns
+    -------
+    RiccatiSolution
+        X as `P`, and the gain (m, n).
+
+    Raises
+    ------
+    ShapeError, ModelError
+        For bad sizes, entries that are not finite, a singular R.
+    SolverError
+        When no strictly stabilising solution exists or the residual stays bad.
     """
     return _dual(solve_care(_transposed(A), _transposed(B), Q=Q, R=R, S=S))
 
