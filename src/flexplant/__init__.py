@@ -47,6 +47,7 @@ from .plant import Poi as Poi
 from .plant import Ports as Ports
 from .plant import Reference as Reference
 from .plant import Sensor as Sensor
+from .plant import StageWeights as StageWeights
 from .plant import StandardPlant as StandardPlant
 from .plant import assemble_plant as assemble_plant
 from .plant import highpass as highpass
@@ -54,6 +55,8 @@ from .plant import inverse_sensitivity as inverse_sensitivity
 from .plant import leadlag as leadlag
 from .plant import lowpass as lowpass
 from .plant import notch as notch
+from .plant import reference_errors as reference_errors
+from .plant import stage_weights as stage_weights
 from .reduction import DesiredDofs as DesiredDofs
 from .reduction import Modes as Modes
 from .reduction import ReducedModel as ReducedModel
@@ -70,6 +73,8 @@ from .structure import ModalDamping as ModalDamping
 from .structure import Rayleigh as Rayleigh
 from .structure import kirchhoff_plate as kirchhoff_plate
 from .synthesis import Controller as Controller
+from .synthesis import Riccati as Riccati
+from .synthesis import design_hinf as design_hinf
 from .synthesis import design_servo as design_servo
 from .updating import AddedDamping as AddedDamping
 from .updating import AddedMass as AddedMass

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import scipy.linalg as la
+from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray
@@ -13,6 +15,11 @@ from .statespace import StateSpace, System, as_statespace
 
 def append(*systems: System) -> StateSpace:
     """Return the block-diagonal system: inputs and outputs of all, in order.
+
+    Parameters
+    ----------
+    *systems : StateSpace
+        Any number.
 
     Raises
     ------
@@ -37,6 +44,11 @@ def append(*systems: System) -> StateSpace:
 
 def series(first: System, second: System) -> StateSpace:
     """Return second * first: the outputs of `first` drive the inputs of `second`, in order.
+
+    Parameters
+    ----------
+    first, second : StateSpace
+        As many outputs of the first as inputs of the second; their names need not agree.
 
     Raises
     ------
@@ -66,6 +78,11 @@ def series(first: System, second: System) -> StateSpace:
 
 def parallel(first: System, second: System) -> StateSpace:
     """Return first + second: same inputs, outputs added, channel by channel.
+
+    Parameters
+    ----------
+    first, second : StateSpace
+        With the same channel names.
 
     Raises
     ------
@@ -285,14 +302,22 @@ def common_dt(systems: Iterable[StateSpace]) -> float:
 
 
 def _well_posed(loop: FloatArray) -> FloatArray:
-    """Return (I - loop)^-1, refusing an algebraic loop that has no solution."""
-    matrix = np.eye(loop.shape[0]) - loop
-    if loop.size and (condition := np.linalg.cond(matrix)) > 1e12:
-        raise ModelError(
-            f"the algebraic loop is ill-posed: I - D D has condition {condition:.1e}. Break it "
-            "with a sample of delay or a controller without direct feedthrough."
-        )
-    return np.asarray(np.linalg.inv(matrix))
+    """Return (I - loop)^-1, refusing an algebraic loop that has no solution.
+
+    Only channels that depend on themselves can be ill-posed, whatever their units: each strongly
+    connected part is judged after balancing.
+    """
+    count, part = csgraph.connected_components(loop != 0, connection="strong")
+    for i in range(count):
+        inside = np.flatnonzero(part == i)
+        balanced, _ = la.matrix_balance(loop[np.ix_(inside, inside)], permute=False)
+        condition = float(np.linalg.cond(np.eye(inside.size) - balanced))
+        if condition > 1e12:
+            raise ModelError(
+                f"the algebraic loop is ill-posed: I - D D has condition {condition:.1e}. Break it "
+                "with a sample of delay or a controller without direct feedthrough."
+            )
+    return np.asarray(np.linalg.inv(np.eye(loop.shape[0]) - loop))
 
 
 def _stacked(matrices: Sequence[FloatArray]) -> FloatArray:

@@ -9,6 +9,9 @@ from .ports import Poi as Poi
 from .ports import Ports as Ports
 from .ports import Reference as Reference
 from .ports import Sensor as Sensor
+from .stage import StageWeights as StageWeights
+from .stage import reference_errors as reference_errors
+from .stage import stage_weights as stage_weights
 from .standard import StandardPlant as StandardPlant
 from .weights import highpass as highpass
 from .weights import inverse_sensitivity as inverse_sensitivity

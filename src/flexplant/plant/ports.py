@@ -269,7 +269,10 @@ def _check_place(port: Disturbance | Actuator | Sensor | Poi) -> None:
     if isinstance(at, Mapping):
         if not at:
             raise LabelError(f"{port.name!r} is at an empty mapping: name at least one DOF.")
-        place: Place = {str(label): float(weight) for label, weight in at.items()}
+        place: Place = {
+            str(label): float(real_array(weight, f"weight of {label!r} in {port.name!r}", ()))
+            for label, weight in at.items()
+        }
     elif isinstance(at, str):
         place = at
     else:

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, positive
 from .ports import Ports
 from .realisation import ModalRealisation
 
@@ -60,6 +60,8 @@ class StandardPlant(Value):
     ------
     LabelError
         When the names are not those of the system's channels, in this order.
+    ModelError
+        When a density is negative or not finite.
     """
 
     system: StateSpace
@@ -86,7 +88,8 @@ class StandardPlant(Value):
         for name in self.asd:
             if name not in self.w:
                 raise unknown_label("w channel with an asd", name, self.w)
-        self._set(asd=self.asd, noise_factor=self.noise_factor)
+        asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
+        self._set(asd=asd, noise_factor=self.noise_factor)
 
     def __repr__(self) -> str:
         kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
@@ -273,6 +276,33 @@ class StandardPlant(Value):
         from .weighting import weighted
 
         return weighted(self, dict(z or {}), dict(w or {}))
+
+    def through(self, block: System) -> StandardPlant:
+        """Return the plant whose measurements are the outputs of a block that reads y.
+
+        What the controller then reads may be errors, decoupled motions or filtered sensors; close
+        the loop with the same block before the controller.
+
+        Parameters
+        ----------
+        block : StateSpace
+            Its inputs are channels of y; its outputs become y.
+
+        Returns
+        -------
+        StandardPlant
+            With the same w, u and z.
+
+        Raises
+        ------
+        LabelError
+            When an input of the block is not in y.
+        ModelError
+            When its sampling time differs.
+        """
+        from .weighting import measured_through
+
+        return measured_through(self, block)
 
     def with_ports(self, ports: Ports) -> StandardPlant:
         """Return the plant of the same structure, sampled alike, with other ports.

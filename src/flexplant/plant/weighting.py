@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import ModelError, unknown_label
 from ..lti.interconnection import append, series
-from ..lti.statespace import StateSpace, as_statespace
+from ..lti.statespace import StateSpace, System, as_statespace
 from .standard import StandardPlant
 
 
@@ -41,8 +41,34 @@ def weighted(plant: StandardPlant, z: Mapping[str, Any], w: Mapping[str, Any]) -
         ports=plant.ports,
         realisation=plant.realisation,
         delay=plant.delay,
-        unweighted=plant,
+        unweighted=plant.unweighted or plant,
     )
+
+
+def measured_through(plant: StandardPlant, block: System) -> StandardPlant:
+    """Return the plant with y read through a block."""
+    g = as_statespace(block)
+    inner = plant.system.select([*plant.z, *(plant.y[i] for i in _columns(plant, g))])
+    after = append(_through(plant, plant.z), g if g.n_states else g.replace(dt=plant.dt))
+    return StandardPlant(
+        series(inner, after).replace(name=plant.system.name),
+        plant.w,
+        plant.u,
+        plant.z,
+        tuple(g.outputs),
+        {},
+        ports=plant.ports,
+        realisation=plant.realisation,
+        delay=plant.delay,
+        unweighted=plant.unweighted or plant,
+    )
+
+
+def _columns(plant: StandardPlant, g: StateSpace) -> list[int]:
+    for name in g.inputs:
+        if name not in plant.y:
+            raise unknown_label("channel of y", name, plant.y)
+    return [plant.y.index(name) for name in g.inputs]
 
 
 def _weight(plant: StandardPlant, weight: Any, name: str) -> StateSpace:

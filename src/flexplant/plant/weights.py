@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import ModelError
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
-from ..values import positive
+from ..values import positive, real_array
 
 
 def first_order(b1: float, b0: float, omega: float) -> StateSpace:
@@ -29,6 +29,10 @@ def second_order(b2: float, b1: float, b0: float, omega: float, zeta: float) -> 
         outputs=["out"],
         blocks=[2],
     )
+
+
+def _number(gain: float) -> float:
+    return float(real_array(gain, "gain", ()))
 
 
 def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
@@ -51,9 +55,9 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     Raises
     ------
     ModelError
-        When freq is not positive or the order is neither 1 nor 2.
+        When freq is not positive, gain not a number, or the order neither 1 nor 2.
     """
-    omega = 2.0 * np.pi * positive(freq, "freq")
+    omega, gain = 2.0 * np.pi * positive(freq, "freq"), _number(gain)
     if order == 1:
         return first_order(0.0, gain, omega)
     if order == 2:
@@ -81,9 +85,9 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     Raises
     ------
     ModelError
-        When freq is not positive or the order is neither 1 nor 2.
+        When freq is not positive, gain not a number, or the order neither 1 nor 2.
     """
-    omega = 2.0 * np.pi * positive(freq, "freq")
+    omega, gain = 2.0 * np.pi * positive(freq, "freq"), _number(gain)
     if order == 1:
         return first_order(gain, 0.0, omega)
     if order == 2:
@@ -138,7 +142,7 @@ def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     ModelError
         When a frequency is not positive.
     """
-    ratio = positive(pole, "pole") / positive(zero, "zero")
+    ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _number(gain)
     return first_order(gain * ratio, gain, 2.0 * np.pi * pole)
 
 

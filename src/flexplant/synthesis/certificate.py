@@ -64,7 +64,7 @@ def swept_norm(loop: StateSpace) -> float:
     """Return the largest gain over a grid that is refined at resonances and at its own peak."""
     poles = loop.poles()
     if loop.dt:
-        poles = np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt
+        poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt)
     nyquist = 0.5 / loop.dt if loop.dt else np.inf
     speeds = np.abs(poles.imag[np.abs(poles.imag) > 0]) / (2 * np.pi)
     sizes = np.abs(poles) / (2 * np.pi)
@@ -90,4 +90,4 @@ def swept_norm(loop: StateSpace) -> float:
 
 def _largest(loop: StateSpace, freq: FloatArray) -> FloatArray:
     gain = frequency_response(loop, freq).data.transpose(2, 0, 1)
-    return np.asarray(np.linalg.svd(gain, compute_uv=False)[:, 0])
+    return np.asarray(np.linalg.norm(gain, 2, axis=(1, 2)))

@@ -114,19 +114,16 @@ def _open_size(problem: Prepared) -> float:
     """Return a gamma to begin with: the size of the problem's gains at its own speed."""
     gain = problem.system.evaluated(1j)
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
-    return float(max(np.linalg.norm(gain[:p1, :m1], 2), 1.0))
+    return max(float(np.linalg.norm(gain[:p1, :m1], 2)), 1.0)
 
 
 def _direct_bound(problem: Prepared) -> float:
     """Return the bound that the feedthrough alone puts on gamma (Glover and Doyle, (i))."""
     D, m2, p2 = problem.D11, problem.B2.shape[1], problem.C2.shape[0]
     rows, columns = D.shape[0] - m2, D.shape[1] - p2
-    return float(
-        max(
-            np.linalg.norm(D[:rows], 2) if rows else 0.0,
-            np.linalg.norm(D[:, :columns], 2) if columns else 0.0,
-        )
-    )
+    parts = (D[:rows], D[:, :columns])
+    sizes = [float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts]
+    return max(sizes)
 
 
 def _attempt(problem: Prepared, gamma: float) -> tuple[StateSpace, float] | None:

@@ -11,6 +11,7 @@ from ..lti.discretisation import discretized, tustin
 from ..lti.interconnection import append, lft, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import Poi, StandardPlant
+from ..plant.stage import rigid_gain
 from ..plant.weights import leadlag, lowpass, notch
 from ..values import FloatArray, positive
 from .controller import Controller
@@ -99,18 +100,13 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
 def _decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
     """Return T_u: accelerations of the POI's axes to actuator forces, of least norm."""
     continuous = plant.continuous or plant
-    system, r = continuous.system, continuous.n_rigid
+    r = continuous.n_rigid
     if not r:
         raise AssumptionError(
             "the plant has no rigid-body modes to servo: it is constrained. Use design_hinf."
         )
     continuous.check().require(("stabilisable",), "a servo of the rigid body")
-    rows = system.output_index([poi.channel(axis) for axis in poi.axes])
-    columns = system.input_index(plant.u)
-    # displacement rows see omega_r q, forces drive dq/dt: their product over the pair's gain
-    position, velocity = np.arange(r) * 2, np.arange(r) * 2 + 1
-    pair = system.A[position, velocity]
-    gain = (system.C[np.ix_(rows, position)] * pair) @ system.B[np.ix_(velocity, columns)]
+    gain = rigid_gain(plant, [poi.channel(axis) for axis in poi.axes], list(plant.u))
     size = np.linalg.norm(gain, axis=1, keepdims=True)
     if len(poi.axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
         raise AssumptionError(

@@ -248,7 +248,7 @@ class WaferStage(Value):
             shaken = np.array([_lines(wave, samples, periods, lines) for wave in signal])
             forces[:, experiment] = shaken + lag * commands
             motions[:, experiment] = [_lines(run[s.name], samples, periods, lines) for s in ports.y]
-        data = np.linalg.solve(forces.transpose(2, 1, 0), motions.transpose(2, 1, 0))
+        data: Any = np.linalg.solve(forces.transpose(2, 1, 0), motions.transpose(2, 1, 0))
         return Frf(
             lines / period,
             data.transpose(2, 1, 0),

@@ -1,0 +1,220 @@
+"""What a positioning stage needs before H-infinity: error measurements and four-block weights."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssumptionError
+from ..lti.discretisation import tustin
+from ..lti.interconnection import series
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value, positive
+from .ports import Ports
+from .standard import StandardPlant
+from .weights import inverse_sensitivity, leadlag
+
+#: |S| of the finished loop crosses 1 below the weight's crossing by about gamma, which is near 1.6
+_HEADROOM = 1.6
+
+
+def rigid_gain(plant: StandardPlant, outputs: list[str], inputs: list[str]) -> FloatArray:
+    """Return the accelerations at outputs per force at inputs, of the rigid body alone.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled from a free structure.
+    outputs, inputs : lists of str
+        Displacements in z or y; forces in w or u.
+
+    Returns
+    -------
+    (n_out, n_in) array [1/kg and the like]
+    """
+    shape, push = _rigid_parts(plant)
+    system = (plant.continuous or plant).system
+    return np.asarray(shape[system.output_index(outputs)] @ push[:, system.input_index(inputs)])
+
+
+def _rigid_parts(plant: StandardPlant) -> tuple[FloatArray, FloatArray]:
+    """Return the rigid-body shapes at all outputs, and the modal forces of all inputs."""
+    system, r = (plant.continuous or plant).system, plant.n_rigid
+    position, velocity = np.arange(r) * 2, np.arange(r) * 2 + 1
+    # displacement rows see omega_r q: the pair's own gain turns them into shapes
+    return system.C[:, position] * system.A[position, velocity], system.B[velocity]
+
+
+def reference_errors(plant: StandardPlant) -> StateSpace:
+    """Return the static block from sensors and references to errors at the sensors.
+
+    ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i would be if the whole body were
+    rigid and the POI followed its reference, its other axes at rest. A controller that reads these
+    errors has one degree of freedom: what it does to a reference it does to a disturbance.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled from a free structure, with a reference and displacement sensors.
+
+    Returns
+    -------
+    StateSpace
+        Static; use it as `plant.through(block)` for design, and in `close_loop`.
+
+    Raises
+    ------
+    AssumptionError
+        When the plant has no reference, no displacement sensors, or the POI's axes do not span
+        the rigid-body modes.
+    """
+    ports = _ports(plant)
+    if not ports.references:
+        raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
+    poi = ports.poi(ports.references[0].poi)
+    sensors = [s.name for s in ports.y if s.quantity == "displacement"]
+    system = (plant.continuous or plant).system
+    shape, _ = _rigid_parts(plant)
+    axes = shape[system.output_index([poi.channel(axis) for axis in poi.axes])]
+    if not sensors or len(poi.axes) < plant.n_rigid or np.linalg.matrix_rank(axes) < plant.n_rigid:
+        raise AssumptionError(
+            f"POI {poi.name!r} with axes {poi.axes} and sensors {sensors} do not tell the "
+            f"{plant.n_rigid} rigid-body motions: give the POI all its axes."
+        )
+    moved = shape[system.output_index(sensors)] @ np.linalg.pinv(axes)[:, 0]
+    return StateSpace(
+        [],
+        [],
+        [],
+        np.hstack([-np.eye(len(sensors)), moved[:, None]]),
+        plant.dt,
+        inputs=[*sensors, poi.derived(poi.axes[0], "ref")],
+        outputs=[f"{name}:error" for name in sensors],
+        name="reference errors",
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StageWeights(Value):
+    """Weights for `plant.weighted(z=weights.z, w=weights.w)`; print it, change it.
+
+    Parameters
+    ----------
+    z, w : mapping {channel: StateSpace, float or None}
+        None leaves the channel out.
+    text : str
+        What they mean.
+    """
+
+    z: Mapping[str, Any]
+    w: Mapping[str, Any]
+    text: str
+
+    def __post_init__(self) -> None:
+        self._set(z=dict(self.z), w=dict(self.w))
+
+    def __repr__(self) -> str:
+        return f"<StageWeights {self.text}>"
+
+
+def stage_weights(
+    plant: StandardPlant,
+    bandwidth: float,
+    *,
+    peak: float = 2.0,
+    disturbance: float = 0.3,
+    effort: float = 0.3,
+    noise: float = 0.005,
+) -> StageWeights:
+    """Return a four-block set of weights for a positioning stage.
+
+    Everything is measured in one length at the POI (1 m of reference) and in the force f0 that
+    accelerates the rigid body by ``w_b^2`` times it: [W_S S, W_S P W_d; W_u K S, W_u K P W_d]. W_S
+    asks for |S| < 1 below the bandwidth with some headroom and |S| < peak above; W_u lets the
+    efforts roll off from six times the bandwidth; W_d = disturbance f0.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled from a free structure, continuous or sampled.
+    bandwidth : float [Hz]
+        Below which |S| shall stay under 1.
+    peak : float
+        Bound on |S| at high frequencies.
+    disturbance, effort : float
+        Sizes of W_d f0^-1 and W_u f0; their product bounds the complementary sensitivity at u.
+    noise : float
+        Noise of each sensor beside 1 m of reference.
+
+    Returns
+    -------
+    StageWeights
+
+    Raises
+    ------
+    AssumptionError
+        When the plant is not assembled from a free structure with POIs, actuators and sensors.
+    ModelError
+        When a number is out of range.
+    """
+    ports = _ports(plant)
+    if not ports.z or not ports.u or not ports.y:
+        raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
+    first = ports.z[0].channel(ports.z[0].axes[0])
+    push = np.linalg.norm(rigid_gain(plant, [first], [port.name for port in ports.u]))
+    force = (2.0 * np.pi * positive(bandwidth, "bandwidth")) ** 2 / float(push)
+    arm = _arm(plant, ports)
+    sense = inverse_sensitivity(_HEADROOM * bandwidth, peak=peak, floor=0.01)
+    rolloff = leadlag(6.0 * bandwidth, 60.0 * bandwidth, gain=positive(effort, "effort") / force)
+    z: dict[str, Any] = {}
+    for poi in ports.z:
+        for axis in poi.axes:
+            error = poi.derived(axis, "error")
+            size = arm if axis.startswith("r") else 1.0
+            weight = _sampled(series(sense, np.array([[size]])), plant)
+            if error in plant.z:
+                z[poi.channel(axis)], z[error] = None, weight
+            else:
+                z[poi.channel(axis)] = weight
+    z |= {f"{port.name}:effort": _sampled(rolloff, plant) for port in ports.u}
+    w: dict[str, Any] = {
+        port.name: positive(disturbance, "disturbance")
+        * force
+        * (arm if port.direction.startswith("r") else 1.0)
+        for port in ports.w
+    }
+    w |= {name: positive(noise, "noise") for name in plant.w if name.endswith(":noise")}
+    text = (
+        f"{bandwidth:g} Hz: |S| < {peak:g}, forces in {force:.4g} N, rotations in 1/{arm:.3g} rad, "
+        f"disturbance {disturbance:g}, effort {effort:g}, noise {noise:g}"
+    )
+    return StageWeights(z, w, text)
+
+
+def _ports(plant: StandardPlant) -> Ports:
+    if plant.ports is None or not plant.n_rigid:
+        raise AssumptionError(
+            "this is for a plant assembled from a free structure: assemble_plant(model, ports)."
+        )
+    return plant.ports
+
+
+def _arm(plant: StandardPlant, ports: Ports) -> float:
+    """Return the length that makes rotations displacements: how far the sensors are, in shape."""
+    shape, _ = _rigid_parts(plant)
+    system = (plant.continuous or plant).system
+    turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
+    if not turning:
+        return 1.0
+    seen = shape[system.output_index([sensor.name for sensor in ports.y])]
+    turned = shape[system.output_index(turning)]
+    ratio = np.linalg.norm(seen, axis=0) / np.sqrt(len(ports.y))
+    turns = np.linalg.norm(turned, axis=0)
+    return float(np.max(ratio[turns > 1e-6 * turns.max()] / turns[turns > 1e-6 * turns.max()]))
+
+
+def _sampled(weight: StateSpace, plant: StandardPlant) -> StateSpace:
+    return tustin(weight, 1.0 / plant.dt) if plant.dt else weight
