@@ -1,5 +1,7 @@
 """Riccati equations: closed forms, extended-precision recursion, scipy where it works, refusals."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -214,7 +216,7 @@ def test_noise_that_misses_a_rigid_body_mode_is_named():
 
 def test_two_rigid_body_modes_excited_as_one_but_for_rounding_are_refused():
     A, C, _, R = machine(2, 2)
-    for apart, refused in ((1e-3, False), (1e-8, True)):
+    for apart, refused in ((1e-3, False), (3e-8, True), (0.0, True)):
         B = np.zeros((8, 2))
         B[1::2] = [[1, 1], [1, 1 + apart], [1, 0], [0, 1]]
         Q = B @ B.T * 1e-12
@@ -231,6 +233,28 @@ def test_outputs_that_miss_a_rigid_body_mode_are_named():
         solve_dare(A, C[:2], Q=Q, R=R[:2, :2])
     with pytest.raises(SolverError, match=r"cannot be seen"):
         solve_care(np.diag([1.0, -1.0]), np.array([[0.0, 1.0]]), Q=np.eye(2), R=np.eye(1))
+
+
+def test_compleib_problems_equal_scipy_or_have_no_solution():
+    path = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
+    if not path.exists():
+        pytest.skip("the COMPleib data are not here")
+    data = np.load(path)
+    refused = []
+    for name in sorted({key.split("/")[0] for key in data.files}):
+        A, B1, B2, C1 = (data[f"{name}/{part}"] for part in ("A", "B1", "B2", "C1"))
+        B, Q = np.hstack([B1, B2]), C1.T @ C1
+        R = np.diag([-1e6] * B1.shape[1] + [1.0] * B2.shape[1])
+        hamiltonian = np.block([[A, -B @ np.linalg.solve(R, B.T)], [-Q, -A.T]])
+        balanced = la.matrix_balance(hamiltonian, permute=False)[0]
+        if np.abs(la.eigvals(balanced).real).min() < 1e-9 * la.norm(balanced):
+            with pytest.raises(SolverError, match="not excited"):
+                control_care(A, B, Q=Q, R=R)
+            refused.append(name)
+            continue
+        X = la.solve_continuous_are(A, B, Q, R)
+        np.testing.assert_allclose(control_care(A, B, Q=Q, R=R).P, X, atol=1e-9 * np.abs(X).max())
+    assert refused == ["AC2", "TMD"]
 
 
 def test_delay_states_have_no_error():

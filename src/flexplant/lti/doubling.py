@@ -240,7 +240,10 @@ def _newton(
             break
         last = min(size, last)
     else:
-        raise SolverError(f"Newton steps stall at a relative correction of {last:.1e}.")
+        raise SolverError(
+            f"the solution is determined to {last:.1e} only (Newton steps stall there): a mode is "
+            "hardly excited by Q, or hardly seen in the outputs."
+        )
     K = kind.gain(p, P)
     return P, K, kind.relative(p, kind.residual(p, P, K), P), taken
 
@@ -272,7 +275,8 @@ def _defect(p: Problem, growth: Callable[[ComplexArray], FloatArray], marginal: 
         if missed:
             return (
                 f"{missed} mode(s) of A at {value:.6g} (rigid-body or unstable) cannot be seen in "
-                "the outputs, so their error is unbounded. Add or move sensors."
+                "the outputs (reached by the inputs, in the control form), so their error is "
+                "unbounded. Add or move sensors (actuators)."
             )
         missed = _unseen(shifted.conj().T, p.Q) if growth(np.array(value)) < 1e-6 * size else 0
         if missed:
