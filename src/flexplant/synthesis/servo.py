@@ -66,6 +66,8 @@ def design_servo(
         When the plant is continuous, or the axes or actuators do not span the rigid-body modes.
     LabelError
         When the POI is unknown.
+    ModelError
+        When the plant is weighted, or a frequency is not positive or not below half the rate.
     SolverError
         When the rigid-body loop is unstable: the bandwidth is too high for rate and delay.
     """
@@ -79,7 +81,11 @@ def design_servo(
         raise ModelError(f"bandwidth {bandwidth:g} Hz is not well below the rate, {rate:g} Hz.")
     decoupling = _decoupling(plant, poi_port)
     axis = _axis_controller(
-        bandwidth, rolloff or 8.0 * bandwidth, integrator or 0.1 * bandwidth, notches, rate
+        bandwidth,
+        8.0 * bandwidth if rolloff is None else rolloff,
+        0.1 * bandwidth if integrator is None else integrator,
+        notches,
+        rate,
     )
     certificate = _certified(axis, rate, plant.delay, bandwidth)
     return Controller(
@@ -90,6 +96,14 @@ def design_servo(
 
 
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
+    if not isinstance(plant, StandardPlant):
+        raise ModelError(
+            f"need a StandardPlant, got {type(plant).__name__}: assemble_plant(model, ports)."
+        )
+    if plant.unweighted is not None:
+        raise ModelError(
+            "the plant is weighted: a servo acts on physical channels. Use plant.unweighted."
+        )
     if plant.ports is None or not plant.ports.z:
         raise AssumptionError("a servo needs a plant assembled from ports with a POI.")
     if name is None and len(plant.ports.z) > 1:

@@ -1,0 +1,189 @@
+"""Sampling against scipy.linalg.expm, and delays against runs at ten times the rate."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.lti import StateSpace, frequency_response, tustin
+from flexplant.lti.discretisation import discretized, pair_expm, pair_exponential
+from oracles_plant import delayed_run, hold
+
+RATE = 200.0
+
+
+def modal(omega, zeta, *, seed=0, blocks=True):
+    """Modes as 2 x 2 blocks in states of one size, two inputs, one output."""
+    omega, zeta = np.asarray(omega, float), np.asarray(zeta, float)
+    rng = np.random.default_rng(seed)
+    n, scale = 2 * omega.size, np.where(omega > 0, omega, 10.0)
+    A = np.zeros((n, n))
+    k = np.arange(omega.size)
+    A[2 * k, 2 * k + 1], A[2 * k + 1, 2 * k] = scale, -(omega**2) / scale
+    A[2 * k + 1, 2 * k + 1] = -2 * zeta * omega
+    return StateSpace(
+        A,
+        rng.standard_normal((n, 2)),
+        rng.standard_normal((1, n)),
+        [[0.3, -0.2]],
+        inputs=["a", "b"],
+        outputs=["y"],
+        blocks=[2] * omega.size if blocks else None,
+    )
+
+
+PLAIN = ([0.0, 10.0, 63.0, 400.0], [0.0, 0.01, 0.7, 0.001])
+
+
+@pytest.mark.parametrize("blocks", [True, False])
+def test_zero_order_hold_is_the_matrix_exponential(blocks):
+    g = modal(*PLAIN, blocks=blocks)
+    found = discretized(g, RATE)
+    A, B = hold(g.A, g.B, 1 / RATE)
+    np.testing.assert_allclose(found.A, A, rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(found.B, B, rtol=1e-11, atol=1e-14)
+    np.testing.assert_array_equal(found.C, g.C)
+    np.testing.assert_array_equal(found.D, g.D)
+    assert found.dt == pytest.approx(1 / RATE, rel=1e-15)
+    assert (found.inputs, found.outputs, found.states) == (g.inputs, g.outputs, g.states)
+
+
+@given(
+    st.floats(0.0, 1e5),
+    st.floats(0.0, 3.0),
+    st.floats(1e-6, 1.0),
+    st.sampled_from(["modal", "rotation", "upper"]),
+)
+def test_a_pair_in_closed_form(omega, zeta, h, kind):
+    """Oscillating, critical, overdamped, rigid: e^(A h) and its integral, per block."""
+    if omega * h > 200:
+        omega = 200 / h
+    A = np.array([[0.0, max(omega, 1.0)], [-(omega**2) / max(omega, 1.0), -2 * zeta * omega]])
+    if kind == "rotation":
+        A = np.array([[-zeta, omega], [-omega, -zeta]])
+    if kind == "upper":
+        A = np.array([[-zeta, omega], [0.0, -2 * zeta]])
+    wanted_E, wanted_I = hold(A, np.eye(2), h)
+    np.testing.assert_allclose(pair_expm(A[None], h)[0], wanted_E, rtol=1e-7, atol=1e-9)
+    E, integral = pair_exponential(A[None], h)
+    np.testing.assert_allclose(E[0], wanted_E, rtol=1e-7, atol=1e-9)
+    np.testing.assert_allclose(integral[0], wanted_I, rtol=1e-7, atol=1e-9 * h)
+
+
+def test_a_rigid_body_is_exact():
+    g = discretized(modal([0.0], [0.0]), 1000.0)
+    np.testing.assert_array_equal(g.A, [[1.0, 0.01], [0.0, 1.0]])
+    B = modal([0.0], [0.0]).B
+    h = 1e-3
+    np.testing.assert_allclose(g.B, [h * B[0] + 10 * h**2 / 2 * B[1], h * B[1]], rtol=1e-14)
+
+
+def test_a_slow_mode_beside_a_fast_one_keeps_its_digits():
+    g = modal([1e-3, 1e5], [0.01, 0.01])
+    found = discretized(g, 1e4)
+    # oracle: the slow block alone, where the exponential has nothing large in it
+    A, B = hold(g.A[:2, :2], g.B[:2], 1e-4)
+    np.testing.assert_allclose(found.A[:2, :2], A, rtol=1e-14, atol=1e-22)
+    np.testing.assert_allclose(found.B[:2], B, rtol=1e-13)
+    assert not found.A[:2, 2:].any()
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.7, 2.0, 3.5])
+@pytest.mark.parametrize("blocks", [True, False])
+def test_delays_against_ten_times_the_rate(delay, blocks):
+    g = modal(*PLAIN, blocks=blocks)
+    g = g.replace(D=np.zeros((1, 2)))
+    rng = np.random.default_rng(3)
+    u = rng.standard_normal((30, 2))
+    wanted = delayed_run(g.A, g.B, g.C, u, 1 / RATE, delay)
+    found = discretized(g, RATE, delay=delay)
+    x, y = np.zeros(found.n_states), []
+    for row in u:
+        y.append(found.C @ x + found.D @ row)
+        x = found.A @ x + found.B @ row
+    np.testing.assert_allclose(y, wanted, rtol=1e-9, atol=1e-9 * np.abs(wanted).max())
+    assert found.n_states == g.n_states + 2 * int(np.ceil(delay))
+    if blocks and delay:
+        assert tuple(found.blocks[:4]) == (2, 2, 2, 2)
+        np.testing.assert_allclose(
+            np.sort(np.abs(found.poles())),
+            np.sort(np.abs(la.eigvals(found.A))),
+            atol=1e-3,  # delays: defective eigenvalues at 0
+        )
+
+
+def test_only_the_named_inputs_are_delayed():
+    g = modal(*PLAIN)
+    found = discretized(g, RATE, delay=1.4, delayed=["b"])
+    assert found.states[-2:] == ("b:delay2", "b:delay1")
+    now = discretized(g, RATE)
+    np.testing.assert_array_equal(found.B[: g.n_states, 0], now.B[:, 0])
+    assert not found.B[: g.n_states, 1].any()
+    np.testing.assert_array_equal(found.D, [[0.3, 0.0]])  # its feedthrough comes late too
+    late = frequency_response(found, np.array([7.0])).data[0, 1, 0]
+    # oracle: e^(-s tau) times the held response of the fine loop, by linearity of the two parts
+    A, B = hold(g.A, g.B[:, 1:], 0.6 / RATE)
+    _, part = hold(g.A, g.B[:, 1:], 0.4 / RATE)
+    full, _ = hold(g.A, g.B[:, 1:], 1 / RATE)
+    z = np.exp(2j * np.pi * 7.0 / RATE)
+    push = B / z + A @ part / z**2
+    wanted = g.C @ np.linalg.solve(z * np.eye(8) - full, push) + g.D[0, 1] / z**2
+    np.testing.assert_allclose(late, wanted[0, 0], rtol=1e-10)
+
+
+def test_nothing_to_delay_and_nothing_to_hold():
+    g = modal(*PLAIN)
+    assert discretized(g, RATE, delay=2.5, delayed=[]).n_states == g.n_states
+    gain = StateSpace([], [], [], [[2.0]], inputs=["a"], outputs=["y"])
+    late = discretized(gain, RATE, delay=1.0)
+    assert late.n_states == 1
+    np.testing.assert_array_equal(late.D, [[0.0]])
+    value = frequency_response(late, np.array([20.0])).data[0, 0, 0]
+    assert value == pytest.approx(2.0 * np.exp(-2j * np.pi * 20.0 / RATE))
+
+
+def test_refusals():
+    g = modal(*PLAIN)
+    for bad in (0.0, -5.0, np.nan, np.inf, "fast", [1.0, 2.0]):
+        with pytest.raises((ModelError, ShapeError), match="rate"):
+            discretized(g, bad)
+    for bad in (-0.1, np.nan):
+        with pytest.raises(ModelError, match="delay"):
+            discretized(g, RATE, delay=bad)
+    with pytest.raises(LabelError, match="'c'"):
+        discretized(g, RATE, delay=1, delayed=["c"])
+    with pytest.raises(ModelError, match=r"sampled already.*continuous"):
+        discretized(discretized(g, RATE), RATE)
+    with pytest.raises(ModelError, match="StateSpace"):
+        discretized("g", RATE)
+
+
+def test_tustin_is_the_bilinear_map():
+    g = modal([10.0, 63.0], [0.2, 0.7])
+    freq = np.array([0.5, 3.0, 20.0, 90.0])
+    z = np.exp(2j * np.pi * freq / RATE)
+    s = 2 * RATE * (z - 1) / (z + 1)
+    wanted = [g.C @ np.linalg.solve(v * np.eye(4) - g.A, g.B) + g.D for v in s]
+    found = frequency_response(tustin(g, RATE), freq).data
+    np.testing.assert_allclose(found, np.moveaxis(wanted, 0, 2), rtol=1e-10)
+    warped = tustin(g, RATE, prewarp=20.0)
+    exact = frequency_response(g, np.array([20.0])).data
+    np.testing.assert_allclose(frequency_response(warped, np.array([20.0])).data, exact, rtol=1e-10)
+    assert abs(frequency_response(tustin(g, RATE), np.array([20.0])).data / exact - 1).max() > 1e-3
+    assert (warped.inputs, warped.outputs) == (g.inputs, g.outputs)
+
+
+def test_tustin_refuses():
+    g = modal([10.0], [0.2])
+    for bad in (0.0, 100.0, 120.0, -3.0, np.nan):
+        with pytest.raises(ModelError, match="prewarp"):
+            tustin(g, RATE, prewarp=bad)
+    with pytest.raises(ModelError, match="rate"):
+        tustin(g, np.nan)
+    with pytest.raises(ModelError, match="sampled already"):
+        tustin(tustin(g, RATE), RATE)
+    pole = StateSpace([[2 * RATE]], [[1.0]], [[1.0]], [[0.0]])
+    with pytest.raises(ModelError, match="infinity"):
+        tustin(pole, RATE)

@@ -1,0 +1,128 @@
+"""Ports: what they hold, how they are named, and what they refuse."""
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor
+from flexplant.store import load
+from stages import ports
+
+P = (0.1, 0.2, 0.0)
+
+
+def test_defaults():
+    assert Disturbance("d", at=P).asd == 0.0
+    assert Disturbance("d", at=P).direction == "z"
+    assert Sensor("y", at="3:z").quantity == "displacement"
+    assert Poi("die", at=P).axes == ("z",)
+    assert Poi("die", at=P, axes="rx").axes == ("rx",)
+    assert Actuator("u", at=np.array(P)).at == P
+    assert Actuator("u", at={"1:z": 1, "2:z": -1}).at == {"1:z": 1.0, "2:z": -1.0}
+
+
+def test_places_are_copies():
+    point = np.array(P)
+    port = Actuator("u", at=point)
+    point[0] = 9.0
+    assert port.at == P
+
+
+def test_names_of_channels():
+    poi = Poi("die", at=P, axes=("z", "rx"))
+    assert poi.channel("rx") == "die:rx"
+    assert poi.derived("z", "hat") == "die:hat"
+    assert poi.derived("rx", "hat") == "die:rx:hat"
+
+
+def test_ports_take_one_of_a_kind_without_a_list():
+    one = Ports(u=Actuator("u", at=P), y=Sensor("y", at=P))
+    assert [port.name for port in one.forces] == ["u"]
+    assert one.y[0].name == "y"
+    assert ports().poi("die").axes == ("z", "rx", "ry")
+
+
+def test_repr_is_one_line_of_names():
+    assert repr(Ports(u=[Actuator("u", at=P)], z=[Poi("die", at=P)])) == "<Ports u: u, z: die>"
+
+
+def test_saves_and_loads(tmp_path):
+    ports().save(tmp_path / "p.npz")
+    again = load(tmp_path / "p.npz")
+    assert repr(again) == repr(ports())
+    assert [tuple(s.at) for s in again.y] == [tuple(s.at) for s in ports().y]
+    assert again.y[0].asd == ports().y[0].asd
+
+
+KINDS = (Disturbance, Actuator, Sensor, Poi)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    ("at", "error", "words"),
+    [
+        ((0.1, 0.2), ShapeError, r"place of 'p' must have shape \(3\), got \(2,\)"),
+        ((0.1, np.nan, 0.0), ModelError, "place of 'p' has a NaN"),
+        ((0.1, 1j, 0.0), ModelError, "must be real"),
+        ((0.1, "x", 0.0), ModelError, "must hold numbers"),
+        (None, ShapeError, "shape"),
+        ({}, LabelError, "empty mapping: name at least one DOF"),
+        ({"1:z": np.nan}, ModelError, "weight of '1:z'.*NaN"),
+        ({"1:z": "much"}, ModelError, "weight of '1:z'.*must hold numbers"),
+    ],
+)
+def test_bad_places(kind, at, error, words):
+    with pytest.raises(error, match=words):
+        kind("p", at=at)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", ["", "a.b", "-a"])
+def test_bad_names(kind, name):
+    with pytest.raises(LabelError, match="Rename"):
+        kind(name, at=P)
+
+
+def test_bad_directions_and_quantities():
+    for kind in (Disturbance, Actuator, Sensor):
+        with pytest.raises(LabelError, match=r"no direction of 'p' 'up'.*Known are: 'x'"):
+            kind("p", at=P, direction="up")
+    with pytest.raises(LabelError, match=r"no axis of POI 'p' 'rz2'.*Close matches: 'rz'"):
+        Poi("p", at=P, axes=("z", "rz2"))
+    with pytest.raises(LabelError, match=r"no quantity of 'p' 'speed'.*'velocity'"):
+        Sensor("p", at=P, quantity="speed")
+    with pytest.raises(LabelError, match="no axes: name at least one"):
+        Poi("p", at=P, axes=())
+    with pytest.raises(LabelError, match="more than once"):
+        Poi("p", at=P, axes=("z", "z"))
+    with pytest.raises(LabelError, match="combination of DOFs, so it has one axis"):
+        Poi("p", at={"1:z": 0.5, "2:z": 0.5}, axes=("z", "rx"))
+
+
+@pytest.mark.parametrize("kind", [Disturbance, Sensor])
+@pytest.mark.parametrize("asd", [-1.0, np.nan, np.inf, "loud", [1.0, 2.0]])
+def test_bad_densities(kind, asd):
+    with pytest.raises((ModelError, ShapeError), match="asd of 'p'"):
+        kind("p", at=P, asd=asd)
+
+
+def test_ports_refuse_strangers_and_doubles():
+    u, y, die = Actuator("u", at=P), Sensor("y", at=P), Poi("die", at=P)
+    with pytest.raises(ModelError, match=r"Ports.u holds Actuators, got Sensor"):
+        Ports(u=[y])
+    with pytest.raises(ModelError, match=r"Ports.references holds References, got str"):
+        Ports(z=[die], references=["die"])
+    with pytest.raises(ModelError, match=r"Ports.z holds Pois, got str"):
+        Ports(z="die")
+    with pytest.raises(LabelError, match=r"inputs w and u hold \['u'\] more than once"):
+        Ports(w=[Disturbance("u", at=P)], u=[u])
+    with pytest.raises(LabelError, match=r"outputs y hold \['y'\] more than once"):
+        Ports(y=[y, y])
+    with pytest.raises(LabelError, match="POIs hold"):
+        Ports(z=[die, die])
+    with pytest.raises(LabelError, match="references hold"):
+        Ports(z=[die], references=[Reference("die"), Reference("die")])
+    with pytest.raises(LabelError, match=r"no POI 'dye'.*'die'"):
+        Ports(z=[die], references=[Reference("dye")])
+    with pytest.raises(LabelError, match="no POI 'dye'"):
+        ports().poi("dye")

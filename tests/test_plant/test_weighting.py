@@ -1,0 +1,87 @@
+"""Weighted plants: Wz P Ww, names kept."""
+
+import control
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError
+from flexplant.lti import StateSpace, frequency_response, tustin
+from flexplant.plant import StandardPlant, assemble_plant, highpass, lowpass
+from stages import RATE, ports, some_modes
+
+FREQ = np.array([1.0, 50.0, 245.0, 700.0])
+
+
+def gain_of(sys):
+    return frequency_response(sys, FREQ).data
+
+
+@pytest.mark.parametrize("rate", [0.0, RATE])
+def test_the_transfer_is_wz_p_ww(rate):
+    plant = assemble_plant(some_modes(), ports())
+    low, high = lowpass(100.0, order=2, gain=1e9), highpass(20.0, gain=3.0)
+    if rate:
+        plant, low, high = plant.discretized(rate, delay=1), tustin(low, rate), tustin(high, rate)
+    heavy = plant.weighted(
+        z={"die:z": low, "u1:effort": 0.1, "die:rx": None, "die:ry": None},
+        w={"amp2": high, "y1:noise": 1e-10, "die:ref": None},
+    )
+    assert heavy.z == tuple(n for n in plant.z if n not in ("die:rx", "die:ry"))
+    assert heavy.w == tuple(n for n in plant.w if n != "die:ref")
+    assert (heavy.u, heavy.y) == (plant.u, plant.y)
+    assert heavy.unweighted is plant
+    assert heavy.dt == plant.dt
+    # oracle: frequency by frequency, numbers times numbers
+    P = gain_of(plant.system.select([*heavy.z, *heavy.y], [*heavy.w, *heavy.u])).copy()
+    for name, factor in (("die:z", gain_of(low)[0, 0]), ("u1:effort", 0.1)):
+        P[heavy.z.index(name)] = P[heavy.z.index(name)] * factor
+    for name, factor in (("amp2", gain_of(high)[0, 0]), ("y1:noise", 1e-10)):
+        P[:, heavy.w.index(name)] = P[:, heavy.w.index(name)] * factor
+    found = gain_of(heavy.system)
+    np.testing.assert_allclose(found, P, rtol=1e-9, atol=1e-12 * np.abs(P).max())
+    np.testing.assert_allclose(gain_of(heavy.Gyu), gain_of(plant.Gyu), rtol=1e-10)
+    assert heavy.system.n_states == plant.system.n_states + low.n_states + high.n_states
+
+
+def test_nothing_named_changes_nothing():
+    plant = assemble_plant(some_modes(), ports())
+    same = plant.weighted()
+    np.testing.assert_allclose(gain_of(same.system), gain_of(plant.system), rtol=1e-12)
+    assert same.unweighted is plant
+    assert not same.asd  # H-infinity sees the noise only through weights
+
+
+def test_weights_of_python_control():
+    plant = assemble_plant(some_modes(), ports())
+    twin = control.tf([1.0], [0.01, 1.0])
+    heavy = plant.weighted(z={"die:z": control.ss(twin)})
+    wanted = gain_of(plant.Gzw)[0] / (0.02j * np.pi * FREQ + 1)
+    np.testing.assert_allclose(gain_of(heavy.Gzw)[0], wanted, rtol=1e-9, atol=1e-20)
+
+
+def test_check_looks_at_the_machine_behind_the_weights():
+    plant = assemble_plant(some_modes(), ports())
+    heavy = plant.weighted(z={"die:z": lowpass(10.0)})
+    assert heavy.check()["excited"].holds
+    assert heavy.check().ok
+
+
+def test_refusals():
+    plant = assemble_plant(some_modes(), ports()).discretized(RATE)
+    with pytest.raises(LabelError, match=r"no channel of z 'dye:z'.*'die:z'"):
+        plant.weighted(z={"dye:z": 1.0})
+    with pytest.raises(LabelError, match="no channel of w 'amp9'"):
+        plant.weighted(w={"amp9": 1.0})
+    with pytest.raises(ModelError, match=r"has dt 0 s, the plant 0.0001 s.*Discretise the weight"):
+        plant.weighted(z={"die:z": lowpass(10.0)})
+    with pytest.raises(ModelError, match=r"one input and one output.*one by one"):
+        plant.weighted(z={"die:z": StateSpace([], [], [], np.eye(2))})
+    with pytest.raises(ModelError, match="left out: keep at least one"):
+        plant.weighted(z=dict.fromkeys(plant.z))
+    with pytest.raises(ModelError, match="NaN"):
+        plant.weighted(z={"die:z": np.nan})
+    with pytest.raises(ModelError):
+        plant.weighted(z={"die:z": "heavy"})
+    g = StateSpace([[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]], np.zeros((2, 2)))
+    small = StandardPlant.from_statespace(g, u=["u2"], y=["y2"]).weighted(w={"u1": 2.0})
+    assert gain_of(small.Gzw)[0, 0, 0] == pytest.approx(2 / (2j * np.pi + 1))

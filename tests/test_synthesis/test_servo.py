@@ -1,0 +1,232 @@
+"""design_servo: decoupling by F = m a, PID in closed form, loops by dense eigenvalues."""
+
+import numpy as np
+import pytest
+
+from flexplant.errors import AssumptionError, LabelError, ModelError, SolverError
+from flexplant.estimation import design_kalman, design_static
+from flexplant.loop import close_loop
+from flexplant.plant import Actuator, Poi, Ports, assemble_plant
+from flexplant.structure import FEModel
+from flexplant.synthesis import Controller, design_servo
+from oracles_plant import hold
+from stages import INSET, RATE, Z8, L, block, fitted, full, ports, reduced, sampled, some_modes
+
+MASS = L * L * 0.0272 * 2702
+INERTIA = MASS * L * L / 12
+HATS = ["die:hat", "die:rx:hat", "die:ry:hat"]
+CENTRE = np.array([L / 2, L / 2])
+
+
+def rigid_gain(poi, places):
+    """Accelerations (z, rx, ry) of a rigid plate at a point per force: F = m a, M = J alpha."""
+    rows = []
+    p = np.asarray(poi[:2]) - CENTRE
+    for place in places:
+        x, y = np.asarray(place[:2]) - CENTRE
+        rx, ry = y / INERTIA, -x / INERTIA
+        rows.append([1 / MASS + p[1] * rx - p[0] * ry, rx, ry])
+    return np.array(rows).T
+
+
+def at(system, freq, inputs):
+    z = np.exp(2j * np.pi * freq * system.dt)
+    B = system.B[:, [system.inputs.index(name) for name in inputs]]
+    D = system.D[:, [system.inputs.index(name) for name in inputs]]
+    return system.C @ np.linalg.solve(z * np.eye(system.n_states) - system.A, B) + D
+
+
+def pid(freq, bandwidth, *, rolloff=None, integrator=None, notches=(), rate=RATE):
+    """Closed form of one axis, Tustin's s, crossing of the double integrator at the bandwidth."""
+
+    def shape(f):
+        s = 2 * rate * 1j * np.tan(np.pi * f / rate)
+        w = (
+            2
+            * np.pi
+            * np.array([bandwidth, rolloff or 8 * bandwidth, integrator or bandwidth / 10])
+        )
+        p = s / w[1]
+        value = (1 + w[2] / s) * (1 + 4 * s / w[0]) / (1 + s / (4 * w[0]))
+        value = value / (p**2 + np.sqrt(2) * p + 1)
+        for f0 in notches:
+            q = s / (2 * np.pi * f0)
+            value = value * (q**2 + 2 * 0.05 * 0.3 * q + 1) / (q**2 + 2 * 0.3 * q + 1)
+        return value
+
+    return (2 * np.pi * bandwidth) ** 2 * shape(freq) / abs(shape(bandwidth))
+
+
+@pytest.mark.parametrize("die", [(L / 2, L / 2, 0.0), (0.31, 0.1, 0.0)])
+@pytest.mark.parametrize("notches", [(), (459.0, 640.0)])
+def test_the_controller_in_closed_form(die, notches):
+    servo = design_servo(sampled(reduced(), ports(die=die)), bandwidth=50.0, notches=notches)
+    assert servo.system.inputs == ("die:ref", *HATS)
+    assert servo.system.outputs == ("u1", "u2", "u3", "u4")
+    gain = rigid_gain(die, INSET)
+    for freq in (2.0, 50.0, 459.0, 2000.0):
+        K = at(servo.system, freq, HATS)
+        wanted = pid(freq, 50.0, notches=notches)
+        # plant rigid gain times T_u is the identity
+        np.testing.assert_allclose(gain @ K / -wanted, np.eye(3), rtol=1e-6, atol=1e-7)
+        ref = at(servo.system, freq, ["die:ref"])
+        np.testing.assert_allclose(ref[:, 0], -K[:, 0], rtol=1e-9, atol=1e-15 * abs(K).max())
+
+
+def test_the_decoupling_takes_least_force():
+    # oracle: the pseudo-inverse of F = m a; four actuators, three motions
+    servo = design_servo(sampled(reduced()), bandwidth=50.0)
+    T_u = at(servo.system, 50.0, HATS) / -pid(50.0, 50.0)
+    wanted = np.linalg.pinv(rigid_gain((L / 2, L / 2), INSET))
+    np.testing.assert_allclose(T_u, wanted, rtol=1e-6, atol=1e-6 * abs(wanted).max())
+    np.testing.assert_allclose(T_u[:, 0], MASS / 4, rtol=1e-6)
+    thick = design_servo(sampled(reduced(thickness=0.0272 * 1.01)), bandwidth=50.0)
+    T_u = at(thick.system, 50.0, HATS) / -pid(50.0, 50.0)
+    np.testing.assert_allclose(T_u[:, 0], 1.01 * MASS / 4, rtol=1e-6)
+
+
+def test_options_reach_the_controller():
+    plant = sampled(reduced())
+    options = {"rolloff": 250.0, "integrator": 2.0}
+    servo = design_servo(plant, bandwidth=30.0, **options)
+    K = at(servo.system, 100.0, HATS)
+    found = rigid_gain((L / 2, L / 2), INSET) @ K
+    np.testing.assert_allclose(found[0, 0], -pid(100.0, 30.0, **options), rtol=1e-6)
+
+
+def rigid_loop(servo, delay, rate=RATE, sign=1.0):
+    """Eigenvalues of the rigid plate, held and late, with the controller: dense."""
+    gain = rigid_gain((L / 2, L / 2), INSET)
+    A = np.kron([[0.0, 1.0], [0.0, 0.0]], np.eye(3))
+    B = np.vstack([np.zeros((3, 4)), gain])
+    Ad, _ = hold(A, B, 1 / rate)
+    whole, fraction = int(delay), delay - int(delay)
+    new = hold(A, B, (1 - fraction) / rate)[1]
+    old = hold(A, B, (1 - fraction) / rate)[0] @ hold(A, B, fraction / rate)[1]
+    lines = whole + 1
+    n, k = 6, 4 * lines
+    P = np.zeros((n + k, n + k))
+    P[:n, :n] = Ad
+    Bp = np.zeros((n + k, 4))
+    if whole:
+        P[:n, n + 4 * (whole - 1) : n + 4 * whole] = new
+    else:
+        Bp[:n] = new
+    P[:n, n + 4 * whole : n + 4 * (whole + 1)] += old
+    Bp[n : n + 4] = np.eye(4)
+    for i in range(1, lines):
+        P[n + 4 * i : n + 4 * i + 4, n + 4 * i - 4 : n + 4 * i] = np.eye(4)
+    C = np.hstack([np.eye(3), np.zeros((3, 3 + k))])
+    g = servo.system
+    Bc, Dc = sign * g.B[:, 1:], sign * g.D[:, 1:]
+    loop = np.block([[P + Bp @ Dc @ C, Bp @ g.C], [Bc @ C, g.A]])
+    return np.abs(np.linalg.eigvals(loop)).max()
+
+
+@pytest.mark.parametrize("delay", [0, 1, 1.5, 2])
+@pytest.mark.parametrize("bandwidth", [10.0, 50.0, 200.0])
+def test_the_certificate(delay, bandwidth):
+    servo = design_servo(sampled(reduced(), delay=delay), bandwidth=bandwidth)
+    found = servo.certificate
+    radius = rigid_loop(servo, delay)
+    # a cluster of three equal axes: eigenvalues of the dense loop are known to its cube root
+    assert radius < 1
+    assert found["rigid-body spectral radius"] == pytest.approx(radius, abs=1e-4)
+    assert rigid_loop(servo, delay, sign=-1.0) > 1
+    freq = np.geomspace(0.02 * bandwidth, 0.5 * RATE, 4000)[:-1]
+    z = np.exp(2j * np.pi * freq / RATE)
+    whole, f = int(delay), delay - int(delay)
+    held = [0.5 / RATE**2 * c for c in ((1 - f) ** 2, 1 + 2 * f * (1 - f), f**2)]
+    body = (held[0] * z**2 + held[1] * z + held[2]) / (z * (z - 1) ** 2) / z**whole
+    L_ = np.array([pid(f0, bandwidth) for f0 in freq]) * body
+    margin = np.abs(1 + L_).min()
+    assert found["rigid-body modulus margin"] == pytest.approx(margin, rel=1e-3)
+    # |S| near 4 dB, as the docstring says, where rate and delay leave the phase alone
+    if bandwidth < 100:
+        assert 3.0 < -20 * np.log10(margin) < 5.5
+
+
+def test_the_loop_on_the_plate_is_stable_and_turns_unstable_with_the_sign():
+    plant = sampled(reduced())
+    observer, servo = design_kalman(plant), design_servo(plant, bandwidth=50.0, notches=[463.1])
+    loop = close_loop(plant, observer, servo)
+    assert loop.spectral_radius < 1
+    assert -20 * np.log10(loop.modulus_margin) < 6.0
+    g = servo.system
+    wrong = g.replace(C=-g.C, D=-g.D)
+    assert close_loop(plant, observer, wrong).spectral_radius > 1
+
+
+def test_the_loop_follows_a_constant_reference():
+    plant = sampled(reduced())
+    servo = design_servo(plant, bandwidth=50.0)
+    loop = close_loop(plant, design_static(plant), servo).system
+    still = loop.C @ np.linalg.solve(np.eye(loop.n_states) - loop.A, loop.B) + loop.D
+    rows = [loop.outputs.index(name) for name in ("die:z", "die:error")]
+    column = loop.inputs.index("die:ref")
+    np.testing.assert_allclose(still[rows, column], [1.0, 0.0], atol=1e-5)
+
+
+def test_one_of_several_pois_and_no_reference():
+    axes = ("z", "rx", "ry")
+    two = [Poi("die", at=(L / 2, L / 2, 0.0), axes=axes), Poi("edge", at=Z8, axes=axes)]
+    plant = sampled(some_modes(), ports(z=two, references=[]))
+    servo = design_servo(plant, bandwidth=50.0, poi="edge")
+    assert servo.system.inputs == ("edge:hat", "edge:rx:hat", "edge:ry:hat")
+    gain = rigid_gain(Z8, INSET)
+    K = at(servo.system, 50.0, servo.system.inputs)
+    np.testing.assert_allclose(gain @ K / -pid(50.0, 50.0), np.eye(3), atol=1e-5)
+    with pytest.raises(LabelError, match="2 POIs: say which"):
+        design_servo(plant, bandwidth=50.0)
+    with pytest.raises(LabelError, match="no POI 'dye'"):
+        design_servo(plant, bandwidth=50.0, poi="dye")
+
+
+def test_what_it_is():
+    servo = design_servo(sampled(reduced()), bandwidth=50.0)
+    assert isinstance(servo, Controller)
+    assert repr(servo).startswith("<Controller servo 50 Hz on 'die': 12 states")
+    assert "rigid-body modulus margin" in repr(servo)
+    assert servo.gamma is None
+    assert set(block(servo.system)) == {"A", "B", "C", "D", "inputs", "outputs"}
+    after = fitted(reduced(), [-28.569 + 2883.567j, -39.451 + 3983.308j]).model
+    heavier = design_servo(sampled(after), bandwidth=50.0)
+    T_u = at(heavier.system, 50.0, HATS) / -pid(50.0, 50.0)
+    assert T_u[:, 0].sum() == pytest.approx(MASS + 0.5, rel=1e-2)
+
+
+@pytest.mark.parametrize("name", ["bandwidth", "rolloff", "integrator"])
+@pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
+def test_bad_frequencies(name, bad):
+    options = {"bandwidth": 50.0} | {name: bad}
+    with pytest.raises(ModelError, match="must be positive|has a NaN|not well below"):
+        design_servo(sampled(some_modes()), **options)
+
+
+def test_refusals():
+    plant = sampled(some_modes())
+    with pytest.raises(ModelError, match="bandwidth 5000 Hz is not well below the rate"):
+        design_servo(plant, bandwidth=5000.0)
+    with pytest.raises(SolverError, match=r"unstable \(spectral radius.*Lower the bandwidth"):
+        design_servo(sampled(some_modes(), delay=3), bandwidth=1500.0)
+    with pytest.raises(ModelError, match="freq"):
+        design_servo(plant, bandwidth=50.0, notches=[-1.0])
+    with pytest.raises(AssumptionError, match=r"discretized\(rate"):
+        design_servo(assemble_plant(some_modes(), ports()), bandwidth=50.0)
+    with pytest.raises(AssumptionError, match=r"axes that span them.*z, rx, ry"):
+        design_servo(plant.at({"die": Z8}).with_ports(
+            ports(z=[Poi("die", at=Z8, axes=("z", "rx"))])), bandwidth=50.0)  # fmt: skip
+    with pytest.raises(ModelError, match="need a StandardPlant, got str"):
+        design_servo("plant", bandwidth=50.0)
+    with pytest.raises(ModelError, match=r"weighted.*plant.unweighted"):
+        design_servo(plant.weighted(z={"die:z": 2.0}), bandwidth=50.0)
+    with pytest.raises(AssumptionError, match="a POI"):
+        design_servo(plant.with_ports(ports(z=[], references=[])), bandwidth=50.0)
+    few = ports(u=[Actuator("u1", at=INSET[0]), Actuator("u2", at=INSET[1])])
+    with pytest.raises(AssumptionError, match="u does not reach the rigid-body"):
+        design_servo(plant.with_ports(few), bandwidth=50.0)
+    free = full()
+    held = FEModel(free.M, free.K + 1e9 * free.M, dofs=free.dofs)
+    port = Ports(u=few.u, z=few.z, y=few.y)
+    with pytest.raises(AssumptionError, match="constrained"):
+        design_servo(assemble_plant(held, port).discretized(RATE), bandwidth=50.0)
