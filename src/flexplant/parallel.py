@@ -1,0 +1,185 @@
+"""The same function of many items, on any executor: chunks, seeds, progress.
+
+Results are those of a plain loop, in order and to the bit: seeds belong to items, not to workers,
+and linear algebra runs on one thread while items are computed (its rounding depends on how many).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Executor, Future
+from time import perf_counter
+from types import TracebackType
+from typing import Any, Self, TypeVar
+
+import numpy as np
+
+from .errors import ModelError
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+#: work of one chunk [s]: long beside the cost of sending it, short beside the whole
+CHUNK = 0.5
+#: items computed here before the rest is sent take this long [s]: they tell how long one takes
+PROBE = 0.05
+#: shorter work than this [s] shows no bar
+PATIENCE = 2.0
+
+
+class Progress:
+    """A bar for long work: after two seconds, on a terminal only, unless forced.
+
+    Parameters
+    ----------
+    total : int
+        Number of items.
+    description : str
+        What is done.
+    progress : bool, optional
+        True shows it at once and anywhere, False never; None decides.
+    """
+
+    def __init__(self, total: int, description: str, *, progress: bool | None = None) -> None:
+        self.bar: Any = None
+        if progress or (progress is None and sys.stderr.isatty()):
+            from tqdm import tqdm
+
+            delay = 0.0 if progress else PATIENCE
+            self.bar = tqdm(total=total, desc=description, delay=delay, leave=bool(progress))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        if self.bar is not None:
+            self.bar.close()
+
+    def advance(self, items: int = 1) -> None:
+        """Count some items as done."""
+        if self.bar is not None:
+            self.bar.update(items)
+
+
+def mapped(
+    function: Callable[..., Result],
+    items: Iterable[Item],
+    *,
+    executor: Executor | None = None,
+    progress: bool | None = None,
+    rng: int | np.random.SeedSequence | np.random.Generator | None = None,
+    description: str = "items",
+) -> list[Result]:
+    """Return ``[function(item) for item in items]``, computed on an executor.
+
+    Parameters
+    ----------
+    function : callable
+        Of one item; of an item and its `numpy.random.Generator` when `rng` is given. For a
+        process pool it can be pickled: defined in a module, or a value of this package.
+    items : iterable
+        The items.
+    executor : concurrent.futures.Executor, optional
+        Threads, processes, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; only
+        `submit` is used. The first items are computed here to learn how long one takes, the rest
+        goes out in chunks of about half a second. None: a plain loop.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
+    rng : int, SeedSequence or Generator, optional
+        From it a seed is spawned for each item, whoever computes it.
+    description : str
+        Name of the bar.
+
+    Returns
+    -------
+    list
+        In the order of the items; the same to the bit with and without an executor.
+
+    Raises
+    ------
+    ModelError
+        When the function cannot be called or the executor has no `submit`.
+
+    Examples
+    --------
+    >>> mapped(abs, [-1, 2, -3])
+    [1, 2, 3]
+    """
+    if not callable(function):
+        raise ModelError(f"function must be callable, got {type(function).__name__}.")
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise ModelError(
+            f"executor must be a concurrent.futures.Executor, got {type(executor).__name__}. "
+            "Pass the pool itself, such as ProcessPoolExecutor(), not its map."
+        )
+    listed = list(items)
+    calls: list[tuple[Any, ...]] = [(item,) for item in listed]
+    if rng is not None:
+        calls = [(*call, seed) for call, seed in zip(calls, _seeds(rng, len(calls)), strict=True)]
+    with _one_thread(), Progress(len(calls), description, progress=progress) as bar:
+        results: list[Result] = []
+        start = perf_counter()
+        for call in calls:
+            if executor is not None and results and perf_counter() - start > PROBE:
+                break
+            results.append(_call(function, call))
+            bar.advance()
+        if executor is None or len(results) == len(calls):
+            return results
+        each = (perf_counter() - start) / len(results)
+        size = max(1, round(CHUNK / max(each, 1e-9)))
+        return results + _sent(function, calls[len(results) :], size, executor, bar)
+
+
+def _sent(
+    function: Callable[..., Result],
+    calls: Sequence[tuple[Any, ...]],
+    size: int,
+    executor: Executor,
+    bar: Progress,
+) -> list[Result]:
+    """Return the results of chunks of calls; an error stops those that have not begun."""
+    chunks = [calls[i : i + size] for i in range(0, len(calls), size)]
+    futures: list[Future[list[Result]]] = []
+    results: list[Result] = []
+    try:
+        futures += [executor.submit(_chunk, function, chunk) for chunk in chunks]
+        for future, chunk in zip(futures, chunks, strict=True):
+            results += future.result()
+            bar.advance(len(chunk))
+    finally:
+        for future in futures:
+            future.cancel()
+    return results
+
+
+def _chunk(function: Callable[..., Result], calls: Sequence[tuple[Any, ...]]) -> list[Result]:
+    with _one_thread():
+        return [_call(function, call) for call in calls]
+
+
+def _call(function: Callable[..., Result], call: tuple[Any, ...]) -> Result:
+    item, *seed = call
+    return function(item, np.random.default_rng(seed[0])) if seed else function(item)
+
+
+def _one_thread() -> Any:
+    from threadpoolctl import threadpool_limits
+
+    return threadpool_limits(limits=1, user_api="blas")
+
+
+def _seeds(
+    rng: int | np.random.SeedSequence | np.random.Generator, count: int
+) -> list[np.random.SeedSequence]:
+    if isinstance(rng, np.random.Generator):
+        source = rng.bit_generator.seed_seq
+    else:
+        source = rng if isinstance(rng, np.random.SeedSequence) else np.random.SeedSequence(rng)
+    return list(source.spawn(count))  # type: ignore[attr-defined]

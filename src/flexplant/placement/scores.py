@@ -1,0 +1,240 @@
+"""Score layouts: how well each set of sensors or actuators would do."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError, ModelError
+from ..parallel import mapped
+from ..plant import StandardPlant
+from ..values import FloatArray, IntArray, Value
+from .candidates import (
+    Criterion,
+    Port,
+    Reasoned,
+    Side,
+    checked_plant,
+    confirmed,
+    known_candidates,
+    scorer_of,
+    with_side,
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Scores(Value):
+    """Layouts with their scores, the best first.
+
+    Parameters
+    ----------
+    layouts : sequence of tuples of str
+        Names of the chosen sensors or actuators.
+    values : (n,) array
+        Scores, ascending; infinite for a layout that is infeasible.
+    reasons : sequence of str
+        Why a layout is infeasible; empty when it is not.
+    order : (n,) array of int
+        Where each layout stood in the list that was given.
+    criterion : str
+        What was scored.
+    candidates : sequence of Sensor or Actuator
+        All that appear in a layout.
+    side : {"y", "u"}
+        Whether they are sensors or actuators.
+    """
+
+    layouts: tuple[tuple[str, ...], ...]
+    values: FloatArray
+    reasons: tuple[str, ...]
+    order: IntArray
+    criterion: str
+    candidates: tuple[Port, ...]
+    side: Side
+
+    def __post_init__(self) -> None:
+        self._set(values=self.values, order=self.order)
+
+    def __len__(self) -> int:
+        return len(self.layouts)
+
+    def __repr__(self) -> str:
+        feasible = int(np.count_nonzero(np.isfinite(self.values)))
+        head = f"<Scores of {len(self)} layouts by {self.criterion}, {feasible} feasible>"
+        return "\n".join([head, *self._lines(5)])
+
+    @property
+    def best(self) -> tuple[str, ...]:
+        """The names of the best layout."""
+        return self.layouts[0]
+
+    def table(self, count: int = 10) -> str:
+        """Return the best few as text, one per line.
+
+        Parameters
+        ----------
+        count : int
+            How many.
+        """
+        return "\n".join(self._lines(count))
+
+    def on(self, plant: StandardPlant, rank: int = 0) -> StandardPlant:
+        """Return the plant with the layout of a rank (0 is the best) instead of its own.
+
+        Parameters
+        ----------
+        plant : StandardPlant
+            Of the same machine; assembled from a structure.
+        rank : int
+            Which layout.
+        """
+        known = {port.name: port for port in self.candidates}
+        return with_side(plant, self.side, [known[name] for name in self.layouts[rank]])
+
+    def _lines(self, count: int) -> list[str]:
+        lines = []
+        for i, value in enumerate(self.values[:count]):
+            why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
+            lines.append(f"  {value:<11.4g} {' '.join(self.layouts[i]):.80}{why}")
+        return lines
+
+
+def score_sensors(
+    plant: StandardPlant,
+    layouts: Sequence[Sequence[Any]],
+    criterion: Criterion | None = None,
+    *,
+    candidates: Sequence[Any] = (),
+    executor: Executor | None = None,
+    progress: bool | None = None,
+) -> Scores:
+    """Return the scores of layouts of sensors, each instead of the plant's own sensors.
+
+    Before any score the layout must see every rigid-body mode: one that does not would score best
+    by mistake. For `PoiVariance` only rows of C and R change, so that one layout takes about as
+    long as one Riccati equation by doubling; the best one is confirmed by `design_kalman`.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, assembled from a structure.
+    layouts : sequence of layouts
+        A layout is a sequence of `Sensor` values, or of names: of the plant's sensors, of
+        `candidates`, or of sensors in earlier layouts.
+    criterion : PoiVariance or callable, optional
+        From a plant to a float, smaller is better; `PoiVariance()` when not given.
+    candidates : sequence of Sensor
+        What names may stand for, besides the plant's own sensors.
+    executor : concurrent.futures.Executor, optional
+        Computes in chunks; the result is the same to the bit.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
+
+    Returns
+    -------
+    Scores
+        Sorted, the best first; infeasible layouts last, with the reason in words.
+
+    Raises
+    ------
+    ModelError
+        When the plant is not sampled or has no structure, a layout is empty or something is no
+        sensor.
+    LabelError
+        When a name or a place is unknown, or a sensor is twice in a layout.
+    AssumptionError
+        When the criterion has no meaning on this plant, whatever the sensors.
+    CertificateError
+        When the best layout's score is not confirmed by the other route.
+    """
+    return _scored(plant, "y", layouts, criterion, candidates, executor, progress)
+
+
+def score_actuators(
+    plant: StandardPlant,
+    layouts: Sequence[Sequence[Any]],
+    criterion: Criterion | None = None,
+    *,
+    candidates: Sequence[Any] = (),
+    executor: Executor | None = None,
+    progress: bool | None = None,
+) -> Scores:
+    """Return the scores of layouts of actuators, each instead of the plant's own actuators.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, assembled from a structure.
+    layouts : sequence of layouts
+        A layout is a sequence of `Actuator` values, or of names.
+    criterion : PoiLqr or callable, optional
+        From a plant to a float, smaller is better; `PoiLqr()` when not given.
+    candidates : sequence of Actuator
+        What names may stand for, besides the plant's own actuators.
+    executor : concurrent.futures.Executor, optional
+        Computes in chunks; the result is the same to the bit.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
+
+    Returns
+    -------
+    Scores
+        Sorted, the best first; layouts that leave a rigid-body mode alone are last, and say so.
+
+    Raises
+    ------
+    ModelError
+        When the plant is not sampled or has no structure, a layout is empty or something is no
+        actuator.
+    LabelError
+        When a name or a place is unknown, or an actuator is twice in a layout.
+    AssumptionError
+        When the criterion has no meaning on this plant, whatever the actuators.
+    CertificateError
+        When the best layout's score is not confirmed by the other route.
+    """
+    return _scored(plant, "u", layouts, criterion, candidates, executor, progress)
+
+
+def _scored(
+    plant: StandardPlant,
+    side: Side,
+    layouts: Sequence[Sequence[Any]],
+    criterion: Criterion | None,
+    candidates: Sequence[Any],
+    executor: Executor | None,
+    progress: bool | None,
+) -> Scores:
+    checked_plant(plant)
+    listed = [(layout,) if isinstance(layout, str) else tuple(layout) for layout in layouts]
+    if not listed or not all(listed):
+        raise ModelError("there is nothing to score: give at least one layout, none of them empty.")
+    known = known_candidates(plant, side, [*candidates, *(p for part in listed for p in part)])
+    names = [tuple(p if isinstance(p, str) else p.name for p in layout) for layout in listed]
+    for layout in names:
+        if len(set(layout)) != len(layout):
+            raise LabelError(f"the layout {layout} holds a name twice: each port is used once.")
+    used = {name for layout in names for name in layout}
+    ports = tuple(port for name, port in known.items() if name in used)
+    position = {port.name: i for i, port in enumerate(ports)}
+    scorer = scorer_of(plant, side, ports, criterion)
+    chosen = [tuple(position[name] for name in layout) for layout in names]
+    found = mapped(
+        Reasoned(scorer), chosen, executor=executor, progress=progress, description="layouts"
+    )
+    values = np.array([value for value, _ in found])
+    order = np.argsort(values, kind="stable")
+    confirmed(scorer, chosen[order[0]], float(values[order[0]]))
+    return Scores(
+        tuple(names[i] for i in order),
+        values[order],
+        tuple(found[i][1] for i in order),
+        order,
+        repr(scorer.criterion),
+        ports,
+        side,
+    )

@@ -1,0 +1,133 @@
+"""Where one more sensor helps most: a score at every point."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError
+from ..parallel import mapped
+from ..plant import Sensor, StandardPlant
+from ..plant.ports import Quantity
+from ..values import FloatArray, Value, positive, real_array
+from .candidates import Criterion, checked_plant, confirmed, require_any, scorer_of
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class SensorMap(Value):
+    """The score with one more sensor at each of many points.
+
+    Parameters
+    ----------
+    points : (n, 3) array [m]
+        Where the sensor was tried.
+    values : (n,) array
+        Scores, infinite where even with it a rigid-body mode is missed.
+    without : float
+        The score of the plant's own sensors alone (infinite when they do not suffice).
+    criterion : str
+        What was scored.
+    """
+
+    points: FloatArray
+    values: FloatArray
+    without: float
+    criterion: str
+
+    def __post_init__(self) -> None:
+        self._set(points=self.points, values=self.values)
+
+    def __repr__(self) -> str:
+        x, y, z = self.best
+        return (
+            f"<SensorMap of {self.values.size} points by {self.criterion}: {self.without:.4g} "
+            f"without, {self.values.min():.4g} with a sensor at ({x:.4g}, {y:.4g}, {z:.4g}) m>"
+        )
+
+    @property
+    def best(self) -> FloatArray:
+        """The point (3,) where the sensor helps most."""
+        return np.array(self.points[int(np.argmin(self.values))])
+
+    @property
+    def ratio(self) -> FloatArray:
+        """Score with the sensor over score without it (n,): 1 where it is of no use."""
+        if not np.isfinite(self.without):
+            return np.where(np.isfinite(self.values), 0.0, 1.0)
+        return np.asarray(self.values / self.without)
+
+
+def sensor_map(
+    plant: StandardPlant,
+    points: npt.ArrayLike,
+    criterion: Criterion | None = None,
+    *,
+    asd: float,
+    direction: str = "z",
+    quantity: Quantity = "displacement",
+    executor: Executor | None = None,
+    progress: bool | None = None,
+) -> SensorMap:
+    """Return how much one more sensor would help at each of many points.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, assembled from a structure; its own sensors stay.
+    points : (n, 3) array [m]
+        On the structure.
+    criterion : PoiVariance or callable, optional
+        From a plant to a float, smaller is better; `PoiVariance()` when not given.
+    asd : float [m/sqrt(Hz), ...]
+        Noise of the new sensor, as in `Sensor`.
+    direction : str
+        What it measures at the point.
+    quantity : {"displacement", "velocity", "acceleration"}
+        What it measures.
+    executor : concurrent.futures.Executor, optional
+        Computes in chunks; the result is the same to the bit.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
+
+    Returns
+    -------
+    SensorMap
+        In the order of the points.
+
+    Raises
+    ------
+    ModelError
+        When the plant is not sampled or has no structure, or there is no point.
+    ShapeError
+        When the points are not (n, 3).
+    LabelError
+        When a point is off the structure or the direction is unknown.
+    AssumptionError
+        When even a sensor at every point misses a rigid-body mode, which is named.
+    CertificateError
+        When the best score is not confirmed by the other route.
+    """
+    checked_plant(plant)
+    places = real_array(points, "points", (None, 3))
+    if not places.size:
+        raise ModelError("there is no point to try: give at least one.")
+    noise = positive(asd, "asd", zero=True)
+    own = plant.ports.y if plant.ports is not None else ()
+    taken = {sensor.name for sensor in own}
+    prefix = next(p for p in ("extra", "extra_", "extra__", "extra___") if f"{p}1" not in taken)
+    tried = [
+        Sensor(f"{prefix}{i}", at=place, direction=direction, quantity=quantity, asd=noise)
+        for i, place in enumerate(places, 1)
+    ]
+    scorer = scorer_of(plant, "y", (*own, *tried), criterion)
+    require_any(scorer)
+    base = tuple(range(len(own)))
+    sets = [base, *((*base, len(own) + i) for i in range(len(tried)))]
+    found = mapped(scorer, sets, executor=executor, progress=progress, description="points")
+    values = np.array([value for value, _ in found])
+    best = 1 + int(np.argmin(values[1:]))
+    confirmed(scorer, sets[best], float(values[best]))
+    return SensorMap(places, values[1:], float(values[0]), repr(scorer.criterion))
