@@ -2,6 +2,7 @@
 
 from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity
+from .placement import sensor_map as sensor_map
 from .response import response as response
 from .structure import layout as layout
 from .structure import mode_shape as mode_shape

@@ -51,7 +51,7 @@ def frf(
 def sensitivity(
     curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None
 ) -> Axes:
-    """Draw the largest singular value of sensitivities over frequency, with 0 and 6 dB.
+    """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
 
     Parameters
     ----------
@@ -70,4 +70,4 @@ def sensitivity(
     for level, style in ((0.0, "-"), (6.0, "--")):
         ax.axhline(level, color="0.4", linestyle=style, linewidth=0.8)
     ax.legend(frameon=False)
-    return finish(ax, x="frequency [Hz]", y="largest singular value of S [dB]")
+    return finish(ax, x="frequency [Hz]", y="|S| [dB]")

@@ -19,6 +19,8 @@ def response(
     channels: Sequence[str] | None = None,
     *,
     unit: str = "m",
+    label: str | None = None,
+    color: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw channels of a run over time; of several runs the first.
@@ -31,6 +33,10 @@ def response(
         Which; the errors (or else the first channel) when not given.
     unit : str
         SI unit of the channels; a prefix is chosen.
+    label : str, optional
+        Put before the channels' names, to compare runs in one axes.
+    color : str, optional
+        Of the lines; a cycle when not given.
     ax : Axes, optional
         Where to draw.
 
@@ -53,6 +59,12 @@ def response(
     size = max(float(np.max(np.abs(signal))) for signal in signals)
     factor, prefix = next((s for s in SCALES if size < 1e3 * s[0]), SCALES[-1])
     for i, (name, signal) in enumerate(zip(names, signals, strict=True)):
-        ax.plot(run.time, signal / factor, color=CYCLE[i % len(CYCLE)], label=name, linewidth=0.8)
+        ax.plot(
+            run.time,
+            signal / factor,
+            color=color or CYCLE[i % len(CYCLE)],
+            label=name if label is None else f"{label}: {name}",
+            linewidth=0.8,
+        )
     ax.legend(frameon=False, loc="upper right")
     return finish(ax, x="time [s]", y=f"[{prefix}{unit}]")

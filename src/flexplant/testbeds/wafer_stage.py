@@ -214,6 +214,7 @@ class WaferStage(Value):
             raise ModelError(f"an FRF needs actuators and sensors, got {ports!r}.")
         random = np.random.default_rng(rng)
         count, samples = len(ports.u), round(positive(period, "period") * self.rate)
+        _check_multisine(samples, periods, discard)
         shakers = [f"{port.name}:excitation" for port in ports.u]
         own = Ports(
             w=[
@@ -262,6 +263,16 @@ def _holding(ports: Ports, rate: float, delay: int) -> tuple[Any, ...]:
     drawing = kirchhoff_plate(elements=(4, 4), **DRAWING).with_damping(ModalDamping(0.01))
     plant = assemble_plant(drawing, ports).discretized(rate, delay=delay)
     return design_static(plant), design_servo(plant, bandwidth=8.0, rolloff=40.0)
+
+
+def _check_multisine(samples: int, periods: int, discard: int) -> None:
+    if samples < 4:
+        raise ModelError(
+            f"a period of {samples} samples has no frequencies to measure at. Lengthen period."
+        )
+    for name, number, least in (("periods", periods, 1), ("discard", discard, 0)):
+        if not isinstance(number, int | np.integer) or number < least:
+            raise ModelError(f"{name} must be a whole number, {least} or more, got {number!r}.")
 
 
 def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:

@@ -1,0 +1,44 @@
+"""Pictures of placement."""
+
+from __future__ import annotations
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..placement import SensorMap
+from ..plant import Ports
+from ._axes import MEASURED, UPDATED, axes, finish
+
+
+def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
+    """Draw where one more sensor helps, seen from above.
+
+    Parameters
+    ----------
+    found : SensorMap
+        From `flexplant.sensor_map`.
+    ports : Ports, optional
+        Sensors that are there already, where their places are points.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        Filled contours of the square root of the score's ratio: the error with the sensor over
+        the error without it.
+    """
+    ax = axes(ax, figsize=(6.4, 5.4))
+    ratio = np.sqrt(found.ratio)
+    x, y = found.points[:, 0], found.points[:, 1]
+    contours = ax.tricontourf(x, y, ratio, levels=20, cmap="viridis_r")
+    ax.figure.colorbar(contours, ax=ax, label="POI error with / without a further sensor [1]")
+    ax.plot(x, y, ".", color="white", markersize=1.5)
+    there = [port.at for port in ports.y if isinstance(port.at, tuple)] if ports else []
+    if there:
+        points = np.array(there)
+        ax.plot(points[:, 0], points[:, 1], "P", color=MEASURED, label="sensors", clip_on=False)
+    ax.plot(*found.best[:2], "*", color=UPDATED, markersize=14, label="best place", clip_on=False)
+    ax.set_aspect("equal")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
+    return finish(ax, x="x [m]", y="y [m]")
