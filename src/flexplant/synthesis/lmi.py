@@ -1,0 +1,174 @@
+"""H-infinity synthesis by linear matrix inequalities: no assumption on the ranks of D12 and D21."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import FlexplantError, InfeasibleError, ModelError, SolverError
+from ..lti.interconnection import lft
+from ..lti.norms import peak_gain
+from ..lti.preparation import Prepared
+from ..lti.statespace import StateSpace
+from ..values import Value, positive
+from .lmi_programs import (
+    Matrices,
+    Optimum,
+    Plant,
+    lqg_states,
+    moderate_controller,
+    same_states,
+    smallest_gamma,
+    unit_channels,
+)
+
+if TYPE_CHECKING:
+    from .hinf import Solved
+
+#: gap between value and lower bound at which no other coordinates are tried
+_GAP = 5e-4
+#: what a closed loop may exceed its target by
+_EXCESS = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Lmi(Value):
+    """Synthesis by linear matrix inequalities (LMIs), solved by Clarabel through cvxpy.
+
+    Needs a stabilising controller to exist and nothing else: efforts without weight, sensors
+    without noise and modes on the stability boundary are allowed. Suits small plants: the time
+    grows with the sixth power of the number of states, about 10 s at 24.
+
+    Parameters
+    ----------
+    back_off : float
+        Relative distance of the target from the smallest gamma, at which the controller's gains
+        may be infinite.
+    tolerance : float
+        Of the solver: gap and residuals, relative.
+    max_states : int
+        Larger problems are refused.
+    time_limit : float [s]
+        For each of the few semidefinite programs.
+
+    Raises
+    ------
+    ModelError
+        When a value is not positive.
+
+    References
+    ----------
+    Gahinet, Apkarian, A linear matrix inequality approach to H-infinity control, Int. J. Robust
+    Nonlinear Control 4, 1994 (the smallest gamma). Scherer, Gahinet, Chilali, Multiobjective
+    output-feedback control via LMI optimization, IEEE Trans. Autom. Control 42, 1997 (the
+    controller, section IV; its Â is eliminated here).
+    """
+
+    back_off: float = 0.05
+    tolerance: float = 1e-9
+    max_states: int = 30
+    time_limit: float = 60.0
+
+    def __post_init__(self) -> None:
+        self._set(
+            back_off=positive(self.back_off, "back_off"),
+            tolerance=positive(self.tolerance, "tolerance"),
+            max_states=int(positive(self.max_states, "max_states")),
+            time_limit=positive(self.time_limit, "time_limit"),
+        )
+
+    def solve(self, problem: Prepared) -> Solved:
+        """Return the controller of a prepared problem.
+
+        `lower` is a bound by weak duality from multipliers repaired to satisfy their equations;
+        it holds for all controllers whose Lyapunov matrices are no larger than those found.
+
+        Raises
+        ------
+        ModelError
+            When the problem has no states, or more than max_states.
+        InfeasibleError
+            When the solver proves that no stabilising controller exists.
+        SolverError
+            When the solver stops early, or no controller keeps what the LMIs promise.
+        """
+        from .hinf import Solved
+
+        n = problem.A.shape[0]
+        if not 0 < n <= self.max_states:
+            raise ModelError(
+                f"Lmi takes plants of 1 to {self.max_states} states, got {n}: time grows as n^6. "
+                "Reduce the order first, use Riccati(), or raise Lmi(max_states=...)."
+            )
+        plant, u_size, y_size = unit_channels(problem)
+        found = self._smallest(plant)
+        failures = []
+        for back_off in (self.back_off, 2 * self.back_off):
+            try:
+                K = moderate_controller(found.plant, 1.0 + back_off, self._settings)
+                K = (K[0], K[1] / y_size, K[2] / u_size[:, None], K[3] / y_size / u_size[:, None])
+                norm = _verified(problem, K, found.value * (1.0 + back_off))
+            except (FlexplantError, la.LinAlgError) as error:
+                failures.append(f"{100 * back_off:.3g} % above it: {error}")
+                continue
+            return Solved(*K, norm, min(found.lower, norm))
+        raise SolverError(
+            f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
+            + " ".join(failures)
+            + " Loosen weights, add a little noise to each sensor, or raise Lmi(back_off=...)."
+        )
+
+    @property
+    def _settings(self) -> dict[str, float]:
+        return {
+            "tol_gap_abs": self.tolerance,
+            "tol_gap_rel": self.tolerance,
+            "tol_feas": self.tolerance,
+            "time_limit": self.time_limit,
+        }
+
+    def _smallest(self, plant: Plant) -> Optimum:
+        """Return the smallest gamma, from several choices of states until its bound is close."""
+        found: list[Optimum] = []
+        failures: list[FlexplantError] = []
+        guess = plant.size()
+        for start in (lqg_states, same_states):
+            try:
+                states = start(plant)
+                for _ in range(2):
+                    scale = found[-1].value if found else guess
+                    found.append(smallest_gamma(states.scaled(scale), scale, self._settings))
+                    best = min(found, key=lambda one: one.value - one.lower)
+                    if best.value - best.lower <= _GAP * best.value:
+                        return best
+                    states = found[-1].plant.scaled(1.0 / found[-1].value)
+            except (SolverError, InfeasibleError) as error:
+                failures.append(error)
+        if not found:
+            # a proof of infeasibility says more than a solver that stopped
+            raise min(failures, key=lambda error: not isinstance(error, InfeasibleError))
+        best = min(found, key=lambda one: one.value - one.lower)
+        return best._replace(lower=min(max(one.lower for one in found), best.value))
+
+
+def _verified(problem: Prepared, K: Matrices, target: float) -> float:
+    """Return the norm of the closed loop of a controller, computed anew.
+
+    Raises
+    ------
+    SolverError
+        When the loop is unstable or misses the target.
+    """
+    A, B, C, D = K
+    loop = lft(problem.system, StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u))
+    if not loop.is_stable:
+        raise SolverError(
+            f"its closed loop is unstable (largest real part {np.max(loop.poles().real):.3g})."
+        )
+    norm, _ = peak_gain(loop)
+    if not norm <= target * (1.0 + _EXCESS):
+        raise SolverError(f"its closed loop has the norm {norm:.6g}, not {target:.6g}.")
+    return norm
