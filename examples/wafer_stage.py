@@ -458,12 +458,14 @@ def draw_loops(both: dict[str, Any]) -> None:
     for (name, loop), color in zip(both.items(), ("tab:blue", "tab:red"), strict=True):
         fx.plot.response(loop["run"], ["die:error"], label=name, color=color, ax=left)
     left.set_title("error at the POI, on the virtual machine, through a 100 um move")
-    curves = {
-        f"{name}, {where}": sensitivity(loop[where])
-        for name, loop in both.items()
-        for where in ("on model", "on machine")
-    }
-    fx.plot.sensitivity(curves, ax=right)
+    shades = {"servo": ("tab:blue", "navy"), "H-infinity": ("tab:red", "darkred")}
+    curves, colors = {}, {}
+    for name, loop in both.items():
+        for where, color in zip(("on model", "on machine"), shades[name], strict=True):
+            curves[f"{name}, {where}"] = sensitivity(loop[where])
+            colors[f"{name}, {where}"] = color
+    dashed = [label for label in curves if label.endswith("machine")]
+    fx.plot.sensitivity(curves, colors=colors, dashed=dashed, ax=right)
     right.set_title("sensitivity, die:ref to die:error")
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from ..lti.frequency import Frf
+from ..values import FloatArray
 from ._axes import CYCLE, axes, finish
 
 
@@ -49,7 +50,11 @@ def frf(
 
 
 def sensitivity(
-    curves: Mapping[str, tuple[np.ndarray, np.ndarray]], *, ax: Axes | None = None
+    curves: Mapping[str, tuple[FloatArray, FloatArray]],
+    *,
+    colors: Mapping[str, str] | None = None,
+    dashed: Collection[str] = (),
+    ax: Axes | None = None,
 ) -> Axes:
     """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
 
@@ -57,6 +62,10 @@ def sensitivity(
     ----------
     curves : mapping {label: (freq [Hz], size)}
         What to compare.
+    colors : mapping {label: color}, optional
+        Of some lines.
+    dashed : collection of str
+        Labels of lines to dash, so that equal ones show.
     ax : Axes, optional
         Where to draw.
 
@@ -66,8 +75,10 @@ def sensitivity(
     """
     ax = axes(ax, figsize=(8.0, 4.5))
     for i, (label, (freq, size)) in enumerate(curves.items()):
-        ax.semilogx(freq, 20.0 * np.log10(size), color=CYCLE[i % len(CYCLE)], label=label)
-    for level, style in ((0.0, "-"), (6.0, "--")):
+        color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
+        style = "--" if label in dashed else "-"
+        ax.semilogx(freq, 20.0 * np.log10(size), style, color=color, label=label)
+    for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color="0.4", linestyle=style, linewidth=0.8)
     ax.legend(frameon=False)
     return finish(ax, x="frequency [Hz]", y="|S| [dB]")
