@@ -91,7 +91,7 @@ def test_bad_frequencies(bad):
         lambda: leadlag(10.0, bad),
         lambda: inverse_sensitivity(bad),
     ):
-        with pytest.raises((ModelError, ShapeError), match="must|has a NaN"):
+        with pytest.raises((ModelError, ShapeError), match=r"must|has a NaN"):
             make()
 
 

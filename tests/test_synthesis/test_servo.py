@@ -199,7 +199,7 @@ def test_what_it_is():
 @pytest.mark.parametrize("bad", [0.0, -1.0, np.nan, np.inf])
 def test_bad_frequencies(name, bad):
     options = {"bandwidth": 50.0} | {name: bad}
-    with pytest.raises(ModelError, match="must be positive|has a NaN|not well below"):
+    with pytest.raises(ModelError, match=r"must be positive|has a NaN|not well below"):
         design_servo(sampled(some_modes()), **options)
 
 

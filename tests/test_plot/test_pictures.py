@@ -1,0 +1,169 @@
+"""Pictures: what is drawn is what was given, and nothing is blank."""
+
+import io
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib import image
+
+import flexplant as fx
+from flexplant.errors import LabelError, ModelError
+from flexplant.lti import Frf
+from flexplant.simulation import Response
+from stages import CORNERS, INSET, Z8, L, fitted, ports, reduced, some_modes
+
+POLES = np.array([-28.569 + 2883.567j, -39.451 + 3983.308j])
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
+
+
+def ink(ax):
+    """Share of pixels that are not background."""
+    buffer = io.BytesIO()
+    ax.figure.savefig(buffer, format="png", dpi=50)
+    buffer.seek(0)
+    pixels = image.imread(buffer)[:, :, :3]
+    assert pixels.std() > 0.02
+    return float(np.mean(np.any(np.abs(pixels - pixels[0, 0]) > 0.02, axis=2)))
+
+
+def texts(ax):
+    return {text.get_text() for text in ax.texts} | {
+        text.get_text() for text in (ax.get_legend().get_texts() if ax.get_legend() else [])
+    }
+
+
+def some_frf(scale=1.0):
+    freq = np.geomspace(1.0, 1e3, 50)
+    data = scale / (1j * freq + 30.0)
+    return Frf(freq, data[None, None], inputs=["u1"], outputs=["y1"])
+
+
+def test_frf():
+    ax = fx.plot.frf({"one": some_frf(), "two": some_frf(10.0)}, "y1", "u1", unit="m/N")
+    first, second = ax.get_lines()
+    np.testing.assert_allclose(first.get_ydata(), 20 * np.log10(np.abs(some_frf()["y1", "u1"])))
+    np.testing.assert_allclose(second.get_ydata() - first.get_ydata(), 20.0)
+    assert texts(ax) == {"one", "two"}
+    assert "Hz" in ax.get_xlabel()
+    assert "1 m/N" in ax.get_ylabel()
+    assert ax.get_xscale() == "log"
+    assert 0.005 < ink(ax) < 0.6
+    ax = fx.plot.frf({"one": some_frf()}, "y1", "u1", colors={"one": "black"})
+    assert ax.get_lines()[0].get_color() == "black"
+    with pytest.raises(LabelError, match="y2"):
+        fx.plot.frf({"one": some_frf()}, "y2", "u1")
+
+
+def test_sensitivity():
+    freq = np.geomspace(1.0, 100.0, 20)
+    ax = fx.plot.sensitivity({"model": (freq, np.full(20, 10.0))})
+    np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), 20.0)
+    levels = {line.get_ydata()[0] for line in ax.get_lines()[1:]}
+    assert levels == {0.0, 6.0}
+    assert ink(ax) > 0.005
+
+
+def run_of(errors):
+    time = np.arange(50) * 1e-3
+    return Response(time, np.array(errors), ("die:z", "die:error"))
+
+
+@pytest.mark.parametrize(("size", "prefix"), [(3e-9, "n"), (4e-6, "u"), (5e-3, "m"), (20.0, "")])
+def test_response_chooses_a_prefix(size, prefix):
+    wave = size * np.sin(np.arange(50))
+    ax = fx.plot.response(run_of([wave, 0.5 * wave]))
+    factor = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "": 1.0}[prefix]
+    np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), 0.5 * wave / factor)
+    assert ax.get_ylabel() == f"[{prefix}m]"
+    assert texts(ax) == {"die:error"}
+    both = fx.plot.response(run_of([wave, wave]), ["die:z", "die:error"], unit="rad")
+    assert len(both.get_lines()) == 2
+    assert both.get_ylabel().endswith("rad]")
+    assert ink(ax) > 0.005
+
+
+def test_response_of_several_runs_and_of_unknown_channels():
+    wave = np.random.default_rng(0).standard_normal((3, 2, 50))
+    ax = fx.plot.response(run_of(wave))
+    np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), wave[0, 1])
+    with pytest.raises(LabelError, match="no channel 'dye'"):
+        fx.plot.response(run_of(wave), ["dye"])
+
+
+def test_layout_shows_every_port_where_it_is():
+    dofs = some_modes().dofs
+    z8 = dofs.nearest(Z8, "z")
+    ax = fx.plot.layout(dofs, ports=ports(), desired=[z8], marked={"here": z8})
+    lines = {line.get_label(): np.array(line.get_xydata()) for line in ax.get_lines()}
+    assert len(lines["nodes"]) == 81
+    np.testing.assert_allclose(lines["actuators u"], [p[:2] for p in INSET])
+    np.testing.assert_allclose(lines["sensors y"], [p[:2] for p in CORNERS])
+    np.testing.assert_allclose(lines["points of interest"], [[L / 2, L / 2]])
+    np.testing.assert_allclose(lines["1 desired DOFs"], [Z8[:2]])
+    assert {"u1", "y4", "die", "here"} <= texts(ax)
+    assert 0.005 < ink(ax) < 0.5
+    bare = fx.plot.layout(dofs)
+    assert [line.get_label() for line in bare.get_lines()] == ["nodes"]
+    with pytest.raises(LabelError, match="no DOF"):
+        fx.plot.layout(dofs, desired=["0:z"])
+
+
+@pytest.mark.parametrize("kind", ["full", "reduced", "complex"])
+def test_mode_shapes(kind):
+    modes = {
+        "full": some_modes,
+        "reduced": lambda: reduced().modes(),
+        "complex": lambda: fitted(reduced(), POLES).model.modes(),
+    }[kind]()
+    ax = fx.plot.mode_shape(modes, 4)
+    x, y, z = ax.get_lines()[0].get_data_3d()
+    assert np.abs(z).max() == pytest.approx(1.0)
+    # torsion: xy about the centre, zero on both centre lines
+    torsion = (x - L / 2) * (y - L / 2)
+    turned = np.corrcoef(np.asarray(z), torsion)[0, 1]
+    assert abs(turned) > 0.98
+    middle = np.isclose(x, L / 2) | np.isclose(y, L / 2)
+    assert np.abs(np.asarray(z)[middle]).max() < 1e-3
+    assert "mode 4, 245." in ax.get_title()
+    assert ink(ax) > 0.05
+    for bad in (0, modes.omega.size + 1):
+        with pytest.raises(ModelError, match=f"no mode {bad}: modes are numbered 1 to"):
+            fx.plot.mode_shape(modes, bad)
+
+
+def test_the_update():
+    fit = fitted(reduced(), POLES)
+    steps = len(fit.history) + 1
+    ax = fx.plot.residual(fit)
+    np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), fit.history.error)
+    assert ax.get_yscale() == "log"
+    assert ink(ax) > 0.005
+    ax = fx.plot.eigenvalues(fit, POLES)
+    lines = ax.get_lines()
+    assert len(lines) == 4
+    start = np.abs(fit.history.eigenvalues[0] - POLES)
+    np.testing.assert_allclose(lines[1].get_ydata()[0], start[0], rtol=0.01)
+    assert all(len(line.get_ydata()) == steps for line in lines)
+    drawn = fx.plot.parameters(fit, truth=dict(zip(fit.parameters, (0.5, 0.0), strict=True)))
+    assert len(drawn) == 2
+    np.testing.assert_allclose(drawn[0].get_lines()[0].get_ydata(), fit.history.parameters[:, 0])
+    assert drawn[0].get_lines()[1].get_ydata()[0] == 0.5
+    assert "[kg]" in drawn[0].get_ylabel()
+    assert ink(drawn[1]) > 0.005
+    axs = list(plt.subplots(2)[1])
+    assert fx.plot.parameters(fit, axs=axs) == axs
+
+
+def test_they_draw_where_they_are_told():
+    ax = plt.subplots()[1]
+    assert fx.plot.frf({"one": some_frf()}, "y1", "u1", ax=ax) is ax
+    assert fx.plot.layout(some_modes().dofs, ax=ax) is ax
+    wave = np.ones((2, 50))
+    assert fx.plot.response(run_of(wave), ax=ax) is ax
+    assert fx.plot.residual(fitted(reduced(), POLES), ax=ax) is ax

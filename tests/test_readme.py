@@ -1,0 +1,40 @@
+"""The README keeps its word: its commands are there, its code runs."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+COMMANDS = (
+    "python -m pip install -e . && python examples/wafer_stage.py",
+    "python -m pip install -e '.[test]' && python -m pytest",
+)
+
+pytestmark = pytest.mark.skipif(len(README) < 200, reason="the README is not written yet")
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_the_two_commands(command):
+    assert command in README.splitlines()
+    steps = (ROOT / ".ci" / "run").read_text(encoding="utf-8").splitlines()
+    assert command in steps
+
+
+def test_files_that_it_names_exist():
+    named = re.findall(r"(?:examples|tests|src)/[\w/.]+\w", README)
+    assert "examples/wafer_stage.py" in named
+    for path in named:
+        assert (ROOT / path).exists() or path.startswith("examples/out"), path
+
+
+@pytest.mark.slow
+def test_the_code_runs(tmp_path, monkeypatch):
+    """All python blocks, in order, in one namespace, as a reader would paste them."""
+    assert BLOCKS
+    monkeypatch.chdir(tmp_path)
+    names = {"__name__": "readme"}
+    for i, code in enumerate(BLOCKS, 1):
+        exec(compile(code, f"README block {i}", "exec"), names)
