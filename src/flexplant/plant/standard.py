@@ -17,6 +17,7 @@ from .realisation import ModalRealisation
 
 if TYPE_CHECKING:
     from .check import AssumptionReport
+    from .uncertainty import UncertainPlant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -345,6 +346,60 @@ class StandardPlant(Value):
             ports.poi(name)
         moved = [replace(p, at=places.get(p.name, p.at)) for p in ports.z]
         return self.with_ports(ports.replace(z=moved))
+
+    def uncertain(
+        self,
+        source: Any,
+        parameters: Any = None,
+        *,
+        modes: Sequence[int] | None = None,
+        deviations: float = 2.0,
+        neglected: Any = None,
+    ) -> UncertainPlant:
+        """Return the plant with the doubt of a fit opened as real Deltas on its modes.
+
+        The covariance of the parameters goes to the modes by the eigenvalue sensitivities,
+        ``J C J'``; each chosen mode's stiffness omega^2 and damping 2 zeta omega becomes a channel
+        `mode6:freq`, `mode6:damping` with ``|delta| <= 1`` at some standard deviations.
+
+        Parameters
+        ----------
+        source : UpdateResult or MeasuredModes
+            A fit whose `model` this plant was assembled from, or measured poles with mode numbers
+            and a covariance.
+        parameters : sequence of Parameter, optional
+            Those that were given to `update`, in its order; for a fit.
+        modes : sequence of int, optional
+            Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
+            given.
+        deviations : float
+            Standard deviations at which a delta is 1.
+        neglected : StandardPlant, FEModel, Modes or ReducedModel, optional
+            A larger model with the same u and y: the difference is bounded by an additive weight.
+
+        Returns
+        -------
+        UncertainPlant
+            `.system`, `.deltas`, `.lft(values)`, `.sample(rng, n)`.
+
+        Raises
+        ------
+        LabelError
+            When parameters are not those of the fit, or a mode is unknown.
+        ModelError
+            When there is no covariance, the fit is of another model, or the doubt covers negative
+            stiffness or damping.
+        """
+        from .uncertainty import uncertain
+
+        return uncertain(
+            self,
+            source,
+            parameters,
+            modes=modes,
+            deviations=deviations,
+            neglected=neglected,
+        )
 
     def to_control(self) -> Any:
         """Return the whole system as a `control.StateSpace` with the same names."""
