@@ -25,7 +25,7 @@ def test_variance_is_that_of_the_recursion(make, seed, axes):
     A, _, C, Q, R, rows = matrices(plant, named)
     rows = rows * np.array(list(named.values()))[:, None]
     expected = kalman_variance(A, C, Q, R, rows)
-    assert PoiVariance("die", axes)(plant) == pytest.approx(expected, rel=1e-8)
+    assert PoiVariance("die", axes)(plant) == pytest.approx(expected, rel=1e-8, abs=0.0)
 
 
 @pytest.mark.parametrize("delay", [0.0, 1.0, 2.0, 0.4, 1.6])
@@ -33,16 +33,16 @@ def test_cost_is_that_of_the_recursion(make, delay):
     plant, _, _ = make(3, delay=delay)
     A, B, _, W, _, rows = matrices(plant, ("z", "rx", "ry"))
     expected = lqr_cost(A, B, W, rows, 1e-8)
-    assert PoiLqr("die", effort=1e-8)(plant) == pytest.approx(expected, rel=1e-8)
+    assert PoiLqr("die", effort=1e-8)(plant) == pytest.approx(expected, rel=1e-8, abs=0.0)
 
 
 def test_a_factor_scales_a_rotation(make):
     plant, _, _ = make(1)
     assert PoiVariance("die", {"rx": 2.0})(plant) == pytest.approx(
-        4 * PoiVariance("die", "rx")(plant), rel=1e-12
+        4 * PoiVariance("die", "rx")(plant), rel=1e-12, abs=0.0
     )
     z, rx = (PoiVariance("die", axis)(plant) for axis in ("z", "rx"))
-    assert PoiVariance(axes=("z", "rx"))(plant) == pytest.approx(z + rx, rel=1e-12)
+    assert PoiVariance(axes=("z", "rx"))(plant) == pytest.approx(z + rx, rel=1e-12, abs=0.0)
 
 
 def test_refusals_name_the_motion(make):

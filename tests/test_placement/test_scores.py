@@ -46,7 +46,7 @@ def test_sensor_scores_are_those_of_the_recursion(make, seed):
             sampled.sensor_noise,
             rows,
         )
-        assert scores.values[rank] == pytest.approx(expected, rel=1e-8)
+        assert scores.values[rank] == pytest.approx(expected, rel=1e-8, abs=0.0)
         assert scores.layouts[rank] == tuple(s.name for s in layouts[given])
     assert np.all(np.diff(scores.values) >= 0)
     assert scores.best == tuple(s.name for s in sensors)  # more sensors are never worse
@@ -62,7 +62,7 @@ def test_actuator_scores_are_those_of_the_recursion(make, delay):
         sampled = plant.with_ports(plant.ports.replace(u=layouts[given]))
         rows = sampled.C1[:3] * np.array([1.0, 0.2, 0.1])[:, None]
         expected = lqr_cost(sampled.system.A, sampled.B2, sampled.process_noise, rows, 1e-9)
-        assert scores.values[rank] == pytest.approx(expected, rel=1e-7)
+        assert scores.values[rank] == pytest.approx(expected, rel=1e-7, abs=0.0)
 
 
 def test_velocity_sensors_count_too(make):
@@ -70,7 +70,7 @@ def test_velocity_sensors_count_too(make):
     moving = Sensor("v", at=sensors[5].at, quantity="velocity", asd=1e-9)
     scores = score_sensors(plant, [[*sensors[:3], moving], sensors[:3], [moving, *sensors[:2]]])
     direct = PoiVariance()(plant.with_ports(plant.ports.replace(y=[*sensors[:3], moving])))
-    assert scores.values[0] == pytest.approx(direct, rel=1e-9)
+    assert scores.values[0] == pytest.approx(direct, rel=1e-9, abs=0.0)
     assert scores.best == ("s0", "s1", "s2", "v")
     assert scores.values[1] > 1.0001 * scores.values[0]
     assert np.isinf(scores.values[2])  # a velocity does not see where a rigid body is
@@ -115,7 +115,7 @@ def test_names_stand_for_sensors(make):
     scores = score_sensors(plant, [("s0", "s4", "s5")], candidates=sensors)
     assert scores.best == ("s0", "s4", "s5")
     assert [s.name for s in scores.on(plant).ports.y] == ["s0", "s4", "s5"]
-    assert PoiVariance()(scores.on(plant)) == pytest.approx(scores.values[0], rel=1e-9)
+    assert PoiVariance()(scores.on(plant)) == pytest.approx(scores.values[0], rel=1e-9, abs=0.0)
 
 
 def test_any_callable_serves(make):
