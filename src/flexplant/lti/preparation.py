@@ -14,9 +14,13 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from ..errors import ModelError
 from ..values import FloatArray, Value
 from .discretisation import bilinear, tustin
 from .statespace import StateSpace
+
+#: a direction of D12 or D21 below this, beside columns of unit size, counts as missing
+_RANK = 1e-9
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,6 +76,25 @@ class Prepared(Value):
             outputs=[f"z{i}" for i in range(1, self.C1.shape[0] + 1)] + list(self.y),
         )
 
+    def measured_in(self, unit: float) -> Prepared:
+        """Return the problem with z in multiples of `unit`; u too, so that D12 is kept.
+
+        Its controller's C and D times `unit` are those of this problem.
+        """
+        return self.replace(
+            B2=unit * self.B2,
+            C1=self.C1 / unit,
+            D11=self.D11 / unit,
+            D22=unit * self.D22,
+            u_scale=unit * self.u_scale,
+        )
+
+    def frequency(self, omega: float) -> float:
+        """Return the frequency [Hz] of the original plant that a scaled one [1] stands for."""
+        if self.dt:
+            return float(np.arctan(0.5 * self.dt * self.speed * omega) / (np.pi * self.dt))
+        return self.speed * omega / (2.0 * np.pi)
+
     def restored(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> StateSpace:
         """Return the controller of the original plant from that of the scaled problem.
 
@@ -84,9 +107,20 @@ class Prepared(Value):
         -------
         StateSpace
             In the user's channels, units and sampling time; the states are the scaled ones.
+
+        Raises
+        ------
+        ModelError
+            When the loop of the controller and D22 is ill-posed.
         """
         # the plant's own D22 is subtracted: u = K (y - D22 u)
-        loop = np.linalg.inv(np.eye(D.shape[0]) + D @ self.D22)
+        inner = np.eye(D.shape[0]) + D @ self.D22
+        if np.linalg.cond(inner) > 1e12:
+            raise ModelError(
+                "the controller and the feedthrough from u to y (D22, as of accelerometers) make "
+                "an algebraic loop that has no solution. Give u a sample of delay or a low-pass."
+            )
+        loop = np.linalg.inv(inner)
         A, B, C, D = (
             A - B @ self.D22 @ loop @ C,
             B @ (np.eye(B.shape[1]) - self.D22 @ loop @ D),
@@ -119,19 +153,23 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
     ModelError
         When a sampled plant has a pole at z = -1.
     """
-    g = bilinear(P, 1.0 / P.dt) if P.dt else P
+    # balanced first: whether I + A can be inverted must not depend on the units of the states
+    A, B, C = _balanced(P.A, P.B, P.C, 1.0)
+    g = P.replace(A=A, B=B, C=C, blocks=None)
+    g = bilinear(g, 1.0 / P.dt) if P.dt else g
     speed = _speed(g.A)
     m1, p1 = len(g.inputs) - len(u), len(g.outputs) - len(y)
     root = np.sqrt(speed)
-    A, B, C = _balanced(g.A / speed, g.B / root, g.C / root)
+    A, B, C = g.A / speed, g.B / root, g.C / root
     D12, D21 = g.D[:p1, m1:], g.D[p1:, :m1]
-    z_turn, u_scale = _normalised(D12)
-    w_turn, y_scale_t = _normalised(D21.T)
+    z_turn, u_scale = _normalised(D12, np.linalg.norm(B[:, m1:], axis=0))
+    w_turn, y_scale_t = _normalised(D21.T, np.linalg.norm(C[p1:], axis=1))
     y_scale = y_scale_t.T
     A, B, C = _balanced(
         A,
         np.hstack([B[:, :m1] @ w_turn, B[:, m1:] @ u_scale]),
         np.vstack([z_turn.T @ C[:p1], y_scale @ C[p1:]]),
+        np.exp(1j),
     )
     return Prepared(
         A,
@@ -159,50 +197,50 @@ def _speed(A: FloatArray) -> float:
     return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0
 
 
-def _normalised(D: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank.
 
-    Columns that D does not see (rank-deficient) are only turned, with unit scale.
+    Columns are brought to unit size first, so that rank does not depend on their units; those
+    that are zero in D to unit `reach` (of B2, or C2). Directions that D does not see
+    (rank-deficient) are only turned.
     """
     m = D.shape[1]
-    left, values, right = la.svd(D, full_matrices=True)
+    columns = np.linalg.norm(D, axis=0)
+    columns = np.where(columns > 0, columns, np.where(reach > 0, reach, 1.0))
+    left, values, right = la.svd(D / columns, full_matrices=True)
     sizes = np.zeros(m)
     sizes[: values.size] = values
-    rank = int(np.count_nonzero(sizes > 1e-10 * max(float(np.max(sizes, initial=0.0)), 1e-300)))
+    rank = int(np.count_nonzero(sizes > _RANK))
     # columns of Z: what D does not reach first, then what it does
     Z = np.hstack([left[:, rank:], left[:, :rank]])
-    S = right.T @ np.diag(np.where(np.arange(m) < rank, 1.0 / np.where(sizes > 0, sizes, 1.0), 1.0))
-    return Z, S
+    S = right.T @ np.diag(1.0 / np.where(np.arange(m) < rank, sizes, 1.0))
+    return Z, S / columns[:, None]
 
 
 def _balanced(
-    A: FloatArray, B: FloatArray, C: FloatArray
+    A: FloatArray, B: FloatArray, C: FloatArray, s: complex
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return the system in states scaled (by powers of two) so that rows and columns match.
 
-    Each state's row of [A, B] and column of [A; C] get equal norms, in turn, as in Osborne's
-    balancing; B and C count as a whole, at the size of A.
+    Osborne's balancing of A bordered by the sizes of the rows of B and of the columns of C; the
+    border counts as much as it takes to give ``C (s I - A)^-1 B`` unit size, which no scaling of
+    states or channels changes.
     """
     n = A.shape[0]
-    scale = np.ones(n)
-    size_B, size_C = (max(float(np.linalg.norm(X)), 1e-300) for X in (B, C))
-    size_A = max(float(np.linalg.norm(A)), 1e-300)
-    weight = size_A / np.sqrt(size_B * size_C)
-    B_, C_ = weight * B * np.sqrt(size_C / size_B), weight * C * np.sqrt(size_B / size_C)
-    off = A - np.diag(np.diag(A))
-    for _ in range(60):
-        changed = False
-        for i in range(n):
-            row = np.linalg.norm(np.concatenate([off[i] * scale / scale[i], B_[i] / scale[i]]))
-            column = np.linalg.norm(
-                np.concatenate([off[:, i] / scale * scale[i], C_[:, i] * scale[i]])
-            )
-            if row == 0.0 or column == 0.0:
-                continue
-            factor = 2.0 ** np.round(0.5 * np.log2(row / column))
-            if factor != 1.0:
-                scale[i] *= factor
-                changed = True
-        if not changed:
-            break
-    return A * scale[None, :] / scale[:, None], B / scale[:, None], C * scale[None, :]
+    if not n:
+        return A, B, C
+    scale = la.matrix_balance(A, permute=False, separate=True)[1][0]
+    for _ in range(2):  # the border is weighed anew once the states have sizes alike
+        A_, B_, C_ = A * scale / scale[:, None], B / scale[:, None], C * scale
+        try:
+            gain = float(np.linalg.norm(C_ @ np.linalg.solve(s * np.eye(n) - A_, B_)))
+        except np.linalg.LinAlgError:  # a pole at s: any weight will do
+            gain = 1.0
+        weight = 1.0 / np.sqrt(gain) if 0.0 < gain < np.inf else 1.0
+        bordered = np.zeros((n + 1, n + 1))
+        bordered[:n, :n] = A_
+        bordered[:n, n] = weight * np.linalg.norm(B_, axis=1)
+        bordered[n, :n] = weight * np.linalg.norm(C_, axis=0)
+        found = la.matrix_balance(bordered, permute=False, separate=True)[1][0]
+        scale = scale * (found[:n] / found[n])
+    return A * scale / scale[:, None], B / scale[:, None], C * scale

@@ -79,7 +79,7 @@ def swept_norm(loop: StateSpace) -> float:
     freq = np.concatenate([[0.0], np.geomspace(min(low, 0.5 * high), high, 600), near])
     freq = np.unique(freq[(freq >= 0) & (freq <= nyquist)])
     best = float(np.linalg.norm(loop.D, 2)) if not loop.dt and loop.D.size else 0.0
-    for _ in range(6):
+    for _ in range(3):
         gains = _largest(loop, freq)
         peak = int(np.argmax(gains))
         best = max(best, float(gains[peak]))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple, Protocol
 
+import numpy as np
+
 from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
@@ -65,7 +67,7 @@ def design_hinf(
     ------
     AssumptionError
         When an assumption of the method fails; the message says which, in physical words.
-    InfeasibleError
+    InfeasibleError, SolverError
         When no stabilising controller was found.
     CertificateError
         When the closed loop does not keep the promise.
@@ -87,8 +89,10 @@ def design_hinf(
     method = Riccati() if method is None else method
     if not plant.w or not plant.z or not plant.u or not plant.y:
         raise AssumptionError(f"H-infinity synthesis needs channels w, z, u and y, got {plant!r}.")
-    plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
+    if plant.realisation is not None:  # it can name the rigid-body motion that is missed
+        plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
+    _require_reach(problem)
     found = method.solve(problem)
     controller = problem.restored(found.A, found.B, found.C, found.D).replace(name="hinf")
     certificate = certified_norm(plant.system, controller, found.gamma)
@@ -99,3 +103,29 @@ def design_hinf(
         lower=found.lower,
         certificate=certificate,
     )
+
+
+def _require_reach(problem: Prepared) -> None:
+    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable.
+
+    Weights included. Hautus' rank test in the prepared coordinates, whatever the user's units.
+    """
+    A = problem.A
+    poles = np.linalg.eigvals(A)
+    size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, 1e-300)
+    # the poles of a chain of integrators come out of rounding as a ring around zero
+    poles = np.where(np.abs(poles) < 1e-6 * size, 0.0, poles)
+    for pole in poles[poles.real > -1e-10 * size]:
+        for matrix, gain, text in (
+            (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
+            (A.T, problem.C2.T, f"y ({', '.join(problem.y)}) does not see"),
+        ):
+            reach = size * gain / max(float(np.linalg.norm(gain, 2)), 1e-300)
+            pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
+            if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-12 * size:
+                raise AssumptionError(
+                    f"{text} a mode at {problem.frequency(abs(float(pole.imag))):.3g} Hz that is "
+                    "not stable, of the plant or of a weight (an integrator in a weight is one): "
+                    "no controller can stabilise it. Add or move an actuator or a sensor, or give "
+                    "the weight finite gain."
+                )

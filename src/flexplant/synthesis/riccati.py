@@ -3,32 +3,40 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantError, InfeasibleError
+from ..errors import AssumptionError, FlexplantError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
+from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive
+from .central import OnAxisError, central, quadratic, riccati_solutions
 
 if TYPE_CHECKING:
     from .hinf import Solved
 
-#: steps of the search for a feasible gamma, and of the bisection after it
-_GROWTH, _BISECTION = 30, 40
+#: steps of the bisection, and of going up from its result
+_BISECTION, _GROWTH = 60, 12
+#: a norm beside that of the least quadratic cost at which nothing is left to gain
+_NOTHING = 1e-9
+#: relative: by how much rounding may put a gain above its gamma; what is nothing but rounding
+_SLACK, _ROUNDING = 1e-6, 1e-14
 
 
 @dataclass(frozen=True, eq=False)
 class Riccati(Value):
     """Synthesis by the two Riccati equations of Glover and Doyle, gamma by bounded bisection.
 
-    A gamma counts as reached only when the closed loop that it gives is stable and has a norm
-    below it, computed anew. The controller is then taken back_off above the smallest one: at the
-    optimum it is fast and badly conditioned, and gains nothing.
+    The search begins at the norm of the loop with least quadratic cost, which exists whenever any
+    controller does. A gamma counts as reached only by the closed loop that it gives: stable, its
+    gains below gamma. The controller is taken back_off above the smallest one (at the optimum it
+    is fast and badly conditioned, and gains nothing) when the exact norm of its loop holds. The
+    lower bound is the largest gamma that was refuted, not the largest that failed.
 
     Parameters
     ----------
@@ -58,42 +66,69 @@ class Riccati(Value):
         Raises
         ------
         AssumptionError
-            When D12 or D21 has not full rank.
-        InfeasibleError
-            When no gamma up to a very large one is reached.
+            When D12 or D21 has not full rank, or z or w misses a mode on the stability boundary.
+        SolverError
+            When the plant is too badly conditioned to be stabilised in rounding.
         """
         from .hinf import Solved
 
         _require_full_rank(problem)
-        scale = _open_size(problem)
-        high, best = self._reachable(problem, scale)
-        low = _direct_bound(problem)
-        low = min(low, high)
-        for _ in range(_BISECTION):
-            if high <= low * (1.0 + self.tolerance) or high < 1e-9 * scale:
-                break
-            middle = np.sqrt(max(low, 1e-3 * high) * high)
-            attempt = _attempt(problem, middle)
-            if attempt is None:
-                low = middle
-            else:
-                high, best = min(middle, attempt[1]), attempt
-        backed_off = _attempt(problem, high * (1.0 + self.back_off))
-        controller, norm = best if backed_off is None else backed_off
-        return Solved(controller.A, controller.B, controller.C, controller.D, norm, float(low))
-
-    def _reachable(self, problem: Prepared, start: float) -> tuple[float, tuple[StateSpace, float]]:
-        """Return a gamma that is reached, growing it from the size of the open plant."""
-        gamma = start
-        for _ in range(_GROWTH):
-            attempt = _attempt(problem, gamma)
-            if attempt is not None:
-                return min(gamma, attempt[1]), attempt
-            gamma *= 4.0
-        raise InfeasibleError(
-            f"no stabilising controller with a norm below {gamma:.3g} was found. Check that u "
-            "reaches and y sees every unstable mode, and that no weight has a pole on the axis."
+        # the least quadratic cost stabilises: its norm is where the search for less begins
+        least = quadratic(problem)
+        unit = _seen(problem, least)
+        if not np.isfinite(unit):
+            raise SolverError(
+                "the controller of least quadratic cost does not stabilise in rounding: the plant "
+                "is too badly conditioned. Bring its weights closer together, or leave out states "
+                "that u hardly reaches or y hardly sees."
+            )
+        if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
+            return Solved(least.A, least.B, least.C, least.D, 0.0, 0.0)
+        scaled = problem.measured_in(unit)
+        high, low = self._searched(scaled)
+        controller, norm = self._accepted(scaled, high)
+        if controller is None:  # nothing below it holds
+            controller = least.replace(C=least.C / unit)
+            norm = _norm(scaled, controller)
+        return Solved(
+            controller.A,
+            controller.B,
+            unit * controller.C,
+            unit * controller.D,
+            unit * norm,
+            unit * min(low, norm),
         )
+
+    def _searched(self, problem: Prepared) -> tuple[float, float]:
+        """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
+        high = 1.0
+        low = tried = min(_direct_bound(problem), high)
+        for _ in range(_BISECTION):
+            if high <= tried * (1.0 + self.tolerance) or high < _NOTHING:
+                break
+            middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
+            attempt = _attempt(problem, middle)
+            K = attempt.controller
+            if K is not None and _seen(problem, K) <= middle * (1.0 + _SLACK):
+                high = middle
+                continue
+            tried = middle
+            if attempt.refuted:
+                low = middle
+        return high, low
+
+    def _accepted(self, problem: Prepared, high: float) -> tuple[StateSpace | None, float]:
+        """Return the backed-off controller with the norm of its loop, going up until it holds."""
+        step = self.back_off
+        for _ in range(_GROWTH):
+            gamma = high * (1.0 + step)
+            controller = _attempt(problem, gamma).controller
+            if controller is not None:
+                norm = _norm(problem, controller)
+                if norm <= gamma * (1.0 + _SLACK):
+                    return controller, norm
+            step = max(2.0 * step, self.tolerance)
+        return None, 1.0
 
 
 def _require_full_rank(problem: Prepared) -> None:
@@ -111,10 +146,10 @@ def _require_full_rank(problem: Prepared) -> None:
 
 
 def _open_size(problem: Prepared) -> float:
-    """Return a gamma to begin with: the size of the problem's gains at its own speed."""
-    gain = problem.system.evaluated(1j)
-    m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
-    return max(float(np.linalg.norm(gain[:p1, :m1], 2)), 1.0)
+    """Return the size of the way from w to z: a norm far below it is rounding."""
+    inner = float(np.linalg.norm(problem.A)) or 1.0
+    way = float(np.linalg.norm(problem.C1) * np.linalg.norm(problem.B1)) / inner
+    return way + float(np.linalg.norm(problem.D11))
 
 
 def _direct_bound(problem: Prepared) -> float:
@@ -126,74 +161,72 @@ def _direct_bound(problem: Prepared) -> float:
     return max(sizes)
 
 
-def _attempt(problem: Prepared, gamma: float) -> tuple[StateSpace, float] | None:
-    """Return the central controller for gamma and its true norm, or None when not reached."""
+def _bound_at(problem: Prepared, omega: float) -> float:
+    """Return what no controller undercuts at one frequency: u cannot act on, y does not tell."""
+    m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     try:
-        controller = _central(problem, gamma)
+        P = problem.system.evaluated(1j * omega)
+    except la.LinAlgError:  # an undamped pole lies there
+        return 0.0
+    out_of_reach = la.svd(P[:p1, m1:])[0][:, P.shape[1] - m1 :]
+    unseen = la.svd(P[p1:, :m1])[2].conj().T[:, P.shape[0] - p1 :]
+    parts = (out_of_reach.conj().T @ P[:p1, :m1], P[:p1, :m1] @ unseen)
+    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
+
+
+def _norm(problem: Prepared, controller: StateSpace) -> float:
+    return peak_gain(lft(problem.system, controller))[0]
+
+
+def _seen(problem: Prepared, controller: StateSpace) -> float:
+    """Return the largest gain of the loop at its resonances: quick, at most its norm."""
+    try:
         loop = lft(problem.system, controller)
-        if not loop.is_stable:
-            return None
-        norm, _ = peak_gain(loop)
-    except (FlexplantError, la.LinAlgError, ValueError):
-        return None
-    return (controller, norm) if norm <= gamma * (1.0 + 1e-6) else None
+    except FlexplantError:
+        return np.inf
+    if not loop.is_stable:
+        return np.inf
+    poles = loop.poles()
+    freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)
+    gains = np.linalg.norm(responses(loop, freq).transpose(2, 0, 1), 2, axis=(1, 2))
+    return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
 
 
-def _central(p: Prepared, gamma: float) -> StateSpace:
-    """Return the central controller of Glover and Doyle for ||w -> z|| < gamma.
+class _Attempt(NamedTuple):
+    """The central controller for a gamma; without one: whether gamma is refuted for good."""
 
-    Their normalisation is D12 = [0; I], D21 = [0, I]; D11 is partitioned accordingly.
+    controller: StateSpace | None
+    refuted: bool = False
 
-    Raises
-    ------
-    InfeasibleError, LinAlgError
-        When gamma is so small that a Riccati equation or a factor does not exist. Their further
-        conditions (X, Y >= 0, rho(X Y) < gamma^2) are left to the closed loop, which is stable
-        with a norm below gamma only when they hold.
+
+def _attempt(problem: Prepared, gamma: float) -> _Attempt:
+    """Return the central controller for gamma, or why there is none.
+
+    Refuted means proved, not that the numerics failed: at some frequency what u cannot act on or y
+    does not tell exceeds gamma; or an accurate stabilising solution is not positive semi-definite,
+    or rho(X Y) > gamma^2.
     """
-    m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
-    B, C = np.hstack([p.B1, p.B2]), np.vstack([p.C1, p.C2])
-    row, column = np.hstack([p.D11, p.D12]), np.vstack([p.D11, p.D21])
-    R = row.T @ row - la.block_diag(gamma**2 * np.eye(m1), np.zeros((m2, m2)))
-    Rt = column @ column.T - la.block_diag(gamma**2 * np.eye(p1), np.zeros((p2, p2)))
-    X, F = _stabilising(p.A, B, p.C1.T @ p.C1, R, p.C1.T @ row)
-    Y, Ht = _stabilising(p.A.T, C.T, p.B1 @ p.B1.T, Rt, p.B1 @ column.T)
-    H = Ht.T
-    F12, F2 = F[m1 - p2 : m1], F[m1:]
-    H12, H2 = H[:, p1 - m2 : p1], H[:, p1:]
-    D11, D12 = p.D11[: p1 - m2, : m1 - p2], p.D11[: p1 - m2, m1 - p2 :]
-    D21, D22 = p.D11[p1 - m2 :, : m1 - p2], p.D11[p1 - m2 :, m1 - p2 :]
-    inner = np.linalg.solve(gamma**2 * np.eye(p1 - m2) - D11 @ D11.T, D12)
-    Dk = -D21 @ D11.T @ inner - D22
-    Dk21 = la.cholesky(np.eye(p2) - D12.T @ inner)
-    Z = np.linalg.inv(np.eye(p.A.shape[0]) - Y @ X / gamma**2)
-    C2k = -Dk21 @ (p.C2 + F12)
-    B1k = -Z @ H2 + Z @ (p.B2 + H12) @ Dk
-    C1k = F2 + Dk @ np.linalg.solve(Dk21, C2k)
-    Ak = p.A + B @ F + B1k @ np.linalg.solve(Dk21, C2k)
-    return StateSpace(Ak, B1k, C1k, Dk, inputs=p.y, outputs=p.u)
+    try:
+        X, F, Y, H = riccati_solutions(problem, gamma)
+    except OnAxisError as found:
+        # these frequencies are witnesses: the bound there is gamma
+        return _Attempt(
+            None, any(_bound_at(problem, w) >= gamma * (1 - _SLACK) for w in found.omega)
+        )
+    except (la.LinAlgError, ValueError):
+        return _Attempt(None)
+    coupling = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
+    speed = float(np.linalg.norm(problem.A)) or 1.0
+    sizes = (float(np.linalg.norm(part)) ** 2 / speed for part in (problem.C1, problem.B1))
+    if any(map(_indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
+        return _Attempt(None, True)
+    try:
+        return _Attempt(central(problem, gamma, X, F, Y, H))
+    except (la.LinAlgError, FlexplantError):
+        return _Attempt(None)
 
 
-def _stabilising(
-    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable.
-
-    R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
-    not need X to be reached from zero, which an indefinite R does not promise. Accuracy is not
-    judged here but by the closed loop.
-    """
-    n = A.shape[0]
-    inner = np.linalg.solve(R, np.hstack([B.T, S.T]))
-    BR, SR = inner[:, :n], inner[:, n:]
-    drift = A - B @ SR
-    hamiltonian = np.block([[drift, -B @ BR], [-(Q - S @ SR), -drift.T]])
-    balanced, (scale, _) = la.matrix_balance(hamiltonian, permute=False, separate=True)
-    _, vectors, count = la.schur(balanced, sort="lhp")
-    if count != n:
-        raise InfeasibleError(f"the Hamiltonian has {count} stable eigenvalues, {n} are needed.")
-    basis = vectors[:, :n] * scale[:, None]
-    top, bottom = basis[:n], basis[n:]
-    X = np.linalg.solve(top.T, bottom.T).T
-    X = 0.5 * (X + X.T)
-    return X, -(BR @ X + SR)
+def _indefinite(X: FloatArray, size: float) -> bool:
+    """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
+    values = la.eigvalsh(X) if X.size else np.zeros(1)
+    return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)

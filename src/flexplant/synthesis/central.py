@@ -1,0 +1,152 @@
+"""The formulas of Glover and Doyle: central controllers from two Riccati equations.
+
+They are for prepared problems, D12 = [0; I] and D21 = [0, I].
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import AssumptionError
+from ..lti.preparation import Prepared
+from ..lti.statespace import StateSpace
+from ..values import FloatArray
+
+#: relative: what counts as on the imaginary axis; the largest residual of a Riccati equation
+_AXIS, _RESIDUAL = 1e-10, 1e-6
+
+
+class OnAxisError(Exception):
+    """A Hamiltonian has eigenvalues on the imaginary axis."""
+
+    def __init__(self, omega: FloatArray) -> None:
+        super().__init__(f"eigenvalues at {omega} rad/s")
+        self.omega = omega
+
+
+def riccati_solutions(
+    p: Prepared, gamma: float
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return X, F, Y, H of Glover and Doyle's two Riccati equations."""
+    m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
+    B, C = np.hstack([p.B1, p.B2]), np.vstack([p.C1, p.C2])
+    row, column = np.hstack([p.D11, p.D12]), np.vstack([p.D11, p.D21])
+    R = row.T @ row - la.block_diag(gamma**2 * np.eye(m1), np.zeros((m2, m2)))
+    Rt = column @ column.T - la.block_diag(gamma**2 * np.eye(p1), np.zeros((p2, p2)))
+    X, F = stabilising(p.A, B, p.C1.T @ p.C1, R, p.C1.T @ row)
+    Y, Ht = stabilising(p.A.T, C.T, p.B1 @ p.B1.T, Rt, p.B1 @ column.T)
+    return X, F, Y, Ht.T
+
+
+def central(
+    p: Prepared, gamma: float, X: FloatArray, F: FloatArray, Y: FloatArray, H: FloatArray
+) -> StateSpace:
+    """Return the central controller of Glover and Doyle for ||w -> z|| < gamma.
+
+    Their normalisation is D12 = [0; I], D21 = [0, I]; D11 is partitioned accordingly.
+
+    Raises
+    ------
+    LinAlgError
+        When gamma is so small that a factor does not exist.
+    """
+    m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
+    B = np.hstack([p.B1, p.B2])
+    F12, F2 = F[m1 - p2 : m1], F[m1:]
+    H12, H2 = H[:, p1 - m2 : p1], H[:, p1:]
+    D11, D12 = p.D11[: p1 - m2, : m1 - p2], p.D11[: p1 - m2, m1 - p2 :]
+    D21, D22 = p.D11[p1 - m2 :, : m1 - p2], p.D11[p1 - m2 :, m1 - p2 :]
+    inner = np.linalg.solve(gamma**2 * np.eye(p1 - m2) - D11 @ D11.T, D12)
+    Dk = -D21 @ D11.T @ inner - D22
+    Dk21 = la.cholesky(np.eye(p2) - D12.T @ inner)
+    Z = np.linalg.inv(np.eye(p.A.shape[0]) - Y @ X / gamma**2)
+    C2k = -Dk21 @ (p.C2 + F12)
+    B1k = -Z @ H2 + Z @ (p.B2 + H12) @ Dk
+    C1k = F2 + Dk @ np.linalg.solve(Dk21, C2k)
+    Ak = p.A + B @ F + B1k @ np.linalg.solve(Dk21, C2k)
+    return StateSpace(Ak, B1k, C1k, Dk, inputs=p.y, outputs=p.u)
+
+
+def quadratic(p: Prepared) -> StateSpace:
+    """Return the controller of least H2 norm, feedthrough apart (gamma without bound).
+
+    Raises
+    ------
+    AssumptionError
+        When it does not exist, which no gamma mends: the message says where.
+    """
+    rows, columns = p.B2.shape[1], p.C2.shape[0]
+    try:
+        _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
+    except OnAxisError as found:
+        raise AssumptionError(
+            f"z does not feel all that u moves at {_listed(p, found)}: an undamped (rigid-body or "
+            "integrating) mode there is left out of z, or hidden by a zero of its weight. Keep "
+            "that motion in z with a weight of finite gain, or give it damping."
+        ) from found
+    try:
+        _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
+    except OnAxisError as found:
+        raise AssumptionError(
+            f"w does not excite all that y sees at {_listed(p, found)}: an undamped (rigid-body or "
+            "integrating) mode there has no disturbance, or it is hidden by a zero of its weight. "
+            "Add a disturbance that reaches it, or give it damping."
+        ) from found
+    H = Ht.T
+    return StateSpace(
+        p.A + p.B2 @ F + H @ p.C2,
+        -H,
+        F,
+        np.zeros((rows, columns)),
+        inputs=p.y,
+        outputs=p.u,
+    )
+
+
+def _listed(p: Prepared, found: OnAxisError) -> str:
+    return f"{p.frequency(float(np.min(found.omega))):.3g} Hz"
+
+
+def stabilising(
+    A: FloatArray, B: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable.
+
+    R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
+    not need X to be reached from zero, which an indefinite R does not promise.
+
+    Raises
+    ------
+    OnAxisError
+        When there is none: eigenvalues on the imaginary axis.
+    LinAlgError
+        When X is infinite, or too inaccurate to decide anything.
+    """
+    n = A.shape[0]
+    inner = np.linalg.solve(R, np.hstack([B.T, S.T]))
+    BR, SR = inner[:, :n], inner[:, n:]
+    if not n:
+        return np.zeros((0, 0)), np.asarray(-SR)
+    drift, spread = A - B @ SR, B @ BR
+    rest = Q - S @ SR
+    hamiltonian = np.block([[drift, -spread], [-rest, -drift.T]])
+    balanced, (scale, _) = la.matrix_balance(hamiltonian, permute=False, separate=True)
+    triangle, vectors, count = la.schur(balanced, sort="lhp")
+    values = la.eigvals(triangle)
+    margin = _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))
+    on_axis = np.abs(values.real) <= margin
+    if count != n or np.any(on_axis):
+        near = np.argsort(np.abs(values.real))[:2]
+        raise OnAxisError(np.unique(np.abs(values.imag[on_axis if np.any(on_axis) else near])))
+    basis = vectors[:, :n] * scale[:, None]
+    top, bottom = basis[:n], basis[n:]
+    X = np.linalg.solve(top.T, bottom.T).T
+    X = 0.5 * (X + X.T)
+    moved, bent = drift.T @ X, X @ spread @ X
+    residual = np.linalg.norm(moved + moved.T - bent + rest)
+    # Q itself: where it cancels with S R^-1 S' the solution is zero but for rounding
+    sizes = (float(np.linalg.norm(term)) for term in (moved, bent, Q))
+    if not residual <= _RESIDUAL * sum(sizes):
+        raise la.LinAlgError("the stabilising solution is too inaccurate.")
+    return X, np.asarray(-(BR @ X + SR))
