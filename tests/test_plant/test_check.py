@@ -47,6 +47,12 @@ CASES = [
     ("excited", {"asd": 0.0, "w": []}, "translation z and rotation rx and rotation ry"),
     ("detectable", {"y": sensors(MIDDLE)}, "y does not see the rigid-body rotation rx"),
     ("detectable", {"y": sensors([(p[1], p[0], 0.0) for p in MIDDLE])}, "rigid-body rotation ry"),
+    # a skew line through the centre: rotation about it, two parts of rx to one of ry
+    (
+        "detectable",
+        {"y": sensors([(0.1, 0.2, 0.0), CENTRE, (0.5, 0.4, 0.0)])},
+        "rotation rx and rotation ry",
+    ),
     ("detectable", {"y": sensors([CENTRE])}, "rotation rx and rotation ry"),
     ("detectable", {"y": sensors(CORNERS, direction="rx")}, "translation z and rotation ry"),
     (
