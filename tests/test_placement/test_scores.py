@@ -1,6 +1,7 @@
 """Scores: right, sorted, honest about what is infeasible, the same on any executor."""
 
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import fields
 from itertools import combinations
 from multiprocessing import get_context
 
@@ -16,7 +17,7 @@ from flexplant.errors import (
 )
 from flexplant.placement import PoiLqr, PoiVariance, score_actuators, score_sensors
 from flexplant.placement.candidates import confirmed, scorer_of
-from flexplant.plant import Sensor, StandardPlant
+from flexplant.plant import Sensor, StandardPlant, lowpass
 from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
 
@@ -116,6 +117,20 @@ def test_names_stand_for_sensors(make):
     assert scores.best == ("s0", "s4", "s5")
     assert [s.name for s in scores.on(plant).ports.y] == ["s0", "s4", "s5"]
     assert PoiVariance()(scores.on(plant)) == pytest.approx(scores.values[0], rel=1e-9, abs=0.0)
+
+
+def test_ports_with_filters_take_the_slow_way(make):
+    """What the fast form leaves out is not scored by it."""
+    plant, sensors, _ = make(4)
+    if "dynamics" not in {field.name for field in fields(Sensor)}:
+        pytest.skip("sensors have no dynamics yet")
+    slow = [s.replace(dynamics=lowpass(300.0)) for s in sensors[:3]]
+    scorer = scorer_of(plant, "y", slow, PoiVariance())
+    assert scorer.problem is None
+    assert scorer_of(plant, "y", sensors[:3], PoiVariance()).problem is not None
+    value = score_sensors(plant, [slow]).values[0]
+    direct = PoiVariance()(plant.with_ports(plant.ports.replace(y=slow)))
+    assert value == direct
 
 
 def test_any_callable_serves(make):

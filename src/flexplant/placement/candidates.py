@@ -20,7 +20,7 @@ from ..plant import Actuator, Sensor, StandardPlant, assemble_plant
 from ..plant.ports import QUANTITIES
 from ..plant.realisation import ModalRealisation
 from ..values import FloatArray, Value
-from .criteria import PoiLqr, PoiVariance
+from .criteria import PoiLqr, PoiVariance, plain
 from .quadratic import Quadratic
 
 Port: TypeAlias = "Sensor | Actuator"
@@ -162,8 +162,9 @@ def scorer_of(
     everything = range(len(candidates))
     if isinstance(criterion, PoiVariance | PoiLqr):
         criterion.check(plant, candidates)
-        # without a single feasible choice there is no fast form to prepare
-        if not scorer.missing(everything):
+        # without a single feasible choice there is no fast form to prepare; with filters and delays
+        # of single ports every choice has states of its own: the criterion is asked each time
+        if not scorer.missing(everything) and plain(plant, candidates):
             return scorer.replace(problem=criterion.prepared(plant, candidates))
     return scorer
 

@@ -21,7 +21,7 @@ from ..lti.discretisation import discretized
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
 from ..lti.statespace import StateSpace
-from ..plant import Poi, StandardPlant
+from ..plant import Disturbance, Poi, StandardPlant
 from ..plant.ports import QUANTITIES
 from ..values import FloatArray, Value, positive
 from .quadratic import Quadratic, quadratic
@@ -105,7 +105,8 @@ class PoiVariance(Value):
             )
         if realisation is None or plant.ports is None:
             raise ModelError("the plant has no structure.")
-        loud = [d for d in plant.ports.w if d.asd > 0]
+        # noise that is shaped first does not arrive at once
+        loud = [d for d in plant.ports.w if isinstance(d, Disturbance) and d.asd > 0 and _bare(d)]
         B = [realisation.force(realisation.row(d.at, d.direction)) for d in loud]
         for sensor in candidates:
             row = realisation.row(sensor.at, sensor.direction)
@@ -287,6 +288,29 @@ class PoiLqr(Value):
                 f"{error} The effort of {self.effort:g} m/N may be too small to tell gains apart: "
                 "try a larger one."
             ) from error
+
+
+def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
+    """Tell whether candidates change rows of B or C only: no port has a filter or delay of its own.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        With ports.
+    candidates : sequence of Sensor or Actuator
+        All that may be chosen.
+    """
+    ports, realisation = plant.ports, plant.realisation
+    if ports is None or realisation is None:
+        return False
+    forces = all(isinstance(port, Disturbance) for port in ports.w)
+    rigidly = getattr(realisation, "static_inputs", None) is None
+    return forces and rigidly and all(map(_bare, (*ports.w, *ports.u, *ports.y, *candidates)))
+
+
+def _bare(port: Any) -> bool:
+    """Tell whether a port is without filter and delay."""
+    return not any(getattr(port, name, None) for name in ("dynamics", "shape", "delay"))
 
 
 def _axes(axes: Axes) -> tuple[str, ...] | Mapping[str, float] | None:
