@@ -38,7 +38,10 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
     """
     loop = lft(P, K)
     poles = loop.poles()
-    stability = float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real))
+    if not poles.size:  # a static loop
+        stability = 0.0 if loop.dt else -np.inf
+    else:
+        stability = float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real))
     if not stability < (1.0 if loop.dt else 0.0):
         kind = "spectral radius" if loop.dt else "largest real part"
         raise CertificateError(
@@ -62,7 +65,11 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
 
 def swept_norm(loop: StateSpace) -> float:
     """Return the largest gain over a grid that is refined at resonances and at its own peak."""
+    if not loop.D.size:
+        return 0.0
     poles = loop.poles()
+    if not poles.size:
+        return float(np.linalg.norm(loop.D, 2))
     if loop.dt:
         poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt)
     nyquist = 0.5 / loop.dt if loop.dt else np.inf

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -38,8 +39,8 @@ def design_hinf(
     plant: StandardPlant | System,
     method: Method | None = None,
     *,
-    u: tuple[str, ...] | None = None,
-    y: tuple[str, ...] | None = None,
+    u: Sequence[str] | None = None,
+    y: Sequence[str] | None = None,
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
@@ -54,7 +55,7 @@ def design_hinf(
         serves too, with u and y named.
     method : Riccati or Lmi, optional
         `Riccati()` unless given. `Lmi()` needs no full-rank D12 and D21, but suits small plants.
-    u, y : tuples of str, optional
+    u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
 
     Returns
@@ -72,7 +73,7 @@ def design_hinf(
     CertificateError
         When the closed loop does not keep the promise.
     ModelError
-        When the plant is of another type.
+        When the plant or the method is of another type, or a sampled plant has a pole at z = -1.
 
     References
     ----------
@@ -85,8 +86,13 @@ def design_hinf(
                 f"design_hinf needs a StandardPlant, got {type(plant).__name__}. For a StateSpace "
                 "name the controller's channels: design_hinf(sys, u=(...), y=(...))."
             )
+        u, y = ((side,) if isinstance(side, str) else side for side in (u, y))
         plant = StandardPlant.from_statespace(plant, u=u, y=y)
+    elif u is not None or y is not None:
+        raise ModelError("a StandardPlant knows its u and y: leave them out.")
     method = Riccati() if method is None else method
+    if not hasattr(method, "solve"):
+        raise ModelError(f"method must be Riccati(...) or Lmi(...), got {method!r:.60}.")
     if not plant.w or not plant.z or not plant.u or not plant.y:
         raise AssumptionError(f"H-infinity synthesis needs channels w, z, u and y, got {plant!r}.")
     if plant.realisation is not None:  # it can name the rigid-body motion that is missed
@@ -124,8 +130,15 @@ def _require_reach(problem: Prepared) -> None:
             pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
             if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-12 * size:
                 raise AssumptionError(
-                    f"{text} a mode at {problem.frequency(abs(float(pole.imag))):.3g} Hz that is "
-                    "not stable, of the plant or of a weight (an integrator in a weight is one): "
-                    "no controller can stabilise it. Add or move an actuator or a sensor, or give "
-                    "the weight finite gain."
+                    f"{text} a mode of the plant or of a weight that is not stable "
+                    f"({_described(problem, complex(pole))}): no controller can stabilise it. "
+                    "Add or move an actuator or a sensor, or give the weight finite gain."
                 )
+
+
+def _described(problem: Prepared, pole: complex) -> str:
+    if pole.imag:
+        return f"at {problem.frequency(abs(pole.imag)):.3g} Hz"
+    if pole.real > 1e-6:
+        return f"it grows e-fold in {1.0 / (problem.speed * pole.real):.3g} s"
+    return "at 0 Hz: rigid-body or integrating"

@@ -74,13 +74,17 @@ class Riccati(Value):
 
         _require_full_rank(problem)
         # the least quadratic cost stabilises: its norm is where the search for less begins
-        least = quadratic(problem)
-        unit = _seen(problem, least)
+        try:
+            least = quadratic(problem)
+            unit = _seen(problem, least)
+        except la.LinAlgError:
+            unit = np.inf
         if not np.isfinite(unit):
             raise SolverError(
-                "the controller of least quadratic cost does not stabilise in rounding: the plant "
-                "is too badly conditioned. Bring its weights closer together, or leave out states "
-                "that u hardly reaches or y hardly sees."
+                "no controller of least quadratic cost stabilises in rounding: the plant is too "
+                "badly conditioned. Weight z and w so that their sizes are alike (metres beside "
+                "newtons are not; stage_weights), or leave out states that u hardly reaches or y "
+                "hardly sees."
             )
         if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
             return Solved(least.A, least.B, least.C, least.D, 0.0, 0.0)
