@@ -1,0 +1,132 @@
+"""How well channels reach and see the modes of a structure: information, not an assumption."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from ..values import ComplexArray, FloatArray, Value
+from .ports import QUANTITIES
+from .standard import StandardPlant
+
+#: a mode reached or seen less than this, beside the channel's strongest mode, is called weak
+WEAK = 0.01
+_VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
+
+
+@dataclass(frozen=True, eq=False)
+class ModeVisibility(Value):
+    """How well w excites, u reaches, y and z see an elastic mode.
+
+    Parameters
+    ----------
+    mode : int
+        Number, from 1, rigid-body modes included.
+    freq : float [Hz]
+        Frequency.
+    zeta : float
+        Damping ratio.
+    shares : mapping {"w", "u", "y", "z": float}
+        The best channel's modal force per unit force (or modal displacement per unit motion)
+        beside that of the elastic mode where this channel is strongest: 1 at best, 0 at a node.
+    channels : mapping {"w", "u", "y", "z": str}
+        That channel.
+    """
+
+    mode: int
+    freq: float
+    zeta: float
+    shares: dict[str, float]
+    channels: dict[str, str]
+
+    def __post_init__(self) -> None:
+        self._set(shares=self.shares, channels=self.channels)
+
+    @property
+    def weak(self) -> tuple[str, ...]:
+        """What is below one percent, in words."""
+        return tuple(
+            f"{side} {_VERBS[side]} mode {self.mode} ({self.freq:.4g} Hz, damping "
+            f"{100 * self.zeta:.2g} %) "
+            + (
+                f"at {100 * share:.2g} % of its strongest mode (best: {self.channels[side]})."
+                if share > 1e-8
+                else "nowhere: it has a node at every channel."
+            )
+            for side, share in self.shares.items()
+            if share < WEAK
+        )
+
+
+def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
+    """Return the visibility of every elastic mode; none for a plant without a structure.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Not weighted; of a sampled plant the continuous one is looked at.
+    """
+    plant = plant.continuous or plant
+    if plant.realisation is None:
+        return ()
+    g, n_rigid = plant.system, plant.n_rigid
+    count = sum(name.startswith("mode") for name in plant.realisation.names) // 2
+    own = [np.linalg.eigvals(pair) for pair in plant.realisation.pairs[n_rigid:count]]
+    wanted = np.array([pole[np.argmax(pole.imag)] for pole in own], dtype=np.complex128)
+    left, right = _vectors(g.A, wanted, 2 * n_rigid)
+    omega = np.abs(wanted)
+    sides: dict[str, tuple[Sequence[str], FloatArray]] = {}
+    for side in "wu":
+        names = [n for n in getattr(plant, side) if np.any(g.B[:, g.input_index([n])])]
+        sides[side] = names, np.abs(left.conj().T @ g.B[:, g.input_index(names)])
+    orders = {s.name: QUANTITIES.index(s.quantity) for s in plant.ports.y} if plant.ports else {}
+    for side in "yz":
+        names = [n for n in getattr(plant, side) if np.any(g.C[g.output_index([n])])]
+        power = np.array([1 - orders.get(name, 0) for name in names])
+        gains = np.abs(g.C[g.output_index(names)] @ right).T * omega[:, None] ** power
+        sides[side] = names, gains
+    return tuple(_entry(n_rigid + 1 + k, pole, k, sides) for k, pole in enumerate(wanted.tolist()))
+
+
+def _entry(
+    number: int, pole: complex, k: int, sides: dict[str, tuple[Sequence[str], FloatArray]]
+) -> ModeVisibility:
+    shares, channels = {}, {}
+    for side, (names, gains) in sides.items():
+        if not names:
+            continue
+        share = gains[k] / np.maximum(gains.max(axis=0), 1e-300)
+        best = int(np.argmax(share))
+        shares[side], channels[side] = float(share[best]), names[best]
+    size = abs(pole)
+    return ModeVisibility(number, size / (2 * np.pi), -pole.real / size, shares, channels)
+
+
+def _vectors(A: FloatArray, poles: ComplexArray, first: int) -> tuple[ComplexArray, ComplexArray]:
+    """Return left and right eigenvectors (n, k) of modes; right ones of unit size in their states.
+
+    Mode k has the states first + 2 k and the next; other states (of actuators, say) follow.
+    """
+    n, count = A.shape[0], poles.size
+    left = np.zeros((n, count), dtype=np.complex128)
+    right = np.zeros((n, count), dtype=np.complex128)
+    for k, pole in enumerate(poles.tolist()):
+        own = slice(first + 2 * k, first + 2 * k + 2)
+        values, rights = np.linalg.eig(A[own, own])
+        lefts = la.inv(rights).conj().T
+        i = int(np.argmin(np.abs(values - pole)))
+        left[own, k], right[own, k] = lefts[:, i], rights[:, i]
+    rest = np.arange(first + 2 * count, n)
+    if rest.size and np.any(A[: rest[0], rest]):
+        for k, pole in enumerate(poles.tolist()):
+            shifted = pole * np.eye(rest.size) - A[np.ix_(rest, rest)]
+            into = left[: rest[0], k].conj() @ A[: rest[0], rest]
+            left[rest, k] = np.linalg.solve(shifted.T, into).conj()
+    if rest.size and np.any(A[rest, : rest[0]]):
+        for k, pole in enumerate(poles.tolist()):
+            shifted = pole * np.eye(rest.size) - A[np.ix_(rest, rest)]
+            right[rest, k] = np.linalg.solve(shifted, A[rest, : rest[0]] @ right[: rest[0], k])
+    return left, right
