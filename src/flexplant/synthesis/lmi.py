@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -22,7 +23,6 @@ from .lmi_programs import (
     moderate_controller,
     same_states,
     smallest_gamma,
-    unit_channels,
 )
 
 if TYPE_CHECKING:
@@ -30,6 +30,10 @@ if TYPE_CHECKING:
 
 #: gap between value and lower bound at which no other coordinates are tried
 _GAP = 5e-4
+#: programs from one choice of states
+_ROUNDS = 4
+#: gamma, relative to the plant's size, that is taken for zero
+_NOTHING = 1e-7
 #: what a closed loop may exceed its target by
 _EXCESS = 1e-3
 
@@ -91,7 +95,7 @@ class Lmi(Value):
         ModelError
             When the problem has no states, or more than max_states.
         InfeasibleError
-            When the solver proves that no stabilising controller exists.
+            When the solver proves that no stabilising controller exists, or no gamma is smallest.
         SolverError
             When the solver stops early, or no controller keeps what the LMIs promise.
         """
@@ -103,13 +107,11 @@ class Lmi(Value):
                 f"Lmi takes plants of 1 to {self.max_states} states, got {n}: time grows as n^6. "
                 "Reduce the order first, use Riccati(), or raise Lmi(max_states=...)."
             )
-        plant, u_size, y_size = unit_channels(problem)
-        found = self._smallest(plant)
+        found = self._smallest(Plant.of(problem))
         failures = []
         for back_off in (self.back_off, 2 * self.back_off):
             try:
                 K = moderate_controller(found.plant, 1.0 + back_off, self._settings)
-                K = (K[0], K[1] / y_size, K[2] / u_size[:, None], K[3] / y_size / u_size[:, None])
                 norm = _verified(problem, K, found.value * (1.0 + back_off))
             except (FlexplantError, la.LinAlgError) as error:
                 failures.append(f"{100 * back_off:.3g} % above it: {error}")
@@ -131,27 +133,43 @@ class Lmi(Value):
         }
 
     def _smallest(self, plant: Plant) -> Optimum:
-        """Return the smallest gamma, from several choices of states until its bound is close."""
+        """Return the smallest gamma, from two choices of states unless the first one's is sure."""
         found: list[Optimum] = []
         failures: list[FlexplantError] = []
         guess = plant.size()
         for start in (lqg_states, same_states):
             try:
-                states = start(plant)
-                for _ in range(2):
-                    scale = found[-1].value if found else guess
-                    found.append(smallest_gamma(states.scaled(scale), scale, self._settings))
-                    best = min(found, key=lambda one: one.value - one.lower)
-                    if best.value - best.lower <= _GAP * best.value:
-                        return best
-                    states = found[-1].plant.scaled(1.0 / found[-1].value)
+                scale = found[-1].value if found else guess
+                found.extend(self._rounds(start(plant), scale))
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
+            if found and _settled(found[-1]):
+                break
         if not found:
             # a proof of infeasibility says more than a solver that stopped
             raise min(failures, key=lambda error: not isinstance(error, InfeasibleError))
         best = min(found, key=lambda one: one.value - one.lower)
+        if best.value < _NOTHING * guess:
+            raise InfeasibleError(
+                f"there is no smallest gamma: {best.value:.3g} is reached, where the plant's own "
+                f"size is {guess:.3g}. u cancels w in z, at no cost. Weight the efforts in z, or "
+                "give the sensors noise in w."
+            )
         return best._replace(lower=min(max(one.lower for one in found), best.value))
+
+    def _rounds(self, states: Plant, scale: float) -> Iterator[Optimum]:
+        """Yield smallest gammas, each in the states and the scale that the one before gives."""
+        for number in range(_ROUNDS):
+            one = smallest_gamma(states.scaled(scale), scale, self._settings)
+            yield one
+            if _settled(one) or (number and one.value > 0.99 * scale):
+                return
+            states, scale = one.plant.scaled(1.0 / one.value), one.value
+
+
+def _settled(one: Optimum) -> bool:
+    """Whether the bound is close, in a scale that resolves it."""
+    return one.value - one.lower <= _GAP * one.value and one.value > 0.03 * one.scale
 
 
 def _verified(problem: Prepared, K: Matrices, target: float) -> float:

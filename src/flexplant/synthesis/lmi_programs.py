@@ -35,6 +35,46 @@ class Plant(NamedTuple):
     D11: FloatArray
     D12: FloatArray
     D21: FloatArray
+    #: its u is u_size times that of the problem, its y that of the problem over y_size
+    u_size: FloatArray
+    y_size: FloatArray
+    #: unit of its frequency, in that of the problem
+    speed: float = 1.0
+
+    @classmethod
+    def of(cls, p: Prepared) -> Plant:
+        """Return the plant of a prepared problem."""
+        matrices = (p.A, p.B1, p.B2, p.C1, p.C2, p.D11, p.D12, p.D21)
+        return cls(*matrices, np.ones(p.B2.shape[1]), np.ones(p.C2.shape[0])).with_unit_channels()
+
+    def with_unit_channels(self) -> Plant:
+        """Return the plant with u and y in units that make columns [B2; D12], rows [C2, D21] one.
+
+        What is not seen of noise or effort has no unit of its own.
+        """
+        u_size = np.linalg.norm(np.vstack([self.B2, self.D12]), axis=0)
+        y_size = np.linalg.norm(np.hstack([self.C2, self.D21]), axis=1)
+        u_size, y_size = (np.where(size > 0, size, 1.0) for size in (u_size, y_size))
+        return self._replace(
+            B2=self.B2 / u_size,
+            D12=self.D12 / u_size,
+            C2=self.C2 / y_size[:, None],
+            D21=self.D21 / y_size[:, None],
+            u_size=self.u_size * u_size,
+            y_size=self.y_size * y_size,
+        )
+
+    def timed(self, speed: float) -> Plant:
+        """Return the plant in a unit of frequency larger by speed; norms stay."""
+        root = np.sqrt(speed)
+        return self._replace(
+            A=self.A / speed,
+            B1=self.B1 / root,
+            B2=self.B2 / root,
+            C1=self.C1 / root,
+            C2=self.C2 / root,
+            speed=self.speed * speed,
+        )
 
     def scaled(self, gamma: float) -> Plant:
         """Return the plant whose norms w -> z are divided by gamma."""
@@ -79,27 +119,8 @@ class Optimum(NamedTuple):
     lower: float
     #: scaled by value and balanced
     plant: Plant
-
-
-def unit_channels(p: Prepared) -> tuple[Plant, FloatArray, FloatArray]:
-    """Return the plant with u and y in units that make columns [B2; D12], rows [C2, D21] one.
-
-    The u returned are u_size times those of p, the y those of p divided by y_size.
-    """
-    u_size = np.linalg.norm(np.vstack([p.B2, p.D12]), axis=0)
-    y_size = np.linalg.norm(np.hstack([p.C2, p.D21]), axis=1)
-    u_size, y_size = (np.where(size > 0, size, 1.0) for size in (u_size, y_size))
-    plant = Plant(
-        p.A,
-        p.B1,
-        p.B2 / u_size,
-        p.C1,
-        p.C2 / y_size[:, None],
-        p.D11,
-        p.D12 / u_size,
-        p.D21 / y_size[:, None],
-    )
-    return plant, u_size, y_size
+    #: in which it was sought
+    scale: float
 
 
 def same_states(p: Plant) -> Plant:
@@ -108,7 +129,9 @@ def same_states(p: Plant) -> Plant:
 
 
 def lqg_states(p: Plant) -> Plant:
-    """Return the plant in LQG-balanced states: Riccati solutions stand in for X and Y.
+    """Return the plant in LQG-balanced states, in the unit of frequency of the LQG loop.
+
+    The Riccati solutions stand in for X and Y.
 
     Raises
     ------
@@ -120,9 +143,14 @@ def lqg_states(p: Plant) -> Plant:
     Q, W = p.C1.T @ p.C1, p.B1 @ p.B1.T
     Q = Q + 1e-8 * np.linalg.norm(Q) * np.eye(n)
     W = W + 1e-8 * np.linalg.norm(W) * np.eye(n)
-    control = control_care(p.A, p.B2, Q=Q, R=p.D12.T @ p.D12 + 1e-1 * np.eye(nu))
-    filtered = solve_care(p.A, p.C2, Q=W, R=p.D21 @ p.D21.T + 1e-1 * np.eye(ny))
-    return p.balanced(control.P, filtered.P)
+    try:
+        control = control_care(p.A, p.B2, Q=Q, R=p.D12.T @ p.D12 + 0.1 * np.eye(nu))
+        filtered = solve_care(p.A, p.C2, Q=W, R=p.D21 @ p.D21.T + 0.1 * np.eye(ny))
+    except la.LinAlgError as error:
+        raise SolverError(f"no LQG design for the choice of states: {error}.") from error
+    sizes = np.abs(np.concatenate([control.poles, filtered.poles]))
+    speed = float(np.exp(np.mean(np.log(np.maximum(sizes, 1e-300)))))
+    return p.balanced(control.P, filtered.P).timed(speed)
 
 
 def _factor(P: FloatArray) -> FloatArray:
@@ -187,16 +215,16 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
     # the little trace picks one of the many X and Y, and keeps them finite
     size = cp.trace(X) + cp.trace(Y)
     _solve(cp.Problem(cp.Minimize(gamma + 1e-9 * size), constraints), settings)
-    value = float(gamma.value)
+    value = max(float(gamma.value), 1e-12)
     U = onto_u @ constraints[0].dual_value @ onto_u.T
     V = onto_y @ constraints[1].dual_value @ onto_y.T
     lower = dual_bound(p, U, V, X.value, Y.value)
-    if not value > 1e-7:
-        raise SolverError(
-            f"the smallest gamma is {value * scale:.3g}, nothing beside the plant's open gain: u "
-            "can cancel w in z entirely. Weight the efforts in z to ask for a definite controller."
-        )
-    return Optimum(value * scale, lower * scale, p.scaled(value).balanced(X.value, Y.value))
+    return Optimum(
+        value * scale,
+        lower * scale,
+        p.scaled(value).balanced(X.value, Y.value).with_unit_channels(),
+        scale,
+    )
 
 
 def dual_bound(p: Plant, U: FloatArray, V: FloatArray, X: FloatArray, Y: FloatArray) -> float:
@@ -281,8 +309,10 @@ def _reconstructed(
     N, M = left * np.sqrt(values), right.T * np.sqrt(values)
     CK, BK = C - D @ p.C2 @ Y, B - X @ p.B2 @ D
     AK = A_hat - X @ A @ Y - X @ p.B2 @ CK - BK @ p.C2 @ Y
-    AK = np.asarray(la.solve(N, la.solve(M, AK.T).T))
-    return AK, np.asarray(la.solve(N, BK)), np.asarray(la.solve(M, CK.T).T), D
+    root = np.sqrt(p.speed)
+    AK, BK, CK = la.solve(N, la.solve(M, AK.T).T), la.solve(N, BK), la.solve(M, CK.T).T
+    u_size = p.u_size[:, None]
+    return p.speed * AK, root * BK / p.y_size, root * CK / u_size, D / p.y_size / u_size
 
 
 def _solve(problem: Any, settings: dict[str, float]) -> None:
@@ -301,8 +331,8 @@ def _solve(problem: Any, settings: dict[str, float]) -> None:
     how = f"Clarabel: {status} after {raw.iterations} iterations"
     if "PrimalInfeasible" in status:
         raise InfeasibleError(
-            f"no controller of any norm satisfies the LMIs ({how}). Check that u reaches and y "
-            "sees every unstable mode."
+            f"the LMIs have no solution ({how}). Check that u reaches and y sees every unstable "
+            "mode, and that the plant's units are sane."
         )
     if status not in ("Solved", "AlmostSolved", "InsufficientProgress"):
         n = max(variable.shape[0] for variable in problem.variables() if variable.shape)
