@@ -140,6 +140,7 @@ class Lmi(Value):
         for start in (lqg_states, same_states):
             try:
                 scale = found[-1].value if found else guess
+                # what was found before an error stays
                 found.extend(self._rounds(start(plant), scale))
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
@@ -147,7 +148,7 @@ class Lmi(Value):
                 break
         if not found:
             # a proof of infeasibility says more than a solver that stopped
-            raise min(failures, key=lambda error: not isinstance(error, InfeasibleError))
+            raise next((e for e in failures if isinstance(e, InfeasibleError)), failures[-1])
         best = min(found, key=lambda one: one.value - one.lower)
         if best.value < _NOTHING * guess:
             raise InfeasibleError(

@@ -331,14 +331,14 @@ def _solve(problem: Any, settings: dict[str, float]) -> None:
     how = f"Clarabel: {status} after {raw.iterations} iterations"
     if "PrimalInfeasible" in status:
         raise InfeasibleError(
-            f"the LMIs have no solution ({how}). Check that u reaches and y sees every unstable "
-            "mode, and that the plant's units are sane."
+            f"the LMIs have no solution ({how}). Does u reach and y see every unstable mode?"
         )
     if status not in ("Solved", "AlmostSolved", "InsufficientProgress"):
         n = max(variable.shape[0] for variable in problem.variables() if variable.shape)
         raise SolverError(
             f"the LMIs were not solved ({how}, residuals {raw.r_prim:.1e} and {raw.r_dual:.1e}, "
-            f"{n} states). Loosen weights or reduce the order of the plant."
+            f"{n} states). Does u reach and y see every unstable mode? If so, loosen weights or "
+            "reduce the order of the plant."
         )
     with warnings.catch_warnings():
         # what is inaccurate is judged below

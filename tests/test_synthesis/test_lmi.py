@@ -1,0 +1,360 @@
+"""H-infinity by LMI: gammas known by hand and from COMPleib, the trap of `>>`, refusals."""
+
+import csv
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from flexplant.errors import CertificateError, InfeasibleError, ModelError, SolverError
+from flexplant.lti import StateSpace
+from flexplant.lti.preparation import prepared
+from flexplant.store import load
+from flexplant.synthesis import lmi_programs
+from flexplant.synthesis.certificate import certified_norm
+from flexplant.synthesis.hinf import design_hinf
+from flexplant.synthesis.lmi import Lmi
+from flexplant.synthesis.lmi_programs import Plant, dual_bound, smallest_gamma, symmetric_blocks
+from flexplant.synthesis.riccati import Riccati
+from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
+
+SETTINGS = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9, "time_limit": 20.0}
+DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
+KEYS = ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21")
+SMALL = ["NN2", "DIS2", "NN8", "AC15", "AC4", "DIS5", "HE1", "HE2", "NN4", "REA2", "AC2", "EB1"]
+LARGE = ["TMD", "DIS1", "HE5", "AC8", "DLR1", "EB2", "TG1", "WEC1", "BDT1", "AGS", "CM1", "CSE1"]
+
+
+def system(parts, dt=0.0):
+    """(StateSpace, u, y) of the eight matrices."""
+    A, B1, B2, C1, C2, D11, D12, D21 = (np.atleast_2d(np.asarray(p, float)) for p in parts)
+    nw, nu, nz, ny = B1.shape[1], B2.shape[1], C1.shape[0], C2.shape[0]
+    u, y = tuple(f"u{i}" for i in range(nu)), tuple(f"y{i}" for i in range(ny))
+    P = StateSpace(
+        A,
+        np.hstack([B1, B2]),
+        np.vstack([C1, C2]),
+        np.block([[D11, D12], [D21, np.zeros((ny, nu))]]),
+        dt,
+        inputs=[*(f"w{i}" for i in range(nw)), *u],
+        outputs=[*(f"z{i}" for i in range(nz)), *y],
+    )
+    return P, u, y
+
+
+def scalar(a, noise):
+    """x' = a x + w1 + u, z = (x, u), y = x + noise w2."""
+    return (
+        [[a]],
+        [[1.0, 0.0]],
+        [[1.0]],
+        [[1.0], [0.0]],
+        [[1.0]],
+        np.zeros((2, 2)),
+        [[0.0], [1.0]],
+        [[0.0, noise]],
+    )
+
+
+def transposed(parts):
+    """The dual problem: D12 and D21 change places."""
+    A, B1, B2, C1, C2, D11, D12, D21 = (np.asarray(p, float).T for p in parts)
+    return A, C1, C2, B1, B2, D11, D21, D12
+
+
+def problem(parts, dt=0.0):
+    return prepared(*system(parts, dt))
+
+
+def random_parts(seed, n=8, nw=3, nu=2, nz=4, ny=2):
+    """Full-rank D12 and D21 and a D11."""
+    rng = np.random.default_rng(seed)
+    A = rng.standard_normal((n, n)) - 1.0 * np.eye(n)
+    return (
+        A,
+        rng.standard_normal((n, nw)),
+        rng.standard_normal((n, nu)),
+        rng.standard_normal((nz, n)),
+        rng.standard_normal((ny, n)),
+        rng.standard_normal((nz, nw)),
+        rng.standard_normal((nz, nu)),
+        rng.standard_normal((ny, nw)),
+    )
+
+
+def compleib(name):
+    if not DATA.exists():
+        pytest.skip("the COMPleib problems are not here")
+    with np.load(DATA) as file:
+        parts = tuple(np.atleast_2d(file[f"{name}/{key}"]) for key in KEYS)
+    with DATA.with_suffix(".csv").open() as file:
+        gamma = {row["name"]: float(row["gamma"]) for row in csv.DictReader(file)}
+    return parts, gamma[name]
+
+
+def check(parts, gamma, bound=3e-3):
+    """Design, and hold loop, claim and bound against the oracle and the best known gamma."""
+    P, u, y = system(parts)
+    found = design_hinf(P, Lmi(time_limit=100.0), u=u, y=y)
+    K = found.system
+    assert (K.inputs, K.outputs) == (y, u)
+    loop = closed_loop(*(np.atleast_2d(np.asarray(p, float)) for p in parts), (K.A, K.B, K.C, K.D))
+    assert np.linalg.eigvals(loop[0]).real.max() < 0
+    assert found.gamma == pytest.approx(found.certificate["claim"], rel=1e-3)
+    assert swept_norm(*loop) <= found.gamma * (1 + 1e-6)
+    assert swept_norm(*loop) >= found.gamma * (1 - 1e-2)
+    assert found.gamma <= 1.07 * gamma
+    # the gammas of COMPleib are known to 3-4 digits
+    assert (1 - bound) * gamma <= found.lower <= (1 + 1e-4) * gamma
+    return found
+
+
+@pytest.mark.parametrize("a", [-2.0, -0.5, 0.0, 1.0])
+def test_measurement_without_noise_reaches_state_feedback(a):
+    check(scalar(a, 0.0), state_feedback_gamma(a))
+
+
+@pytest.mark.parametrize("a", [-2.0, 0.0, 1.0])
+def test_effort_without_weight_is_the_dual(a):
+    check(transposed(scalar(a, 0.0)), state_feedback_gamma(a))
+
+
+@pytest.mark.parametrize("a", [-2.0, -0.5, 0.0, 1.0])
+def test_scalar_output_feedback_equals_the_root_of_its_riccati_equations(a):
+    check(scalar(a, 1.0), output_feedback_gamma(a), bound=1e-5)
+
+
+# AC4 and HE1: the smallest gamma is only approached as the Lyapunov matrices grow without bound
+@pytest.mark.parametrize("name", SMALL)
+def test_compleib(name):
+    check(*compleib(name), bound={"AC4": 2e-2, "HE1": 5e-3, "EB1": 1e-4}.get(name, 1e-3))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [*LARGE, "JE3"])
+def test_compleib_up_to_24_states(name):
+    check(*compleib(name), bound=1e-3)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_bound_and_riccati_meet_with_feedthrough(seed):
+    P, u, y = system(random_parts(seed))
+    by_riccati = design_hinf(P, Riccati(back_off=0.0, tolerance=1e-4), u=u, y=y)
+    by_lmi = design_hinf(P, Lmi(), u=u, y=y)
+    assert by_lmi.lower == pytest.approx(by_riccati.gamma, rel=1e-3)
+    assert by_lmi.lower <= by_riccati.gamma
+    assert by_lmi.gamma <= 1.05 * 1.001 * by_riccati.gamma
+
+
+def test_sampled_plant_with_rigid_body_and_noise_free_sensor():
+    h = 1e-3
+    # 2 kg on no spring in SI units, sampled; y in m, z the position error in um and the effort
+    parts = (
+        [[1.0, h], [0.0, 1.0]],
+        [[h * h / 4], [h / 2]],
+        [[h * h / 4], [h / 2]],
+        [[1e6, 0.0], [0.0, 0.0]],
+        [[1.0, 0.0]],
+        np.zeros((2, 1)),
+        [[0.0], [1.0]],
+        [[0.0]],
+    )
+    P, u, y = system(parts, h)
+    found = design_hinf(P, Lmi(), u=u, y=y)
+    assert found.system.dt == h
+    assert found.certificate["stability"] < 1
+    assert found.lower <= found.gamma <= 1.07 * found.lower
+    # w and u enter alike: no controller can do better than to cancel w
+    assert found.gamma >= 1.0
+
+
+def test_back_off_is_what_the_loop_may_lose():
+    P, u, y = system(scalar(-0.5, 1.0))
+    tight, loose = (design_hinf(P, Lmi(back_off=b), u=u, y=y) for b in (0.01, 0.3))
+    assert tight.gamma <= 1.0101 * tight.lower
+    assert loose.gamma <= 1.301 * loose.lower
+    assert loose.gamma > tight.gamma
+
+
+def test_flipped_sign_is_refused_by_the_certificate():
+    P, u, y = system(scalar(1.0, 1.0))
+    found = design_hinf(P, Lmi(), u=u, y=y)
+    K = found.system
+    assert certified_norm(P, K, found.gamma)["norm"] == found.gamma
+    with pytest.raises(CertificateError, match="not stable"):
+        certified_norm(P, K.replace(C=-K.C, D=-K.D), found.gamma)
+    with pytest.raises(CertificateError, match="was claimed"):
+        certified_norm(P, K, 0.9 * found.gamma)
+
+
+# --- the trap: `M >> 0` constrains only the symmetric part of M
+
+
+def test_cvxpy_accepts_what_is_not_symmetric():
+    import cvxpy as cp
+
+    M = cp.Variable((2, 2))
+    trap = cp.Problem(cp.Maximize(M[0, 1]), [M >> 0, cp.diag(M) == 1, M[1, 0] == -10])
+    trap.solve(solver="CLARABEL")
+    assert M.value[0, 1] == pytest.approx(12, abs=1e-4)
+    # the same blocks made by the helper: the mirror is not another unknown
+    b = cp.Variable((1, 1))
+    one = np.ones((1, 1))
+    meant = cp.Problem(cp.Maximize(b[0, 0]), [symmetric_blocks([[one, b], [one]]) >> 0])
+    meant.solve(solver="CLARABEL")
+    assert b.value[0, 0] == pytest.approx(1, abs=1e-4)
+
+
+def test_a_program_that_falls_into_the_trap_is_refused():
+    import cvxpy as cp
+
+    M = cp.Variable((2, 2))
+    trap = cp.Problem(cp.Maximize(M[0, 1]), [M >> 0, cp.diag(M) == 1, M[1, 0] == -10])
+    with pytest.raises(SolverError, match="not symmetric"):
+        lmi_programs._solve(trap, SETTINGS)
+
+
+def test_blocks_are_mirrored():
+    rng = np.random.default_rng(1)
+    a, b, c = rng.standard_normal((3, 3)), rng.standard_normal((3, 2)), rng.standard_normal((2, 2))
+    M = symmetric_blocks([[a, b], [c]]).value
+    np.testing.assert_allclose(M, np.block([[(a + a.T) / 2, b], [b.T, (c + c.T) / 2]]))
+
+
+def test_every_lmi_is_symmetric_for_any_values(monkeypatch):
+    seen = []
+
+    def look(program, settings):
+        rng = np.random.default_rng(0)
+        for variable in program.variables():
+            value = rng.standard_normal(variable.shape)
+            variable.value = value + value.T if variable.attributes["symmetric"] else value
+        for constraint in program.constraints:
+            M = constraint.args[0].value
+            assert np.max(np.abs(M - M.T)) <= 1e-12 * np.max(np.abs(M))
+            seen.append(M.shape)
+        raise SolverError("seen")
+
+    monkeypatch.setattr(lmi_programs, "_solve", look)
+    p = Plant.of(problem(random_parts(5, n=4)))
+    with pytest.raises(SolverError, match="seen"):
+        smallest_gamma(p, 1.0, SETTINGS)
+    with pytest.raises(SolverError, match="seen"):
+        lmi_programs.moderate_controller(p, 1.05, SETTINGS)
+    assert seen[2] == (8, 8) and seen[3:] == [(11, 11), (11, 11), (8, 8)]
+
+
+# --- the bound
+
+
+@settings(max_examples=30, deadline=None)
+@given(seed=st.integers(0, 2**32 - 1), decades=st.floats(-3, 3))
+def test_no_multipliers_give_a_bound_above_what_is_reached(seed, decades):
+    rng = np.random.default_rng(seed)
+    p = Plant.of(problem(scalar(-0.5, 1.0)))
+    onto_u = np.linalg.svd(np.hstack([p.B2.T, p.D12.T]))[2][1:].T
+    onto_y = np.linalg.svd(np.hstack([p.C2, p.D21]))[2][1:].T
+    multipliers = []
+    for onto, more in ((onto_u, 2), (onto_y, 2)):
+        wide = np.block(
+            [[onto, np.zeros((3, more))], [np.zeros((more, onto.shape[1])), np.eye(more)]]
+        )
+        root = rng.standard_normal((wide.shape[1], 2)) * 10.0 ** (decades * rng.random((1, 2)))
+        multipliers.append(wide @ root @ root.T @ wide.T)
+    # the Lyapunov matrices of a controller that exists: those at 1.2 times the smallest gamma
+    X, Y, gamma = reached()
+    assert dual_bound(p, *multipliers, X, Y) <= gamma * (1 + 1e-9)
+
+
+def reached(slack=1.2):
+    """X, Y and gamma of the scalar problem, feasible by hand: X = Y = gamma / X_riccati.
+
+    At a larger gamma the Riccati solution satisfies its LMI with room to spare.
+    """
+    a = -0.5
+    gamma = slack * output_feedback_gamma(a)
+    c = 1.0 - 1.0 / gamma**2
+    # a little above the Riccati solution, so that the inequality is strict
+    P = (1 + 1e-6) * (a + np.sqrt(a * a + c)) / c
+    assert gamma > P
+    return np.array([[gamma / P]]), np.array([[gamma / P]]), gamma
+
+
+# --- what is refused
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"back_off": 0.0},
+        {"back_off": -0.05},
+        {"tolerance": 0.0},
+        {"time_limit": np.nan},
+        {"max_states": -3},
+    ],
+)
+def test_bad_options(options):
+    with pytest.raises(ModelError, match=next(iter(options))):
+        Lmi(**options)
+
+
+def test_too_many_states_or_none():
+    with pytest.raises(ModelError, match=r"1 to 7 states, got 8.*Reduce the order"):
+        Lmi(max_states=7).solve(problem(random_parts(0)))
+    static = StateSpace(
+        np.zeros((0, 0)),
+        np.zeros((0, 2)),
+        np.zeros((2, 0)),
+        [[1.0, 1.0], [1.0, 0.0]],
+        inputs=["w", "u"],
+        outputs=["z", "y"],
+    )
+    with pytest.raises(ModelError, match="got 0"):
+        Lmi().solve(prepared(static, ["u"], ["y"]))
+
+
+def test_an_unreachable_unstable_mode_has_no_controller():
+    # only weakly infeasible (Y towards 0 satisfies all), so that the solver has no proof
+    parts = list(scalar(1.0, 1.0))
+    parts[2] = [[0.0]]
+    with pytest.raises(SolverError, match=r"after \d+ iterations.*Does u reach"):
+        Lmi().solve(problem(parts))
+
+
+def test_a_proof_of_infeasibility_is_named():
+    import cvxpy as cp
+
+    X = cp.Variable((2, 2), symmetric=True)
+    impossible = cp.Problem(cp.Minimize(0), [X - np.eye(2) >> 0, -X - np.eye(2) >> 0])
+    with pytest.raises(InfeasibleError, match="PrimalInfeasible after"):
+        lmi_programs._solve(impossible, SETTINGS)
+
+
+def test_a_violated_lmi_is_named(monkeypatch):
+    monkeypatch.setattr(lmi_programs, "VIOLATION", -1e-3)
+    with pytest.raises(SolverError, match=r"an LMI is violated: smallest eigenvalue"):
+        Lmi().solve(problem(scalar(1.0, 1.0)))
+
+
+def test_time_limit_is_kept_and_named():
+    with pytest.raises(SolverError, match=r"MaxTime after \d+ iterations.*8 states"):
+        Lmi(time_limit=1e-6).solve(problem(random_parts(0)))
+
+
+def test_a_disturbance_that_u_cancels_entirely():
+    # y = w, w and u enter alike: u = -w leaves nothing, at no cost
+    parts = ([[-1.0]], [[1.0]], [[1.0]], [[1.0]], [[0.0]], [[0.0]], [[0.0]], [[1.0]])
+    with pytest.raises(InfeasibleError, match=r"no smallest gamma.*Weight the efforts"):
+        Lmi().solve(problem(parts))
+
+
+def test_value_prints_saves_and_stays_light(tmp_path):
+    assert repr(Lmi(back_off=0.1)).startswith("Lmi(back_off=0.1")
+    Lmi(back_off=0.1).save(tmp_path / "lmi.npz")
+    assert repr(load(tmp_path / "lmi.npz")) == repr(Lmi(back_off=0.1))
+    code = "import sys, flexplant.synthesis.lmi; assert 'cvxpy' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
