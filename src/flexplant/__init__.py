@@ -9,6 +9,7 @@ From finite-element matrices and a measurement to the closed-loop error at a poi
 from typing import Any
 
 from . import errors as errors
+from . import parallel as _parallel  # noqa: F401  # before lti's connection takes the name
 from . import testbeds as testbeds
 from .errors import FlexplantError as FlexplantError
 from .errors import FlexplantWarning as FlexplantWarning

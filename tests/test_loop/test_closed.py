@@ -264,3 +264,16 @@ def test_the_recursion_itself(loop):
                 rtol=1e-8,
                 atol=1e-12 * np.abs(by_hand[output]).max(initial=1e-300),
             )
+
+
+def test_frequency_response_by_structure_equals_the_closed_system(loop):
+    # oracle: C (zI - A)^-1 B + D of the closed loop as one dense system
+    freq = np.geomspace(1.0, 0.49 * RATE, 50)
+    found = loop.frequency_response(freq)
+    g = loop.system
+    z = np.exp(2j * np.pi * freq * DT)
+    dense = np.array(
+        [g.C @ np.linalg.solve(x * np.eye(g.n_states) - g.A, g.B) + g.D for x in z]
+    ).transpose(1, 2, 0)
+    assert (tuple(found.inputs), tuple(found.outputs)) == (loop.plant.w, loop.plant.z)
+    np.testing.assert_allclose(found.data, dense, rtol=1e-7, atol=1e-9 * np.abs(dense).max())

@@ -31,7 +31,7 @@ def test_sensors_equal_every_subset_and_the_bound_bounds(make, seed, total, coun
     scorer = scorer_of(plant, "y", sensors, criterion)
     best, values = best_subset(count, total, lambda chosen: scorer(chosen)[0])
     assert len(values) == comb(total, count) <= 1500
-    found = place_sensors(plant, sensors, count, criterion, rng=seed)
+    found = place_sensors(plant, sensors, count, criterion, method=Exchange(), rng=seed)
     assert found.chosen == tuple(f"s{i}" for i in best)
     assert found.value == values[best]
     assert found.bound <= values[best]
@@ -51,7 +51,7 @@ def test_actuators_equal_every_subset_and_the_bound_bounds(make, seed, total, co
     criterion = PoiLqr("die", effort=1e-8)
     scorer = scorer_of(plant, "u", actuators, criterion)
     best, values = best_subset(count, total, lambda chosen: scorer(chosen)[0])
-    found = place_actuators(plant, actuators, count, criterion, rng=seed)
+    found = place_actuators(plant, actuators, count, criterion, method=Exchange(), rng=seed)
     assert found.value == values[best]
     assert found.chosen == tuple(f"a{i}" for i in best)
     assert scorer(range(total))[0] <= scorer.problem.bound(count, ()) <= values[best]
@@ -162,9 +162,18 @@ def test_executors_give_the_same_to_the_bit(make, kind, send_everything):
         assert serial._fields() | {"ports": 0} == other._fields() | {"ports": 0}
 
 
+def test_few_subsets_are_all_scored_unless_told_otherwise(make):
+    plant, sensors, _ = make(12)
+    found = place_sensors(plant, sensors[:8], 3)
+    assert found.evaluations == comb(8, 3)
+    assert found.bound == found.value
+
+
 def test_seeds_repeat(make):
     plant, sensors, _ = make(12)
-    first, again, other = (place_sensors(plant, sensors, 4, rng=seed).history for seed in (1, 1, 2))
+    first, again, other = (
+        place_sensors(plant, sensors, 4, method=Exchange(), rng=seed).history for seed in (1, 1, 2)
+    )
     assert first == again
     assert first[0] == other[0]  # the greedy start is no matter of chance
     assert first != other

@@ -9,8 +9,10 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, unknown_label
+from ..lti.frequency import Frf, frequency_response
 from ..lti.interconnection import connect, lft
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -101,6 +103,43 @@ class ClosedLoop(Value):
     def system(self) -> StateSpace:
         """The closed loop from w to z; states of the plant, then of the controller."""
         return self.monitored.select(outputs=self.plant.z)
+
+    def frequency_response(self, freq: npt.ArrayLike) -> Frf:
+        """Return the response from w to z, plant and controller each by their own structure.
+
+        ``P11 + P12 K (I - P22 K)^-1 P21`` at each frequency: a plant in modal blocks costs O(n),
+        where the closed loop as one system has lost its blocks.
+
+        Parameters
+        ----------
+        freq : (n_freq,) array [Hz]
+            Not above half the rate.
+
+        Returns
+        -------
+        Frf
+            Of all z and w.
+
+        Raises
+        ------
+        ModelError
+            When a frequency is not allowed, or the loop is singular at one.
+        """
+        grid = np.asarray(freq, dtype=np.float64)
+        P = frequency_response(self.plant.system, grid)
+        heard = list(self.controller.inputs)
+        K = frequency_response(self.controller.select(outputs=self.driven), grid).data
+        w, u = (self.plant.system.input_index(names) for names in (self.plant.w, self.driven))
+        z, y = (self.plant.system.output_index(names) for names in (self.plant.z, heard))
+        Kt = np.moveaxis(K, 2, 0)
+        Pt = np.moveaxis(P.data, 2, 0)
+        back = np.eye(u.size) - Kt @ Pt[:, y][:, :, u]
+        try:
+            command = np.linalg.solve(back, Kt @ Pt[:, y][:, :, w])
+        except np.linalg.LinAlgError as error:
+            raise ModelError("the loop has a pole at one of the frequencies: move it.") from error
+        data = Pt[:, z][:, :, w] + Pt[:, z][:, :, u] @ command
+        return Frf(grid, np.moveaxis(data, 0, 2), tuple(self.plant.w), tuple(self.plant.z))
 
     @property
     def spectral_radius(self) -> float:

@@ -41,8 +41,9 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
     Parameters
     ----------
     loop : ClosedLoop, or (plant, controller)
-        The plant a StandardPlant, a StateSpace or a measured Frf; the controller y -> u with the
-        sign of the feedback in it.
+        The plant a StandardPlant, a StateSpace or a measured Frf (with the delay that the loop
+        will have); the controller y -> u with the sign of the feedback in it, or a ClosedLoop,
+        whose controller is then closed on this plant.
     freq : (n_freq,) array, optional [Hz]
         A grid refined at resonances when not given; those of the Frf for a measured plant.
     at : {"u", "y"}
@@ -170,10 +171,9 @@ def taken_apart(loop: Loop) -> Pieces:
         raise ModelError(
             f"need a ClosedLoop or a tuple (plant, controller), got {type(loop).__name__}."
         )
-    plant, law = loop[0], getattr(loop[1], "system", loop[1])
-    controller = law if isinstance(law, StateSpace) else StateSpace.from_control(law)
+    plant, controller = loop[0], _controller(loop[1])
     if isinstance(plant, Frf):
-        return _measured(plant, controller)
+        return _measured(plant, controller, _quantities(loop[1]))
     if isinstance(plant, StandardPlant):
         unread = [name for name in controller.inputs if name not in plant.y]
         if unread:
@@ -230,13 +230,33 @@ def _modelled(
     return Pieces(tuple(plant.inputs), tuple(plant.outputs), respond, poles, dt, None)
 
 
-def _measured(plant: Frf, controller: StateSpace) -> Pieces:
+def _controller(law: Any) -> StateSpace:
+    """Return the system y -> u of a controller; that of a closed loop between sensors and drives."""
+    if isinstance(law, ClosedLoop):
+        return law.controller.select(law.driven, law.fed_back)
+    law = getattr(law, "system", law)
+    return law if isinstance(law, StateSpace) else StateSpace.from_control(law)
+
+
+def _quantities(law: Any) -> dict[str, str]:
+    """Return what the sensors measure that a controller was designed for, as far as it knows."""
+    ports = getattr(getattr(law, "plant", None), "ports", None)
+    return {} if ports is None else {sensor.name: sensor.quantity for sensor in ports.y}
+
+
+def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> Pieces:
     for name in controller.inputs:
         if name not in plant.outputs:
             error = unknown_label("measured output", name, plant.outputs, "the Frf")
             raise LabelError(
                 f"{error} Select what was measured: controller.select(inputs=[...]); references "
                 "are no part of the loop."
+            )
+        wanted = quantities.get(name, plant.quantity)
+        if plant.quantity is not None and wanted != plant.quantity:
+            raise ModelError(
+                f"the Frf was measured as {plant.quantity}, the controller reads {name!r} as "
+                f"{wanted}: convert it, frf.converted({wanted!r})."
             )
     driven = [name for name in controller.outputs if name in plant.inputs]
     if not driven:

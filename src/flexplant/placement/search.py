@@ -32,6 +32,9 @@ from .candidates import (
 #: an exchange must gain this, relative, to be made: rounding must not make it go round in circles
 _GAIN = 1e-12
 
+#: up to here every subset is scored unless told otherwise: it takes seconds, and leaves no doubt
+_FEW = 1500
+
 
 @dataclass(frozen=True, eq=False)
 class Exchange(Value):
@@ -50,7 +53,7 @@ class Exchange(Value):
         When starts is not at least 1.
     """
 
-    starts: int = 5
+    starts: int = 10
 
     def __post_init__(self) -> None:
         if int(self.starts) != self.starts or self.starts < 1:
@@ -161,7 +164,7 @@ def place_sensors(
     required : sequence of str
         Candidates that any choice includes.
     method : Exchange or Exhaustive, optional
-        `Exchange()` when not given.
+        Every subset where there are at most 1500, else `Exchange()`, when not given.
     executor : concurrent.futures.Executor, optional
         Works on starts (or chunks of subsets); the result is the same to the bit.
     progress : bool, optional
@@ -220,7 +223,7 @@ def place_actuators(
     required : sequence of str
         Candidates that any choice includes.
     method : Exchange or Exhaustive, optional
-        `Exchange()` when not given.
+        Every subset where there are at most 1500, else `Exchange()`, when not given.
     executor : concurrent.futures.Executor, optional
         Works on starts (or chunks of subsets); the result is the same to the bit.
     progress : bool, optional
@@ -283,7 +286,9 @@ def _placed(
             f"no choice of {count} of the {len(ports)} candidates will do; of the nearest one: "
             f"{scorer.reason(spanning)} Choose more, or require others."
         )
-    method = Exchange() if method is None else method
+    if method is None:
+        few = comb(len(ports) - len(kept), int(count) - len(kept)) <= _FEW
+        method = Exhaustive() if few else Exchange()
     if isinstance(method, Exhaustive):
         found = _all(scorer, int(count), kept, method, executor, progress)
     elif isinstance(method, Exchange):
