@@ -231,7 +231,7 @@ def _modelled(
 
 
 def _controller(law: Any) -> StateSpace:
-    """Return the system y -> u of a controller; that of a closed loop between sensors and drives."""
+    """Return the system y -> u of a controller; of a closed loop, its own."""
     if isinstance(law, ClosedLoop):
         return law.controller.select(law.driven, law.fed_back)
     law = getattr(law, "system", law)

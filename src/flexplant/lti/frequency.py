@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..errors import ModelError, ShapeError, unknown_label
-from ..values import ComplexArray, FloatArray, Value, real_array, signal_names
+from ..values import ComplexArray, FloatArray, Value, positive, real_array, signal_names
 from .responses import continuous_poles, responses
 from .statespace import System, as_statespace
 
@@ -112,6 +113,53 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             inputs=chosen_in,
             outputs=chosen_out,
             coherence=None if self.coherence is None else self.coherence[picked],
+        )
+
+    def converted(self, quantity: str) -> Frf:
+        """Return the responses of another quantity: a time derivative is a factor 2 pi i f.
+
+        Parameters
+        ----------
+        quantity : {"displacement", "velocity", "acceleration"}
+            What the outputs shall be.
+
+        Raises
+        ------
+        ModelError
+            When the own quantity is not known, or zero frequency would be integrated.
+        LabelError
+            When `quantity` is another word.
+        """
+        orders = {"displacement": 0, "velocity": 1, "acceleration": 2}
+        if quantity not in orders:
+            raise unknown_label("quantity", quantity, orders)
+        if self.quantity not in orders:
+            raise ModelError(
+                f"the quantity of this Frf is {self.quantity!r}: state what was measured, "
+                "frf.replace(quantity='acceleration'), before it is converted."
+            )
+        order = orders[quantity] - orders[self.quantity]
+        if order < 0 and self.freq.size and self.freq[0] == 0:
+            raise ModelError("zero frequency cannot be integrated: leave it out of the Frf.")
+        data = self.data * (2j * np.pi * self.freq) ** order
+        return self.replace(data=data, quantity=quantity)
+
+    def to_control(self, dt: float = 0.0) -> Any:
+        """Return a `control.FrequencyResponseData` with the same names.
+
+        Parameters
+        ----------
+        dt : float [s]
+            Sampling time of the system it came from; 0 for continuous time.
+        """
+        import control
+
+        return control.FrequencyResponseData(
+            self.data,
+            2 * np.pi * self.freq,
+            positive(dt, "dt", zero=True),
+            inputs=list(self.inputs),
+            outputs=list(self.outputs),
         )
 
     def _place(self, key: tuple[str, str]) -> tuple[int, int]:

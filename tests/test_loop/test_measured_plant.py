@@ -1,0 +1,164 @@
+"""Loop quantities of a measured plant: the controller is closed on the FRF first."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError
+from flexplant.estimation import design_static
+from flexplant.loop import (
+    bandwidth,
+    close_loop,
+    complementary_sensitivity,
+    control_sensitivity,
+    loop_gain,
+    modulus_margin,
+    sensitivity,
+)
+from flexplant.lti import Frf, StateSpace, frequency_response
+from flexplant.plant import Sensor, assemble_plant
+from flexplant.synthesis import design_servo
+from flexplant.testbeds import wafer_stage
+from stages import CORNERS, RATE, full, ports
+
+QUANTITIES = [loop_gain, sensitivity, complementary_sensitivity, control_sensitivity]
+
+
+@cache
+def loop_of(mass=0.5):
+    """A servo on the static estimate, closed around the plant with the delay of one sample."""
+    plant = assemble_plant(full(mass=mass), ports()).discretized(RATE, delay=1)
+    return close_loop(plant, design_static(plant), design_servo(plant, bandwidth=40.0))
+
+
+def frf_of(loop, freq):
+    return frequency_response(loop.plant.system.select(loop.fed_back, loop.driven), freq)
+
+
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_an_frf_of_the_model_gives_what_the_model_gives(quantity):
+    loop, freq = loop_of(), np.geomspace(2.0, 2000.0, 60)
+    measured, modelled = quantity((frf_of(loop, freq), loop)), quantity(loop, freq=freq)
+    assert (measured.inputs, measured.outputs) == (modelled.inputs, modelled.outputs)
+    size = np.abs(modelled.data).max()
+    np.testing.assert_allclose(measured.data, modelled.data, rtol=1e-7, atol=1e-9 * size)
+    if quantity is not control_sensitivity:
+        at_y = quantity((frf_of(loop, freq), loop), at="y")
+        wanted = quantity(loop, freq=freq, at="y")
+        assert at_y.inputs == tuple(loop.fed_back)
+        np.testing.assert_allclose(at_y.data, wanted.data, rtol=1e-6, atol=1e-7)
+
+
+def test_channels_of_the_frf_in_any_order_and_more_of_them():
+    loop, freq = loop_of(), np.geomspace(5.0, 500.0, 20)
+    frf = frf_of(loop, freq)
+    extra = np.concatenate([frf.data, 7 * frf.data[:1]])[::-1]
+    shuffled = Frf(
+        freq, extra[:, ::-1], inputs=frf.inputs[::-1], outputs=("spare", *frf.outputs[::-1])
+    )
+    np.testing.assert_allclose(
+        sensitivity((shuffled, loop)).data, sensitivity(loop, freq=freq).data, rtol=1e-7, atol=1e-9
+    )
+
+
+def test_margin_and_bandwidth_on_a_dense_frf_are_those_of_the_model():
+    loop = loop_of()
+    frf = frf_of(loop, np.arange(1.0, 4000.0, 0.5))
+    assert modulus_margin((frf, loop)) == pytest.approx(loop.modulus_margin, rel=1e-3)
+    assert modulus_margin((frf, loop)) >= loop.modulus_margin * (1 - 1e-9)  # a grid misses peaks
+    found, wanted = bandwidth((frf, loop)), bandwidth(loop)
+    assert wanted <= found <= wanted + 0.5 + 1e-9  # the first line above
+
+
+@cache
+def measured():
+    """The stage under feedback, its noise acting; the machine's delay put in by its phase."""
+    frf = wafer_stage().measure_frf(ports(asd=1e-4), period=0.5, periods=4, amplitude=30.0, rng=3)
+    return frf.replace(data=frf.data * np.exp(-2j * np.pi * frf.freq / RATE))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("quantity", QUANTITIES)
+def test_the_machine_measured_under_feedback(quantity):
+    """Lines of 2 Hz: what the truth gives, to the error of the measurement."""
+    loop, frf = loop_of(), measured()
+    low = frf.freq < 1500.0
+    found = quantity((frf, loop)).data[:, :, low]
+    wanted = quantity(loop, freq=frf.freq[low]).data
+    size = np.linalg.norm(wanted, axis=(0, 1))
+    off = np.linalg.norm(found - wanted, axis=(0, 1)) / size
+    assert np.median(off) < 0.01
+    assert off.max() < 0.05
+    # and it is the machine: a stage without its hidden mass is told apart
+    other = quantity(loop_of(mass=0.0), freq=frf.freq[low]).data
+    assert np.max(np.linalg.norm(found - other, axis=(0, 1)) / size) > 10 * off.max()
+
+
+@pytest.mark.slow
+def test_margin_and_bandwidth_of_the_machine():
+    loop, frf = loop_of(), measured()
+    assert modulus_margin((frf, loop)) == pytest.approx(loop.modulus_margin, rel=2e-3)
+    assert bandwidth((frf, loop)) == pytest.approx(bandwidth(loop), abs=2.0)
+
+
+def test_velocity_sensors_and_displacement_controllers():
+    """A controller knows what its sensors measure; an Frf of another quantity is refused."""
+    loop, freq = loop_of(), np.geomspace(5.0, 500.0, 20)
+    speed = [Sensor(s.name, at=p, quantity="velocity") for s, p in zip(ports().y, CORNERS)]  # noqa: B905
+    plant = assemble_plant(full(mass=0.5), ports(y=speed))
+    velocity = frequency_response(plant.system.select(loop.fed_back, loop.driven), freq)
+    velocity = velocity.replace(quantity="velocity")
+    with pytest.raises(ModelError, match=r"as velocity.*'y1' as displacement.*converted"):
+        sensitivity((velocity, loop))
+    moved = velocity.converted("displacement")
+    continuous = assemble_plant(full(mass=0.5), ports())
+    wanted = frequency_response(continuous.system.select(loop.fed_back, loop.driven), freq)
+    size = np.abs(wanted.data).max(axis=2, keepdims=True)
+    assert np.max(np.abs(moved.data - wanted.data) / size) < 1e-9
+    assert moved.quantity == "displacement"
+    S = sensitivity((moved, loop))
+    np.testing.assert_allclose(S.data, sensitivity((wanted, loop)).data, rtol=1e-6, atol=1e-9)
+    # a bare controller does not know what it reads: then the Frf decides
+    bare = loop.controller.select(loop.driven, loop.fed_back)
+    assert not np.allclose(sensitivity((velocity, bare)).data, S.data, rtol=0.1)
+
+
+def test_conversion_by_powers_of_2_pi_i_f():
+    frf = Frf([0.0, 2.0], [[[3.0, 1j]]], quantity="displacement")
+    acceleration = frf.converted("acceleration")
+    np.testing.assert_allclose(acceleration.data[0, 0], [0.0, -1j * (4 * np.pi) ** 2])
+    assert acceleration.quantity == "acceleration"
+    with pytest.raises(ModelError, match="zero frequency cannot be integrated"):
+        acceleration.converted("velocity")
+    with pytest.raises(ModelError, match=r"quantity of this Frf is None.*state what was measured"):
+        Frf([1.0], [[[1.0]]]).converted("velocity")
+    with pytest.raises(LabelError, match="no quantity 'speed'"):
+        frf.converted("speed")
+
+
+def test_frf_to_control():
+    frf = frf_of(loop_of(), np.array([3.0, 40.0, 900.0]))
+    theirs = frf.to_control(1 / RATE)
+    assert theirs.input_labels == list(frf.inputs)
+    assert theirs.output_labels == list(frf.outputs)
+    assert theirs.dt == 1 / RATE
+    np.testing.assert_allclose(theirs.omega, 2 * np.pi * frf.freq)
+    np.testing.assert_array_equal(theirs.complex, frf.data)
+    assert frf.to_control().dt == 0
+
+
+def test_what_was_not_measured_is_refused():
+    loop, freq = loop_of(), np.geomspace(5.0, 500.0, 20)
+    frf = frf_of(loop, freq)
+    with pytest.raises(LabelError, match="no measured output 'y4'"):
+        sensitivity((frf.select(["y1", "y2", "y3"]), loop))
+    with pytest.raises(LabelError, match="no measured input"):
+        sensitivity((frf.replace(inputs=("a", "b", "c", "d")), loop))
+    with pytest.raises(ModelError, match="half the sampling rate"):
+        late = Frf([10.0, RATE], np.ones((4, 4, 2)), inputs=frf.inputs, outputs=frf.outputs)
+        sensitivity((late, loop))
+    with pytest.raises(ModelError, match="own frequencies"):
+        control_sensitivity((frf, loop), freq=np.array([33.3]))
+    gain = StateSpace([], [], [], [[1.0]], inputs=["y1"], outputs=["u1"])
+    assert loop_gain((frf, gain)).data[0, 0, 3] == frf["y1", "u1"][3]
