@@ -64,6 +64,39 @@ def test_block_upper_triangular_systems(seed):
 
 
 @given(st.integers(0, 10_000))
+def test_block_diagonal_systems_of_any_kind(seed):
+    """Oscillating, overdamped, critical, real and unstable blocks, with feedthrough."""
+    rng = np.random.default_rng(seed)
+    sizes = rng.integers(1, 3, rng.integers(1, 7))
+    A = la.block_diag(*(rng.standard_normal((k, k)) * 10 ** rng.uniform(-1, 1) for k in sizes))
+    n = A.shape[0]
+    B, C = rng.standard_normal((n, 2)), rng.standard_normal((3, n))
+    g = StateSpace(A, B, C, rng.standard_normal((3, 2)) * rng.integers(0, 2), blocks=sizes)
+    freq = np.geomspace(1e-3, 10.0, 30)
+    assert_same(g, freq)
+    assert_same(g.replace(dt=0.04, A=A / 20), freq)
+
+
+def test_more_frequencies_than_one_pass_takes():
+    g = machine(3, 5)
+    freq = np.linspace(1.0, 4000.0, 1300)
+    assert_same(g, freq)
+    assert_same(g.replace(D=np.ones((5, 4))), freq)
+
+
+def test_slow_poles_of_a_sampled_system_keep_their_digits():
+    rate = 1e4
+    slow = np.array([0.01, 0.3]) / rate  # poles at exp(-slow), a millionth from 1
+    A = np.diag(np.exp(-slow))
+    g = StateSpace(A, slow[:, None], np.eye(2), np.zeros((2, 1)), 1 / rate, blocks=[1, 1])
+    freq = np.geomspace(1e-5, 1.0, 40)
+    found = frequency_response(g, freq).data[:, 0]
+    # z - p as expm1 terms: no difference of numbers near 1
+    z = np.expm1(2j * np.pi * freq[None] / rate) - np.expm1(-slow[:, None])
+    np.testing.assert_allclose(found, slow[:, None] / z, rtol=1e-9)
+
+
+@given(st.integers(0, 10_000))
 def test_dense_systems(seed):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(1, 9))
@@ -112,20 +145,53 @@ def test_first_order_gain_in_closed_form():
     assert value == pytest.approx((1 - pole) / (z - pole), rel=1e-12, abs=0)
 
 
-def test_default_grid_finds_resonances_and_antiresonances():
+@pytest.mark.parametrize(("size", "zeta"), [(1, 1e-3), (4, 1e-2), (4, 1e-4)])
+@pytest.mark.parametrize("sampled", [False, True])
+def test_the_line_through_the_default_grid_is_the_response(size, zeta, sampled):
+    g = machine(2, 8, m=size, p=size, zeta=zeta, seed=4)
+    g = discretized(g, 1e4, delay=1.5) if sampled else g
+    freq = default_freq(g)
+    found = np.log(np.abs(frequency_response(g, freq).data))
+    # not only in the middles, where the refinement looked
+    for part in (0.2, 0.5, 0.77):
+        between = freq[:-1] + part * np.diff(freq)
+        truth = np.log(np.abs(sweep(g.A, g.B, g.C, g.D, g.dt, between)))
+        line = (1 - part) * found[:, :, :-1] + part * found[:, :, 1:]
+        assert np.abs(line - truth).max() < 0.1
+    assert freq.size < 3000
+    assert np.all(np.diff(freq) > 0)
+
+
+def test_the_default_grid_meets_peaks_and_dips():
     g = machine(0, 3, m=1, p=1, seed=4)
     freq = default_freq(g)
-    found = frequency_response(g, freq)["y1", "u1"]
-    # whatever lies between two points is close to the line between them, also in the dips
-    middle = 0.5 * (freq[1:] + freq[:-1])
-    line = 0.5 * (found[1:] + found[:-1])
-    truth = sweep_fast(g, middle)
-    assert np.max(np.abs(line - truth) / np.abs(truth)) < 0.1
+    found = np.abs(frequency_response(g, freq)["y1", "u1"])
     dense = np.linspace(200, 4000, 400_001)
-    assert np.abs(found).max() == pytest.approx(np.abs(sweep_fast(g, dense)).max(), rel=1e-2, abs=0)
-    assert freq.size <= 3000
-    assert np.all(np.diff(freq) > 0)
+    truth = np.abs(sweep_fast(g, dense))
+    assert found.max() == pytest.approx(truth.max(), rel=1e-2, abs=0)
+    dips = np.flatnonzero((truth[1:-1] < truth[:-2]) & (truth[1:-1] < truth[2:])) + 1
+    assert dips.size == 2
+    line = np.interp(dense[dips], freq, np.log(found))
+    np.testing.assert_allclose(line, np.log(truth[dips]), rtol=0, atol=0.1)
     assert frequency_response(g).freq.size == freq.size
+
+
+def test_the_default_grid_keeps_to_its_number_of_points():
+    g = machine(0, 20, m=3, p=3)
+    assert default_freq(g).size > 700
+    assert default_freq(g, points=700).size == 700
+    assert default_freq(g, points=50).size == 50
+    assert default_freq(g, tolerance=1.0).size < default_freq(g).size
+    for bad in ({"points": 1}, {"points": -5}, {"tolerance": 0.0}):
+        with pytest.raises(ModelError, match=next(iter(bad))):
+            default_freq(g, **bad)
+
+
+def test_a_silent_channel_costs_no_points():
+    g = machine(0, 10, m=1, p=2)
+    noise = np.random.default_rng(0).standard_normal((1, g.n_states)) * 1e-22
+    quiet = g.replace(C=np.vstack([g.C[0], noise]))
+    assert default_freq(quiet).size < 1.2 * default_freq(g[["y1"], ["u1"]]).size
 
 
 def sweep_fast(g, freq):

@@ -150,7 +150,7 @@ def test_the_level_set_alone_finds_the_peak(monkeypatch, start, feedthrough, del
     g = g if delay is None else discretized(g, 1e4, delay=delay)
     expected = hinf_norm(g)
 
-    def poor(g, top):
+    def poor(g, find, top):
         return largest_gain(g.A, g.B, g.C, g.D, g.dt, np.array([start])), start
 
     monkeypatch.setattr(norms, "_searched", poor)

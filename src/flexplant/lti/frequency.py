@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, ShapeError, unknown_label
-from ..values import ComplexArray, FloatArray, Value, positive, real_array, signal_names
-from .responses import continuous_poles, responses
+from ..values import ComplexArray, FloatArray, Value, positive, real_array, rebuild, signal_names
+from .grid import default_freq as default_freq
+from .responses import responses
 from .statespace import System, as_statespace
 
 
@@ -211,7 +212,16 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
             f"frequency {freq[-1]:g} Hz lies above half the sampling rate ({0.5 / g.dt:g} Hz), "
             "where a sampled system has no response of its own. Stay below."
         )
-    return Frf(freq, responses(g, freq), inputs=g.inputs, outputs=g.outputs)
+    if np.any(np.diff(freq) <= 0):
+        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
+    data = responses(g, freq)
+    # the checks of Frf hold already: its copy and its look at every entry cost twice the response
+    for array in (freq, data):
+        array.flags.writeable = False
+    fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}
+    frf = rebuild(Frf, fields | {"quantity": None, "coherence": None})
+    assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
+    return frf
 
 
 def checked_freq(freq: FloatArray) -> FloatArray:
@@ -220,72 +230,6 @@ def checked_freq(freq: FloatArray) -> FloatArray:
     if freq.size and freq.min() < 0:
         raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
     return freq
-
-
-def default_freq(sys: System, *, points: int = 3000, tolerance: float = 0.05) -> FloatArray:
-    """Return a grid [Hz] that follows the resonances and antiresonances of a system.
-
-    From a decade below the slowest pole to a decade above the fastest (or half the sampling rate),
-    with points through every resonance; then intervals are halved where a response differs from
-    the line between its neighbours by more than `tolerance` of its own size, the worst first.
-
-    Parameters
-    ----------
-    sys : StateSpace
-        The system.
-    points : int
-        Most points.
-    tolerance : float
-        Relative.
-
-    Returns
-    -------
-    (n_freq,) array [Hz]
-        Increasing, positive.
-    """
-    g = as_statespace(sys)
-    poles = continuous_poles(g)
-    size = np.abs(poles) / (2 * np.pi)
-    top = 0.5 / g.dt if g.dt else np.inf
-    moving = size[(size > 1e-12 * size.max(initial=0.0)) & (size < top)]
-    low, high = (0.1 * moving.min(), 10 * moving.max()) if moving.size else (0.01, 100.0)
-    high = min(high, top)
-    low = min(low, 1e-3 * high)
-    freq = [np.geomspace(low, high, 200)]
-    zeta = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
-    around = np.sinh(np.linspace(-4.0, 4.0, 9)) / np.sinh(1.0)
-    for f, z in zip(np.abs(poles.imag) / (2 * np.pi), zeta, strict=True):
-        if low < f < high and z < 0.3:
-            freq.append(f * (1 + max(z, 1e-6) * around))
-    grid = np.unique(np.concatenate(freq))
-    grid = grid[(grid >= low) & (grid <= high)]
-    data = responses(g, grid)
-    while grid.size < points:
-        worst = _crooked(grid, data)
-        order = np.argsort(worst)[::-1]
-        bent = order[worst[order] > tolerance][: max(1, (points - grid.size) // 2)] + 1
-        if not bent.size:
-            break
-        halves = np.unique(np.concatenate([bent - 1, bent]))[: points - grid.size]
-        fresh = 0.5 * (grid[halves] + grid[halves + 1])
-        fresh = fresh[(fresh > grid[halves]) & (fresh < grid[halves + 1])]
-        if not fresh.size:
-            break
-        data = np.concatenate([data, responses(g, fresh)], axis=2)
-        grid = np.concatenate([grid, fresh])
-        order = np.argsort(grid)
-        grid, data = grid[order], data[:, :, order]
-    return grid
-
-
-def _crooked(grid: FloatArray, data: ComplexArray) -> FloatArray:
-    """Return how far inner points (n_freq - 2,) lie off the line of their neighbours, relative."""
-    weight = (grid[1:-1] - grid[:-2]) / (grid[2:] - grid[:-2])
-    line = data[:, :, :-2] * (1 - weight) + data[:, :, 2:] * weight
-    off = np.abs(data[:, :, 1:-1] - line)
-    floor = 1e-9 * np.max(np.abs(data), axis=2, initial=0.0)[:, :, None]
-    relative = off / np.maximum(np.abs(data[:, :, 1:-1]), floor + 1e-300)
-    return np.asarray(relative.max(axis=(0, 1), initial=0.0))
 
 
 def _index(known: Sequence[str], name: str, side: str) -> int:

@@ -7,7 +7,7 @@ import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
 from ..values import FloatArray, real_array
-from .statespace import StateSpace, System, as_statespace
+from .statespace import StateSpace, System, as_statespace, is_block_diagonal
 
 #: doublings: 2^60 terms of the series; a slower decay is not told from none
 DOUBLINGS = 60
@@ -150,14 +150,9 @@ def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
             f"{g!r} is not strictly stable, so its Gramian is infinite. Take rigid-body and "
             "unstable modes out, or close a loop first."
         )
-    if g.blocks is not None and set(g.blocks) <= {1, 2} and _block_diagonal(g):
+    if is_block_diagonal(g):
         return _modal_gramian(A, B, g.blocks, bool(g.dt))
     return solve_stein(A, B @ B.T) if g.dt else solve_lyapunov(A, B @ B.T)
-
-
-def _block_diagonal(g: StateSpace) -> bool:
-    owner = np.repeat(np.arange(len(g.blocks or ())), g.blocks or ())
-    return not np.any(g.A[owner[:, None] != owner[None, :]])
 
 
 def _modal_gramian(

@@ -10,28 +10,57 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray, IntArray
+from .scaling import state_scale
 from .statespace import StateSpace
 
-#: entries of the largest intermediate array (complex)
+#: entries of the largest intermediate array of a back substitution (complex)
 CHUNK = 2_000_000
+#: frequencies at a time in block form: the scalar functions of all modes stay in cache
+MODAL_STEP = 512
+
+#: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument
+Solver = Callable[[ComplexArray, ComplexArray], None]
 
 
 def responses(g: StateSpace, freq: FloatArray) -> ComplexArray:
     """Return the (n_out, n_in, n_freq) responses at frequencies [Hz] that were checked."""
-    omega = 2 * np.pi * freq
-    s: ComplexArray = np.asarray(np.exp(1j * omega * g.dt) if g.dt else 1j * omega)
-    out = np.empty((len(g.outputs), len(g.inputs), freq.size), dtype=np.complex128)
-    out[:] = g.D[:, :, None]
-    if not g.n_states or not out.size:
-        return out
+    return responder(g)(freq)
+
+
+def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
+    """Return the function of frequency [Hz] that gives the responses, prepared once."""
+    shape = len(g.outputs), len(g.inputs)
+    if not g.n_states or not g.D.size:
+        return lambda freq: np.repeat(g.D[:, :, None], freq.size, axis=2).astype(np.complex128)
+    modal = _modal(g)
+    if modal is not None:
+        return lambda freq: _finite(modal(_points(g, freq)), freq)
     solve = _solver(g)
     step = max(1, CHUNK // (g.n_states * (len(g.inputs) + 2)))
-    for start in range(0, freq.size, step):
-        part = slice(start, start + step)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            solve(s[part], out[:, :, part])
-    bad = ~np.isfinite(out).all(axis=(0, 1))
-    if bad.any():
+
+    def found(freq: FloatArray) -> ComplexArray:
+        s = _points(g, freq)
+        out = np.empty((*shape, freq.size), dtype=np.complex128)
+        out[:] = g.D[:, :, None]
+        for start in range(0, freq.size, step):
+            part = slice(start, start + step)
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                solve(s[part], out[:, :, part])
+        return _finite(out, freq)
+
+    return found
+
+
+def _points(g: StateSpace, freq: FloatArray) -> ComplexArray:
+    omega = 2 * np.pi * freq
+    return np.asarray(np.exp(1j * omega * g.dt) if g.dt else 1j * omega)
+
+
+def _finite(out: ComplexArray, freq: FloatArray) -> ComplexArray:
+    # the sum is infinite or NaN when an entry is; it may also overflow, which the entries decide
+    with np.errstate(invalid="ignore", over="ignore"):
+        suspect = not np.isfinite(out.sum())
+    if suspect and (bad := ~np.isfinite(out).all(axis=(0, 1))).any():
         raise ModelError(
             f"the response at {freq[bad][0]:g} Hz is infinite: an undamped pole (rigid-body modes "
             "are poles at 0 Hz) lies there. Leave the frequency out or add damping."
@@ -49,14 +78,9 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
     return np.asarray(logs[np.isfinite(logs)] / g.dt)
 
 
-def _solver(g: StateSpace) -> Callable[[ComplexArray, ComplexArray], None]:
-    """Return a function that adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument."""
-    sizes = set(g.blocks) if g.blocks is not None else {0}
-    if sizes <= {1, 2}:
-        pairs, slots, coupling = _paired(g)
-        if not np.any(coupling):
-            return _modal(g, pairs, slots)
-        return _substitution(g, pairs, slots, coupling)
+def _solver(g: StateSpace) -> Solver:
+    if g.blocks is not None and set(g.blocks) <= {1, 2}:
+        return _substitution(g, *_paired(g))
     return _schur(g)
 
 
@@ -75,27 +99,65 @@ def _paired(g: StateSpace) -> tuple[FloatArray, IntArray, FloatArray]:
     return pairs, slots, coupling
 
 
-def _modal(
-    g: StateSpace, pairs: FloatArray, slots: IntArray
-) -> Callable[[ComplexArray, ComplexArray], None]:
-    """Block-diagonal A: ``sum_i C_i adj(s I - A_i) B_i / det(s I - A_i)``, two real products."""
+def _modal(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | None:
+    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
+
+    With m half the trace of a block, N = A - m I and N^2 = q I (Cayley-Hamilton),
+    ``(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)``: no cancellation near s = m, which matters
+    for slow modes of a sampled system. A 1 x 1 block is N = 0. Complex numbers are pairs of real
+    columns, so that no complex product is formed.
+    """
+    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+        return None
+    pairs, slots, coupling = _paired(g)
+    if np.any(coupling):
+        return None
     real = slots >= 0
-    a, b, c, d, first, second = _closed_form(g, pairs, real)
+    pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]  # N = 0 for a 1 x 1 block
+    mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
+    N = pairs.copy()
+    N[:, 0, 0] = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
+    N[:, 1, 1] = -N[:, 0, 0]
+    q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+    split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     B = g.B[slots] * real[:, :, None]  # (b, 2, m)
     C = (g.C[:, slots] * real).transpose(1, 2, 0)  # (b, 2, p)
-    with_s = np.einsum("bip,bim->pmb", C, B)
-    adjugate = np.stack([np.stack([-d, b], 1), np.stack([c, -a], 1)], 1)
-    without = np.einsum("bip,bij,bjm->pmb", C, adjugate, B)
-    shape = (*with_s.shape[:2], -1)
-    both = np.concatenate([with_s.reshape(-1, len(a)), without.reshape(-1, len(a))])
+    with_s = np.einsum("bip,bim->pmb", C, B).reshape(g.D.size, -1)
+    without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(g.D.size, -1)
+    moving, fixed = np.any(with_s, axis=0), np.any(without, axis=0)
+    through = g.D.reshape(-1, 1) if np.any(g.D) else np.zeros((g.D.size, 0))
+    residues = np.hstack([with_s[:, moving], without[:, fixed], through])
+    n_moving, n_both = int(moving.sum()), int(moving.sum() + fixed.sum())
 
-    def add(s: ComplexArray, out: ComplexArray) -> None:
-        inverse = 1.0 / ((s - first[:, None]) * (s - second[:, None]))  # (b, n_s)
-        parts = both @ inverse.real + 1j * (both @ inverse.imag)
-        moving, fixed = np.split(parts, 2)
-        out += (moving * s + fixed).reshape(shape)
+    def found(s: ComplexArray) -> ComplexArray:
+        data = np.empty((*g.D.shape, s.size), dtype=np.complex128)
+        out = data.reshape(g.D.size, -1).view(np.float64)
+        for start in range(0, s.size, MODAL_STEP):
+            part = s[start : start + MODAL_STEP]
+            x, y = part.real - mean[:, None], part.imag
+            real_part = (x - split[:, None]) * (x + split[:, None])
+            real_part += (swing[:, None] - y) * (swing[:, None] + y)
+            imag_part = 2.0 * x * y
+            functions = np.empty((residues.shape[1], part.size, 2))
+            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+                size = 1.0 / (real_part * real_part + imag_part * imag_part)
+                real_part *= size
+                imag_part *= -size  # (real_part, imag_part) is 1 / ((s - m)^2 - q) now
+                if n_moving:
+                    r, i, x = real_part[moving], imag_part[moving], x[moving]
+                    functions[:n_moving, :, 0] = x * r - y * i
+                    functions[:n_moving, :, 1] = x * i + y * r
+                functions[n_moving:n_both, :, 0] = real_part[fixed]
+                functions[n_moving:n_both, :, 1] = imag_part[fixed]
+                functions[n_both:] = (1.0, 0.0)
+                np.matmul(
+                    residues,
+                    functions.reshape(residues.shape[1], -1),
+                    out=out[:, 2 * start : 2 * (start + part.size)],
+                )
+        return data
 
-    return add
+    return found
 
 
 def _closed_form(
@@ -113,7 +175,7 @@ def _closed_form(
 
 def _substitution(
     g: StateSpace, pairs: FloatArray, slots: IntArray, coupling: FloatArray
-) -> Callable[[ComplexArray, ComplexArray], None]:
+) -> Solver:
     """Block upper triangular A: all blocks of one level (no coupling among them) at once."""
     real = slots >= 0
     a, b, c, d, first, second = _closed_form(g, pairs, real)
@@ -150,13 +212,13 @@ def _substitution(
     return add
 
 
-def _schur(g: StateSpace) -> Callable[[ComplexArray, ComplexArray], None]:
+def _schur(g: StateSpace) -> Solver:
     """Any A: back substitution with the Schur form of the balanced A.
 
     Balancing first: the orthogonal transformation mixes rounding with the norm of all of A, which
     plain (q, dq/dt) states let grow with the square of the fastest mode.
     """
-    _, (d, _) = la.matrix_balance(g.A, permute=False, separate=True)
+    d = state_scale(g.A, g.B, g.C)
     A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
     T, U = la.schur(A, output="complex")
     n, m = B.shape

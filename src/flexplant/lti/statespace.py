@@ -188,6 +188,37 @@ class StateSpace(Value):
             outputs=[(outputs or {}).get(name, name) for name in self.outputs],
         )
 
+    def transformed(self, T: npt.ArrayLike, *, states: Sequence[str] = ()) -> StateSpace:
+        """Return the same system in other states, ``x = T x_new`` (a similarity).
+
+        ``A_new = T^-1 A T, B_new = T^-1 B, C_new = C T``. Channels and D stay; blocks are not kept.
+
+        Parameters
+        ----------
+        T : (n, n) array
+            Not singular; judged after scaling its columns, which only change units.
+        states : sequence of str, optional
+            Names of the new states; `x1`... when not given.
+
+        Raises
+        ------
+        ShapeError, ModelError, LabelError
+            When T has another shape or is singular to working precision, or names do not fit.
+        """
+        n = self.n_states
+        matrix = real_array(T, "T", (n, n))
+        size = np.linalg.norm(matrix, axis=0)
+        condition = float(np.linalg.cond(matrix / np.where(size > 0, size, 1.0))) if n else 1.0
+        if not condition < 1e14:
+            raise ModelError(
+                f"T is singular (condition {condition:.1e}): its columns must be n independent "
+                "directions of the state, else information is lost. Reduce the system instead."
+            )
+        new = np.linalg.solve(matrix, np.hstack([self.A @ matrix, self.B]))
+        return self.replace(
+            A=new[:, :n], B=new[:, n:], C=self.C @ matrix, states=tuple(states), blocks=None
+        )
+
     def evaluated(self, s: complex) -> ComplexArray:
         """Return the gain ``C (s I - A)^-1 B + D`` at one complex frequency s (z when sampled)."""
         shifted = s * np.eye(self.n_states) - self.A
@@ -275,6 +306,14 @@ def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
         part = slice(start, start + size)
         poles[part] = la.eigvals(A[part, part])
     return poles
+
+
+def is_block_diagonal(g: StateSpace) -> bool:
+    """Return whether A is known to be made of 1 x 1 and 2 x 2 diagonal blocks alone."""
+    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+        return False
+    owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
+    return not np.any(g.A[owner[:, None] != owner[None, :]])
 
 
 def _checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:

@@ -1,0 +1,211 @@
+"""Balanced reduction: fewer states, with the error promised beforehand and measured afterwards."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError, SolverError
+from ..values import FloatArray, Value, positive
+from .factors import compressed, controllability_factor, observability_factor
+from .interconnection import parallel, series
+from .norms import peak_gain
+from .splitting import Split, split_stable
+from .stability import obstacle
+from .statespace import StateSpace, System, as_statespace
+
+#: Hankel singular values below this of the largest are rounding
+RANK = 1e-14
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BalancedReduction(Value):
+    """A reduced system and what the reduction costs.
+
+    Parameters
+    ----------
+    system : StateSpace
+        The reduced system: balanced states, then the rigid-body and unstable ones as they were.
+    hankel : (n_stable,) array [output unit / input unit]
+        Hankel singular values of the stable part (of the weighted one), the largest first.
+    bound : float [output unit / input unit]
+        Twice the sum of the discarded values: no frequency has a larger error. NaN with weights,
+        where no such bound holds.
+    error : float [output unit / input unit]
+        H-infinity norm of the error that was made, computed from the error system (weighted).
+    error_freq : float [Hz]
+        Where the error is largest.
+    n_kept : int
+        Rigid-body and unstable states, which are kept exactly.
+    """
+
+    system: StateSpace
+    hankel: FloatArray
+    bound: float
+    error: float
+    error_freq: float
+    n_kept: int
+
+    def __post_init__(self) -> None:
+        self._set(hankel=self.hankel)
+
+    def __repr__(self) -> str:
+        full = self.hankel.size + self.n_kept
+        promised = f"bound {self.bound:.3g}" if np.isfinite(self.bound) else "no bound (weighted)"
+        return (
+            f"<BalancedReduction: {full} -> {self.system.n_states} states ({self.n_kept} kept "
+            f"exactly), error {self.error:.3g} at {self.error_freq:.4g} Hz, {promised}>"
+        )
+
+
+def balanced(
+    sys: System,
+    *,
+    order: int | None = None,
+    tol: float | None = None,
+    match_dc: bool = False,
+    input_weight: System | None = None,
+    output_weight: System | None = None,
+) -> BalancedReduction:
+    """Return a system with fewer states by balanced truncation or residualisation.
+
+    ``|G - G_r| <= 2 (s_{r+1} + ... + s_n)`` in the H-infinity norm, s the Hankel singular values
+    of the stable part. Rigid-body and unstable modes are split off first and kept exactly. With
+    weights (Enns) the states are balanced as the weights see them, and ``W_o (G - G_r) W_i`` is
+    measured.
+
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Continuous or sampled.
+    order : int, optional
+        States of the result, those kept exactly included. Give this or `tol`.
+    tol : float, optional
+        The smallest order whose bound is at most this times the largest Hankel singular value.
+    match_dc : bool
+        Residualise: the gain at 0 Hz is kept instead of that at infinite frequency. The discarded
+        states are taken at rest (singular perturbation) rather than left out; same bound.
+    input_weight, output_weight : StateSpace, optional
+        Stable filters before the inputs and behind the outputs, matched in order.
+
+    Returns
+    -------
+    BalancedReduction
+
+    Raises
+    ------
+    ModelError
+        When not exactly one of order and tol is given, order is outside what is possible, or a
+        weight does not fit or is not stable.
+    SolverError
+        When a two-sided weight leaves the reduced system unstable.
+
+    References
+    ----------
+    Enns, Model reduction with balanced realizations, CDC 1984. Liu, Anderson, Singular
+    perturbation approximation of balanced systems, Int. J. Control 50, 1989. Laub, Heath, Paige,
+    Ward, Computation of system balancing transformations, IEEE Trans. Autom. Control 32, 1987.
+    """
+    g = as_statespace(sys)
+    if (order is None) == (tol is None):
+        raise ModelError("balanced needs either order= (states) or tol= (relative error bound).")
+    before, after = _weight(input_weight, g, "input"), _weight(output_weight, g, "output")
+    split = split_stable(g)
+    stable = split.stable
+    Lp, Lq = _controllability(stable, before), _observability(stable, after)
+    left, values, right = np.linalg.svd(Lq.T @ Lp)
+    rank = int(np.sum(values > RANK * values[0])) if values.size and values[0] > 0 else 0
+    n_kept = split.rest.n_states
+    r = min(_order(order, tol, values, n_kept), rank)
+    W = Lq @ left[:, :rank] / np.sqrt(values[:rank])
+    T = Lp @ right[:rank].T / np.sqrt(values[:rank])
+    reduced = _reduced(stable, W, T, r, residual=match_dc)
+    if (problem := obstacle(reduced)) is not None:
+        raise SolverError(
+            f"the weighted reduction to {r} stable states is {problem.reason}: with weights on "
+            "both sides stability is not promised. Take another order or one weight."
+        )
+    error, freq = _error(stable, reduced, before, after)
+    weighted = before is not None or after is not None
+    bound = float("nan") if weighted else 2.0 * float(np.sum(values[r:]))
+    return BalancedReduction(_rejoined(g, split, reduced), values, bound, error, freq, n_kept)
+
+
+def _order(order: int | None, tol: float | None, values: FloatArray, n_kept: int) -> int:
+    """Return the number of stable states."""
+    if order is not None:
+        r = int(order) - n_kept
+        if order != int(order) or not 0 <= r <= values.size:
+            raise ModelError(
+                f"order must be a whole number from {n_kept} (rigid-body and unstable states, "
+                f"kept exactly) to {n_kept + values.size}, got {order}."
+            )
+        return r
+    limit = positive(tol, "tol") * float(np.max(values, initial=0.0))
+    tails = np.append(2.0 * np.cumsum(values[::-1])[::-1], 0.0)
+    return int(np.argmax(tails <= limit))
+
+
+def _reduced(g: StateSpace, W: FloatArray, T: FloatArray, r: int, *, residual: bool) -> StateSpace:
+    A, B, C, D = W.T @ g.A @ T, W.T @ g.B, g.C @ T, g.D
+    if residual and r < A.shape[0]:
+        # the discarded states at rest: 0 = A21 x1 + A22 x2 + B2 u (x2 = ... when sampled)
+        rest = (np.eye(A.shape[0] - r) if g.dt else 0.0) - A[r:, r:]
+        solved = np.linalg.solve(rest, np.hstack([A[r:, :r], B[r:]]))
+        x, u = solved[:, :r], solved[:, r:]
+        A, B, C, D = (
+            A[:r, :r] + A[:r, r:] @ x,
+            B[:r] + A[:r, r:] @ u,
+            C[:, :r] + C[:, r:] @ x,
+            (D + C[:, r:] @ u),
+        )
+    return g.replace(A=A[:r, :r], B=B[:r], C=C[:, :r], D=D, states=(), blocks=None)
+
+
+def _rejoined(g: StateSpace, split: Split, reduced: StateSpace) -> StateSpace:
+    names = [f"balanced{i}" for i in range(1, reduced.n_states + 1)]
+    both = parallel(reduced, split.rest) if split.rest.n_states else reduced
+    kept = [f"kept{i}" for i in range(1, split.rest.n_states + 1)]
+    return both.replace(states=[*names, *kept], name=g.name)
+
+
+def _weight(weight: System | None, g: StateSpace, side: str) -> StateSpace | None:
+    """Return a weight with its channels named so that it fits, or None."""
+    if weight is None:
+        return None
+    w = as_statespace(weight)
+    ours = g.inputs if side == "input" else g.outputs
+    theirs = w.outputs if side == "input" else w.inputs
+    if len(theirs) != len(ours):
+        raise ModelError(
+            f"the {side} weight needs {len(ours)} {'outputs' if side == 'input' else 'inputs'} "
+            f"for the {side}s of the system, got {len(theirs)}."
+        )
+    if w.n_states and w.dt != g.dt:
+        raise ModelError(f"the {side} weight has sampling time {w.dt:g} s, the system {g.dt:g} s.")
+    if (problem := obstacle(w)) is not None:
+        raise ModelError(f"the {side} weight is {problem.reason}: weights must be stable.")
+    return w.replace(dt=g.dt)
+
+
+def _controllability(g: StateSpace, before: StateSpace | None) -> FloatArray:
+    # series puts the states of g first
+    joined = g if before is None else series(before, g)
+    return compressed(controllability_factor(joined)[: g.n_states])
+
+
+def _observability(g: StateSpace, after: StateSpace | None) -> FloatArray:
+    joined = g if after is None else series(g, after)
+    return compressed(observability_factor(joined)[joined.n_states - g.n_states :])
+
+
+def _error(
+    g: StateSpace, reduced: StateSpace, before: StateSpace | None, after: StateSpace | None
+) -> tuple[float, float]:
+    difference = parallel(g, reduced.replace(C=-reduced.C, D=-reduced.D))
+    if before is not None:
+        difference = series(before, difference)
+    if after is not None:
+        difference = series(difference, after)
+    return peak_gain(difference)

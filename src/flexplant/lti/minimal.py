@@ -1,0 +1,104 @@
+"""Minimal realisations: without the states that no input moves or no output sees."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import FloatArray, positive
+from .factors import controllability_factor, observability_factor
+from .interconnection import parallel
+from .modal import modal_form
+from .splitting import split_stable
+from .statespace import StateSpace, System, as_statespace
+
+
+def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
+    """Return the system without states that are not both reached and seen.
+
+    The stable part is balanced and loses the states with Hankel singular values below `tol` of
+    the largest; channels are scaled to one size first, so that metres beside newtons do not decide
+    what is small. Rigid-body and unstable modes are judged in the same way after a shift of the
+    axis, which changes neither reachability nor observability.
+
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Continuous or sampled.
+    tol : float
+        Relative; below it rounding decides. A state of this size changes no frequency response by
+        more than twice `tol` of the largest.
+
+    Returns
+    -------
+    StateSpace
+        The same channels; `sys` itself when nothing is to be left out, and blocks are found again
+        when it had any.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is no system or tol is not between 0 and 1.
+    SolverError
+        When stable and unstable modes cannot be told apart.
+
+    References
+    ----------
+    Tombs, Postlethwaite, Truncated balanced realization of a stable non-minimal state-space
+    system, Int. J. Control 46, 1987.
+    """
+    g = as_statespace(sys)
+    if not positive(tol, "tol") < 1.0:
+        raise ModelError(f"tol must lie between 0 and 1, got {tol:g}.")
+    if not g.n_states:
+        return g
+    split = split_stable(g)
+    stable, rest = _less(split.stable, tol), _less(split.rest, tol)
+    n = stable.n_states + rest.n_states
+    if n == g.n_states:
+        return g
+    both = parallel(stable, rest)
+    blocks = both.blocks if g.blocks is not None else None
+    return both.replace(
+        states=[f"x{i}" for i in range(1, n + 1)], name=g.name, blocks=blocks or None
+    )
+
+
+def _less(g: StateSpace, tol: float) -> StateSpace:
+    n = g.n_states
+    if not n:
+        return g
+    judged = _stabilised(g)
+    # one size for all channels: what reaches the states from each input, what each output sees
+    seen = observability_factor(judged)
+    drive = _inverse(np.linalg.norm(seen.T @ g.B, axis=0))
+    judged = judged.replace(B=judged.B * drive)
+    reached = controllability_factor(judged)
+    sight = _inverse(np.linalg.norm(g.C @ reached, axis=1))
+    judged = judged.replace(C=judged.C * sight[:, None])
+    seen = observability_factor(judged)
+    left, values, right = np.linalg.svd(seen.T @ reached)
+    r = int(np.sum(values > tol * values[0])) if values[0] > 0 else 0
+    if r == n:
+        return g
+    root = np.sqrt(values[:r])
+    W, T = seen @ left[:, :r] / root, reached @ right[:r].T / root
+    less = g.replace(A=W.T @ g.A @ T, B=W.T @ g.B, C=g.C @ T, states=(), blocks=None)
+    return modal_form(less).system if g.blocks is not None and r else less
+
+
+def _stabilised(g: StateSpace) -> StateSpace:
+    """Return the system with its poles moved together until it is stable: the same subspaces."""
+    poles = g.poles()
+    if g.dt:
+        radius = float(np.max(np.abs(poles)))
+        return g if radius < 1 and g.is_stable else g.replace(A=g.A / (1.1 * radius + 0.1))
+    growth = float(poles.real.max())
+    if growth < 0:
+        return g
+    speed = float(np.linalg.norm(g.A) / np.sqrt(g.n_states)) or 1.0
+    return g.replace(A=g.A - (growth + speed) * np.eye(g.n_states))
+
+
+def _inverse(size: FloatArray) -> FloatArray:
+    return np.asarray(1.0 / np.where(size > 0, size, 1.0))

@@ -1,0 +1,33 @@
+"""Units of the states in which rounding does little harm."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..values import FloatArray
+
+
+def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
+    """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even.
+
+    A is bordered by the sizes of B's rows and C's columns and balanced with them: balancing A
+    alone shrinks whatever lies above its diagonal blocks without end (a Schur form of 84 states
+    got units of 1e26 beside 1e-34), which costs B and C all their digits.
+    """
+    n = A.shape[0]
+    drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
+    size = float(np.linalg.norm(A)) or 1.0
+    bordered = np.zeros((n + 1, n + 1))
+    bordered[:n, :n] = A
+    # both borders as large as A, whatever the units of inputs and outputs
+    bordered[:n, n] = drive * (size / (np.linalg.norm(drive) or 1.0))
+    bordered[n, :n] = sight * (size / (np.linalg.norm(sight) or 1.0))
+    # gebal itself: scipy's matrix_balance reads scales above 2^63 as permutations, with a warning
+    found = la.lapack.dgebal(bordered, scale=1, permute=0)[3]
+    return np.asarray(found[:n] / found[n])
+
+
+def balanced_matrix(A: FloatArray) -> FloatArray:
+    """Return A with even rows and columns (LAPACK's gebal): the same eigenvalues."""
+    return np.asarray(la.lapack.dgebal(A, scale=1, permute=0)[0])

@@ -1,0 +1,132 @@
+"""A system as the sum of its stable part and the rest (rigid-body and unstable modes)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import SolverError
+from ..values import FloatArray, Value
+from .scaling import state_scale
+from .stability import doubted_poles
+from .statespace import (
+    StateSpace,
+    System,
+    as_statespace,
+    block_eigenvalues,
+    is_block_diagonal,
+)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Split(Value):
+    """``sys = stable + rest``: add the two (`parallel`) to have the system back.
+
+    Parameters
+    ----------
+    stable : StateSpace
+        Strictly stable, with the feedthrough.
+    rest : StateSpace
+        Rigid-body, marginal and unstable modes, strictly proper.
+    separation : float
+        Norm of the decoupling transformation: how much rounding grows; 0 when A had blocks.
+    """
+
+    stable: StateSpace
+    rest: StateSpace
+    separation: float
+
+    def __repr__(self) -> str:
+        return (
+            f"<Split: {self.stable.n_states} stable states, {self.rest.n_states} others, "
+            f"separation {self.separation:.1e}>"
+        )
+
+
+def split_stable(sys: System) -> Split:
+    """Return the additive decomposition into a stable part and the rest.
+
+    Where A is block diagonal its blocks are sorted, exactly. Otherwise by ordered Schur form
+    ``[[A1, A12], [0, A2]]`` and the Sylvester equation ``A1 X - X A2 + A12 = 0`` that removes A12;
+    a pole nearer to the edge of stability than its rounding (of A, times the condition of the
+    eigenvalue) is not called stable, nor is any that lies nearer than such a pole.
+
+    Parameters
+    ----------
+    sys : StateSpace or control.StateSpace
+        Continuous or sampled.
+
+    Returns
+    -------
+    Split
+        Both parts with all channels and their names.
+
+    Raises
+    ------
+    ModelError
+        When `sys` is no system.
+    SolverError
+        When the two parts share a pole to working precision.
+    """
+    g = as_statespace(sys)
+    if not g.n_states:
+        return Split(g, g.replace(D=0 * g.D), 0.0)
+    if is_block_diagonal(g):
+        return _by_blocks(g)
+    poles, doubt = doubted_poles(g)
+    growth = np.abs(poles) - 1.0 if g.dt else poles.real
+    outside = growth >= -doubt
+    edge = float(min(growth[outside].min(), 0.0) - doubt[outside].max()) if outside.any() else 0.0
+    d = state_scale(g.A, g.B, g.C)
+    A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
+
+    def inside(real: float, imag: float) -> bool:
+        return bool((np.hypot(real, imag) - 1.0 if g.dt else real) < edge)
+
+    T, Z, k = la.schur(A, sort=inside)
+    if k == g.n_states:
+        return Split(g, part_of(g, np.zeros(k, dtype=bool)).replace(D=0 * g.D), 0.0)
+    if not k:
+        return Split(part_of(g, np.zeros(g.n_states, dtype=bool)), g.replace(D=0 * g.D), 0.0)
+    X, scale, info = la.lapack.dtrsyl(T[:k, :k], T[k:, k:], -T[:k, k:], isgn=-1)
+    if info or not np.isfinite(X).all():
+        raise SolverError(
+            f"{g!r} cannot be split: its stable part and the rest share a pole to working "
+            "precision. Add damping, or reduce it in coordinates where the modes are apart."
+        )
+    X = X / scale
+    turned, seen = Z.T @ B, C @ Z
+    stable = _part(g, T[:k, :k], turned[:k] - X @ turned[k:], seen[:, :k], g.D)
+    rest = _part(g, T[k:, k:], turned[k:], seen[:, :k] @ X + seen[:, k:], 0 * g.D)
+    return Split(stable, rest, float(np.linalg.norm(X, 2)))
+
+
+def _by_blocks(g: StateSpace) -> Split:
+    sizes = np.asarray(g.blocks)
+    poles = block_eigenvalues(g.A, g.blocks or ())
+    owner = np.repeat(np.arange(sizes.size), sizes)
+    growth = np.full(sizes.size, -np.inf)
+    np.maximum.at(growth, owner, np.abs(poles) - 1.0 if g.dt else poles.real)
+    stable = (growth < 0)[owner]
+    return Split(part_of(g, stable), part_of(g, ~stable).replace(D=0 * g.D), 0.0)
+
+
+def part_of(g: StateSpace, kept: np.typing.NDArray[np.bool_]) -> StateSpace:
+    """Return the system with some states alone, decoupled from the others; whole blocks."""
+    blocks = None
+    if g.blocks is not None:
+        starts = np.cumsum(g.blocks) - g.blocks
+        blocks = [b for b, start in zip(g.blocks, starts, strict=True) if kept[start]]
+    return g.replace(
+        A=g.A[np.ix_(kept, kept)],
+        B=g.B[kept],
+        C=g.C[:, kept],
+        states=[name for name, keep in zip(g.states, kept, strict=True) if keep],
+        blocks=blocks,
+    )
+
+
+def _part(g: StateSpace, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> StateSpace:
+    return g.replace(A=A, B=B, C=C, D=D, states=(), blocks=None)

@@ -1,0 +1,74 @@
+"""Whether a system has norms at all, and the pole that says no."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..values import ComplexArray, FloatArray
+from .scaling import state_scale
+from .statespace import StateSpace
+
+#: poles this close to the axis, relative to the size of A, are looked at with their condition
+NEAR = 1e-6
+#: roundings of A that a pole is allowed to have suffered
+ROUNDINGS = 4.0
+
+
+class Obstacle(NamedTuple):
+    """A pole that makes a norm infinite."""
+
+    reason: str
+    freq: float  # [Hz]
+
+
+def obstacle(g: StateSpace, *, axis_only: bool = False) -> Obstacle | None:
+    """Return the worst pole on or beyond the edge of stability (or on it alone), or None.
+
+    Computed poles are moved by rounding: those of a rigid body in dense A come out at some 1e-4
+    rad/s, on either side. A pole nearer to the edge than its own uncertainty (rounding of A times
+    the condition of the eigenvalue) counts as lying on it.
+    """
+    if not g.n_states:
+        return None
+    poles, doubt = doubted_poles(g)
+    growth = np.abs(poles) - 1.0 if g.dt else poles.real
+    on_axis = np.abs(growth) <= doubt
+    beyond = (growth > 0) & ~on_axis & (not axis_only)
+    if not (beyond | on_axis).any():
+        return None
+    worst = int(np.argmax(np.where(beyond if beyond.any() else on_axis, growth, -np.inf)))
+    pole, unsure = poles[worst], float(doubt[worst])
+    edge = "the unit circle" if g.dt else "the imaginary axis"
+    freq = abs(float(np.angle(pole)) / g.dt if g.dt else pole.imag) / (2 * np.pi)
+    if beyond[worst]:
+        return Obstacle(
+            f"unstable: a pole at {freq:.6g} Hz lies {growth[worst]:.3g}"
+            f"{'' if g.dt else ' rad/s'} beyond {edge}",
+            freq,
+        )
+    integrates = abs(pole - 1.0 if g.dt else pole) <= unsure
+    kind = "a rigid-body mode or integrator" if integrates else f"an undamped pole at {freq:.6g} Hz"
+    rounding = f" (to within its rounding, {unsure:.1g})" if unsure else ""
+    return Obstacle(f"marginal: {kind} lies on {edge}{rounding}", 0.0 if integrates else freq)
+
+
+def doubted_poles(g: StateSpace) -> tuple[ComplexArray, FloatArray]:
+    """Return the poles and how far rounding may have moved each."""
+    poles = g.poles()
+    if g.blocks is not None and max(g.blocks) <= 2:
+        return poles, np.zeros(poles.size)  # closed form: as exact as A
+    d = state_scale(g.A, g.B, g.C)
+    A = g.A * d / d[:, None]
+    size = float(np.linalg.norm(A, 2))
+    gap = np.abs(np.abs(poles) - 1.0 if g.dt else poles.real)
+    doubt = np.finfo(float).eps * size * np.ones(poles.size)
+    if not np.any(gap <= NEAR * size):
+        return poles, doubt
+    found: Any = la.eig(A, left=True, right=True)
+    values, left, right = found
+    aligned = np.abs(np.einsum("ij,ij->j", left.conj(), right))
+    condition = 1.0 / np.maximum(aligned, np.sqrt(np.finfo(float).eps))
+    return np.asarray(values, dtype=np.complex128), ROUNDINGS * doubt * condition
