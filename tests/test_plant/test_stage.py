@@ -1,0 +1,112 @@
+"""reference_errors by geometry, stage_weights by their formulas, refusals."""
+
+import numpy as np
+import pytest
+
+from flexplant.errors import AssumptionError, ModelError
+from flexplant.lti import frequency_response
+from flexplant.plant import (
+    Poi,
+    Reference,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+    reference_errors,
+    stage_weights,
+)
+from oracles_synthesis import rigid_sensor
+from stages import AXES, CORNERS, INSET, NOISE, OFF_NODE, L, ports, sampled, some_modes
+
+MASS = L * L * 0.0272 * 2702
+INERTIA = MASS * L * L / 12
+
+
+def size(weight, freq):
+    return np.abs(frequency_response(weight, np.atleast_1d(freq)).data[0, 0])
+
+
+@pytest.mark.parametrize("die", [(L / 2, L / 2, 0.0), OFF_NODE])
+def test_errors_vanish_when_the_rigid_body_follows(die):
+    """Each sensor of z sees 1 m per 1 m of reference at the die, wherever both are."""
+    block = reference_errors(sampled(some_modes(), ports(die=die)))
+    assert block.outputs == tuple(f"y{i}:error" for i in range(1, 5))
+    expected = np.array([rigid_sensor(p, die, AXES)[0] for p in CORNERS])
+    np.testing.assert_allclose(block.D, np.hstack([-np.eye(4), expected[:, None]]), atol=1e-9)
+
+
+def test_errors_follow_the_first_axis_only():
+    """A reference of rotation moves sensors by their arms; other sensors are left out."""
+    die = (0.2, 0.25, 0.0)
+    y = [Sensor(f"y{i}", at=p, asd=NOISE) for i, p in enumerate(CORNERS[:3], 1)]
+    y.append(Sensor("v", at=CORNERS[3], quantity="velocity", asd=1e-9))
+    channels = ports(
+        z=[Poi("die", at=die, axes=("rx", "z", "ry"))], y=y, references=[Reference("die")]
+    )
+    block = reference_errors(sampled(some_modes(), channels))
+    assert block.inputs == ("y1", "y2", "y3", "die:ref")
+    expected = [rigid_sensor(p, die, ("rx",))[0] for p in CORNERS[:3]]
+    np.testing.assert_allclose(block.D[:, 3], expected, atol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e4])
+def test_weights_are_what_their_formulas_say(rate):
+    plant = assemble_plant(some_modes(), ports())
+    plant = plant.discretized(rate, delay=1) if rate else plant
+    weights = stage_weights(plant, 30.0, peak=3.0, disturbance=0.2, effort=0.4, noise=0.01)
+    crossing = 48.0
+    # each of the four actuators accelerates the centre by 1 / mass
+    force = (2 * np.pi * crossing) ** 2 / (2.0 / MASS)
+    assert weights.z["die:z"] is None
+    error = weights.z["die:error"]
+    assert size(error, crossing)[0] == pytest.approx(1.0, rel=1e-3)
+    assert size(error, 1e-4)[0] == pytest.approx(100.0, rel=1e-3)
+    assert size(error, 4.9e3)[0] == pytest.approx(1 / 3, rel=1e-3)
+    effort = weights.z["u2:effort"]
+    assert size(effort, 1e-3)[0] == pytest.approx(0.4 / force, rel=1e-4)
+    assert size(effort, 6 * crossing)[0] == pytest.approx(0.4 / force * np.sqrt(2), rel=2e-2)
+    assert weights.w["amp1"] == pytest.approx(0.2 * force)
+    assert weights.w["y3:noise"] == 0.01
+    # the arm of the rotations: the corners are L / 2 from the axis through the centre
+    arm = size(weights.z["die:rx"], 10.0)[0] / size(error, 10.0)[0]
+    assert arm == pytest.approx(L / 2, rel=1e-6)
+    weighted = plant.weighted(z=weights.z, w=weights.w)
+    assert weighted.dt == plant.dt
+    assert "30 Hz" in repr(weights) and len(repr(weights).splitlines()) == 1
+
+
+def test_a_bandwidth_moves_all_frequencies_together():
+    plant = sampled(some_modes())
+    slow, fast = (stage_weights(plant, f) for f in (10.0, 20.0))
+    assert fast.w["amp1"] == pytest.approx(4 * slow.w["amp1"])
+    ratio = size(fast.z["die:error"], 20.0) / size(slow.z["die:error"], 10.0)
+    assert ratio[0] == pytest.approx(1.0, rel=1e-4)
+
+
+def test_a_plant_made_elsewhere_is_refused():
+    plant = sampled(some_modes())
+    other = StandardPlant.from_statespace(plant.system, u=plant.u, y=plant.y)
+    for call in (reference_errors, lambda p: stage_weights(p, 30.0)):
+        with pytest.raises(AssumptionError, match="assemble_plant"):
+            call(other)
+
+
+def test_missing_references_axes_and_sensors_are_named():
+    without = sampled(some_modes(), ports(references=[]))
+    with pytest.raises(AssumptionError, match=r"Reference\(\.\.\.\)"):
+        reference_errors(without)
+    one_axis = ports(z=[Poi("die", at=INSET[0])])
+    with pytest.raises(AssumptionError, match="all its axes"):
+        reference_errors(sampled(some_modes(), one_axis))
+    blind = ports(y=[Sensor("v", at=CORNERS[0], quantity="velocity", asd=1e-9)])
+    with pytest.raises(AssumptionError, match="do not tell"):
+        reference_errors(sampled(some_modes(), blind))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"peak": 0.9}, {"disturbance": 0.0}, {"effort": -1.0}, {"noise": np.nan}, {"bandwidth": 0.0}],
+)
+def test_numbers_out_of_range_are_refused(wrong):
+    options = {"bandwidth": 30.0} | wrong
+    with pytest.raises(ModelError):
+        stage_weights(sampled(some_modes()), options.pop("bandwidth"), **options)

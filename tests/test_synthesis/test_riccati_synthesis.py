@@ -1,0 +1,339 @@
+"""Riccati(): optima known in closed form, COMPleib, honest lower bounds, bounded work."""
+
+import csv
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from flexplant.errors import AssumptionError, CertificateError, ModelError, SolverError
+from flexplant.lti import StateSpace, tustin
+from flexplant.synthesis import Riccati, design_hinf
+from flexplant.synthesis.certificate import certified_norm
+from oracles_synthesis import (
+    brute_norm,
+    closed_loop,
+    coprime_problem,
+    scalar_optimum,
+    split,
+    stability,
+)
+
+DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
+FULL_RANK = ("AC4", "AC8", "DIS5", "EB1", "EB2", "HE5", "JE3")
+needs_data = pytest.mark.skipif(not DATA.exists(), reason="COMPleib is not here")
+
+
+def named(A, B, C, D, nu, ny, dt=0.0):
+    """A StateSpace with channels w1.., u1.., z1.., y1.., and the names of u and y."""
+    D = np.atleast_2d(np.asarray(D, float))
+    u, y = [f"u{i + 1}" for i in range(nu)], [f"y{i + 1}" for i in range(ny)]
+    w = [f"w{i + 1}" for i in range(D.shape[1] - nu)]
+    z = [f"z{i + 1}" for i in range(D.shape[0] - ny)]
+    return StateSpace(A, B, C, D, dt, inputs=[*w, *u], outputs=[*z, *y]), u, y
+
+
+def compleib(name):
+    with np.load(DATA) as data:
+        g = {k: data[f"{name}/{k}"] for k in ("A", "B1", "B2", "C1", "C2", "D11", "D12", "D21")}
+    nu, ny = g["B2"].shape[1], g["C2"].shape[0]
+    return named(
+        g["A"],
+        np.hstack([g["B1"], g["B2"]]),
+        np.vstack([g["C1"], g["C2"]]),
+        np.block([[g["D11"], g["D12"]], [g["D21"], np.zeros((ny, nu))]]),
+        nu,
+        ny,
+    )
+
+
+def problems():
+    """{name: best known gamma}, empty when the data is absent."""
+    if not DATA.exists():
+        return {}
+    with DATA.with_suffix(".csv").open() as file:
+        return {row["name"]: float(row["gamma"]) for row in csv.DictReader(file)}
+
+
+def dense_loop(P, K):
+    return closed_loop(split(P.A, P.B, P.C, P.D, len(K.outputs), len(K.inputs)), K.A, K.B, K.C, K.D)
+
+
+def scalar(a, dt=0.0):
+    """x' = a x + w1 + u, z = (x, u), y = x + w2."""
+    D = [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+    g, u, y = named([[a]], [[1, 0, 1]], [[1], [0], [1]], D, 1, 1)
+    return (tustin(g, 1 / dt) if dt else g), u, y
+
+
+def checked(P, u, y, method=None):
+    """The design, with stability and norm of its loop from dense matrices."""
+    found = design_hinf(P, method, u=u, y=y)
+    loop = dense_loop(P, found.system)
+    assert stability(loop[0], P.dt) < 0
+    assert brute_norm(*loop, P.dt) == pytest.approx(found.gamma, rel=1e-3)
+    assert found.certificate["claim"] == pytest.approx(found.gamma, rel=1e-3)
+    assert found.lower <= found.gamma
+    return found
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.05])
+@pytest.mark.parametrize("a", [0.0, -0.4, 0.3, 2.0, 8.0])
+def test_the_scalar_optimum_lies_between_lower_and_gamma(a, dt):
+    """g = a + (a^2 + 2)^(1/2); Tustin's map keeps it."""
+    best = scalar_optimum(a)
+    found = checked(*scalar(a, dt))
+    assert best * (1 - 2e-3) <= found.lower <= best * (1 + 1e-6)
+    assert best * (1 - 1e-6) <= found.gamma <= 1.055 * best
+
+
+def test_without_back_off_the_optimum_is_met_within_the_tolerance():
+    found = checked(*scalar(1.0), Riccati(back_off=1e-3, tolerance=1e-4))
+    assert found.gamma <= scalar_optimum(1.0) * 1.0013
+    assert found.lower >= scalar_optimum(1.0) * 0.9998
+
+
+@given(seed=st.integers(0, 10**6), n=st.integers(1, 6), m=st.integers(1, 3), p=st.integers(1, 2))
+def test_normalised_coprime_factors_have_glover_and_mcfarlanes_optimum(seed, n, m, p):
+    """A Nehari problem with D11 not zero: (1 + lambda_max(X Y))^(1/2), stable plants or not."""
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.normal(size=(p, n))
+    parts, best = coprime_problem(A, B, C)
+    if best > 1e3:
+        return
+    found = checked(*named(*parts, m, p))
+    assert best * (1 - 3e-3) <= found.lower <= best * (1 + 1e-5)
+    assert best * (1 - 1e-5) <= found.gamma <= 1.06 * best
+
+
+@given(seed=st.integers(0, 10**6), unit=st.floats(-9, 9), dt=st.sampled_from([0.0, 0.1]))
+def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
+    """D11 and D22 not zero; gamma is linear in the unit of w."""
+    rng = np.random.default_rng(seed)
+    n = int(rng.integers(1, 7))
+    A = rng.normal(size=(n, n))
+    if dt:
+        A *= 1.1 / np.max(np.abs(np.linalg.eigvals(A)))
+    B, C, D = rng.normal(size=(n, 5)), rng.normal(size=(5, n)), rng.normal(size=(5, 5))
+    D[3:, 3:] *= 0.2
+    P, u, y = named(A, B, C, D, 2, 2, dt)
+    found = checked(P, u, y)
+    w = np.r_[np.full(3, 10.0**unit), 1.0, 1.0]
+    other = design_hinf(P.replace(B=B * w, D=D * w), u=u, y=y)
+    assert other.gamma == pytest.approx(10.0**unit * found.gamma, rel=1e-6)
+    assert other.lower == pytest.approx(10.0**unit * found.lower, rel=1e-6)
+
+
+def test_lower_is_never_undercut_by_another_controller():
+    """Designs for other weights, judged by this problem's loop, all stay above `lower`."""
+    P, u, y = scalar(1.0)
+    lower = design_hinf(P, u=u, y=y).lower
+    for weight in (0.1, 0.3, 3.0, 10.0):
+        D = P.D.copy()
+        D[1, 2] = weight
+        K = design_hinf(P.replace(D=D), u=u, y=y).system
+        assert brute_norm(*dense_loop(P, K), 0.0) >= lower
+
+
+def test_lower_stays_where_nothing_was_refuted(monkeypatch):
+    """A gamma that only fails in rounding does not raise the bound."""
+    from flexplant.synthesis import riccati
+
+    plain = riccati._attempt
+
+    def fragile(problem, gamma):
+        found = plain(problem, gamma)
+        return riccati._Attempt(None) if found.refuted else found
+
+    monkeypatch.setattr(riccati, "_attempt", fragile)
+    found = design_hinf(scalar(1.0)[0], u=["u1"], y=["y1"])
+    assert found.gamma <= 1.055 * scalar_optimum(1.0)
+    assert found.lower == 0.0
+
+
+def test_a_loop_above_its_gamma_is_not_accepted(monkeypatch):
+    """Only the exact norm of the loop accepts: wrong formulas end at the quadratic controller."""
+    from flexplant.synthesis import riccati
+
+    real = riccati.central
+
+    def wrong(*args):
+        K = real(*args)
+        return K.replace(C=-K.C)
+
+    monkeypatch.setattr(riccati, "central", wrong)
+    found = checked(*scalar(1.0))
+    assert found.gamma > 1.1 * scalar_optimum(1.0)
+    assert found.lower <= scalar_optimum(1.0)
+
+
+@needs_data
+@pytest.mark.parametrize("name", FULL_RANK)
+def test_compleib_with_full_rank(name):
+    P, u, y = compleib(name)
+    best = problems()[name]
+    found = checked(P, u, y)
+    assert best * (1 - 1e-3) <= found.gamma <= 1.07 * best
+    assert 0.995 * best <= found.lower <= best * (1 + 1e-3)
+    for i in range(len(u)):
+        flipped = found.system.C.copy()
+        flipped[i] *= -1
+        D = found.system.D.copy()
+        D[i] *= -1
+        with pytest.raises(CertificateError):
+            certified_norm(P, found.system.replace(C=flipped, D=D), found.gamma)
+
+
+@needs_data
+@pytest.mark.parametrize("name", [n for n in problems() if n not in FULL_RANK])
+def test_compleib_without_full_rank_names_the_matrix(name):
+    P, u, y = compleib(name)
+    with pytest.raises(AssumptionError, match=r"D12|D21") as error:
+        design_hinf(P, u=u, y=y)
+    parts = split(P.A, P.B, P.C, P.D, len(u), len(y))
+    short = {
+        key: np.linalg.matrix_rank(parts[key]) < size
+        for key, size in (("D12", len(u)), ("D21", len(y)))
+    }
+    assert short[str(error.value)[:3]]
+    assert "Lmi()" in str(error.value)
+
+
+@needs_data
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FULL_RANK)
+def test_slycots_norm_agrees(name):
+    """ab13dd on the dense closed loop: a norm of other hands."""
+    slycot = pytest.importorskip("slycot")
+    P, u, y = compleib(name)
+    found = design_hinf(P, u=u, y=y)
+    A, B, C, D = dense_loop(P, found.system)
+    sizes = A.shape[0], B.shape[1], C.shape[0]
+    norm, _ = slycot.ab13dd("C", "I", "S", "D", *sizes, A, np.eye(sizes[0]), B, C, D)
+    assert norm == pytest.approx(found.gamma, rel=1e-4)
+
+
+NOISY = [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+#: A, B, C and what the message says
+IMPOSSIBLE = {
+    "u misses a growing mode": (
+        [[1.0, 0], [0, -1]],
+        [[1, 0, 0], [0, 0, 1]],
+        [[1, 1], [0, 0], [1, 1]],
+        r"u \(u1\) does not reach .* grows e-fold in 1 s",
+    ),
+    "u misses an undamped mode": (
+        [[0, 20, 0], [-20, 0, 0], [0, 0, -1]],
+        [[0, 0, 0], [1, 0, 0], [1, 0, 1]],
+        [[1, 0, 1], [0, 0, 0], [1, 0, 1]],
+        r"u \(u1\) does not reach .*at 3\.18 Hz",
+    ),
+    "y misses a growing mode": (
+        [[1.0, 0], [0, -1]],
+        [[1, 0, 1], [0, 0, 1]],
+        [[1, 1], [0, 0], [0, 1]],
+        r"y \(y1\) does not see .* grows e-fold in 1 s",
+    ),
+    "u misses a rigid body": (
+        [[0, 1, 0], [0, 0, 0], [0, 0, -1]],
+        [[0, 0, 0], [1, 0, 0], [0, 0, 1]],
+        [[1, 0, 1], [0, 0, 0], [1, 0, 1]],
+        "u .* does not reach .* rigid-body or integrating",
+    ),
+    "an integrator as weight": (
+        [[0, 1], [0, -1]],
+        [[0, 0, 0], [1, 0, 1]],
+        [[1, 0], [0, 0], [0, 1]],
+        "y .* does not see .* of a weight .* give the weight finite gain",
+    ),
+    "z misses an integrator": (
+        [[0, 0], [0, -1]],
+        [[1, 0, 1], [1, 0, 1]],
+        [[0, 1], [0, 0], [1, 1]],
+        "z does not feel all that u moves at 0 Hz",
+    ),
+    "z misses an undamped mode": (
+        [[0, 20, 0], [-20, 0, 0], [0, 0, -1]],
+        [[0, 0, 0], [1, 0, 1], [1, 0, 1]],
+        [[0, 0, 1], [0, 0, 0], [1, 0, 1]],
+        r"z does not feel all that u moves at 3\.18 Hz",
+    ),
+    "w misses an integrator": (
+        [[0, 0], [0, -1]],
+        [[0, 0, 1], [1, 0, 1]],
+        [[1, 1], [0, 0], [1, 1]],
+        "w does not excite all that y sees at 0 Hz",
+    ),
+}
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.01])
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_what_is_impossible_is_named_at_once(case, dt):
+    A, B, C, message = IMPOSSIBLE[case]
+    P, u, y = named(A, B, C, NOISY, 1, 1)
+    start = time.perf_counter()
+    if dt:  # Tustin bends frequencies
+        message = message.replace(r"3\.18", r"3\.1[78]")
+        P = tustin(P, 1 / dt)
+    with pytest.raises(AssumptionError, match=message):
+        design_hinf(P, u=u, y=y)
+    assert time.perf_counter() - start < 5.0
+
+
+def test_an_unweighted_mixture_of_units_says_so():
+    """Metres of 1e-12 beside newtons of 1: the cost of a rigid body is lost in rounding."""
+    A, B = [[0, 1], [0, 0]], [[0, 0, 0], [1, 0, 1]]
+    C = [[1e-14, 0], [0, 0], [1e-14, 0]]
+    P, u, y = named(A, B, C, NOISY, 1, 1)
+    try:
+        found = design_hinf(P, u=u, y=y)
+    except (AssumptionError, SolverError) as error:
+        assert "weight" in str(error)
+    else:
+        assert stability(dense_loop(P, found.system)[0], 0.0) < 0
+
+
+def test_stable_weights_that_u_does_not_reach_are_no_obstacle():
+    P, u, y = named(
+        [[-3.0, 0], [0, 1]], [[1, 0, 0], [1, 0, 1]], [[1, 1], [0, 0], [1, 1]], NOISY, 1, 1
+    )
+    checked(P, u, y)
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_static_plant_gets_the_best_gain(dt):
+    """z = (2 w1 + u, w1 / 2 + u), y = w2: nothing is measured, so u stays zero."""
+    D = [[2, 0, 1], [0.5, 0, 1], [0, 1, 0.3]]
+    P, u, y = named([], [], [], D, 1, 1, dt)
+    found = checked(P, u, y)
+    assert found.gamma == pytest.approx(np.sqrt(4.25))
+
+
+def test_a_w_that_does_not_reach_z_costs_nothing():
+    P, u, y = named([[-1.0]], [[0, 0, 1]], [[1], [0], [1]], NOISY, 1, 1)
+    found = design_hinf(P, u=u, y=y)
+    assert (found.gamma, found.lower) == (0.0, 0.0)
+
+
+def test_delays_of_a_sampled_plant():
+    """Two samples of delay (poles at z = 0) before an unstable pole."""
+    P, u, y = named(
+        [[1.1, 1, 0], [0, 0, 1], [0, 0, 0]],
+        [[1, 0, 0], [0, 0, 0], [0, 0, 1]],
+        [[1, 0, 0], [0, 0, 0], [1, 0, 0]],
+        NOISY,
+        1,
+        1,
+        0.1,
+    )
+    checked(P, u, y)
+
+
+@pytest.mark.parametrize("wrong", [{"back_off": -0.1}, {"tolerance": 0.0}, {"tolerance": "x"}])
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(ModelError):
+        Riccati(**wrong)
