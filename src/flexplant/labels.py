@@ -15,8 +15,8 @@ from .errors import LabelError, ShapeError, unknown_label
 from .values import FloatArray, IntArray, Value, real_array
 
 DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-#: a place: a DOF label, a point (x, y, z) [m], or a mapping {label: weight}
-Place: TypeAlias = "str | Sequence[float] | FloatArray | Mapping[str, float]"
+#: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}
+Place: TypeAlias = "str | Sequence[float] | FloatArray | Mapping[Any, float]"
 
 
 class Interpolation(Value):
@@ -31,6 +31,16 @@ class Interpolation(Value):
             When the point is off the structure or the direction is unknown to it.
         """
         raise NotImplementedError
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one.
+
+        Raises
+        ------
+        LabelError
+            When one of them is off the structure.
+        """
+        return np.array([self.row(point, direction) for point in points])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -201,9 +211,10 @@ class DofSet(Value):
         Parameters
         ----------
         at : str, (3,) array [m] or mapping
-            A DOF label, a point (interpolated between nodes), or {label: weight}.
+            A DOF label, a point (interpolated between nodes), or a weighted sum of such,
+            {label or (x, y, z): weight}.
         direction : str
-            The motion at a point; a label or mapping carries its own.
+            The motion at points; a label carries its own.
 
         Raises
         ------
@@ -215,8 +226,9 @@ class DofSet(Value):
             row[self.index(at)] = 1.0
             return row
         if isinstance(at, Mapping):
-            for label, weight in at.items():
-                row[self.index(label)] += float(real_array(weight, f"weight of {label!r}", ()))
+            for place, weight in at.items():
+                part = float(real_array(weight, f"weight of {place!r}", ()))
+                row += part * self.row(place, direction)
             return row
         point = real_array(at, "at", (3,))
         if direction not in DIRECTIONS:
@@ -230,9 +242,23 @@ class DofSet(Value):
             raise LabelError(
                 f"the point {tuple(point.tolist())} is {offset:.3g} m from the nearest node with "
                 f"direction {direction!r} ({label!r}), and this model has no shape functions to "
-                f"interpolate with. Use at={label!r} or a mapping {{label: weight}}."
+                f"interpolate with. Use at={label!r}, a mapping {{label: weight}}, or interpolate "
+                "the shapes between nodes: flexplant.interpolated(model)."
             )
         return row
+
+    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
+        """Return the rows (p, n) of the motion at many points (p, 3) [m]; see `row`.
+
+        Raises
+        ------
+        LabelError
+            When a point is off the structure.
+        """
+        places = real_array(points, "points", (None, 3))
+        if self.interpolation is not None and direction in DIRECTIONS:
+            return self.interpolation.rows(places, direction)
+        return np.array([self.row(place, direction) for place in places]).reshape(-1, len(self))
 
     @classmethod
     def from_table(cls, table: str | Path | Iterable[Mapping[str, Any]]) -> DofSet:

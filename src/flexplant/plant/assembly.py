@@ -2,38 +2,48 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from ..errors import ModelError
-from ..labels import Place
-from ..lti.discretisation import discretized
+from ..lti.discretisation import diagonal_pairs, discretized
 from ..lti.noise import noise_factor
 from ..lti.statespace import StateSpace
-from ..values import FloatArray
-from .ports import QUANTITIES, Poi, Ports
+from ..values import FloatArray, positive
+from .dynamics import structure_system, with_filters, with_gains
+from .ports import Ports
 from .realisation import ModalRealisation, Structure, realised
+from .residual import FastStates, Residual
+from .sampling import sampled_physical
 from .standard import StandardPlant
 
 
-def assemble_plant(model: Structure | ModalRealisation, ports: Ports) -> StandardPlant:
+def assemble_plant(
+    model: Structure | ModalRealisation, ports: Ports, *, residual: Residual | None = None
+) -> StandardPlant:
     """Return the standard plant of a structure with its channels.
 
     ``M q'' + D q' + K q = f`` (the paper's (1), or (8) when reduced) in modal states, with forces
-    at the disturbances and actuators and motions at the POIs and sensors.
+    at the disturbances and actuators and motions at the POIs and sensors. The filters of the ports
+    (shapes, dynamics) add their states.
 
     Parameters
     ----------
     model : FEModel, Modes or ReducedModel
-        The structure; residual attachment vectors of Modes become fast modes. A plant's
-        `realisation` serves too: the modes are then not solved again.
+        The structure. A plant's `realisation` serves too: the modes are then not solved again.
     ports : Ports
         The channels.
+    residual : FastStates or Feedthrough, optional
+        What residual attachment vectors of Modes become: fast modes (when not given), or a
+        compliance that answers at once.
 
     Returns
     -------
     StandardPlant
         Continuous. w: disturbances, sensor noises `y1:noise`, references; u: actuators;
         z: POI axes `die:z`, errors `die:error`, efforts `u1:effort`; y: sensors, references.
+        Delays of ports act once it is sampled.
 
     Raises
     ------
@@ -48,48 +58,48 @@ def assemble_plant(model: Structure | ModalRealisation, ports: Ports) -> Standar
     """
     if not isinstance(ports, Ports):
         raise ModelError(f"ports must be a Ports value, got {type(ports).__name__}.")
-    return _assembled(realised(model), ports)
+    way = FastStates() if residual is None else residual
+    if not isinstance(way, Residual):
+        raise ModelError(
+            f"residual must be FastStates() or Feedthrough(), got {type(residual).__name__}."
+        )
+    return _assembled(way.applied(realised(model)), ports)
 
 
 def _assembled(realisation: ModalRealisation, ports: Ports) -> StandardPlant:
-    if not (ports.w or ports.u) or not (ports.z or ports.y):
+    physical = with_filters(structure_system(realisation, ports), ports)
+    return _plant(physical, ports, realisation)
+
+
+def structural(plant: StandardPlant) -> StateSpace:
+    """Return ``[w; u] -> [z; y]`` of the structure alone, filters as their static gains.
+
+    Continuous, its states those of the modes: the rigid-body ones are the first pairs.
+
+    Raises
+    ------
+    ModelError
+        When the plant was not assembled from a structure.
+    """
+    if plant.realisation is None or plant.ports is None:
         raise ModelError(
-            f"a plant needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
+            "this plant was not assembled from a structure: assemble_plant(model, ports)."
         )
-    forces = [realisation.row(port.at, port.direction) for port in ports.forces]
-    B = np.array([realisation.force(row) for row in forces]).T
-    motions = [(_poi_row(realisation, poi, axis), 0) for poi in ports.z for axis in poi.axes]
-    motions += [(realisation.row(s.at, s.direction), QUANTITIES.index(s.quantity)) for s in ports.y]
-    C = np.array([realisation.motion(row, derivative) for row, derivative in motions])
-    # an acceleration follows a force at once: d2q/dt2 = S A A x + S A N' f
-    D = np.array(
-        [
-            realisation.motion(row, 1) @ B if derivative == 2 else np.zeros(B.shape[1])
-            for row, derivative in motions
-        ]
-    )
-    physical = StateSpace(
-        realisation.A,
-        B,
-        C,
-        D,
-        inputs=[port.name for port in ports.forces],
-        outputs=[poi.channel(axis) for poi in ports.z for axis in poi.axes]
-        + [sensor.name for sensor in ports.y],
-        states=realisation.names,
-        blocks=[2] * realisation.pairs.shape[0],
-    )
-    return _wired(physical, ports, realisation)
+    if not plant.ports.has_dynamics and plant.unweighted is None:
+        return (plant.continuous or plant).system
+    bare = with_gains(structure_system(plant.realisation, plant.ports), plant.ports)
+    return _wired(bare, plant.ports).system
 
 
-def _poi_row(realisation: ModalRealisation, poi: Poi, axis: str) -> FloatArray:
-    at: Place = poi.at
-    if isinstance(at, str):
-        at = f"{at.split(':')[0]}:{axis}"
-    return realisation.row(at, axis)
+class _Wired(NamedTuple):
+    system: StateSpace
+    w: list[str]
+    u: list[str]
+    z: list[str]
+    y: list[str]
 
 
-def _wired(physical: StateSpace, ports: Ports, realisation: ModalRealisation) -> StandardPlant:
+def _wired(physical: StateSpace, ports: Ports) -> _Wired:
     """Add noises, references, errors and efforts to the physical system: all static."""
     pois = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
     sensors, actuators = [s.name for s in ports.y], [a.name for a in ports.u]
@@ -122,15 +132,20 @@ def _wired(physical: StateSpace, ports: Ports, realisation: ModalRealisation) ->
         D[row[ref], column[ref]] = 1.0
     for name in actuators:
         D[row[f"{name}:effort"], column[name]] = 1.0
+    system = physical.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs)
+    return _Wired(system, w, actuators, z, y)
+
+
+def _plant(physical: StateSpace, ports: Ports, realisation: ModalRealisation) -> StandardPlant:
+    wired = _wired(physical, ports)
     asd = {d.name: d.asd for d in ports.w if d.asd > 0}
     asd |= {f"{s.name}:noise": s.asd for s in ports.y if s.asd > 0}
-    system = physical.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs)
     return StandardPlant(
-        system,
-        tuple(w),
-        tuple(actuators),
-        tuple(z),
-        tuple(y),
+        wired.system,
+        tuple(wired.w),
+        tuple(wired.u),
+        tuple(wired.z),
+        tuple(wired.y),
         asd,
         ports=ports,
         realisation=realisation,
@@ -152,15 +167,35 @@ def sampled(plant: StandardPlant, rate: float, delay: float) -> StandardPlant:
     if plant.physical is None or plant.ports is None or plant.realisation is None:
         system = discretized(plant.system, rate, delay=delay, delayed=plant.u)
         return plant.replace(system=system, continuous=plant, delay=float(delay))
-    physical = discretized(plant.physical, rate, delay=delay, delayed=plant.u)
-    wired = _wired(physical, plant.ports, plant.realisation)
     asd = np.array([plant.asd.get(name, 0.0) for name in plant.physical.inputs])
-    factor = noise_factor(plant.physical, asd, physical.dt)
-    lines = physical.n_states - plant.physical.n_states
-    return wired.replace(
-        continuous=plant,
-        delay=float(delay),
-        noise_factor=np.vstack([factor, np.zeros((lines, factor.shape[1]))]),
+    if plant.ports.delays or diagonal_pairs(plant.physical) is None:
+        physical, factor = _with_own_delays(plant, rate, delay, asd)
+    else:
+        physical = discretized(plant.physical, rate, delay=delay, delayed=plant.u)
+        white = noise_factor(plant.physical, asd, physical.dt)
+        lines = physical.n_states - plant.physical.n_states
+        factor = np.vstack([white, np.zeros((lines, white.shape[1]))])
+    return _plant(physical, plant.ports, plant.realisation).replace(
+        continuous=plant, delay=float(delay), noise_factor=factor
+    )
+
+
+def _with_own_delays(
+    plant: StandardPlant, rate: float, delay: float, asd: FloatArray
+) -> tuple[StateSpace, FloatArray]:
+    """Sample a plant whose ports have filters or delays: these add to that of all u."""
+    ports, g, realisation = plant.ports, plant.physical, plant.realisation
+    if ports is None or g is None or realisation is None:
+        raise ModelError("the plant was not assembled from a structure.")
+    common = positive(delay, "delay", zero=True) / positive(rate, "rate")
+    return sampled_physical(
+        g,
+        rate,
+        head=g.states.index(realisation.names[0]) if realisation.names else 0,
+        pairs=realisation.pairs,
+        late_inputs={port.name: port.delay + common for port in ports.u},
+        late_outputs={port.name: port.delay for port in ports.y},
+        asd=asd,
     )
 
 

@@ -225,7 +225,7 @@ def _lacks(plant: StandardPlant, pole: _Pole, case: _Case) -> list[str]:
     basis = pole.left if case.pushes else pole.right
     rigid = np.zeros(0, dtype=int)
     if plant.realisation is not None and not pole.value:
-        rigid = np.arange(plant.n_rigid) * 2 + (1 if case.pushes else 0)
+        rigid = plant.modal_states[(1 if case.pushes else 0) : 2 * plant.n_rigid : 2]
         if rigid.size == basis.shape[1]:  # one vector for each rigid-body mode
             basis = basis @ np.linalg.inv(basis[rigid])
     rows = g.B[:, g.input_index(case.names)].T if case.pushes else g.C[g.output_index(case.names)]

@@ -4,72 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Any, Literal, TypeAlias
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
-from ..values import Value, check_names, positive, real_array
+from ..lti.interconnection import series
+from ..lti.statespace import StateSpace
+from ..values import Value, check_names, positive
+from .forces import Actuator as Actuator
+from .forces import BaseAcceleration, OutputDisturbance
+from .forces import Disturbance as Disturbance
+from .places import checked_direction, checked_filter, checked_name, checked_place
+from .weights import pade
+
+#: what may be in w
+Disturbing: TypeAlias = Disturbance | BaseAcceleration | OutputDisturbance
 
 Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
 QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
-
-
-@dataclass(frozen=True, eq=False)
-class Disturbance(Value):
-    """A force (or moment) from outside, in w.
-
-    Parameters
-    ----------
-    name : str
-        The channel's name.
-    at : str, (3,) array [m] or mapping
-        A DOF label, a point, or {label: weight}.
-    direction : str
-        At a point: x, y, z [N] or rx, ry, rz [N m].
-    asd : float [N/sqrt(Hz)]
-        One-sided amplitude spectral density of white noise; 0 for a force that is no noise.
-
-    Raises
-    ------
-    LabelError, ModelError
-        For a bad name, place, direction or a negative asd.
-    """
-
-    name: str
-    at: Place
-    direction: str = "z"
-    asd: float = 0.0
-
-    def __post_init__(self) -> None:
-        _check_place(self)
-        self._set(asd=positive(self.asd, f"asd of {self.name!r}", zero=True))
-
-
-@dataclass(frozen=True, eq=False)
-class Actuator(Value):
-    """A force (or moment) that the controller commands, in u.
-
-    Parameters
-    ----------
-    name : str
-        The channel's name.
-    at : str, (3,) array [m] or mapping
-        A DOF label, a point, or {label: weight}: pairs and other combinations.
-    direction : str
-        At a point: x, y, z [N] or rx, ry, rz [N m].
-
-    Raises
-    ------
-    LabelError, ModelError
-        For a bad name, place or direction.
-    """
-
-    name: str
-    at: Place
-    direction: str = "z"
-
-    def __post_init__(self) -> None:
-        _check_place(self)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,19 +33,25 @@ class Sensor(Value):
     name : str
         The channel's name; its noise is the channel `name:noise` of w.
     at : str, (3,) array [m] or mapping
-        A DOF label, a point, or {label: weight}.
+        A DOF label, a point, or a sum {label or point: weight}.
     direction : str
-        At a point: x, y, z or rx, ry, rz.
+        At points: x, y, z or rx, ry, rz.
     quantity : {"displacement", "velocity", "acceleration"}
         What is measured.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
         One-sided amplitude spectral density of its white noise; a sample has variance
-        asd^2 rate / 2.
+        asd^2 rate / 2. It is added to the samples, after dynamics and delay; what passes through
+        them is an OutputDisturbance.
+    dynamics : StateSpace, optional
+        Sensor and anti-alias filter, motion to signal: stable; its states join the plant's.
+    delay : float [s]
+        Of the signal. Exact, also between samples, once the plant is sampled; a continuous plant
+        leaves it out and says so (`ports.with_pade(order)` approximates it there).
 
     Raises
     ------
     LabelError, ModelError
-        For a bad name, place, direction, quantity or a negative asd.
+        For a bad name, place, direction, quantity, dynamics, or a negative asd or delay.
     """
 
     name: str
@@ -101,12 +59,22 @@ class Sensor(Value):
     direction: str = "z"
     quantity: Quantity = "displacement"
     asd: float = 0.0
+    dynamics: StateSpace | None = None
+    delay: float = 0.0
 
     def __post_init__(self) -> None:
-        _check_place(self)
+        self._set(
+            name=checked_name(self.name),
+            direction=checked_direction(self.name, self.direction),
+            at=checked_place(self.name, self.at),
+        )
         if self.quantity not in QUANTITIES:
             raise unknown_label(f"quantity of {self.name!r}", self.quantity, QUANTITIES)
-        self._set(asd=positive(self.asd, f"asd of {self.name!r}", zero=True))
+        self._set(
+            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
+            dynamics=checked_filter(self.name, "dynamics", self.dynamics),
+            delay=positive(self.delay, f"delay of {self.name!r}", zero=True),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +113,7 @@ class Poi(Value):
                 f"POI {self.name!r} is a combination of DOFs, so it has one axis, got {axes}. "
                 "Give a point or a DOF label, or one POI per combination."
             )
-        self._set(axes=axes)
-        _check_place(self)
+        self._set(axes=axes, name=checked_name(self.name), at=checked_place(self.name, self.at))
 
     def channel(self, axis: str) -> str:
         """Return the name of an axis in z, such as `die:z`."""
@@ -187,7 +154,7 @@ class Ports(Value):
 
     Parameters
     ----------
-    w : sequence of Disturbance
+    w : sequence of Disturbance, BaseAcceleration and OutputDisturbance
         Disturbances; sensor noises and references are added to them.
     u : sequence of Actuator
         Actuators; each adds an effort `name:effort` to z.
@@ -201,26 +168,32 @@ class Ports(Value):
     Raises
     ------
     LabelError
-        When a name is used twice, or a Reference names no POI.
+        When a name is used twice, a Reference names no POI, or an OutputDisturbance no sensor.
     ModelError
         When an entry has the wrong type.
     """
 
-    w: Sequence[Disturbance] = ()
+    w: Sequence[Disturbing] = ()
     u: Sequence[Actuator] = ()
     z: Sequence[Poi] = ()
     y: Sequence[Sensor] = ()
     references: Sequence[Reference] = ()
 
     def __post_init__(self) -> None:
-        kinds = {"w": Disturbance, "u": Actuator, "z": Poi, "y": Sensor, "references": Reference}
+        kinds: dict[str, Any] = {
+            "w": Disturbing,
+            "u": Actuator,
+            "z": Poi,
+            "y": Sensor,
+            "references": Reference,
+        }
         for side, kind in kinds.items():
             given = getattr(self, side)
             ports = (given,) if isinstance(given, Value) else tuple(given)
             for port in ports:
                 if not isinstance(port, kind):
                     raise ModelError(
-                        f"Ports.{side} holds {kind.__name__}s, got {type(port).__name__}."
+                        f"Ports.{side} holds {_called(kind)}s, got {type(port).__name__}."
                     )
             self._set(**{side: ports})
         check_names([port.name for port in self.forces], "inputs w and u")
@@ -229,6 +202,9 @@ class Ports(Value):
         check_names([reference.poi for reference in self.references], "references")
         for reference in self.references:
             self.poi(reference.poi)
+        for port in self.w:
+            if isinstance(port, OutputDisturbance):
+                self.sensor(port.sensor)
 
     def __repr__(self) -> str:
         names = {
@@ -241,8 +217,8 @@ class Ports(Value):
         return f"<Ports {sides}>"
 
     @property
-    def forces(self) -> tuple[Disturbance | Actuator, ...]:
-        """All ports that push: disturbances, then actuators."""
+    def forces(self) -> tuple[Disturbing | Actuator, ...]:
+        """All ports that bring something in: disturbances, then actuators."""
         return (*self.w, *self.u)
 
     def poi(self, name: str) -> Poi:
@@ -258,23 +234,60 @@ class Ports(Value):
                 return poi
         raise unknown_label("POI", name, [poi.name for poi in self.z])
 
+    def sensor(self, name: str) -> Sensor:
+        """Return the sensor of a name.
 
-def _check_place(port: Disturbance | Actuator | Sensor | Poi) -> None:
-    """Check name and place of a port, and copy the place."""
-    check_names([str(port.name)], "ports")
-    direction = getattr(port, "direction", "z")
-    if direction not in DIRECTIONS:
-        raise unknown_label(f"direction of {port.name!r}", direction, DIRECTIONS)
-    at = port.at
-    if isinstance(at, Mapping):
-        if not at:
-            raise LabelError(f"{port.name!r} is at an empty mapping: name at least one DOF.")
-        place: Place = {
-            str(label): float(real_array(weight, f"weight of {label!r} in {port.name!r}", ()))
-            for label, weight in at.items()
-        }
-    elif isinstance(at, str):
-        place = at
-    else:
-        place = tuple(real_array(at, f"place of {port.name!r}", (3,)).tolist())
-    port._set(at=place)
+        Raises
+        ------
+        LabelError
+            When there is none.
+        """
+        for sensor in self.y:
+            if sensor.name == name:
+                return sensor
+        raise unknown_label("sensor", name, [sensor.name for sensor in self.y])
+
+    @property
+    def delays(self) -> dict[str, float]:
+        """Delays [s] of the actuators and sensors that have one, by name."""
+        ports: tuple[Actuator | Sensor, ...] = (*self.u, *self.y)
+        return {port.name: port.delay for port in ports if port.delay}
+
+    @property
+    def has_dynamics(self) -> bool:
+        """Whether some port has a filter or a delay: states beside those of the structure."""
+        return bool(self.delays) or any(filter_of(port) for port in (*self.forces, *self.y))
+
+    def with_pade(self, order: int = 2) -> Ports:
+        """Return the ports with every delay as an all-pass filter, for continuous designs.
+
+        Parameters
+        ----------
+        order : int
+            States of each; the phase is right up to about ``order / (6 delay)`` Hz.
+
+        Raises
+        ------
+        ModelError
+            When the order is not 1 or more.
+        """
+
+        def late(port: Any) -> Any:
+            if not port.delay:
+                return port
+            line, own = pade(port.delay, order=order), filter_of(port)
+            both = line if own is None else series(own, line)
+            named = both.replace(states=[f"x{i}" for i in range(1, both.n_states + 1)])
+            return port.replace(dynamics=named, delay=0.0)
+
+        return self.replace(u=[late(port) for port in self.u], y=[late(port) for port in self.y])
+
+
+def filter_of(port: Any) -> StateSpace | None:
+    """Return the shape or the dynamics of a port, or None."""
+    found = port.dynamics if isinstance(port, Actuator | Sensor) else port.shape
+    return found if isinstance(found, StateSpace) else None
+
+
+def _called(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) else "disturbance"

@@ -43,6 +43,9 @@ class ModalRealisation(Value):
         Of the states.
     n_rigid : int
         The first blocks are rigid-body modes.
+    static_outputs, static_inputs : (n, s) arrays, optional
+        Factors of a flexibility ``static_outputs static_inputs'`` [m/N] that answers at once: that
+        of modes left out by `Feedthrough`.
     """
 
     model: Structure
@@ -51,9 +54,12 @@ class ModalRealisation(Value):
     outputs: FloatArray
     names: tuple[str, ...]
     n_rigid: int
+    static_outputs: FloatArray | None = None
+    static_inputs: FloatArray | None = None
 
     def __post_init__(self) -> None:
         self._set(pairs=self.pairs, inputs=self.inputs, outputs=self.outputs)
+        self._set(static_outputs=self.static_outputs, static_inputs=self.static_inputs)
 
     @property
     def A(self) -> FloatArray:
@@ -71,11 +77,23 @@ class ModalRealisation(Value):
         return np.asarray(row @ self.inputs)
 
     def motion(self, row: FloatArray, derivative: int) -> FloatArray:
-        """Return the row (2 b,) of C for a displacement's 0th, 1st or 2nd derivative."""
-        C = np.asarray(row @ self.outputs).reshape(-1, 1, 2)
+        """Return the row (2 b,) of C for a displacement's 0th, 1st or 2nd derivative.
+
+        Rows (p, n) give rows (p, 2 b).
+        """
+        C = np.asarray(row @ self.outputs).reshape(-1, self.pairs.shape[0], 1, 2)
         for _ in range(derivative):
             C = C @ self.pairs
-        return C.reshape(-1)
+        return C.reshape(*np.shape(row)[:-1], -1)
+
+    def at_once(self, see: FloatArray, push: FloatArray) -> FloatArray:
+        """Return the displacements (p, m) along rows (p, n) that forces along (m, n) cause at once.
+
+        Zero unless modes were replaced by their flexibility.
+        """
+        if self.static_outputs is None or self.static_inputs is None:
+            return np.zeros((see.shape[0], push.shape[0]))
+        return np.asarray((see @ self.static_outputs) @ (push @ self.static_inputs).T)
 
 
 def realised(model: Structure | ModalRealisation) -> ModalRealisation:

@@ -13,11 +13,12 @@ from ..lti.discretisation import tustin
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive
+from .forces import BaseAcceleration, OutputDisturbance
 from .ports import Ports
 from .standard import StandardPlant
 from .weights import inverse_sensitivity, leadlag
 
-#: |S| of the finished loop crosses 1 below the weight's crossing by about gamma, which is near 1.6
+#: |S| of the finished loop crosses 1 below the weight's crossing, by gamma, which is near 1.6
 _HEADROOM = 1.6
 
 
@@ -36,13 +37,13 @@ def rigid_gain(plant: StandardPlant, outputs: list[str], inputs: list[str]) -> F
     (n_out, n_in) array [1/kg and the like]
     """
     shape, push = _rigid_parts(plant)
-    system = (plant.continuous or plant).system
+    system = plant.structural
     return np.asarray(shape[system.output_index(outputs)] @ push[:, system.input_index(inputs)])
 
 
 def _rigid_parts(plant: StandardPlant) -> tuple[FloatArray, FloatArray]:
     """Return the rigid-body shapes at all outputs, and the modal forces of all inputs."""
-    system, r = (plant.continuous or plant).system, plant.n_rigid
+    system, r = plant.structural, plant.n_rigid
     position, velocity = np.arange(r) * 2, np.arange(r) * 2 + 1
     # displacement rows see omega_r q: the pair's own gain turns them into shapes
     return system.C[:, position] * system.A[position, velocity], system.B[velocity]
@@ -76,7 +77,7 @@ def reference_errors(plant: StandardPlant) -> StateSpace:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
     poi = ports.poi(ports.references[0].poi)
     sensors = [s.name for s in ports.y if s.quantity == "displacement"]
-    system = (plant.continuous or plant).system
+    system = plant.structural
     shape, _ = _rigid_parts(plant)
     axes = shape[system.output_index([poi.channel(axis) for axis in poi.axes])]
     if not sensors or len(poi.axes) < plant.n_rigid or np.linalg.matrix_rank(axes) < plant.n_rigid:
@@ -132,9 +133,9 @@ def stage_weights(
     """Return a four-block set of weights for a positioning stage.
 
     Everything is measured in one length at the POI (1 m of reference) and in the force f0 that
-    accelerates the rigid body by ``w_b^2`` times it: [W_S S, W_S P W_d; W_u K S, W_u K P W_d]. W_S
-    asks for |S| < 1 below the bandwidth with some headroom and |S| < peak above; W_u lets the
-    efforts roll off from six times the bandwidth; W_d = disturbance f0.
+    accelerates the rigid body by ``w_c^2`` times it: [W_S S, W_S P W_d; W_u K S, W_u K P W_d]. W_S
+    asks for |S| < 1 below f_c, which is 1.6 times the bandwidth since gamma ends near 1.6, and for
+    |S| < peak above; W_u lets the efforts roll off from 6 f_c; W_d = disturbance f0.
 
     Parameters
     ----------
@@ -165,10 +166,11 @@ def stage_weights(
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
     first = ports.z[0].channel(ports.z[0].axes[0])
     push = np.linalg.norm(rigid_gain(plant, [first], [port.name for port in ports.u]))
-    force = (2.0 * np.pi * positive(bandwidth, "bandwidth")) ** 2 / float(push)
+    crossing = _HEADROOM * positive(bandwidth, "bandwidth")
+    force = (2.0 * np.pi * crossing) ** 2 / float(push)
     arm = _arm(plant, ports)
-    sense = inverse_sensitivity(_HEADROOM * bandwidth, peak=peak, floor=0.01)
-    rolloff = leadlag(6.0 * bandwidth, 60.0 * bandwidth, gain=positive(effort, "effort") / force)
+    sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
+    rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=positive(effort, "effort") / force)
     z: dict[str, Any] = {}
     for poi in ports.z:
         for axis in poi.axes:
@@ -180,12 +182,16 @@ def stage_weights(
             else:
                 z[poi.channel(axis)] = weight
     z |= {f"{port.name}:effort": _sampled(rolloff, plant) for port in ports.u}
-    w: dict[str, Any] = {
-        port.name: positive(disturbance, "disturbance")
-        * force
-        * (arm if port.direction.startswith("r") else 1.0)
-        for port in ports.w
-    }
+    push_size = positive(disturbance, "disturbance")
+    w: dict[str, Any] = {}
+    for port in ports.w:
+        if isinstance(port, OutputDisturbance):
+            w[port.name] = positive(noise, "noise")
+        elif isinstance(port, BaseAcceleration):
+            turned = 1.0 / arm if port.direction.startswith("r") else 1.0
+            w[port.name] = push_size * turned * (2.0 * np.pi * crossing) ** 2
+        else:
+            w[port.name] = push_size * force * (arm if port.direction.startswith("r") else 1.0)
     w |= {name: positive(noise, "noise") for name in plant.w if name.endswith(":noise")}
     text = (
         f"{bandwidth:g} Hz: |S| < {peak:g}, forces in {force:.4g} N, rotations in 1/{arm:.3g} rad, "
@@ -205,7 +211,7 @@ def _ports(plant: StandardPlant) -> Ports:
 def _arm(plant: StandardPlant, ports: Ports) -> float:
     """Return the length that makes rotations displacements: how far the sensors are, in shape."""
     shape, _ = _rigid_parts(plant)
-    system = (plant.continuous or plant).system
+    system = plant.structural
     turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
     if not turning:
         return 1.0

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, Value, positive
+from ..values import FloatArray, IntArray, Value, positive
 from .ports import Ports
 from .realisation import ModalRealisation
 
 if TYPE_CHECKING:
     from .check import AssumptionReport
+    from .moving import Along
     from .uncertainty import UncertainPlant
 
 
@@ -100,6 +103,9 @@ class StandardPlant(Value):
             names = getattr(self, side)
             shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
             lines.append(f"  {side} ({len(names)}) {shown}")
+        if self.ports is not None and self.ports.delays and not self.dt:
+            late = ", ".join(f"{name} {delay:g} s" for name, delay in self.ports.delays.items())
+            lines.append(f"  delays that act once it is sampled: {late}")
         return "\n".join(lines)
 
     @classmethod
@@ -156,6 +162,27 @@ class StandardPlant(Value):
     def model(self) -> Any:
         """The structural model that the plant was assembled from, or None."""
         return self.realisation.model if self.realisation is not None else None
+
+    @property
+    def modal_states(self) -> IntArray:
+        """Where the states of the structure's modes are; sensors' filters stand before them.
+
+        Raises
+        ------
+        ModelError
+            When the plant was not assembled from a structure.
+        """
+        if self.realisation is None or self.realisation.names[0] not in self.system.states:
+            raise ModelError("this plant has no modes: it was not assembled from a structure.")
+        first = self.system.states.index(self.realisation.names[0])
+        return np.arange(first, first + len(self.realisation.names), dtype=np.int64)
+
+    @cached_property
+    def structural(self) -> StateSpace:
+        """The structure alone, [w; u] -> [z; y], continuous; filters as their static gains."""
+        from .assembly import structural
+
+        return structural(self)
 
     @property
     def process_noise(self) -> FloatArray:
@@ -320,32 +347,50 @@ class StandardPlant(Value):
         return reassembled(self, ports)
 
     def at(self, poi: Place | Mapping[str, Place]) -> StandardPlant:
-        """Return the plant with the POI moved; only rows of C change.
+        """Return the plant with the POI moved: only its rows of C (and D12, if any) change.
 
         Parameters
         ----------
-        poi : (3,) array [m] or mapping {POI name: place}
-            The new point; a mapping when there are several POIs.
+        poi : (3,) array [m] or mapping {name: place}
+            The new point; a mapping when there are several POIs, or to move other ports too:
+            actuators (columns of B), disturbances, sensors.
 
         Raises
         ------
         LabelError
-            When a POI is unknown, or the plant has several and none is named.
+            When a name is unknown, or the plant has several POIs and none is named.
         """
-        ports = self.ports
-        if ports is None:
-            raise ModelError("this plant has no ports: its POIs have no places to move.")
-        if not isinstance(poi, Mapping):
-            if len(ports.z) != 1:
-                raise LabelError(
-                    f"the plant has {len(ports.z)} POIs: say which moves, at({{name: point}})."
-                )
-            poi = {ports.z[0].name: poi}
-        places: dict[str, Any] = dict(poi)
-        for name in places:
-            ports.poi(name)
-        moved = [replace(p, at=places.get(p.name, p.at)) for p in ports.z]
-        return self.with_ports(ports.replace(z=moved))
+        from .moving import moved
+
+        return self.with_ports(moved(self.ports, poi))
+
+    def along(self, name: str, points: npt.ArrayLike) -> Along:
+        """Return the rows of a POI (or the columns of a force) at many points at once.
+
+        All that depends on where a POI is are its rows of C, and of D where the plant has a
+        feedthrough: for positions that change with time.
+
+        Parameters
+        ----------
+        name : str
+            A POI; or an actuator or disturbance of a continuous plant.
+        points : (p, 3) array [m]
+            The places.
+
+        Returns
+        -------
+        Along
+
+        Raises
+        ------
+        LabelError
+            When the name is unknown or a point is off the structure.
+        ModelError
+            When the plant was not assembled from a structure, or more than B depends on the place.
+        """
+        from .moving import along
+
+        return along(self, name, points)
 
     def uncertain(
         self,

@@ -76,6 +76,10 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
     count = sum(name.startswith("mode") for name in plant.realisation.names) // 2
     own = [np.linalg.eigvals(pair) for pair in plant.realisation.pairs[n_rigid:count]]
     wanted = np.array([pole[np.argmax(pole.imag)] for pole in own], dtype=np.complex128)
+    # the structure's states first: filters of sensors stand before them
+    own_first = [*plant.modal_states, *np.setdiff1d(np.arange(g.n_states), plant.modal_states)]
+    inner = g.A[np.ix_(own_first, own_first)]
+    g = g.replace(A=inner, B=g.B[own_first], C=g.C[:, own_first], states=(), blocks=None)
     left, right = _vectors(g.A, wanted, 2 * n_rigid)
     omega = np.abs(wanted)
     sides: dict[str, tuple[Sequence[str], FloatArray]] = {}

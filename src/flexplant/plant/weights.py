@@ -184,3 +184,42 @@ def inverse_sensitivity(
     if slope == 1:
         return section
     return series(section, section.replace(inputs=["mid"], outputs=["out"], states=["x2"]))
+
+
+def pade(delay: float, *, order: int = 2) -> StateSpace:
+    """Return the all-pass approximation of a delay.
+
+    Parameters
+    ----------
+    delay : float [s]
+        The delay.
+    order : int
+        Number of states, 1 to 12; the phase is right up to about ``order / (6 delay)`` Hz.
+
+    Returns
+    -------
+    StateSpace
+        ``Q(-s) / Q(s)``, ``Q = sum_k c_k (s delay)^k`` with
+        ``c_k = (2n-k)! n! / ((2n)! k! (n-k)!)``, n the order; real modal sections in series.
+
+    Raises
+    ------
+    ModelError
+        When delay is not positive or the order not a whole number from 1 to 12.
+    """
+    time = positive(delay, "delay")
+    if order not in range(1, 13):
+        raise ModelError(f"order must be a whole number from 1 to 12, got {order!r}.")
+    n = int(order)
+    powers = np.cumprod([1.0, *((n - k) / ((2 * n - k) * (k + 1)) for k in range(n))])
+    poles = np.roots(powers[::-1])
+    upper = poles[poles.imag > 1e-9 * np.abs(poles)]
+    line = StateSpace([], [], [], [[1.0]], inputs=["in"], outputs=["out"])
+    for pole in poles[np.abs(poles.imag) <= 1e-9 * np.abs(poles)].real:
+        line = series(line, first_order(-1.0, 1.0, -pole / time).replace(states=["real"]))
+    for i, pole in enumerate(upper, 1):
+        size = abs(pole)
+        zeta = -pole.real / size
+        section = second_order(1.0, -2.0 * zeta, 1.0, size / time, zeta)
+        line = series(line, section.replace(states=[f"pair{i}", f"rate{i}"]))
+    return line

@@ -6,3 +6,5 @@ from .damping import Rayleigh as Rayleigh
 from .model import FEModel as FEModel
 from .plate import PlateShape as PlateShape
 from .plate import kirchhoff_plate as kirchhoff_plate
+from .scattered import ScatteredShape as ScatteredShape
+from .scattered import interpolated as interpolated

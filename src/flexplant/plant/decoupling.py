@@ -1,0 +1,190 @@
+"""Rigid-body decoupling: actuators to forces at the centre of gravity, sensors to its motions."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import AssumptionError, ModelError, unknown_label
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value
+from .body import RigidBody, rigid_body_of
+from .dynamics import load_of
+from .forces import Actuator
+from .ports import Ports, Sensor, filter_of
+from .realisation import ModalRealisation
+from .standard import StandardPlant
+
+#: relative: what the sensors show or the actuators push of other axes
+_CLEAN = 1e-6
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Decoupling(Value):
+    """Static transformations between the channels of a plant and its rigid body.
+
+    With G the rigid-body part of the plant u -> y, ``to_motions G to_actuators = mass^-1 / s^2``
+    and ``to_motions G accelerations = I / s^2``. On ground springs the same transformations hold,
+    from their inertia line on.
+
+    Parameters
+    ----------
+    to_actuators : StateSpace
+        T_u: forces at the centre of gravity `cog:z:force` [N, N m] to actuators, of least norm.
+    to_motions : StateSpace
+        T_y: sensors to motions of the centre of gravity `cog:z` [m, rad], least squares.
+    accelerations : StateSpace
+        ``T_u mass``: accelerations `cog:z:acceleration` to actuators.
+    mass : (r, r) array [kg, kg m, kg m^2]
+        Inertia about the centre of gravity; a rotational block need not be diagonal.
+    centre : (3,) array [m]
+        The centre of gravity; 0 in directions that the model's motions do not tell.
+    axes : sequence of str
+        The r axes, of x, y, z, rx, ry, rz.
+    """
+
+    to_actuators: StateSpace
+    to_motions: StateSpace
+    accelerations: StateSpace
+    mass: FloatArray
+    centre: FloatArray
+    axes: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        self._set(mass=self.mass, centre=self.centre)
+
+    def __repr__(self) -> str:
+        at = ", ".join(f"{c:.4g}" for c in self.centre)
+        return (
+            f"<Decoupling {', '.join(self.axes)} at ({at}) m: {len(self.to_actuators.outputs)} "
+            f"actuators, {len(self.to_motions.inputs)} sensors>"
+        )
+
+    @property
+    def T_u(self) -> FloatArray:
+        """Forces at the centre of gravity to actuators (nu, r)."""
+        return self.to_actuators.D
+
+    @property
+    def T_y(self) -> FloatArray:
+        """Sensors to motions of the centre of gravity (r, ny)."""
+        return self.to_motions.D
+
+
+def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Decoupling:
+    """Return the static transformations to and from the centre of gravity.
+
+    From the geometry: no mode shape is involved but the rigid-body ones, so that a structure on
+    weak springs is decoupled as if it were free.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled from a free or suspended structure, continuous or sampled.
+    axes : sequence of str, optional
+        Some of the rigid-body axes; all that the structure has when not given.
+
+    Returns
+    -------
+    Decoupling
+        Filters of the ports count with their static gains. Only displacement sensors are used.
+
+    Raises
+    ------
+    AssumptionError
+        When the actuators or sensors do not reach or see an axis apart from the others.
+    LabelError
+        When an axis is not one of the structure's.
+    ModelError
+        When the plant was not assembled from a structure, or it is held.
+    """
+    if not isinstance(plant, StandardPlant) or plant.realisation is None or plant.ports is None:
+        raise ModelError(
+            "decoupling needs a plant assembled from a structure: assemble_plant(model, ports)."
+        )
+    body = rigid_body_of(plant.realisation)
+    wanted = body.axes if axes is None else tuple(axes)
+    for axis in wanted:
+        if axis not in body.axes:
+            raise unknown_label("rigid-body axis", axis, body.axes)
+    pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
+    sensors = [s for s in plant.ports.y if s.quantity == "displacement"]
+    see = _gains(sensors)[:, None] * _seen(plant.realisation, sensors, body)
+    push = (_gains(plant.ports.u)[:, None] * _pushed(plant.realisation, plant.ports, body)).T
+    length = _length(body)
+    T_y = _left(see, length, pick)
+    T_u = _left(push.T, 1.0 / length, pick).T
+    _check(T_y @ see, pick, wanted, body, length, "sensors", [s.name for s in sensors])
+    _check((push @ T_u).T, pick, wanted, body, 1.0 / length, "actuators", list(plant.u))
+    mass = pick @ body.mass @ pick.T
+    forces = [f"cog:{axis}:force" for axis in wanted]
+    pushes = [f"cog:{axis}:acceleration" for axis in wanted]
+    return Decoupling(
+        _static(T_u, forces, plant.u, plant.dt),
+        _static(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant.dt),
+        _static(T_u @ mass, pushes, plant.u, plant.dt),
+        mass,
+        body.centre,
+        wanted,
+    )
+
+
+def _gains(ports: Sequence[Actuator | Sensor]) -> FloatArray:
+    found = [filter_of(port) for port in ports]
+    return np.array([1.0 if f is None else float(f.evaluated(0.0)[0, 0].real) for f in found])
+
+
+def _seen(realisation: ModalRealisation, sensors: Sequence[Sensor], body: RigidBody) -> FloatArray:
+    """Return what each sensor (ny, r) shows of the rigid-body motions."""
+    rows = [realisation.row(s.at, s.direction) @ body.motions for s in sensors]
+    return np.array(rows).reshape(-1, len(body.axes))
+
+
+def _pushed(realisation: ModalRealisation, ports: Ports, body: RigidBody) -> FloatArray:
+    """Return the forces and moments (nu, r) of each actuator at the centre of gravity."""
+    rows = [load_of(realisation, port) @ body.motions for port in ports.u]
+    return np.array(rows).reshape(-1, len(body.axes))
+
+
+def _length(body: RigidBody) -> FloatArray:
+    """Return units (r,) in which rotations and translations move the structure alike."""
+    return np.asarray(1.0 / np.linalg.norm(body.motions, axis=0))
+
+
+def _left(matrix: FloatArray, unit: FloatArray, pick: FloatArray) -> FloatArray:
+    """Return the rows `pick` of the least-squares left inverse, its columns in these units."""
+    return np.asarray(pick @ (unit[:, None] * np.linalg.pinv(matrix * unit, rcond=_CLEAN)))
+
+
+def _check(
+    product: FloatArray,
+    pick: FloatArray,
+    wanted: tuple[str, ...],
+    body: RigidBody,
+    unit: FloatArray,
+    side: str,
+    names: list[str],
+) -> None:
+    """Raise AssumptionError unless T (a row per axis) times the geometry is the identity."""
+    own = pick @ unit
+    wrong = np.abs((product - pick) * unit / own[:, None]) > _CLEAN
+    if np.any(wrong):
+        i, j = (int(k) for k in np.argwhere(wrong)[0])
+        what = (
+            f"do not tell {wanted[i]!r} at all"
+            if body.axes[j] == wanted[i]
+            else f"mix {wanted[i]!r} with {body.axes[j]!r}"
+        )
+        raise AssumptionError(
+            f"the axis {wanted[i]!r} cannot be decoupled: the {side} "
+            f"({', '.join(names) or 'none'}) {what}. Add or move some, or ask for fewer "
+            f"axes: decouple(plant, axes=...) of {', '.join(body.axes)}."
+        )
+
+
+def _static(
+    gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], dt: float
+) -> StateSpace:
+    return StateSpace([], [], [], gain, dt, inputs=inputs, outputs=outputs, name="decoupling")

@@ -1,0 +1,179 @@
+"""What pushes a machine: disturbances and actuators."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from ..labels import Place
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value, positive, real_array
+from .places import checked_direction, checked_filter, checked_name, checked_place
+
+
+@dataclass(frozen=True, eq=False)
+class Disturbance(Value):
+    """A force (or moment) from outside, in w.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name.
+    at : str, (3,) array [m] or mapping
+        A DOF label, a point, or a sum {label or point: weight}.
+    direction : str
+        At points: x, y, z [N] or rx, ry, rz [N m].
+    asd : float [N/sqrt(Hz)]
+        One-sided amplitude spectral density of white noise; 0 for a force that is no noise.
+    shape : StateSpace, optional
+        A stable filter that the channel goes through on its way to the structure: the asd is then
+        that of the white noise at its input, and its states join the plant's.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For a bad name, place, direction, shape or a negative asd.
+    """
+
+    name: str
+    at: Place
+    direction: str = "z"
+    asd: float = 0.0
+    shape: StateSpace | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            name=checked_name(self.name),
+            direction=checked_direction(self.name, self.direction),
+            at=checked_place(self.name, self.at),
+            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
+            shape=checked_filter(self.name, "shape", self.shape),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class BaseAcceleration(Value):
+    """An acceleration of the floor (or frame) under the whole structure, in w.
+
+    All motions are then relative to the base, and the structure feels ``-M r a``, r its rigid-body
+    motion in the direction. A free structure answers as a rigid body; springs to ground
+    (`suspend`) and supports make it bend.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name.
+    direction : str
+        x, y, z [m/s^2] or rx, ry, rz [rad/s^2].
+    asd : float [m/s^2/sqrt(Hz), rad/s^2/sqrt(Hz)]
+        One-sided amplitude spectral density of white noise; 0 for none.
+    shape : StateSpace, optional
+        A stable filter between the channel and the base: the floor's spectrum.
+    about : (3,) array [m]
+        The point that a rotation turns about.
+
+    Raises
+    ------
+    LabelError, ModelError, ShapeError
+        For a bad name, direction, shape, point or a negative asd.
+
+    Notes
+    -----
+    Modes and reduced models know their inertia against motions that their shapes can make: free
+    or suspended structures. For a held one pass the FEModel; the mass that couples to its removed
+    DOFs is not in its matrices.
+    """
+
+    name: str
+    direction: str = "z"
+    asd: float = 0.0
+    shape: StateSpace | None = None
+    about: tuple[float, ...] | FloatArray = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        about = real_array(self.about, f"about of {self.name!r}", (3,))
+        self._set(
+            name=checked_name(self.name),
+            direction=checked_direction(self.name, self.direction),
+            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
+            shape=checked_filter(self.name, "shape", self.shape),
+            about=tuple(about.tolist()),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class OutputDisturbance(Value):
+    """Something added to what one sensor measures, before the sensor's own dynamics; in w.
+
+    White noise here needs a sensor with `dynamics` that roll off (an anti-alias filter, say), or a
+    shape that does: a sample of it would have infinite variance. White noise per sample is
+    `Sensor.asd`.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name.
+    sensor : str
+        The name of the sensor.
+    asd : float [unit of the sensor/sqrt(Hz)]
+        One-sided amplitude spectral density of white noise; 0 for none.
+    shape : StateSpace, optional
+        A stable filter between the channel and the sensor: drift, mains hum.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For a bad name, shape or a negative asd.
+    """
+
+    name: str
+    sensor: str
+    asd: float = 0.0
+    shape: StateSpace | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            name=checked_name(self.name),
+            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
+            shape=checked_filter(self.name, "shape", self.shape),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Actuator(Value):
+    """A force (or moment) that the controller commands, in u.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name.
+    at : str, (3,) array [m] or mapping
+        A DOF label, a point, or a sum {label or point: weight}: pairs and other combinations.
+    direction : str
+        At points: x, y, z [N] or rx, ry, rz [N m].
+    dynamics : StateSpace, optional
+        Amplifier and motor, command to force: stable; its states join the plant's.
+    delay : float [s]
+        Of the command, by cable or bus, besides that of `discretized`. It acts exactly, also
+        between samples, once the plant is sampled; a continuous plant leaves it out and says so
+        (`ports.with_pade(order)` approximates it there).
+
+    Raises
+    ------
+    LabelError, ModelError
+        For a bad name, place, direction, dynamics or a negative delay.
+    """
+
+    name: str
+    at: Place
+    direction: str = "z"
+    dynamics: StateSpace | None = None
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._set(
+            name=checked_name(self.name),
+            direction=checked_direction(self.name, self.direction),
+            at=checked_place(self.name, self.at),
+            dynamics=checked_filter(self.name, "dynamics", self.dynamics),
+            delay=positive(self.delay, f"delay of {self.name!r}", zero=True),
+        )

@@ -1,0 +1,165 @@
+"""Places that move: POIs along a trajectory, and actuators or sensors put elsewhere."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..values import FloatArray, Value, real_array
+from .forces import Actuator, Disturbance
+from .ports import Poi, Ports, filter_of
+from .realisation import ModalRealisation
+
+if TYPE_CHECKING:
+    from .standard import StandardPlant
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Along(Value):
+    """What depends on the place of one port, at many points: rows of C and D, or a column of B.
+
+    Parameters
+    ----------
+    name : str
+        The port.
+    points : (p, 3) array [m]
+        The places.
+    channels : sequence of str
+        Of z for a POI, the one input of an actuator or disturbance.
+    C : (p, channels, n) array
+        A POI's rows over the plant's states: ``z = C[i] x + D[i] [w; u]`` while it is at point i.
+    D : (p, channels, inputs) or (p, outputs, 1) array
+        Rows of a POI, or columns of a force.
+    B : (p, n, 1) array
+        Columns of a force; without any for a POI.
+    """
+
+    name: str
+    points: FloatArray
+    channels: tuple[str, ...]
+    C: FloatArray
+    D: FloatArray
+    B: FloatArray
+
+    def __post_init__(self) -> None:
+        self._set(points=self.points, C=self.C, D=self.D, B=self.B)
+
+    def __repr__(self) -> str:
+        return f"<Along {self.points.shape[0]} points: {', '.join(self.channels)}>"
+
+
+def moved(ports: Ports | None, places: Any) -> Ports:
+    """Return ports with some of them elsewhere; one POI, or {name: place} of any ports."""
+    if ports is None:
+        raise ModelError("this plant has no ports: its POIs have no places to move.")
+    if not isinstance(places, Mapping):
+        if len(ports.z) != 1:
+            raise LabelError(
+                f"the plant has {len(ports.z)} POIs: say which moves, at({{name: point}})."
+            )
+        places = {ports.z[0].name: places}
+    for name in places:
+        _port(ports, name)
+
+    def there(side: Any) -> list[Any]:
+        return [p.replace(at=places[p.name]) if p.name in places else p for p in side]
+
+    return ports.replace(w=there(ports.w), u=there(ports.u), z=there(ports.z), y=there(ports.y))
+
+
+def along(plant: StandardPlant, name: str, points: npt.ArrayLike) -> Along:
+    """Return what depends on the place of a POI or a force, at many points at once."""
+    if plant.ports is None or plant.realisation is None or plant.unweighted is not None:
+        raise ModelError(
+            "moving a port needs a plant assembled from a structure and not weighted: use "
+            "assemble_plant(model, ports), or plant.unweighted."
+        )
+    places = real_array(points, "points", (None, 3))
+    port = _port(plant.ports, name)
+    if isinstance(port, Poi):
+        return _poi_along(plant, plant.realisation, port, places)
+    if isinstance(port, Actuator | Disturbance):
+        return _force_along(plant, plant.realisation, port, places)
+    raise ModelError(
+        f"{name!r} is a {type(port).__name__}: POIs, actuators and disturbances move along points. "
+        "plant.at({name: point}) moves any port."
+    )
+
+
+def _port(ports: Ports, name: str) -> Any:
+    pois = [poi for poi in ports.z if poi.name == name]
+    others = [port for port in (*ports.forces, *ports.y) if port.name == name]
+    found = pois or others
+    if not found:
+        known = [port.name for port in (*ports.z, *ports.forces, *ports.y)]
+        raise unknown_label("POI", name, known)
+    if len(found) > 1:
+        raise LabelError(f"{name!r} names an input and a sensor: rename one to move the other.")
+    if not hasattr(found[0], "at"):
+        raise LabelError(f"{name!r} has no place: it is a {type(found[0]).__name__}.")
+    return found[0]
+
+
+def rows_along(realisation: ModalRealisation, points: FloatArray, direction: str) -> FloatArray:
+    """Return the rows (p, n) over the model's DOFs of the motion at many points."""
+    model: Any = realisation.model
+    full = getattr(model, "full_dofs", None)
+    if full is not None:
+        return np.asarray(full.rows(points, direction) @ model.T)
+    return np.asarray(model.dofs.rows(points, direction))
+
+
+def _poi_along(
+    plant: StandardPlant, realisation: ModalRealisation, poi: Poi, points: FloatArray
+) -> Along:
+    g = plant.system
+    tracked = plant.ports is not None and poi.name in [r.poi for r in plant.ports.references]
+    channels = [poi.channel(axis) for axis in poi.axes]
+    shown = [*channels, *([poi.derived(poi.axes[0], "error")] if tracked else [])]
+    at = g.output_index(shown)
+    C = np.zeros((points.shape[0], len(shown), g.n_states))
+    D = np.repeat(g.D[at][None], points.shape[0], axis=0)
+    if realisation.static_outputs is not None:
+        # forces reach a POI at once too, through filters and delays: what the whole plant knows
+        for i, point in enumerate(points):
+            there = plant.at({poi.name: point.tolist()}).system
+            C[i], D[i] = there.C[at], there.D[at]
+        return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
+    for k, axis in enumerate(poi.axes):
+        rows = rows_along(realisation, points, axis)
+        C[:, k, plant.modal_states] = realisation.motion(rows, 0)
+    if tracked:
+        C[:, -1] = -C[:, 0]
+    return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
+
+
+def _force_along(
+    plant: StandardPlant,
+    realisation: ModalRealisation,
+    port: Actuator | Disturbance,
+    points: FloatArray,
+) -> Along:
+    if plant.dt or filter_of(port) is not None:
+        raise ModelError(
+            f"the place of {port.name!r} acts through a filter, a hold or a delay, so that more "
+            "than a column of B depends on it. Use plant.continuous.along for a force without "
+            "dynamics, or plant.at({name: point}) point by point."
+        )
+    g = plant.system
+    i = int(g.input_index([port.name])[0])
+    B = np.zeros((points.shape[0], g.n_states, 1))
+    rows = rows_along(realisation, points, port.direction)
+    B[:, plant.modal_states, 0] = rows @ realisation.inputs
+    D = np.repeat(g.D[None, :, i : i + 1], points.shape[0], axis=0)
+    accelerations = plant.ports is not None and any(
+        sensor.quantity == "acceleration" for sensor in plant.ports.y
+    )
+    if accelerations or realisation.static_inputs is not None:
+        for k, point in enumerate(points):
+            D[k] = plant.at({port.name: point.tolist()}).system.D[:, i : i + 1]
+    return Along(port.name, points, (port.name,), np.zeros((points.shape[0], 0, g.n_states)), D, B)

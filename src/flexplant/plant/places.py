@@ -1,0 +1,76 @@
+"""What the ports of a machine have in common: a place, and the filters of amplifier and sensor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..labels import DIRECTIONS, Place
+from ..lti.statespace import StateSpace, as_statespace
+from ..values import check_names, real_array
+
+
+def checked_name(name: Any) -> str:
+    """Return the name of a port, or raise LabelError."""
+    check_names([str(name)], "ports")
+    return str(name)
+
+
+def checked_direction(name: str, direction: str) -> str:
+    """Return one of the six directions, or raise LabelError."""
+    if direction not in DIRECTIONS:
+        raise unknown_label(f"direction of {name!r}", direction, DIRECTIONS)
+    return direction
+
+
+def checked_place(name: str, at: Any) -> Place:
+    """Return a copy of a place: a label, a point, or a sum {label or point: weight}."""
+    if isinstance(at, Mapping):
+        if not at:
+            raise LabelError(f"{name!r} is at an empty mapping: name at least one DOF.")
+        return {
+            _term(name, place): float(real_array(weight, f"weight of {place!r} in {name!r}", ()))
+            for place, weight in at.items()
+        }
+    if isinstance(at, str):
+        return at
+    return tuple(real_array(at, f"place of {name!r}", (3,)).tolist())
+
+
+def _term(name: str, place: Any) -> Any:
+    if isinstance(place, tuple):
+        return tuple(real_array(place, f"a point of {name!r}", (3,)).tolist())
+    return str(place)
+
+
+def checked_filter(name: str, what: str, given: Any) -> StateSpace | None:
+    """Return a stable continuous system of one input and output, named like its port.
+
+    Raises
+    ------
+    ModelError
+        When it is something else.
+    """
+    if given is None:
+        return None
+    sys = as_statespace(given)
+    if len(sys.inputs) != 1 or len(sys.outputs) != 1:
+        raise ModelError(f"the {what} of {name!r} needs one input and one output, got {sys!r}.")
+    if sys.n_states and sys.dt:
+        raise ModelError(
+            f"the {what} of {name!r} is sampled (dt {sys.dt:g} s), but belongs to the machine: "
+            "give the continuous system, it is sampled with the plant."
+        )
+    if not sys.is_stable:
+        raise ModelError(
+            f"the {what} of {name!r} is not stable (poles {_slowest(sys)} rad/s): nothing would "
+            "be stationary. Replace an integrator by a low-pass with a corner far below the band."
+        )
+    prefix = [f"{name}|{state.rpartition('|')[2]}" for state in sys.states]
+    return sys.replace(inputs=["in"], outputs=["out"], dt=0.0, states=prefix)
+
+
+def _slowest(sys: StateSpace) -> str:
+    worst = sorted(sys.poles(), key=lambda pole: -pole.real)[:2]
+    return ", ".join(f"{pole:.4g}" for pole in worst)

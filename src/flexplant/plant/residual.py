@@ -1,0 +1,99 @@
+"""What a plant makes of the compliance beyond its modes: fast states, or a feedthrough."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import Value, positive
+from .realisation import ModalRealisation
+
+
+class Residual(Value):
+    """How the residual compliance of a reduction appears in a plant."""
+
+    def applied(self, realisation: ModalRealisation) -> ModalRealisation:
+        """Return the realisation in this form."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True, eq=False)
+class FastStates(Residual):
+    """Attachment vectors stay modes of their own, at their own high frequencies (the default).
+
+    The plant stays strictly proper between forces and displacements, so that it can be sampled
+    without delay, filtered for white forces and simulated; it costs two states a vector.
+    """
+
+    def applied(self, realisation: ModalRealisation) -> ModalRealisation:
+        """Return the realisation unchanged."""
+        return realisation
+
+
+@dataclass(frozen=True, eq=False)
+class Feedthrough(Residual):
+    """Attachment vectors, or all modes above a frequency, become their static flexibility.
+
+    Displacements then answer forces at once: D12, D22 and D11 hold ``phi phi' / omega^2`` of what
+    was left out. Velocities and accelerations of that part are left out, being zero below its
+    frequencies. White forces then reach displacements directly (a sample would have infinite
+    variance: shape them for Kalman filters and simulation), and a simulation needs the delay of
+    at least a sample that every machine has.
+
+    Parameters
+    ----------
+    above : float [Hz], optional
+        Also the modes above this frequency; only the attachment vectors when not given.
+
+    Raises
+    ------
+    ModelError
+        When above is not positive.
+    """
+
+    above: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.above is not None:
+            self._set(above=positive(self.above, "above"))
+
+    def applied(self, realisation: ModalRealisation) -> ModalRealisation:
+        """Return the realisation with its fast pairs replaced by their static gain.
+
+        Raises
+        ------
+        ModelError
+            When nothing would be replaced, or everything.
+        """
+        b = realisation.pairs.shape[0]
+        fast = np.array([name.startswith("residual") for name in realisation.names[::2]])
+        if self.above is not None:
+            omega = np.sqrt(np.abs(np.linalg.det(realisation.pairs)))
+            fast |= omega > 2.0 * np.pi * self.above
+        if not fast.any() or fast.all():
+            which = "attachment vectors" if self.above is None else f"modes above {self.above:g} Hz"
+            raise ModelError(
+                f"the model has {'nothing but' if fast.any() else 'no'} {which}: "
+                "Feedthrough(above=...) says which modes become static, and "
+                "solve_modes(..., compliance_at=...) keeps the compliance of those left out."
+            )
+        n = realisation.outputs.shape[0]
+        pairs = realisation.pairs[fast]
+        see = realisation.outputs.reshape(n, b, 2)[:, fast].reshape(n, -1)
+        push = realisation.inputs.reshape(n, b, 2)[:, fast]
+        settled = -np.einsum("bij,nbj->nbi", np.linalg.inv(pairs), push).reshape(n, -1)
+        kept = np.repeat(~fast, 2)
+        if realisation.static_outputs is not None and realisation.static_inputs is not None:
+            see = np.hstack([realisation.static_outputs, see])
+            settled = np.hstack([realisation.static_inputs, settled])
+        return replace(
+            realisation,
+            pairs=realisation.pairs[~fast],
+            inputs=realisation.inputs[:, kept],
+            outputs=realisation.outputs[:, kept],
+            names=tuple(n for n, keep in zip(realisation.names, kept, strict=True) if keep),
+            static_outputs=see,
+            static_inputs=settled,
+        )

@@ -1,0 +1,248 @@
+"""Sampling a plant whose channels have filters and delays of their own: exact, noise included."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import AssumptionError
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, IntArray
+from .propagation import Flow, HeldFlow
+
+
+class Late(NamedTuple):
+    """A delay per channel: whole samples, and a fraction of one in seconds."""
+
+    whole: IntArray
+    fraction: FloatArray
+
+    @classmethod
+    def of(cls, names: Sequence[str], delays: Mapping[str, float], h: float) -> Late:
+        """Split delays [s] at a sampling time; what is whole to rounding is whole."""
+        samples = np.array([delays.get(name, 0.0) for name in names]) / h
+        near = np.round(samples)
+        samples = np.where(np.abs(samples - near) < 1e-9 * np.maximum(near, 1.0), near, samples)
+        whole = np.floor(samples).astype(np.int64)
+        return cls(whole, (samples - whole) * h)
+
+    @property
+    def length(self) -> IntArray:
+        """Samples of an input that must be remembered."""
+        return self.whole + (self.fraction > 0)
+
+
+class Sampled(NamedTuple):
+    """A sampled system, and the factor of the noise that disturbances add to its states."""
+
+    system: StateSpace
+    noise_factor: FloatArray
+
+
+def sampled_physical(
+    g: StateSpace,
+    rate: float,
+    *,
+    head: int,
+    pairs: FloatArray,
+    late_inputs: Mapping[str, float],
+    late_outputs: Mapping[str, float],
+    asd: FloatArray,
+) -> Sampled:
+    """Return the zero-order-hold equivalent of a physical system with delays per channel.
+
+    ``x(k h + t) = E(t) x[k] + N(t) u[k - m] + O(t) u[k - m - 1]``: an input that is (m h + f) late
+    is the new sample for the last t - f and the old one before that. A late output is the motion
+    at its own instant between samples, a state of its own; its noise is the part of the same
+    noise that has acted until then.
+
+    Parameters
+    ----------
+    g : StateSpace
+        Continuous: filters, modes, filters.
+    rate : float [Hz]
+        Sampling rate.
+    head : int
+        States before the modes.
+    pairs : (b, 2, 2) array
+        The modes' blocks.
+    late_inputs, late_outputs : mapping {name: float} [s]
+        Delays.
+    asd : (m,) array
+        One-sided amplitude spectral densities of the white inputs.
+
+    Returns
+    -------
+    Sampled
+        States: late outputs (oldest first), those of g, late inputs (oldest first).
+
+    Raises
+    ------
+    AssumptionError
+        When white noise reaches a late output directly.
+    """
+    h = 1.0 / rate
+    inputs = Late.of(g.inputs, late_inputs, h)
+    outputs = Late.of(g.outputs, late_outputs, h)
+    _check_noise(g, asd, outputs)
+    layout = _Layout(g, inputs, outputs)
+    n, first = g.n_states, layout.first
+    states = slice(first, first + n)
+    held = HeldFlow(g.A, g.B, head, pairs)
+    A = np.zeros((layout.size, layout.size))
+    B = np.zeros((layout.size, len(g.inputs)))
+    C = np.zeros((len(g.outputs), layout.size))
+    E, new, old = _moved(held, inputs, h)
+    A[states, states] = E
+    layout.enter(A, B, states, new, old)
+    layout.remember(A, B)
+    D_new, D_old = _direct(g.D, inputs, 0.0)
+    now = np.zeros((len(g.outputs), layout.size)), np.zeros_like(g.D)
+    now[0][:, states] = g.C
+    layout.enter(now[0], now[1], slice(None), D_new, D_old)
+    D = now[1].copy()
+    D[outputs.length > 0] = 0.0
+    C[outputs.length == 0] = now[0][outputs.length == 0]
+    for j in np.flatnonzero(outputs.length):
+        line = layout.line(int(j))
+        C[j, line[0]] = 1.0
+        for older, newer in pairwise(line):
+            A[older, newer] = 1.0
+        row = slice(line[-1], line[-1] + 1)
+        if not outputs.fraction[j]:
+            A[row], B[row] = now[0][j], now[1][j]
+            continue
+        t = h - float(outputs.fraction[j])
+        E, new, old = _moved(held, inputs, t)
+        direct_new, direct_old = _direct(g.D[j : j + 1], inputs, t)
+        A[row, states] = g.C[j] @ E
+        layout.enter(A, B, row, g.C[j] @ new + direct_new, g.C[j] @ old + direct_old)
+    blocks = None
+    if g.blocks is not None:
+        blocks = [*[1] * first, *g.blocks, *[1] * (layout.size - first - n)]
+    system = g.replace(A=A, B=B, C=C, D=D, dt=h, states=layout.names, blocks=blocks)
+    return Sampled(system, _noise(g, Flow(g.A, head, pairs), asd, h, layout, outputs))
+
+
+class _Layout:
+    """Where the states are: late outputs, then those of the system, then late inputs."""
+
+    def __init__(self, g: StateSpace, inputs: Late, outputs: Late) -> None:
+        self.inputs, self.outputs = inputs, outputs
+        ages = [
+            (age, j)
+            for age in range(int(outputs.length.max(initial=0)), 0, -1)
+            for j in np.flatnonzero(outputs.length >= age).tolist()
+        ]
+        self.seen = {key: i for i, key in enumerate(ages)}
+        self.first = len(ages)
+        lines = [
+            (age, i)
+            for age in range(int(inputs.length.max(initial=0)), 0, -1)
+            for i in np.flatnonzero(inputs.length >= age).tolist()
+        ]
+        start = self.first + g.n_states
+        self.pushed = {key: start + i for i, key in enumerate(lines)}
+        self.size = start + len(lines)
+        self.names = [f"{g.outputs[j]}:late{age}" for age, j in ages]
+        self.names += [*g.states, *(f"{g.inputs[i]}:delay{age}" for age, i in lines)]
+
+    def line(self, output: int) -> list[int]:
+        """Return the states of a late output, oldest first."""
+        length = int(self.outputs.length[output])
+        return [self.seen[age, output] for age in range(length, 0, -1)]
+
+    def enter(
+        self, A: FloatArray, B: FloatArray, rows: slice, new: FloatArray, old: FloatArray
+    ) -> None:
+        """Put the effects (rows, m) of the new and the old sample of each input in their places."""
+        for effect, age_of in ((new, self.inputs.whole), (old, self.inputs.whole + 1)):
+            for i, age in enumerate(age_of.tolist()):
+                if not np.any(effect[:, i]):
+                    continue
+                if age == 0:
+                    B[rows, i] += effect[:, i]
+                else:
+                    A[rows, self.pushed[age, i]] += effect[:, i]
+
+    def remember(self, A: FloatArray, B: FloatArray) -> None:
+        """Let the lines of the inputs move on by one."""
+        for (age, i), state in self.pushed.items():
+            if age == 1:
+                B[state, i] = 1.0
+            else:
+                A[state, self.pushed[age - 1, i]] = 1.0
+
+
+def _moved(held: HeldFlow, inputs: Late, t: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return E(t), and the effects of the new and the old sample of each input."""
+    E, whole = held.at(t)
+    new, old = whole.copy(), np.zeros_like(whole)
+    for f in np.unique(inputs.fraction[inputs.fraction > 0]):
+        columns = inputs.fraction == f
+        if t <= f:
+            new[:, columns], old[:, columns] = 0.0, whole[:, columns]
+            continue
+        rest, late = held.at(t - float(f))
+        new[:, columns] = late[:, columns]
+        old[:, columns] = rest @ held.at(float(f))[1][:, columns]
+    return E, new, old
+
+
+def _direct(D: FloatArray, inputs: Late, t: float) -> tuple[FloatArray, FloatArray]:
+    """Return which sample of each input acts at t within the sample: the new or the old one."""
+    new = np.where(inputs.fraction <= t, D, 0.0)
+    return new, D - new
+
+
+def _check_noise(g: StateSpace, asd: FloatArray, outputs: Late) -> None:
+    loud = np.flatnonzero(asd > 0)
+    late = np.flatnonzero(outputs.length > 0)
+    direct = np.argwhere(g.D[np.ix_(late, loud)])
+    if direct.size:
+        output, name = g.outputs[late[direct[0][0]]], g.inputs[loud[direct[0][1]]]
+        raise AssumptionError(
+            f"white noise of {name!r} reaches {output!r} at once, so that a sample of it would "
+            "have infinite variance. Give the sensor dynamics that roll off (an anti-alias "
+            "filter), or shape the noise."
+        )
+
+
+def _noise(
+    g: StateSpace, flow: Flow, asd: FloatArray, h: float, layout: _Layout, outputs: Late
+) -> FloatArray:
+    """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample.
+
+    Gauss-Legendre quadrature as in `lti.noise`, piece by piece between the instants at which
+    late outputs are taken: a sum of squares, exact to rounding.
+    """
+    loud = np.flatnonzero(asd)
+    if not loud.size or not g.n_states:
+        return np.zeros((layout.size, 0))
+    force = g.B[:, loud] * (np.asarray(asd)[loud] / np.sqrt(2.0))
+    partly = np.flatnonzero(outputs.fraction > 0)
+    instants = h - outputs.fraction[partly]
+    edges = np.unique(np.concatenate([[0.0, h], instants]))
+    fastest = float(np.max(np.abs(g.poles()), initial=0.0))
+    states = slice(layout.first, layout.first + g.n_states)
+    parts = []
+    for start, end in pairwise(edges):
+        count = 16 + int(np.ceil(0.7 * (end - start) * fastest))
+        nodes, weights = np.polynomial.legendre.leggauss(count)
+        for s, weight in zip(
+            start + 0.5 * (end - start) * (nodes + 1.0), 0.5 * (end - start) * weights, strict=True
+        ):
+            column = np.zeros((layout.size, loud.size))
+            column[states] = flow.at(h - s) @ force
+            for j, instant in zip(partly, instants, strict=True):
+                if s < instant:
+                    column[layout.line(int(j))[-1]] = g.C[j] @ flow.at(instant - s) @ force
+            parts.append(np.sqrt(weight) * column)
+    G = np.hstack(parts)
+    if G.shape[1] <= G.shape[0]:
+        return G
+    return np.asarray(la.qr(G.T, mode="r")[0][: G.shape[0]].T)

@@ -1,0 +1,191 @@
+"""Weak springs to ground: gravity compensation, which makes rigid-body modes suspension modes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+
+from ..errors import ModelError
+from ..labels import Place
+from ..reduction import Modes, ReducedModel, normal_form
+from ..structure import FEModel
+from ..values import FloatArray, Value, positive
+from .places import checked_direction, checked_place
+
+Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
+#: relative: a rigid-body motion that stretches a spring by less than this does not
+_SLACK = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class GroundSpring(Value):
+    """A spring and a damper between a place of the structure and the ground.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        A DOF label, a point, or a sum {label or point: weight}.
+    stiffness : float [N/m or N m/rad]
+        Of the spring, above 0.
+    damping : float [N s/m or N m s/rad]
+        Of the damper beside it.
+    direction : str
+        At points: x, y, z, rx, ry, rz.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For a bad place or direction, a stiffness that is not positive or a negative damping.
+    """
+
+    at: Place
+    stiffness: float
+    damping: float = 0.0
+    direction: str = "z"
+
+    def __post_init__(self) -> None:
+        self._set(
+            at=checked_place("a ground spring", self.at),
+            direction=checked_direction("a ground spring", self.direction),
+            stiffness=positive(self.stiffness, "stiffness of a ground spring"),
+            damping=positive(self.damping, "damping of a ground spring", zero=True),
+        )
+
+
+def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) -> Suspended:
+    """Return a structure on springs to ground.
+
+    ``K + sum_s k_s r_s' r_s``, D likewise, r_s the row of a spring's motion. Rigid-body motions
+    that stretch a spring become suspension modes, true oscillations at low frequency; those that
+    do not stay exactly at 0.
+
+    Parameters
+    ----------
+    model : FEModel, ReducedModel or Modes
+        Modes and reduced models are suspended within their own shapes, which for springs much
+        softer than the structure is exact to the ratio of the two.
+    springs : GroundSpring or sequence
+        The springs.
+
+    Returns
+    -------
+    FEModel, ReducedModel or Modes
+        Of the same kind. Modes become complex where dampers make them so; attachment vectors are
+        modes then, or where the springs mix them.
+
+    Raises
+    ------
+    ModelError
+        When there are no springs, the model is of another kind or its modes are complex, or a
+        suspension mode would be overdamped.
+    LabelError
+        When a place is not on the structure.
+    """
+    listed = [springs] if isinstance(springs, GroundSpring) else list(springs)
+    if not listed or not all(isinstance(spring, GroundSpring) for spring in listed):
+        raise ModelError(f"suspend needs GroundSprings, got {springs!r:.80}.")
+    given: Any = model
+    if isinstance(given, FEModel):
+        return _full(given, listed)  # type: ignore[return-value]
+    if isinstance(given, ReducedModel):
+        rows = np.array([given.row(s.at, s.direction) for s in listed])
+        stiffness, damping = _matrices(rows, listed)
+        return given.replace(  # type: ignore[return-value]
+            K=given.K + stiffness,
+            D=given.D + damping,
+            rigid_body=given.rigid_body @ _untouched(rows @ given.rigid_body, rows),
+            method=f"{given.method}, {len(listed)} ground springs",
+        )
+    if isinstance(given, Modes):
+        return _modes(given, listed)  # type: ignore[return-value]
+    raise ModelError(
+        f"suspend needs an FEModel, ReducedModel or Modes, got {type(model).__name__}."
+    )
+
+
+def _matrices(rows: FloatArray, springs: list[GroundSpring]) -> tuple[FloatArray, FloatArray]:
+    k = np.array([spring.stiffness for spring in springs])
+    d = np.array([spring.damping for spring in springs])
+    return rows.T @ (k[:, None] * rows), rows.T @ (d[:, None] * rows)
+
+
+def _untouched(stretch: FloatArray, rows: FloatArray) -> FloatArray:
+    """Return the combinations (r, left) of rigid-body motions that stretch no spring."""
+    r = stretch.shape[1]
+    if not r:
+        return np.zeros((0, 0))
+    size = np.linalg.norm(stretch, axis=1, keepdims=True)
+    _, values, right = np.linalg.svd(stretch / np.where(size > 0, size, 1.0), full_matrices=True)
+    rank = int(np.count_nonzero(values > _SLACK * max(values.max(initial=0.0), 1e-300)))
+    return np.asarray(right[rank:].T)
+
+
+def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
+    import scipy.sparse as sp
+
+    rows = np.array([model.dofs.row(s.at, s.direction) for s in springs])
+    sparse = sp.csc_array(rows)
+    K: Any = model.K
+    D: Any = model.D
+    k = sp.diags_array([s.stiffness for s in springs])
+    d = sp.diags_array([s.damping for s in springs])
+    stiff = sparse.T @ k @ sparse
+    damped = sparse.T @ d @ sparse
+    K = sp.csc_array(K + stiff) if sp.issparse(K) else K + stiff.toarray()
+    if any(s.damping for s in springs):
+        if D is None:
+            D = sp.csc_array(damped)
+        else:
+            D = sp.csc_array(D + damped) if sp.issparse(D) else D + damped.toarray()
+    suspended = model.replace(K=K, D=D)
+    expected = _untouched(rows @ model.rigid_body, rows).shape[1]
+    if suspended.rigid_body.shape[1] != expected:
+        raise ModelError(
+            f"the springs are so weak beside the structure that the matrices do not tell: "
+            f"{suspended.rigid_body.shape[1]} rigid-body motions are left in them, {expected} by "
+            "geometry. Solve the modes of the free structure first and suspend those: "
+            "suspend(solve_modes(model), springs)."
+        )
+    return suspended
+
+
+def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
+    if np.iscomplexobj(modes.phi):
+        raise ModelError(
+            "complex modes cannot be suspended: suspend the FEModel, or reduce and suspend that."
+        )
+    basis = np.real(modes.basis)
+    omega, zeta = modes.basis_omega, modes.basis_zeta
+    b = omega.size
+    rows = np.array([modes.dofs.row(s.at, s.direction) for s in springs]) @ basis
+    stiffness, damping = _matrices(rows, springs)
+    free = np.zeros((b, 0))
+    if modes.n_rigid:
+        kept = _untouched(rows[:, : modes.n_rigid], rows)
+        free = np.vstack([kept, np.zeros((b - modes.n_rigid, kept.shape[1]))])
+    form = normal_form(
+        np.eye(b), np.diag(2.0 * zeta * omega) + damping, np.diag(omega**2) + stiffness, free
+    )
+    size = np.abs(form.poles)
+    ratio = np.where(size > 0, -form.poles.real / np.where(size > 0, size, 1.0), 0.0)
+    shapes = basis @ form.phi
+    if not form.is_real or not modes.n_vectors:
+        return Modes(size, ratio, shapes, modes.dofs, n_rigid=form.n_rigid)
+    # modes that are still mostly attachment vector stay attachment vectors
+    share = np.linalg.norm(np.real(form.phi)[modes.n_modes :], axis=0)
+    extra = np.sort(np.argsort(share)[-modes.n_vectors :])
+    plain = np.setdiff1d(np.arange(b), extra)
+    return Modes(
+        size[plain],
+        ratio[plain],
+        shapes[:, plain],
+        modes.dofs,
+        n_rigid=form.n_rigid,
+        vectors=np.real(shapes[:, extra]),
+        vector_omega=size[extra],
+        vector_zeta=ratio[extra],
+        vector_dofs=modes.vector_dofs,
+    )

@@ -1,0 +1,240 @@
+"""Shapes between the nodes of an imported model, whose elements are not known."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from scipy.interpolate import RBFInterpolator
+from scipy.spatial import ConvexHull, KDTree
+
+from ..errors import LabelError, ModelError
+from ..labels import DIRECTIONS, DofSet, Interpolation
+from ..values import FloatArray, IntArray, positive, real_array
+from .model import FEModel
+
+#: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do
+_GLOBAL = 600
+_NEIGHBOURS = 80
+#: relative to the extent of the nodes: closer than this is the same place
+_SAME = 1e-9
+#: rotation of the material = half the curl: (sign, displacement, derivative along axis)
+_CURL = {
+    "rx": ((1.0, "z", 1), (-1.0, "y", 2)),
+    "ry": ((1.0, "x", 2), (-1.0, "z", 0)),
+    "rz": ((1.0, "y", 0), (-1.0, "x", 1)),
+}
+
+Interpolated = TypeVar("Interpolated", DofSet, FEModel)
+
+
+def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
+    """Return a model (or DofSet) whose shapes are interpolated between its nodes.
+
+    For imported models, whose elements are not known: places may then be any point inside the
+    nodes, not only labels. It is asked for, never done silently.
+
+    Parameters
+    ----------
+    item : FEModel or DofSet
+        With nodes that are not all in one place.
+    margin : float [m]
+        How far outside the hull of the nodes a point may lie: a surface beside a mid-plane, say.
+
+    Returns
+    -------
+    FEModel or DofSet
+        The same, its `dofs.interpolation` a ScatteredShape.
+
+    Raises
+    ------
+    ModelError
+        When it is neither, or margin is negative.
+
+    Notes
+    -----
+    Each displacement is a radial basis function r^3 with linear part (scipy's RBFInterpolator):
+    exact at the nodes and for rigid-body motion. Where the model has no rotations, they are half
+    the curl of the displacements, or the one slope that is known: rx = dz/dy, ry = -dz/dx on a
+    plate. Up to 600 nodes the field is smooth; on larger models it is that of the 80 nearest
+    nodes, and may step by the error of interpolation where these change.
+    """
+    dofs = item.dofs if isinstance(item, FEModel) else item
+    if not isinstance(dofs, DofSet):
+        raise ModelError(f"interpolated needs an FEModel or a DofSet, got {type(item).__name__}.")
+    shape = ScatteredShape(dofs.xyz, dofs.directions, positive(margin, "margin", zero=True))
+    between = dofs.replace(interpolation=shape)
+    if isinstance(item, FEModel):
+        return item.replace(dofs=between)
+    return between
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ScatteredShape(Interpolation):
+    """Radial basis functions between the nodes of a model; made by `interpolated`.
+
+    Parameters
+    ----------
+    xyz : (n, 3) array [m]
+        Coordinates of each DOF's node.
+    directions : sequence of n str
+        Of each DOF.
+    margin : float [m]
+        How far outside their hull points are still taken.
+    """
+
+    xyz: FloatArray
+    directions: tuple[str, ...]
+    margin: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._set(xyz=real_array(self.xyz, "xyz", (len(self.directions), 3)))
+
+    def __repr__(self) -> str:
+        nodes = np.unique(self.xyz, axis=0).shape[0]
+        return f"<ScatteredShape between {nodes} nodes, margin {self.margin:g} m>"
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of all DOFs in the motion `direction` at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is outside the hull of the nodes, or the motion is not known there.
+        """
+        return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        places = real_array(points, "points", (None, 3))
+        if direction not in DIRECTIONS:
+            raise LabelError(f"no motion {direction!r}: use one of {', '.join(DIRECTIONS)}.")
+        if direction in self.directions:
+            return self._field(direction).values(places)
+        terms = [
+            (sign, self._field(moved), axis)
+            for sign, moved, axis in _CURL.get(direction, ())
+            if moved in self.directions and self._field(moved).spans(axis)
+        ]
+        if not terms:
+            raise LabelError(
+                f"this model has no motion {direction!r}, and no displacements whose slopes would "
+                f"give it: it has {', '.join(sorted(set(self.directions)))}."
+            )
+        return np.asarray(
+            sum(sign * field.slopes(places, axis) for sign, field, axis in terms) / len(terms)
+        )
+
+    def _field(self, direction: str) -> _Field:
+        known: dict[str, _Field] = self.__dict__.setdefault("_known_fields", {})
+        if direction not in known:
+            rows = np.array([i for i, d in enumerate(self.directions) if d == direction])
+            known[direction] = _Field(self.xyz, rows, direction, self.margin)
+        return known[direction]
+
+
+class _Field:
+    """One displacement (or rotation) between the nodes that have it."""
+
+    def __init__(self, xyz: FloatArray, rows: IntArray, direction: str, margin: float) -> None:
+        self.n, self.rows, self.direction, self.margin = xyz.shape[0], rows, direction, margin
+        self.nodes = xyz[rows]
+        self.centre = self.nodes.mean(axis=0)
+        _, size, axes = np.linalg.svd(self.nodes - self.centre, full_matrices=False)
+        self.extent = float(np.ptp(self.nodes, axis=0).max())
+        self.axes = axes[size > _SAME * max(size[0], 1e-300)]  # (d, 3): line, plane or solid
+        self.flat = (self.nodes - self.centre) @ self.axes.T
+        self.tree = KDTree(self.nodes)
+        if not self.extent:
+            raise LabelError(f"all DOFs {direction!r} are at one node: nothing to interpolate.")
+        self.step = 1e-3 * self.extent / max(rows.size ** (1 / self.axes.shape[0]), 2.0)
+        self.all = self._interpolant(np.arange(rows.size)) if rows.size <= _GLOBAL else None
+
+    def spans(self, axis: int) -> bool:
+        """Return whether the nodes vary along x, y or z, so that slopes along it are known."""
+        return bool(np.linalg.norm(self.axes[:, axis]) > 1.0 - 1e-6)
+
+    def values(self, points: FloatArray) -> FloatArray:
+        self._check(points)
+        found = self._weights(points, lambda at, here: here(at), axis=None)
+        distance, nearest = self.tree.query(points)
+        for i in np.flatnonzero(distance <= _SAME * self.extent):
+            found[i] = 0.0
+            found[i, self.rows[np.asarray(nearest)[i]]] = 1.0
+        return found
+
+    def slopes(self, points: FloatArray, axis: int) -> FloatArray:
+        self._check(points)
+        move = self.step * self.axes[:, axis]
+
+        def slope(at: FloatArray, here: Any) -> FloatArray:
+            near, far = here(at + move) - here(at - move), here(at + 2 * move) - here(at - 2 * move)
+            return np.asarray((8 * near - far) / (12 * self.step))
+
+        return self._weights(points, slope, axis=axis)
+
+    def _weights(self, points: FloatArray, take: Any, *, axis: int | None) -> FloatArray:
+        flat = (points - self.centre) @ self.axes.T
+        found = np.zeros((points.shape[0], self.n))
+        if self.all is not None:
+            every = np.arange(self.rows.size)
+            found[:, self.rows] = self._exact(take(flat, self.all), every, flat, axis)
+            return found
+        near = np.atleast_2d(self.tree.query(points, k=min(_NEIGHBOURS, self.rows.size))[1])
+        for i, chosen in enumerate(near):
+            at = flat[i : i + 1]
+            part = take(at, self._interpolant(chosen))
+            found[i, self.rows[chosen]] = self._exact(part, chosen, at, axis)[0]
+        return found
+
+    def _interpolant(self, chosen: IntArray) -> RBFInterpolator:
+        try:
+            return RBFInterpolator(self.flat[chosen], np.eye(chosen.size), kernel="cubic", degree=1)
+        except (np.linalg.LinAlgError, ValueError) as error:
+            raise LabelError(
+                f"the nodes of {self.direction!r} cannot be interpolated ({error}): are two of "
+                "them at one place, or too few? Use DOF labels as places instead."
+            ) from error
+
+    def _exact(
+        self,
+        weights: FloatArray,
+        chosen: IntArray,
+        at: FloatArray,
+        axis: int | None,
+    ) -> FloatArray:
+        """Take rounding out: constant and linear fields (rigid-body motion) come out exactly."""
+        linear = np.column_stack([np.ones(chosen.size), self.flat[chosen] / self.extent])
+        if axis is None:
+            wanted = np.column_stack([np.ones(at.shape[0]), at / self.extent])
+        else:
+            slope = np.concatenate([[0.0], self.axes[:, axis] / self.extent])
+            wanted = np.broadcast_to(slope, (at.shape[0], slope.size))
+        for _ in range(2):
+            weights = weights + np.linalg.lstsq(linear.T, (wanted - weights @ linear).T)[0].T
+        return np.asarray(weights)
+
+    def _check(self, points: FloatArray) -> None:
+        offset = points - self.centre
+        flat = offset @ self.axes.T
+        beside = np.linalg.norm(offset - flat @ self.axes, axis=1)
+        outside = np.max(flat @ self._walls[:, :-1].T + self._walls[:, -1], axis=1)
+        miss = np.maximum(beside, outside)
+        worst = int(np.argmax(miss))
+        if miss[worst] > self.margin + _SAME * self.extent:
+            low, high = self.nodes.min(axis=0), self.nodes.max(axis=0)
+            raise LabelError(
+                f"the point {tuple(points[worst].tolist())} is {miss[worst]:.3g} m outside the "
+                f"nodes with direction {self.direction!r}, which reach from "
+                f"{tuple(low.tolist())} to {tuple(high.tolist())} m: its motion is not known. "
+                "Coordinates are in metres; interpolated(model, margin=...) allows for more."
+            )
+
+    @cached_property
+    def _walls(self) -> FloatArray:
+        """Half spaces (walls, d + 1) of the hull: a x + b <= 0 inside."""
+        if self.flat.shape[1] == 1:
+            return np.array([[1.0, -self.flat.max()], [-1.0, self.flat.min()]])
+        return np.asarray(ConvexHull(self.flat).equations, dtype=np.float64)
