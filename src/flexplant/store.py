@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import os
-import tempfile
-from collections.abc import Mapping
+import uuid
+import zipfile
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -30,15 +33,28 @@ def save(value: Value, path: str | Path) -> None:
     """
     arrays: dict[str, Any] = {}
     header = json.dumps(_encode(value, arrays))
+    arrays[_HEADER] = np.array(header)
+    with written(path) as file:
+        np.savez_compressed(file, **arrays)
+
+
+@contextmanager
+def written(path: str | Path) -> Iterator[IO[bytes]]:
+    """Open a new file that takes the place of `path` when all is written, not before.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file to write, overwritten if present.
+    """
     target = Path(path)
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=target.name, suffix=".part")
+    part = target.with_name(f"{target.name}.{uuid.uuid4().hex}.part")
     try:
-        with os.fdopen(handle, "wb") as file:
-            arrays[_HEADER] = np.array(header)
-            np.savez_compressed(file, **arrays)
-        os.replace(name, target)
+        with part.open("xb") as file:
+            yield file
+        os.replace(part, target)
     except BaseException:
-        Path(name).unlink(missing_ok=True)
+        part.unlink(missing_ok=True)
         raise
 
 
@@ -60,13 +76,17 @@ def load(path: str | Path) -> Any:
     FlexplantError
         When the file was not written by flexplant.
     """
-    with np.load(path, allow_pickle=False) as file:
-        if _HEADER not in file:
-            raise FlexplantError(
-                f"{str(path)!r} was not written by flexplant: it holds {sorted(file)[:5]}. "
-                "Use flexplant.io for foreign formats."
-            )
-        arrays = {name: file[name] for name in file.files}
+    foreign = FlexplantError(
+        f"{str(path)!r} was not written by flexplant. Use flexplant.io for foreign formats."
+    )
+    with Path(path).open("rb") as file:
+        try:
+            archive = np.load(file, allow_pickle=False)
+        except (ValueError, EOFError, zipfile.BadZipFile):
+            raise foreign from None
+        if not isinstance(archive, np.lib.npyio.NpzFile) or _HEADER not in archive:
+            raise foreign
+        arrays = {name: archive[name] for name in archive.files}
     return _decode(json.loads(str(arrays[_HEADER])), arrays)
 
 
@@ -100,6 +120,19 @@ def _encode(item: Any, arrays: dict[str, Any]) -> Any:
     )
 
 
+def _rebuilt(cls: type[Value], state: Mapping[str, Any]) -> Value:
+    """Return a value; fields that came after the file was written have their defaults."""
+    known: set[str] = {field.name for field in fields(cls)}  # type: ignore[arg-type]
+    strange = sorted(set(state) - known)
+    missing = sorted(name for name in known - set(state) if not hasattr(cls, name))
+    if strange or missing:
+        raise FlexplantError(
+            f"the file's {cls.__name__} is of another version of flexplant: it has "
+            f"{strange or 'no more'} and lacks {missing or 'nothing'}. Make it again and save it."
+        )
+    return rebuild(cls, {name: state.get(name, getattr(cls, name, None)) for name in known})
+
+
 def _keep(array: Any, arrays: dict[str, Any]) -> str:
     name = f"a{len(arrays)}"
     arrays[name] = array
@@ -117,7 +150,7 @@ def _decode(item: Any, arrays: Mapping[str, Any]) -> Any:
             raise FlexplantError(
                 f"the file holds a {item['value']!r}, which this version of flexplant lacks."
             )
-        return rebuild(cls, {name: _decode(part, arrays) for name, part in item["fields"].items()})
+        return _rebuilt(cls, {name: _decode(part, arrays) for name, part in item["fields"].items()})
     if "array" in item:
         return arrays[item["array"]]
     if "sparse" in item:

@@ -16,7 +16,7 @@ from ..structure.rigid import orthonormalised
 from ..updating import UpdateResult, eigenvalue_sensitivities
 from ..updating.parameters import Parameter
 from ..values import ComplexArray, FloatArray, Value, positive
-from .assembly import assemble_plant, reassembled, sampled
+from .assembly import assemble_plant
 from .neglected import NeglectedModes, neglected_modes, opened
 from .realisation import ModalRealisation, Structure
 from .standard import StandardPlant
@@ -359,7 +359,7 @@ def _with_changes(plant: StandardPlant, changes: Sequence[tuple[Delta, float]]) 
     changed = plant.replace(realisation=realisation.replace(pairs=pairs))
     if plant.ports is None:
         raise ModelError("the plant has no ports.")
-    return reassembled(changed, plant.ports)
+    return changed.with_ports(plant.ports)
 
 
 def _opened(plant: StandardPlant, deltas: Sequence[Delta]) -> StateSpace:
@@ -447,4 +447,4 @@ def _moved(model: Any, parameters: Sequence[Parameter], change: FloatArray) -> A
 
 
 def _sampled_like(nominal: StandardPlant, plant: StandardPlant) -> StandardPlant:
-    return sampled(plant, 1.0 / nominal.dt, nominal.delay) if nominal.dt else plant
+    return plant.discretized(1.0 / nominal.dt, delay=nominal.delay) if nominal.dt else plant

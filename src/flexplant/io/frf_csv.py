@@ -1,0 +1,154 @@
+"""Frequency response functions as CSV: one line a frequency, names and units in the header."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import FlexplantError, LabelError, ModelError
+from ..lti.frequency import Frf
+from ..store import written
+
+_FREQ = "frequency [Hz]"
+_ARROW = " <- "
+_COLUMN = re.compile(r"(.+) <- (.+) (real|imag|coherence)(?: \[(.*)\])?")
+_UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
+
+
+def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None = None) -> None:
+    """Write frequency response functions as a CSV file.
+
+    A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
+    y1 <- u1 imag [m/N], ...` (and `... coherence` where known), then one line a frequency, with
+    all digits.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file, written atomically.
+    frf : Frf
+        What to write.
+    units : mapping {channel: unit}, optional
+        Such as {"y1": "rad", "u1": "N m"}. Where not given: N for inputs, and m, m/s or m/s^2 for
+        outputs by the quantity of the Frf; none when that is not known.
+
+    Raises
+    ------
+    LabelError
+        When a name holds the arrow ' <- ', or units name no channel.
+    ModelError
+        When it is no Frf.
+    OSError
+        When the file cannot be written.
+    """
+    if not isinstance(frf, Frf):
+        raise ModelError(f"need an Frf, got {type(frf).__name__}: frequency_response(sys) is one.")
+    given = dict(units or {})
+    for name in given:
+        if name not in (*frf.inputs, *frf.outputs):
+            raise LabelError(f"units name {name!r}, which is no channel of {frf!r}.")
+    header, columns = [_FREQ], [frf.freq]
+    own = _UNITS.get(frf.quantity or "", "")
+    for i, output in enumerate(frf.outputs):
+        for j, name in enumerate(frf.inputs):
+            if _ARROW in output or _ARROW in name:
+                raise LabelError(f"{output!r} or {name!r} holds {_ARROW!r}: rename the channel.")
+            above, below = given.get(output, own), given.get(name, "N" if own else "")
+            unit = f" [{above}/{below}]" if above and below else ""
+            header += [f"{output}{_ARROW}{name} {part}{unit}" for part in ("real", "imag")]
+            columns += [frf.data[i, j].real, frf.data[i, j].imag]
+            if frf.coherence is not None:
+                header.append(f"{output}{_ARROW}{name} coherence")
+                columns.append(frf.coherence[i, j])
+    text = io.StringIO()
+    text.write(f"# quantity: {frf.quantity or 'unknown'}\n")
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(header)
+    table.writerows([repr(number) for number in row] for row in np.column_stack(columns).tolist())
+    with written(path) as file:
+        file.write(text.getvalue().encode("utf-8"))
+
+
+def read_frf_csv(path: str | Path) -> Frf:
+    """Return the frequency response functions of a CSV file.
+
+    Parameters
+    ----------
+    path : str or Path
+        A file in the form of `write_frf_csv`.
+
+    Returns
+    -------
+    Frf
+
+    Raises
+    ------
+    FlexplantError
+        When the header or a line has another form; the line is named.
+    ModelError
+        When numbers are not finite or frequencies do not increase.
+    FileNotFoundError
+        When there is no such file.
+    """
+    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    comments = [line for line in lines if line.startswith("#")]
+    quantity = next((c.split(":", 1)[1].strip() for c in comments if "quantity:" in c), "unknown")
+    first = len(comments) + 1
+    rows = list(csv.reader(line for line in lines if not line.startswith("#")))
+    keys = _header(rows[0] if rows else [], str(path))
+    values = []
+    for number, row in enumerate(rows[1:], first + 1):
+        try:
+            values.append([float(cell) for cell in row])
+        except ValueError as error:
+            raise FlexplantError(f"{str(path)!r}, line {number}: {error}.") from None
+        if len(row) != len(keys) + 1:
+            raise FlexplantError(
+                f"{str(path)!r}, line {number}: {len(row)} numbers, {len(keys) + 1} columns."
+            )
+    table = np.array(values, dtype=np.float64).reshape(len(values), len(keys) + 1)
+    outputs = list(dict.fromkeys(key[0] for key in keys))
+    inputs = list(dict.fromkeys(key[1] for key in keys))
+    column = {key: table[:, i] for i, key in enumerate(keys, 1)}
+    missing = [
+        f"{a}{_ARROW}{b} {part}"
+        for a in outputs
+        for b in inputs
+        for part in ("real", "imag")
+        if (a, b, part) not in column
+    ]
+    if missing or len(column) != len(keys):
+        raise FlexplantError(f"{str(path)!r} lacks or doubles columns: {missing[:3]}.")
+    pairs = [[(a, b) for b in inputs] for a in outputs]
+    data = np.array([[column[*p, "real"] + 1j * column[*p, "imag"] for p in row] for row in pairs])
+    known = all((a, b, "coherence") in column for a in outputs for b in inputs)
+    return Frf(
+        table[:, 0],
+        data,
+        inputs=inputs,
+        outputs=outputs,
+        quantity=None if quantity == "unknown" else quantity,
+        coherence=np.array([[column[*p, "coherence"] for p in row] for row in pairs])
+        if known
+        else None,
+    )
+
+
+def _header(cells: list[str], path: str) -> list[tuple[str, str, str]]:
+    if not cells or cells[0].strip() != _FREQ or len(cells) < 3:
+        raise FlexplantError(
+            f"{path!r} has no header as {_FREQ!r}, 'y1 <- u1 real', 'y1 <- u1 imag', got "
+            f"{cells[:3]}. Write it like this, or make Frf(freq, data) from your own columns."
+        )
+    keys = []
+    for cell in cells[1:]:
+        match = _COLUMN.fullmatch(cell.strip())
+        if match is None:
+            raise FlexplantError(f"{path!r}: column {cell!r} is not like 'y1 <- u1 real [m/N]'.")
+        keys.append((match[1], match[2], match[3]))
+    return keys
