@@ -86,6 +86,7 @@ from .structure import ModalDamping as ModalDamping
 from .structure import Rayleigh as Rayleigh
 from .structure import kirchhoff_plate as kirchhoff_plate
 from .synthesis import Controller as Controller
+from .synthesis import Lmi as Lmi
 from .synthesis import Riccati as Riccati
 from .synthesis import design_hinf as design_hinf
 from .synthesis import design_servo as design_servo

@@ -2,5 +2,6 @@
 
 from .controller import Controller as Controller
 from .hinf import design_hinf as design_hinf
+from .lmi import Lmi as Lmi
 from .riccati import Riccati as Riccati
 from .servo import design_servo as design_servo
