@@ -108,7 +108,7 @@ def test_states_of_any_size_are_balanced():
 
 @pytest.mark.parametrize("dt", [0.0, 0.05])
 def test_measured_in_divides_the_norm(dt):
-    p = prepared(plant(3, dt=dt), U, Y)
+    p = prepared(plant(3, dt=dt, d22=0.5), U, Y)
     q = p.measured_in(50.0)
     AK, BK, CK, DK = controller(5)
     loops = [
@@ -118,6 +118,10 @@ def test_measured_in_divides_the_norm(dt):
     points = 1j * np.geomspace(0.01, 100, 20)
     np.testing.assert_allclose(gains(*loops[0], points), 50.0 * gains(*loops[1], points))
     np.testing.assert_array_equal(p.D12, q.D12)
+    # the way back is the same: K of p is 50 times the gain of K of q
+    one, two = p.restored(AK, BK, CK, DK), q.restored(AK, BK, CK / 50.0, DK / 50.0)
+    point = np.exp(0.3j) if dt else 0.3j
+    np.testing.assert_allclose(one.evaluated(point), two.evaluated(point))
 
 
 def test_frequencies_come_back_in_hertz():

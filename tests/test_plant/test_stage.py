@@ -6,6 +6,7 @@ import pytest
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.lti import frequency_response
 from flexplant.plant import (
+    Disturbance,
     Poi,
     Reference,
     Sensor,
@@ -18,7 +19,6 @@ from oracles_synthesis import rigid_sensor
 from stages import AXES, CORNERS, INSET, NOISE, OFF_NODE, L, ports, sampled, some_modes
 
 MASS = L * L * 0.0272 * 2702
-INERTIA = MASS * L * L / 12
 
 
 def size(weight, freq):
@@ -72,6 +72,12 @@ def test_weights_are_what_their_formulas_say(rate):
     weighted = plant.weighted(z=weights.z, w=weights.w)
     assert weighted.dt == plant.dt
     assert "30 Hz" in repr(weights) and len(repr(weights).splitlines()) == 1
+
+
+def test_a_disturbing_moment_is_a_force_at_the_arm():
+    w = [Disturbance("force", at=INSET[0]), Disturbance("moment", at=INSET[0], direction="rx")]
+    weights = stage_weights(sampled(some_modes(), ports(w=w)), 30.0)
+    assert weights.w["moment"] == pytest.approx(L / 2 * weights.w["force"], rel=1e-6)
 
 
 def test_a_bandwidth_moves_all_frequencies_together():

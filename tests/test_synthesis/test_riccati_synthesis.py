@@ -121,6 +121,7 @@ def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
     D[3:, 3:] *= 0.2
     P, u, y = named(A, B, C, D, 2, 2, dt)
     found = checked(P, u, y)
+    assert found.gamma <= 1.06 * found.lower
     w = np.r_[np.full(3, 10.0**unit), 1.0, 1.0]
     other = design_hinf(P.replace(B=B * w, D=D * w), u=u, y=y)
     assert other.gamma == pytest.approx(10.0**unit * found.gamma, rel=1e-6)
@@ -282,6 +283,21 @@ def test_what_is_impossible_is_named_at_once(case, dt):
     with pytest.raises(AssumptionError, match=message):
         design_hinf(P, u=u, y=y)
     assert time.perf_counter() - start < 5.0
+
+
+def test_a_rigid_body_is_found_in_any_coordinates():
+    """Rounding turns the double pole at zero into a ring of 1e-8 around it."""
+    A, B = (
+        np.array([[0.0, 1, 0], [0, 0, 0], [0, 0, -1]]),
+        np.array([[0, 0, 0], [1, 0, 0], [1, 0, 1]]),
+    )
+    C = np.array([[1.0, 0, 1], [0, 0, 0], [1, 0, 1]])
+    rng = np.random.default_rng(0)
+    for _ in range(5):
+        T = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        P, u, y = named(T @ A @ T.T, T @ B, C @ T.T, NOISY, 1, 1)
+        with pytest.raises(AssumptionError, match=r"u .* does not reach .* rigid-body"):
+            design_hinf(P, u=u, y=y)
 
 
 def test_an_unweighted_mixture_of_units_says_so():
