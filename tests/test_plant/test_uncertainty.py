@@ -1,0 +1,372 @@
+"""Uncertain plants against modal sums, dense eigenvalues and Monte-Carlo error."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+import oracles_uncertainty as oracle
+from flexplant.errors import LabelError, ModelError
+from flexplant.identification import MeasuredModes
+from flexplant.lti import StateSpace, frequency_response, lft
+from flexplant.plant import Poi, Ports, Sensor, StandardPlant, assemble_plant
+from flexplant.testbeds import wafer_stage
+from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
+from stages import CORNERS, INSET, RATE, Z8, full, ports, reduced, some_modes
+
+FREQ = np.concatenate([np.geomspace(5.0, 2000.0, 60), np.linspace(440.0, 480.0, 41)])
+FREQ.sort()
+
+
+@cache
+def measured(std=0.5):
+    """Poles 6 and 7 of the machine, with a doubt of 0.5 rad/s."""
+    poles = wafer_stage().poles([6, 7])
+    return MeasuredModes(poles.poles, modes=(6, 7), covariance=[std**2, (0.6 * std) ** 2])
+
+
+@cache
+def fitted(std=0.5):
+    model = reduced()
+    at = model.full_dofs.nearest(Z8, "z")
+    unknowns = (AddedMass(at), AddedDamping(at))
+    return update(model, unknowns, [Eigenvalues(measured(std))]), unknowns
+
+
+def updated(std=0.5):
+    return assemble_plant(fitted(std)[0].model, ports())
+
+
+def own_doubt(plant, modes, relative):
+    """Measured modes with the plant's own poles and some relative doubt."""
+    poles = np.array([complex(*_upper(plant.realisation.pairs[k - 1])) for k in modes])
+    std = relative * np.abs(poles.real)
+    return MeasuredModes(poles, modes=modes, covariance=std**2)
+
+
+def _upper(pair):
+    pole = max(np.linalg.eigvals(pair), key=lambda value: value.imag)
+    return pole.real, pole.imag
+
+
+def closed(uncertain, values):
+    """The LFT with its Deltas closed by hand; neglected modes left out."""
+    g, n = uncertain.system, len(uncertain.deltas)
+    names = [delta.name for delta in uncertain.deltas]
+    given = np.array([values.get(name, 0.0) for name in names])
+    fro, to = ([f"{name}:{end}" for name in names] for end in "zw")
+    block = StateSpace([], [], [], np.diag(given), inputs=fro, outputs=to)
+    plant = uncertain.plant.continuous or uncertain.plant
+    keep_out = [*g.outputs[:n], *plant.z, *plant.y]
+    keep_in = [*g.inputs[:n], *plant.w, *plant.u]
+    return lft(g.select(keep_out, keep_in), block)
+
+
+def same_response(a, b, tolerance=1e-9):
+    assert (tuple(a.inputs), tuple(a.outputs)) == (tuple(b.inputs), tuple(b.outputs))
+    one, two = frequency_response(a, FREQ).data, frequency_response(b, FREQ).data
+    size = np.maximum(np.abs(two).max(axis=2, keepdims=True), 1e-300)
+    size[size < 1e-12 * size.max(axis=1, keepdims=True)] = 1.0  # exact zeros
+    return np.max(np.abs(one - two) / size) < tolerance
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "velocity", "acceleration"])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"mode6:freq": 0.8},
+        {"mode6:damping": -1.0},
+        {"mode6:freq": -0.9, "mode5:freq": 0.4, "mode5:damping": 1.3},
+    ],
+)
+def test_a_value_of_delta_is_the_plant_with_that_frequency_and_damping(quantity, values):
+    """The oracle sums the changed modes; |delta| = 1 at deviations x std, shapes as they were."""
+    modes = some_modes()
+    channels = Ports(
+        u=ports().u, z=[Poi("die", at=(0.31, 0.26, 0.0))],
+        y=[Sensor(f"y{i}", at=p, quantity=quantity) for i, p in enumerate(CORNERS, 1)],
+    )  # fmt: skip
+    plant = assemble_plant(modes, channels)
+    doubt = own_doubt(plant, (5, 6), 0.06)
+    uncertain = plant.uncertain(doubt, deviations=3.0)
+    scale = 3.0 * np.sqrt(np.diag(_relative(doubt.poles, doubt.covariance)))
+    omega, zeta = np.array(modes.basis_omega), np.array(modes.basis_zeta)
+    for name, value in values.items():
+        k, row = int(name[4]) - 1, (5, 6).index(int(name[4]))
+        if name.endswith("freq"):
+            stiffer = np.sqrt(1 + value * scale[row])
+            omega[k] *= stiffer
+            zeta[k] /= stiffer  # the damper 2 zeta omega stays
+        else:
+            zeta[k] *= 1 + value * scale[2 + row]
+    basis = np.real(modes.basis)
+    see = np.array([modes.dofs.row(p, "z") @ basis for p in CORNERS])
+    push = np.array([modes.dofs.row(p, "z") @ basis for p in INSET])
+    order = ["displacement", "velocity", "acceleration"].index(quantity)
+    wanted = oracle.modal_gain(omega, zeta, see, push, FREQ, derivative=order)
+    for found in (uncertain.lft(values).system, closed(uncertain, values)):
+        data = frequency_response(found.select(["y1", "y2", "y3", "y4"], plant.u), FREQ).data
+        size = np.abs(wanted).max(axis=2, keepdims=True)
+        assert np.max(np.abs(data - wanted) / size) < 1e-9
+    assert same_response(closed(uncertain, values), uncertain.lft(values).system)
+
+
+def _relative(poles, covariance):
+    G = oracle.relative_jacobian(poles)
+    return G @ covariance @ G.T
+
+
+VALUES = {"mode6:freq": 0.7, "mode7:damping": -0.5, "mode7:freq": -1.0, "mode6:damping": 2.0}
+
+
+@pytest.mark.parametrize("rate", [None, RATE])
+def test_a_fit_with_a_damper_gives_complex_modes_and_the_same_lft(rate):
+    fit, unknowns = fitted()
+    plant = updated() if rate is None else updated().discretized(rate, delay=1.5)
+    uncertain = plant.uncertain(fit, unknowns, modes=[6, 7])
+    assert uncertain.system.dt == 0
+    changed = uncertain.lft(VALUES)
+    assert (changed.dt, changed.delay) == (plant.dt, plant.delay)
+    continuous = changed.continuous or changed
+    assert same_response(closed(uncertain, VALUES), continuous.system)
+    assert not same_response(closed(uncertain, VALUES), (plant.continuous or plant).system, 1e-4)
+    assert same_response(uncertain.lft().system, plant.system)
+    scales = {delta.name: delta.scale for delta in uncertain.deltas}
+    for k in (6, 7):
+        old, new = (p.realisation.pairs[k - 1] for p in (plant, changed))
+        stiffness = 1 + VALUES[f"mode{k}:freq"] * scales[f"mode{k}:freq"]
+        damping = 1 + VALUES[f"mode{k}:damping"] * scales[f"mode{k}:damping"]
+        assert np.linalg.det(new) == pytest.approx(stiffness * np.linalg.det(old), rel=1e-12)
+        assert np.trace(new) == pytest.approx(damping * np.trace(old), rel=1e-12)
+    others = [i for i in range(len(plant.realisation.pairs)) if i not in (5, 6)]
+    assert np.array_equal(changed.realisation.pairs[others], plant.realisation.pairs[others])
+
+
+def test_names_and_order_of_the_channels():
+    plant = updated()
+    uncertain = plant.uncertain(*fitted(), modes=[7, 6])
+    names = ["mode6:freq", "mode6:damping", "mode7:freq", "mode7:damping"]
+    assert [delta.name for delta in uncertain.deltas] == names
+    assert [(delta.mode, delta.kind) for delta in uncertain.deltas][2] == (7, "freq")
+    g = uncertain.system
+    assert list(g.inputs) == [*(f"{n}:w" for n in names), *plant.w, *plant.u]
+    assert list(g.outputs) == [*(f"{n}:z" for n in names), *plant.z, *plant.y]
+    lines = repr(uncertain).splitlines()
+    assert lines[0] == "<UncertainPlant: 4 real Deltas at 2 std"
+    assert lines[1].startswith("  mode6:freq +- 0.00958 %")
+    assert repr(plant.uncertain(*fitted())).splitlines()[-1] == "  ... and 20 more>"
+
+
+def propagated(fit, unknowns, wanted):
+    """J C J' with J by finite differences of dense eigenvalues."""
+    model = fit.model
+    zero = np.zeros_like(model.M)
+    changes = [[zero if part is None else part for part in p.matrices(model)] for p in unknowns]
+    J = oracle.pole_jacobian(model.M, model.D, model.K, changes, wanted, [1e-2, 20.0])
+    return J @ fit.covariance @ J.T
+
+
+def test_the_covariance_of_the_parameters_goes_to_the_modes():
+    fit, unknowns = fitted()
+    plant = updated()
+    modes = (5, 6, 7, 9)
+    uncertain = plant.uncertain(fit, unknowns, modes=modes, deviations=1.5)
+    poles = np.array([complex(*_upper(plant.realisation.pairs[k - 1])) for k in modes])
+    wanted = _relative(poles, propagated(fit, unknowns, poles))
+    order = [0, 4, 1, 5, 2, 6, 3, 7]
+    wanted = wanted[np.ix_(order, order)]
+    scale = np.array([delta.scale for delta in uncertain.deltas])
+    np.testing.assert_allclose(scale, 1.5 * np.sqrt(np.diag(wanted)), rtol=1e-4)
+    unit = wanted / np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+    np.testing.assert_allclose(uncertain.covariance * 1.5**2, unit, rtol=1e-3, atol=1e-4)
+
+
+def within_monte_carlo(values, wanted, sigmas=4.5):
+    """Whether a sample covariance is the wanted one, to its own standard error."""
+    n = len(values)
+    found = np.cov(np.array(values).T)
+    error = np.sqrt((wanted**2 + np.outer(np.diag(wanted), np.diag(wanted))) / n)
+    return np.all(np.abs(found - wanted) < sigmas * error)
+
+
+def test_machines_of_a_fit_spread_as_its_covariance_says():
+    fit, unknowns = fitted(0.1)
+    plant = updated(0.1)
+    uncertain = plant.uncertain(fit, unknowns, modes=[6, 7])
+    machines = uncertain.sample(4, 300)
+    poles = np.array(
+        [[complex(*_upper(m.realisation.pairs[k - 1])) for k in (6, 7, 9)] for m in machines]
+    )
+    nominal = [complex(*_upper(plant.realisation.pairs[k - 1])) for k in (6, 7, 9)]
+    wanted = propagated(fit, unknowns, np.array(nominal))
+    values = np.hstack([poles.real, poles.imag])
+    assert within_monte_carlo(values, wanted)
+    assert not within_monte_carlo(values, 2.0 * wanted)
+    assert not within_monte_carlo(values, np.diag(np.diag(wanted)))
+    assert all(m.w == plant.w and m.n_rigid == 3 for m in machines)
+
+
+def test_machines_of_measured_modes_spread_as_measured():
+    plant = assemble_plant(some_modes(), ports())
+    doubt = own_doubt(plant, (5, 6), 0.05)
+    machines = plant.uncertain(doubt).sample(np.random.default_rng(8), 600)
+    pairs = np.array([m.realisation.pairs[[4, 5]] for m in machines])
+    nominal = plant.realisation.pairs[[4, 5]]
+    stiffness = np.linalg.det(pairs) / np.linalg.det(nominal) - 1
+    damping = np.trace(pairs, axis1=2, axis2=3) / np.trace(nominal, axis1=1, axis2=2) - 1
+    values = np.hstack([stiffness, damping])
+    wanted = _relative(doubt.poles, doubt.covariance)
+    assert within_monte_carlo(values, wanted)
+    assert not within_monte_carlo(values, 2.0 * wanted)
+
+
+def test_seeds_belong_to_machines():
+    plant = updated(0.1).discretized(RATE, delay=1)
+    uncertain = plant.uncertain(*fitted(0.1), modes=[6])
+    three, five = uncertain.sample(7, 3), uncertain.sample(rng=7, n=5)
+    for one, same in zip(three, five, strict=False):
+        assert np.array_equal(one.system.A, same.system.A)
+    assert not np.array_equal(five[0].system.A, five[1].system.A)
+    assert not np.array_equal(uncertain.sample(8, 1)[0].system.A, five[0].system.A)
+    assert (three[0].dt, three[0].delay) == (plant.dt, 1)
+    assert three[0].noise_factor is not None
+    rng = np.random.default_rng(7)
+    first, second = uncertain.sample(rng, 1), uncertain.sample(rng, 1)
+    assert np.array_equal(first[0].system.A, three[0].system.A)
+    assert not np.array_equal(first[0].system.A, second[0].system.A)
+
+
+def test_neglected_modes_are_bounded_by_their_weight():
+    """The difference between all DOFs and the reduced model, by dense solves."""
+    from oracles_plant import machine, receptance, z_row
+
+    fit, unknowns = fitted()
+    plant = updated()
+    uncertain = plant.uncertain(fit, unknowns, modes=[6], neglected=full(mass=fit["mass at 23:z"]))
+    weight = uncertain.neglected
+    assert weight.weight.is_stable
+    assert weight.u == plant.u
+    assert weight.y == ("y1", "y2", "y3", "y4")
+    freq = np.concatenate([np.geomspace(20.0, 2e4, 80), np.linspace(3650.0, 3850.0, 21)])
+    M, D, K = machine(mass=fit["mass at 23:z"])
+    see = np.array([z_row(p[0], p[1]) for p in CORNERS])
+    push = np.array([z_row(p[0], p[1]) for p in INSET])
+    gap = receptance(M, D, K, see, push, 2 * np.pi * freq)
+    small = frequency_response(plant.system.select(weight.y, plant.u), np.sort(freq)).data
+    gap = gap - small[:, :, np.argsort(np.argsort(freq))]
+    scaled = np.moveaxis(gap / weight.sizes[:, None, None], -1, 0)
+    height = np.linalg.norm(scaled, 2, axis=(1, 2))
+    g = weight.weight
+    bound = np.array([abs(g.evaluated(2j * np.pi * f)[0, 0]) for f in freq])
+    assert np.all(height < bound)
+    assert weight.tightest == pytest.approx(1 / 1.05, abs=0.01)
+    low = freq < 400.0
+    assert np.all(bound[low] < 2 * height[low])  # where it matters it is close
+    # at any frequency some Delta of gain below 1 turns the reduced plant into the whole one
+    i, s = 60, 2j * np.pi * freq[60]
+    P = uncertain.system.evaluated(s)
+    at_in = [f"{n}:neglected:w" for n in weight.y]
+    at_out = [f"{n}:neglected:z" for n in weight.u]
+    wi, zi = uncertain.system.input_index(at_in), uncertain.system.output_index(at_out)
+    ui, yi = uncertain.system.input_index(plant.u), uncertain.system.output_index(weight.y)
+    delta = scaled[i] / g.evaluated(s)[0, 0]
+    assert np.linalg.norm(delta, 2) < 1
+    loop = P[np.ix_(yi, wi)] @ delta @ P[np.ix_(zi, ui)]
+    assert not np.any(P[np.ix_(zi, wi)])
+    np.testing.assert_allclose(loop, gap[:, :, i], rtol=1e-9, atol=1e-12 * np.abs(gap).max())
+    assert "NeglectedModes: 4 u -> 4 y" in repr(uncertain)
+    # the other channels are those without the weight
+    assert same_response(closed(uncertain, {"mode6:freq": 0.3}),
+                         uncertain.lft({"mode6:freq": 0.3}).system)  # fmt: skip
+
+
+def test_neglected_modes_are_no_excuse_for_another_mass():
+    fit, unknowns = fitted()
+    plant = updated()
+    with pytest.raises(ModelError, match=r"grows toward low frequencies.*mass"):
+        plant.uncertain(fit, unknowns, modes=[6], neglected=full())
+    with pytest.raises(ModelError, match="does not differ"):
+        plant.uncertain(fit, unknowns, modes=[6], neglected=plant)
+    three = assemble_plant(full(mass=0.5), ports(u=ports().u[:3]))
+    with pytest.raises(ModelError, match="other channels"):
+        plant.uncertain(fit, unknowns, modes=[6], neglected=three)
+
+
+def test_what_cannot_be_opened_is_said():
+    fit, unknowns = fitted()
+    plant = updated()
+    with pytest.raises(LabelError, match=r"got the parameters \[\].*given to update"):
+        plant.uncertain(fit)
+    with pytest.raises(LabelError, match="same order"):
+        plant.uncertain(fit, unknowns[::-1])
+    with pytest.raises(ModelError, match="no covariance"):
+        plant.uncertain(fit.replace(covariance=None), unknowns)
+    with pytest.raises(LabelError, match="no mode 99"):
+        plant.uncertain(fit, unknowns, modes=[99])
+    with pytest.raises(LabelError, match="rigid-body mode"):
+        plant.uncertain(fit, unknowns, modes=[2])
+    with pytest.raises(ModelError, match=r"mode 6 has the pole.*not of the same model"):
+        assemble_plant(reduced(), ports()).uncertain(fit, unknowns, modes=[6])
+    with pytest.raises(ModelError, match="UpdateResult or MeasuredModes, got str"):
+        plant.uncertain("fit")
+    with pytest.raises(ModelError, match="mode numbers and a covariance"):
+        plant.uncertain(MeasuredModes(measured().poles, modes=(6, 7)))
+    with pytest.raises(LabelError, match="no measured mode 8"):
+        plant.uncertain(measured(), modes=[8])
+    with pytest.raises(LabelError, match="no elastic mode of the plant 2"):
+        plant.uncertain(MeasuredModes([-1 + 9j], modes=(2,), covariance=[1.0]))
+    with pytest.raises(ModelError, match="deviations must be positive"):
+        plant.uncertain(measured(), deviations=0.0)
+    with pytest.raises(ModelError, match=r"damping of mode 6 is doubted by \d+ % at 2 standard"):
+        plant.uncertain(measured(60.0))
+    weighted = plant.weighted(z={"die:z": 2.0})
+    bare = StandardPlant.from_statespace(plant.system, u=plant.u, y=plant.y)
+    for other in (weighted, bare):
+        with pytest.raises(ModelError, match="assembled from a structure and not weighted"):
+            other.uncertain(measured())
+
+
+def test_values_of_delta_are_checked():
+    uncertain = updated().uncertain(*fitted(), modes=[6])
+    with pytest.raises(LabelError, match=r"no Delta 'mode6:frequency'.*mode6:freq"):
+        uncertain.lft({"mode6:frequency": 0.1})
+    with pytest.raises(ModelError, match="leaves mode 6 with negative damping"):
+        uncertain.lft({"mode6:damping": -1e4})
+    with pytest.raises(ModelError, match="negative stiffness"):
+        uncertain.lft({"mode6:freq": float("nan")})
+
+
+def test_accelerations_of_complex_modes_are_refused():
+    fit, unknowns = fitted(0.5)
+    damped = fit.replace(model=fit.model.replace(D=damped_unevenly(fit.model)))
+    y = [Sensor(f"y{i}", at=p, quantity="acceleration") for i, p in enumerate(CORNERS, 1)]
+    plant = assemble_plant(damped.model, ports(y=y))
+    with pytest.raises(ModelError, match=r"'y1' depends on products of Deltas.*not proportional"):
+        plant.uncertain(damped, unknowns, modes=[6])
+    speeds = [Sensor(f"y{i}", at=p, quantity="velocity") for i, p in enumerate(CORNERS, 1)]
+    plant = assemble_plant(damped.model, ports(y=speeds))
+    uncertain = plant.uncertain(damped, unknowns, modes=[6])
+    assert same_response(closed(uncertain, VALUES6), uncertain.lft(VALUES6).system)
+
+
+VALUES6 = {"mode6:freq": 0.9, "mode6:damping": -0.9}
+
+
+def damped_unevenly(model):
+    """D with a damper between two DOFs that leaves the rigid body alone."""
+    M = np.asarray(model.M)
+    R = np.asarray(model.rigid_body)
+    elastic = np.eye(len(M)) - R @ np.linalg.solve(R.T @ M @ R, R.T @ M)
+    row = np.zeros(len(M))
+    row[7] = 1.0
+    row = row @ elastic
+    return model.D + 60.0 * np.outer(row, row)
+
+
+def test_a_machine_that_cannot_be_is_named():
+    fit, unknowns = fitted(0.1)
+    huge = fit.replace(covariance=fit.covariance * 1e10)
+    uncertain = updated(0.1).uncertain(fit, unknowns, modes=[6]).replace(fit=huge)
+    with pytest.raises(ModelError, match=r"machine \d+ of the sample is not physical"):
+        uncertain.sample(1, 50)
