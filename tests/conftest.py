@@ -20,6 +20,3 @@ settings.register_profile(
 )
 settings.register_profile("nightly", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
-
-# with --doctest-modules every file is a module to import, and two may not be called conftest
-collect_ignore_glob = ["*/conftest.py"]

@@ -1,0 +1,28 @@
+"""The examples in the docstrings run."""
+
+import doctest
+import importlib
+import pkgutil
+
+import pytest
+
+import flexplant
+
+MODULES = [
+    module.name
+    for module in pkgutil.walk_packages(flexplant.__path__, "flexplant.")
+    if ".plot" not in module.name
+]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_doctests(name):
+    module = importlib.import_module(name)
+    failed, _ = doctest.testmod(module)
+    assert not failed
+
+
+def test_there_are_some():
+    finder = doctest.DocTestFinder()
+    modules = [importlib.import_module(name) for name in MODULES]
+    assert sum(bool(test.examples) for m in modules for test in finder.find(m)) > 20
