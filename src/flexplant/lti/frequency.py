@@ -31,6 +31,11 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         Of a measurement: displacement, velocity or acceleration.
     coherence : (n_out, n_in, n_freq) array, optional
         Of a measurement, between 0 and 1.
+    variance : (n_out, n_in, n_freq) array, optional
+        Of a measurement, E|error|^2 of each entry.
+    correlation : (n_out, n_out, n_freq) complex array, optional
+        Of a measurement: of the errors of different outputs under the same input (a disturbance
+        reaches all of them), with ones on the diagonal.
 
     Raises
     ------
@@ -53,6 +58,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     outputs: Sequence[str] = ()
     quantity: str | None = None
     coherence: FloatArray | None = None
+    variance: FloatArray | None = None
+    correlation: ComplexArray | None = None
 
     def __post_init__(self) -> None:
         freq = checked_freq(self.freq)
@@ -70,12 +77,22 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             coherence = real_array(coherence, "coherence", data.shape)
             if coherence.size and (coherence.min() < 0 or coherence.max() > 1 + 1e-9):
                 raise ModelError("coherence must lie between 0 and 1.")
+        variance = self.variance
+        if variance is not None:
+            variance = real_array(variance, "variance", data.shape)
+            if variance.size and variance.min() < 0:
+                raise ModelError("variance must not be negative: it is E|error|^2.")
+        correlation = self.correlation
+        if correlation is not None:
+            correlation = _checked_correlation(correlation, data.shape)
         self._set(
             freq=freq,
             data=data,
             inputs=signal_names(self.inputs, data.shape[1], "u", "inputs"),
             outputs=signal_names(self.outputs, data.shape[0], "y", "outputs"),
             coherence=coherence,
+            variance=variance,
+            correlation=correlation,
         )
 
     def __repr__(self) -> str:
@@ -114,6 +131,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             inputs=chosen_in,
             outputs=chosen_out,
             coherence=None if self.coherence is None else self.coherence[picked],
+            variance=None if self.variance is None else self.variance[picked],
+            correlation=None if self.correlation is None else self.correlation[np.ix_(rows, rows)],
         )
 
     def converted(self, quantity: str) -> Frf:
@@ -142,8 +161,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         order = orders[quantity] - orders[self.quantity]
         if order < 0 and self.freq.size and self.freq[0] == 0:
             raise ModelError("zero frequency cannot be integrated: leave it out of the Frf.")
-        data = self.data * (2j * np.pi * self.freq) ** order
-        return self.replace(data=data, quantity=quantity)
+        factor = (2j * np.pi * self.freq) ** order
+        variance = None if self.variance is None else self.variance * np.abs(factor) ** 2
+        return self.replace(data=self.data * factor, quantity=quantity, variance=variance)
 
     def to_control(self, dt: float = 0.0) -> Any:
         """Return a `control.FrequencyResponseData` with the same names.
@@ -219,7 +239,8 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
     for array in (freq, data):
         array.flags.writeable = False
     fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}
-    frf = rebuild(Frf, fields | {"quantity": None, "coherence": None})
+    unmeasured = dict.fromkeys(("quantity", "coherence", "variance", "correlation"))
+    frf = rebuild(Frf, fields | unmeasured)
     assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
     return frf
 
@@ -230,6 +251,23 @@ def checked_freq(freq: FloatArray) -> FloatArray:
     if freq.size and freq.min() < 0:
         raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
     return freq
+
+
+def _checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
+    correlation = np.array(value, dtype=np.complex128)
+    if correlation.shape != (shape[0], shape[0], shape[2]):
+        raise ShapeError(
+            f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "
+            f"got {correlation.shape}."
+        )
+    unit = np.eye(shape[0])[:, :, None]
+    hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
+    wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
+    if not (np.all(np.abs(correlation) <= 1 + 1e-9) and np.all(wrong <= 1e-9)):
+        raise ModelError(
+            "correlation must be Hermitian with ones on the diagonal and none larger than one."
+        )
+    return correlation
 
 
 def _index(known: Sequence[str], name: str, side: str) -> int:
