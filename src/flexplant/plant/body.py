@@ -17,6 +17,8 @@ from .realisation import ModalRealisation, Structure
 
 #: relative: a rigid-body motion that the shapes make up to this is one of theirs
 _SPANNED = 1e-7
+#: relative: what complex shapes span less than this is rounding
+_TRUNCATED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,13 +75,9 @@ def inertia_load(
         )
     if isinstance(model, ReducedModel):
         return -np.asarray(model.M @ motion)
+    # any load with these modal forces will do: basis' f = -c, where r = basis c
     basis = _real_basis(model)
-    # any load with these modal forces will do: phi' f = -c, where r = phi c
     share = _share(basis, motion[:, None])[:, 0]
-    if np.iscomplexobj(model.phi):
-        elastic = np.asarray(model.phi)[:, model.n_rigid :]
-        basis = np.hstack([basis, elastic.real, elastic.imag])
-        share = np.concatenate([share, np.zeros(2 * elastic.shape[1])])
     return -np.asarray(np.linalg.lstsq(basis.T, share, rcond=None)[0])
 
 
@@ -141,10 +139,22 @@ def _missed(model: Structure, motion: FloatArray, about: FloatArray, axis: str) 
 
 
 def _real_basis(model: Modes) -> FloatArray:
-    """Return M-orthonormal real shapes: all of them, or the rigid-body ones of complex modes."""
-    if np.iscomplexobj(model.phi):
-        return np.real(np.asarray(model.phi)[:, : model.n_rigid])
-    return np.real(model.basis)
+    """Return M-orthonormal real shapes B that span those of the modes.
+
+    Complex modes tell M on their span by how they answer at once: ``B B' = sum Re(phi phi' lambda
+    / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes.
+    """
+    if not np.iscomplexobj(model.phi):
+        return np.real(model.basis)
+    phi, r = np.asarray(model.phi), model.n_rigid
+    rigid, elastic, poles = phi[:, :r].real, phi[:, r:], model.poles[r:]
+    Q = np.linalg.qr(np.hstack([rigid, elastic.real, elastic.imag]))[0]
+    inner = Q.T @ elastic
+    core = np.real((inner * (poles / (1j * poles.imag))) @ inner.T)
+    core = core + (Q.T @ rigid) @ (Q.T @ rigid).T
+    values, vectors = np.linalg.eigh(0.5 * (core + core.T))
+    kept = values > _TRUNCATED * values[-1]
+    return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
 
 
 def _share(basis: FloatArray, motions: FloatArray) -> FloatArray:

@@ -73,8 +73,8 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     Returns
     -------
     FEModel, ReducedModel or Modes
-        Of the same kind. Modes become complex where dampers make them so; attachment vectors are
-        modes then, or where the springs mix them.
+        Of the same kind. Modes with damping become complex (springs couple what was damped mode
+        by mode), and attachment vectors are modes like the others then.
 
     Raises
     ------

@@ -1,0 +1,116 @@
+"""decouple: transformations to the centre of gravity, against geometry and a rigid body."""
+
+import numpy as np
+import pytest
+
+from flexplant.errors import AssumptionError, LabelError, ModelError
+from flexplant.lti import StateSpace
+from flexplant.plant import (
+    Actuator,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+    decouple,
+    lowpass,
+    suspend,
+)
+from flexplant.plant.suspension import GroundSpring
+from stages import CORNERS, INSET, NOISE, RATE, Z8, L, full, ports, reduced, some_modes
+
+MASS = 0.6 * 0.6 * 0.0272 * 2702
+INERTIA = MASS * 0.6**2 / 12  # bending elements have no rotary inertia of their own
+
+
+def arms(points, centre=(L / 2, L / 2)):
+    """z of each point per z, rx = dz/dy, ry = -dz/dx of the body."""
+    return np.array([[1.0, y - centre[1], -(x - centre[0])] for x, y, *_ in points])
+
+
+@pytest.mark.parametrize("model", [some_modes, reduced, full])
+def test_products_are_the_identity(model):
+    plant = assemble_plant(model(), ports())
+    for base in (plant, plant.discretized(RATE, delay=1)):
+        axes = decouple(base)
+        assert axes.axes == ("z", "rx", "ry")
+        assert axes.to_motions.dt == base.dt
+        np.testing.assert_allclose(axes.T_y @ arms(CORNERS), np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(arms(INSET).T @ axes.T_u, np.eye(3), atol=1e-9)
+        np.testing.assert_allclose(axes.mass, np.diag([MASS, INERTIA, INERTIA]), atol=1e-8)
+        np.testing.assert_allclose(axes.centre, [L / 2, L / 2, 0.0], atol=1e-9)
+        # least norm: nothing in the null space of four forces on three axes
+        null = np.array([1.0, -1.0, -1.0, 1.0])
+        np.testing.assert_allclose(null @ axes.T_u, 0.0, atol=1e-9)
+
+
+def test_the_decoupled_plant_is_a_double_integrator_each_axis():
+    plant = assemble_plant(full(), ports())
+    axes = decouple(plant)
+    assert axes.to_actuators.inputs == ("cog:z:force", "cog:rx:force", "cog:ry:force")
+    assert axes.to_motions.outputs == ("cog:z", "cog:rx", "cog:ry")
+    s = 2j * np.pi * 0.5  # far below the first elastic mode at 246 Hz
+    G = plant.Gyu.select(axes.to_motions.inputs).evaluated(s)
+    found = axes.T_y @ G @ axes.accelerations.D * s**2
+    np.testing.assert_allclose(found, np.eye(3), atol=1e-4)
+    forced = axes.T_y @ G @ axes.T_u * s**2
+    np.testing.assert_allclose(forced @ axes.mass, np.eye(3), atol=1e-4)
+
+
+def test_an_added_mass_moves_the_centre():
+    axes = decouple(assemble_plant(full(mass=0.5), ports()))
+    centre = (MASS * L / 2 + 0.5 * Z8[1]) / (MASS + 0.5)
+    np.testing.assert_allclose(axes.centre[:2], [L / 2, centre], rtol=1e-9)
+    spread = INERTIA + MASS * (L / 2 - centre) ** 2 + 0.5 * (Z8[1] - centre) ** 2
+    np.testing.assert_allclose(np.diag(axes.mass), [MASS + 0.5, spread, INERTIA], rtol=1e-8)
+    assert abs(axes.mass[0, 1]) < 1e-9
+    np.testing.assert_allclose(axes.T_y @ arms(CORNERS, axes.centre), np.eye(3), atol=1e-9)
+
+
+def test_on_weak_springs_it_is_the_same():
+    free = decouple(assemble_plant(some_modes(), ports()))
+    for model, damping in ((some_modes(), 0.5), (some_modes(0.0), 0.0), (reduced(), 0.5)):
+        springs = [GroundSpring(p, 300.0, damping) for p in CORNERS]
+        plant = assemble_plant(suspend(model, springs), ports())
+        assert plant.n_rigid == 0
+        held = decouple(plant)
+        np.testing.assert_allclose(held.T_y, free.T_y, atol=1e-7)
+        np.testing.assert_allclose(held.T_u, free.T_u, atol=1e-7)
+        np.testing.assert_allclose(held.mass, free.mass, atol=1e-6)
+
+
+def test_static_gains_count_and_other_quantities_do_not():
+    double = StateSpace([[-9e3]], [[9e3]], [[2.0]], [[0.0]])
+    y = [Sensor(f"y{i}", at=p, asd=NOISE, dynamics=double) for i, p in enumerate(CORNERS, 1)]
+    y.append(Sensor("v", at=Z8, quantity="velocity", asd=1e-9))
+    u = [Actuator(f"u{i}", at=p, dynamics=double) for i, p in enumerate(INSET, 1)]
+    axes = decouple(assemble_plant(some_modes(), ports(y=y, u=u)))
+    plain = decouple(assemble_plant(some_modes(), ports()))
+    assert "v" not in axes.to_motions.inputs
+    np.testing.assert_allclose(2 * axes.T_y, plain.T_y, atol=1e-12)
+    np.testing.assert_allclose(2 * axes.T_u, plain.T_u, atol=1e-12)
+
+
+def test_some_axes():
+    plant = assemble_plant(some_modes(), ports())
+    one = decouple(plant, axes=["rx"])
+    np.testing.assert_allclose(one.T_y, decouple(plant).T_y[1:2], atol=1e-12)
+    np.testing.assert_allclose(one.mass, [[INERTIA]], rtol=1e-8)
+    # two sensors on a line along y tell z and rx, not ry; but at x = L/2 they do not see ry
+    y = [Sensor("a", at=(L / 2, 0.1, 0.0)), Sensor("b", at=(L / 2, 0.5, 0.0))]
+    two = assemble_plant(some_modes(), ports(y=y, references=[]))
+    assert decouple(two, axes=["z", "rx"]).axes == ("z", "rx")
+    with pytest.raises(AssumptionError, match="'ry' cannot be decoupled.*sensors"):
+        decouple(two)
+    off = [Sensor("a", at=(0.1, 0.1, 0.0)), Sensor("b", at=(0.1, 0.5, 0.0))]
+    with pytest.raises(AssumptionError, match=r"'z' with 'ry'|cannot be decoupled"):
+        decouple(assemble_plant(some_modes(), ports(y=off, references=[])), axes=["z", "rx"])
+
+
+def test_refusals():
+    plant = assemble_plant(some_modes(), ports())
+    with pytest.raises(LabelError, match="no rigid-body axis 'x'"):
+        decouple(plant, axes=["x"])
+    with pytest.raises(AssumptionError, match="actuators"):
+        decouple(assemble_plant(some_modes(), ports(u=[Actuator("u", at=Z8)])))
+    with pytest.raises(ModelError, match="assembled from a structure"):
+        decouple(StandardPlant.from_statespace(lowpass(3.0), u=["in"], y=["out"]))
+    assert repr(decouple(plant)).startswith("<Decoupling z, rx, ry at (0.3, 0.3, 0) m: 4 actua")
