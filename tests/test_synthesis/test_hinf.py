@@ -191,7 +191,7 @@ EFFORTS, NOISES = [f"u{i}:effort" for i in range(1, 5)], [f"y{i}:noise" for i in
     ("rate", "side", "names", "message"),
     [
         (RATE, "z", ["die:rx", "die:ry"], "z does not feel all that u moves at 0 Hz"),
-        (0.0, "z", ["die:rx", "die:ry"], "z does not feel all that u moves at"),
+        (0.0, "z", ["die:rx", "die:ry"], "z does not feel all that u moves at 0 Hz"),
         (RATE, "w", [f"amp{i}" for i in range(1, 5)], "w does not excite all that y sees at 0 Hz"),
         # sampled: the fourth combination bends the plate and is not seen at half the rate either
         (RATE, "z", EFFORTS, r"D12 has rank 3, 4 are needed: .*u1.* z "),

@@ -154,7 +154,7 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         When a sampled plant has a pole at z = -1.
     """
     # balanced first: whether I + A can be inverted must not depend on the units of the states
-    A, B, C = _balanced(P.A, P.B, P.C, 1.0)
+    A, B, C = _balanced(P.A, P.B, P.C, np.exp(1j) * (1.5 if P.dt else _speed(P.A)))
     g = P.replace(A=A, B=B, C=C, blocks=None)
     g = bilinear(g, 1.0 / P.dt) if P.dt else g
     speed = _speed(g.A)

@@ -105,7 +105,9 @@ def quadratic(p: Prepared) -> StateSpace:
 
 
 def _listed(p: Prepared, found: OnAxisError) -> str:
-    return f"{p.frequency(float(np.min(found.omega))):.3g} Hz"
+    omega = float(np.min(found.omega))
+    # a double pole at zero comes out of rounding beside it
+    return f"{p.frequency(omega if omega > 1e-6 else 0.0):.3g} Hz"
 
 
 def stabilising(
