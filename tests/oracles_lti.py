@@ -73,3 +73,19 @@ def double_integrator_dare(h, q, r):
     innovation = r / (1 - alpha)
     p11, p12 = alpha * innovation, beta * innovation / h
     return alpha, beta, p11, p12
+
+
+def hankel(A, B, C, discrete=False):
+    """Hankel singular values: square roots of the eigenvalues of P Q."""
+    solve = stein if discrete else lyapunov
+    P, Q = solve(A, B @ B.T), solve(A.T, C.T @ C)
+    return np.sqrt(np.sort(np.abs(np.linalg.eigvals(P @ Q)))[::-1])
+
+
+def matched_filter(poles, zeros, gain, h, z):
+    """Poles and zeros of a continuous filter mapped by e^(s h), those at infinity to -1."""
+    zeros = np.concatenate([np.exp(zeros * h), -np.ones(len(poles) - len(zeros))])
+    value = np.prod([z - q for q in zeros], axis=0) / np.prod(
+        [z - p for p in np.exp(poles * h)], axis=0
+    )
+    return gain * value

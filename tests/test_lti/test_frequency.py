@@ -11,20 +11,7 @@ from flexplant.lti import Frf, StateSpace, frequency_response, series
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.frequency import default_freq
 from oracles_lti import sweep
-
-
-def machine(n_rigid=3, n_elastic=21, *, zeta=1e-3, m=4, p=5, seed=0):
-    """Modes in plain (q, dq/dt) states and SI units."""
-    rng = np.random.default_rng(seed)
-    omega = np.concatenate([np.zeros(n_rigid), 2 * np.pi * np.linspace(245.0, 3700.0, n_elastic)])
-    n = 2 * omega.size
-    A, B, C = np.zeros((n, n)), np.zeros((n, m)), np.zeros((p, n))
-    k = np.arange(omega.size)
-    A[2 * k, 2 * k + 1], A[2 * k + 1, 2 * k] = 1.0, -(omega**2)
-    A[2 * k + 1, 2 * k + 1] = -2 * zeta * omega
-    B[1::2], C[:, ::2] = rng.standard_normal((k.size, m)) / 5, rng.standard_normal((p, k.size)) / 5
-    return StateSpace(A, B, C, np.zeros((p, m)), blocks=[2] * k.size)
-
+from systems_lti import machine
 
 FREQ = np.unique(np.concatenate([np.geomspace(1.0, 4900.0, 150), np.linspace(245.0, 3700.0, 21)]))
 

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from test_statespace import same, system
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import (
@@ -13,11 +12,13 @@ from flexplant.lti import (
     as_statespace,
     connect,
     feedback,
+    frequency_response,
     lft,
     parallel,
     series,
 )
 from oracles_lti import gain_at
+from systems_lti import same, system
 
 POINTS = (0.3j, 2.0 + 1.0j, 17.0j)
 
@@ -202,3 +203,36 @@ def test_bad_input():
         connect([g, system(3, prefix="b").renamed(outputs={"bout0": "out0"})], [], ["out0"])
     with pytest.raises(ModelError, match="StateSpace"):
         series(g, "gain")
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1]))
+def test_every_operation_takes_a_control_system(seed, dt):
+    g, h = system(seed, m=2, p=2, dt=dt), system(seed + 1, n=3, m=2, p=2, dt=dt, prefix="b")
+    h = h.replace(D=0.1 * h.D)
+    plain = [
+        (series, (g, h)),
+        (parallel, (g, h.replace(inputs=g.inputs, outputs=g.outputs))),
+        (append, (g, h)),
+        (feedback, (g, h)),
+        (lft, (g, h.replace(inputs=g.outputs, outputs=g.inputs).select([g.inputs[0]]))),
+    ]
+    for operation, parts in plain:
+        ours = operation(*parts)
+        theirs = operation(*(part.to_control() for part in parts))
+        same(theirs.replace(name=None), ours.replace(name=None))
+    twins = [g.to_control(), h.replace(inputs=["out0", "r"], D=0 * h.D).to_control()]
+    outer = {"inputs": ["in0", "in1", "r"], "outputs": ["bout1", "out1"]}
+    assert connect(twins, **outer).outputs == ("bout1", "out1")
+
+
+def test_blocks_survive_renaming_and_reordering():
+    pair = StateSpace([[0, 1], [-4, -0.1]], np.eye(2), np.eye(2), np.zeros((2, 2)), blocks=[2])
+    assert pair.renamed(inputs={"u1": "f"}).blocks == (2,)
+    assert pair.select(["y2"], ["u2", "u1"]).blocks == (2,)
+    chain = series(series(pair, pair), pair)
+    assert chain.blocks == (2, 2, 2)
+    freq = np.array([0.1, 0.3])
+    found = frequency_response(chain, freq).data
+    for k, f in enumerate(freq):
+        single = gain(pair, 2j * np.pi * f)
+        np.testing.assert_allclose(found[:, :, k], single @ single @ single, rtol=1e-10)

@@ -7,12 +7,12 @@ import pytest
 import scipy.linalg as la
 from hypothesis import given
 from hypothesis import strategies as st
-from test_frequency import machine
 
 from flexplant.errors import ModelError
 from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain
 from flexplant.lti.discretisation import discretized
 from oracles_lti import largest_gain, lyapunov, stein, sweep
+from systems_lti import machine
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "norms"
 

@@ -12,33 +12,7 @@ from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, as_statespace
 from flexplant.store import load
 from oracles_lti import gain_at
-
-
-def system(seed=0, n=4, m=3, p=2, dt=0.0, prefix=""):
-    rng = np.random.default_rng(seed)
-    return StateSpace(
-        rng.standard_normal((n, n)) - 3 * np.eye(n) * (not dt),
-        rng.standard_normal((n, m)),
-        rng.standard_normal((p, n)),
-        rng.standard_normal((p, m)),
-        dt,
-        inputs=[f"{prefix}in{i}" for i in range(m)],
-        outputs=[f"{prefix}out{i}" for i in range(p)],
-        states=[f"{prefix}state{i}" for i in range(n)],
-        name=f"{prefix}sys",
-    )
-
-
-def same(a, b):
-    for part in "ABCD":
-        np.testing.assert_array_equal(getattr(a, part), getattr(b, part))
-    assert (a.inputs, a.outputs, a.states, a.dt, a.name) == (
-        b.inputs,
-        b.outputs,
-        b.states,
-        b.dt,
-        b.name,
-    )
+from systems_lti import same, system
 
 
 @pytest.mark.parametrize("dt", [0.0, 1e-4])

@@ -9,8 +9,13 @@ from ..values import FloatArray, positive
 from .factors import controllability_factor, observability_factor
 from .interconnection import parallel
 from .modal import modal_form
+from .scaling import state_scale
 from .splitting import split_stable
-from .statespace import StateSpace, System, as_statespace
+from .statespace import StateSpace, System, as_statespace, is_block_diagonal
+
+#: Hankel singular values below this of the sizes of the two factors are rounding: a part that is
+#: not reached where it is seen has no others
+NOISE = 1e-13
 
 
 def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
@@ -53,7 +58,10 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     if not g.n_states:
         return g
     split = split_stable(g)
-    stable, rest = _less(split.stable, tol), _less(split.rest, tol)
+    stable, rest = split.stable, split.rest
+    if not is_block_diagonal(g):  # what a part has of B or C may be what splitting left of zero
+        stable, rest = _cleaned(stable, rest), _cleaned(rest, stable)
+    stable, rest = _less(stable, tol), _less(rest, tol)
     n = stable.n_states + rest.n_states
     if n == g.n_states:
         return g
@@ -62,6 +70,13 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     return both.replace(
         states=[f"x{i}" for i in range(1, n + 1)], name=g.name, blocks=blocks or None
     )
+
+
+def _cleaned(part: StateSpace, other: StateSpace) -> StateSpace:
+    """Return a part with B and C set to zero where they are rounding beside those of the other."""
+    idle = np.linalg.norm(part.B) <= NOISE * np.linalg.norm(other.B)
+    blind = np.linalg.norm(part.C) <= NOISE * np.linalg.norm(other.C)
+    return part.replace(B=0 * part.B, C=0 * part.C) if idle or blind else part
 
 
 def _less(g: StateSpace, tol: float) -> StateSpace:
@@ -78,7 +93,9 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
     judged = judged.replace(C=judged.C * sight[:, None])
     seen = observability_factor(judged)
     left, values, right = np.linalg.svd(seen.T @ reached)
-    r = int(np.sum(values > tol * values[0])) if values[0] > 0 else 0
+    d = state_scale(judged.A, judged.B, judged.C)[:, None]
+    rounding = NOISE * float(np.linalg.norm(seen * d) * np.linalg.norm(reached / d))
+    r = int(np.sum(values > max(tol * values[0], rounding)))
     if r == n:
         return g
     root = np.sqrt(values[:r])

@@ -7,6 +7,9 @@ import scipy.linalg as la
 
 from ..values import FloatArray
 
+#: size of B and C beside A: enough to hold the states of a chain together
+BORDER = 1.0
+
 
 def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """Return d (n,), powers of two, for states ``x = d x_scaled``: ``A d / d[:, None]`` is even.
@@ -17,10 +20,10 @@ def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     """
     n = A.shape[0]
     drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
-    size = float(np.linalg.norm(A)) or 1.0
+    # borders whose size beside the balanced A is moderate, whatever the units of A, inputs, outputs
+    size = BORDER * (float(np.linalg.norm(balanced_matrix(A))) or 1.0)
     bordered = np.zeros((n + 1, n + 1))
     bordered[:n, :n] = A
-    # both borders as large as A, whatever the units of inputs and outputs
     bordered[:n, n] = drive * (size / (np.linalg.norm(drive) or 1.0))
     bordered[n, :n] = sight * (size / (np.linalg.norm(sight) or 1.0))
     # gebal itself: scipy's matrix_balance reads scales above 2^63 as permutations, with a warning
