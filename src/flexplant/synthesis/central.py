@@ -78,6 +78,7 @@ def quadratic(p: Prepared) -> StateSpace:
     """
     rows, columns = p.B2.shape[1], p.C2.shape[0]
     try:
+        _require_full_columns(p.A, p.B2, p.C1, p.D12)
         _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
     except OnAxisError as found:
         raise AssumptionError(
@@ -86,6 +87,7 @@ def quadratic(p: Prepared) -> StateSpace:
             "that motion in z with a weight of finite gain, or give it damping."
         ) from found
     try:
+        _require_full_columns(p.A.T, p.C2.T, p.B1.T, p.D21.T)
         _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
     except OnAxisError as found:
         raise AssumptionError(
@@ -102,6 +104,21 @@ def quadratic(p: Prepared) -> StateSpace:
         inputs=p.y,
         outputs=p.u,
     )
+
+
+def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
+    """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A.
+
+    The Hamiltonian would tell, but four of its eigenvalues meet at a rigid-body mode that costs
+    nothing, and rounding spreads them over 1e-4.
+    """
+    poles = np.linalg.eigvals(A)
+    size = float(np.linalg.norm(A, 2)) if A.size else 0.0
+    near = poles[np.abs(poles.real) <= 1e-6 * size]
+    for omega in np.unique(np.where(np.abs(near) < 1e-6 * size, 0.0, np.abs(near.imag))):
+        pencil = np.block([[A - 1j * omega * np.eye(A.shape[0]), B], [C, D]])
+        if la.svdvals(pencil)[-1] < 1e-12 * size:
+            raise OnAxisError(np.array([omega]))
 
 
 def _listed(p: Prepared, found: OnAxisError) -> str:
