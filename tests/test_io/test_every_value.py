@@ -1,0 +1,225 @@
+"""Every public value goes through a file: all fields equal, arrays read-only, facts the same."""
+
+import pickle
+import sys
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
+from functools import cache
+from inspect import get_annotations
+
+import numpy as np
+import pytest
+import scipy.sparse as sp
+
+import flexplant as fx
+from flexplant import lti, placement, structure, synthesis
+from flexplant import plant as plants
+from flexplant.errors import FlexplantError
+from flexplant.loop import close_loop
+from flexplant.reduction import normal_form, select_dofs
+from flexplant.store import load
+from flexplant.updating import eigenvalue_sensitivities
+from flexplant.values import Value
+from stages import CORNERS, RATE, Z8, full, ports, reduced, some_modes
+
+
+def all_values(base=Value):
+    """Every subclass of Value that this package defines."""
+    found = set()
+    for cls in base.__subclasses__():
+        found |= all_values(cls)
+        if cls.__module__.startswith("flexplant"):
+            found.add(cls)
+    return found
+
+
+def public(cls):
+    """Whether a room shows it, and it is no base of others."""
+    room = sys.modules[".".join(cls.__module__.split(".")[:2])]
+    based = any(cls in other.__mro__[1:] for other in all_values())
+    return is_dataclass(cls) and vars(room).get(cls.__name__) is cls and not based
+
+
+def inside(item):
+    """Yield every value in a value, itself included."""
+    if isinstance(item, Value):
+        yield item
+        for part in item._fields().values():
+            yield from inside(part)
+    elif isinstance(item, Mapping):
+        for part in item.values():
+            yield from inside(part)
+    elif isinstance(item, list | tuple):
+        for part in item:
+            yield from inside(part)
+
+
+def made():
+    """One of each, as a user gets them."""
+    fe, modes, rom = full(), some_modes(), reduced()
+    at = rom.full_dofs.nearest(Z8, "z")
+    unknowns = [fx.AddedMass(at), fx.AddedDamping(at)]
+    poles = fx.testbeds.wafer_stage().poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+    residual = fx.Eigenvalues(poles)
+    fit = fx.update(rom, unknowns, [residual])
+    plant = fx.assemble_plant(rom, ports())
+    sampled = plant.discretized(RATE, delay=1)
+    updated = fx.assemble_plant(fit.model, ports())
+    uncertain = updated.uncertain(fit, unknowns, modes=[6], neglected=full(mass=fit.values[0]))
+    static = fx.design_static(sampled)
+    servo = fx.design_servo(sampled, bandwidth=40.0)
+    loop = close_loop(sampled, static, servo)
+    point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
+    response = fx.simulate(loop, reference=point, duration=0.05, rng=1)
+    candidates = [fx.Sensor(f"c{i}", at=p, asd=1e-12) for i, p in enumerate([*CORNERS, Z8])]
+    small = fx.assemble_plant(some_modes(count=8, attached=False), ports()).discretized(RATE)
+    sensors = fx.place_sensors(small, candidates=candidates, count=4)
+    g = fx.StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
+    solution = fx.lti.solve_care(np.array([[-1.0]]), np.eye(1), Q=np.eye(1), R=np.eye(1))
+    yield from (fe, modes, rom, fx.DesiredDofs(rom.dofs.labels), select_dofs(modes, 25))
+    yield from (normal_form(rom.M, rom.D, rom.K, rom.rigid_body), fx.ModalDamping(0.01))
+    yield from (fx.Rayleigh(1.0, 1e-6), fx.AddedStiffness(at), *unknowns, residual, poles, fit)
+    yield eigenvalue_sensitivities(rom, unknowns, modes=[6])
+    yield from (plant, sampled, sampled.weighted(z={"die:z": 2.0}), uncertain, plant.check())
+    yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
+    yield from (static, fx.design_kalman(sampled), servo, loop, point, response)
+    yield from (fx.Riccati(), fx.testbeds.wafer_stage(), sensors, solution)
+    more = a_system()
+    yield from (lti.balanced(more, order=2), lti.modal_form(more), lti.norm_report(more))
+    yield from (lti.split_stable(more), synthesis.Lmi(), placement.Exchange())
+    yield from (placement.Exhaustive(), placement.PoiLqr("die"), placement.PoiVariance("die"))
+    yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)
+    yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)
+    yield from (plants.GroundSpring(Z8, 1e3), plants.decouple(plant), plants.FastStates())
+    yield from (plants.Feedthrough(), plants.OutputDisturbance("hum", "y1", asd=1e-12))
+    yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
+    yield structure.interpolated(modes.dofs).interpolation
+    yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
+
+
+def a_system():
+    rng = np.random.default_rng(2)
+    A = np.diag([-1.0, -2.0, -3.0, -5.0])
+    return fx.StateSpace(A, rng.standard_normal((4, 2)), rng.standard_normal((1, 4)), [[0, 0]])
+
+
+@cache
+def zoo():
+    """Name of the class -> an instance."""
+    found = {}
+    for value in made():
+        for part in inside(value):
+            found.setdefault(type(part).__name__, part)
+    return found
+
+
+def same(a, b, where):
+    """Assert that two contents are equal to the bit, and the second is read-only."""
+    assert type(a) is type(b), where
+    if isinstance(a, Value):
+        for name, part in a._fields().items():
+            same(part, getattr(b, name), f"{where}.{name}")
+    elif isinstance(a, np.ndarray):
+        assert a.dtype == b.dtype, where
+        assert a.shape == b.shape, where
+        assert a.tobytes() == b.tobytes(), where
+        assert not b.flags.writeable, where
+    elif sp.issparse(a):
+        assert (a != b).nnz == 0, where
+        assert not b.data.flags.writeable, where
+    elif isinstance(a, Mapping):
+        assert list(a) == list(b), where
+        for key in a:
+            same(a[key], b[key], f"{where}[{key!r}]")
+        with pytest.raises(TypeError):
+            b["new"] = 1
+    elif isinstance(a, list | tuple):
+        assert len(a) == len(b), where
+        for i, (one, two) in enumerate(zip(a, b, strict=True)):
+            same(one, two, f"{where}[{i}]")
+    else:
+        assert a == b or a != a, where
+
+
+NAMES = sorted(cls.__name__ for cls in all_values() if public(cls))
+
+
+def test_names_of_values_are_unique():
+    """Files say a value's type by its name."""
+    every = [cls.__name__ for cls in all_values()]
+    assert sorted(set(every)) == sorted(every)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_goes_through_a_file(name, tmp_path):
+    value = zoo().get(name)
+    assert value is not None, f"let made() in this file make a {name}"
+    value.save(tmp_path / "value")
+    found = load(tmp_path / "value")
+    same(value, found, name)
+    assert repr(found) == repr(value)
+    same(value, pickle.loads(pickle.dumps(value)), name)
+
+
+def test_what_was_loaded_works(tmp_path):
+    """Designs and runs from files give the same numbers."""
+    loop = zoo()["ClosedLoop"]
+    loop.save(tmp_path / "loop")
+    found = load(tmp_path / "loop")
+    assert found.modulus_margin == loop.modulus_margin
+    one, two = (fx.simulate(item, duration=0.01, rng=3) for item in (loop, found))
+    assert np.array_equal(one.data, two.data)
+    uncertain = zoo()["UncertainPlant"]
+    uncertain.save(tmp_path / "uncertain")
+    again = load(tmp_path / "uncertain")
+    assert np.array_equal(again.sample(1)[0].system.A, uncertain.sample(1)[0].system.A)
+
+
+def test_files_of_other_versions(tmp_path, monkeypatch):
+    """A field that came later has its default; what the class does not know is named."""
+    plant = zoo()["StandardPlant"]
+    kept = plant._fields()
+    monkeypatch.setattr(type(plant), "_fields", lambda self: {
+        name: part for name, part in kept.items() if name != "unweighted"
+    })  # fmt: skip
+    plant.save(tmp_path / "old")
+    assert load(tmp_path / "old").unweighted is None
+    monkeypatch.setattr(type(plant), "_fields", lambda self: {
+        name: part for name, part in kept.items() if name != "system"
+    })  # fmt: skip
+    plant.save(tmp_path / "old")
+    with pytest.raises(FlexplantError, match=r"another version.*lacks \['system'\]"):
+        load(tmp_path / "old")
+    monkeypatch.setattr(type(plant), "_fields", lambda self: kept | {"colour": 1})
+    plant.save(tmp_path / "new")
+    with pytest.raises(FlexplantError, match=r"it has \['colour'\]"):
+        load(tmp_path / "new")
+
+
+@pytest.mark.parametrize("content", [b"", b"text", b"PK\x03\x04 broken"])
+def test_what_is_no_file_of_ours(tmp_path, content):
+    (tmp_path / "x").write_bytes(content)
+    with pytest.raises(FlexplantError, match="not written by flexplant"):
+        load(tmp_path / "x")
+    with (tmp_path / "array.npy").open("wb") as file:
+        np.save(file, np.ones(3))
+    with pytest.raises(FlexplantError, match="not written by flexplant"):
+        load(tmp_path / "array.npy")
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "none")
+
+
+def test_files_can_be_read_by_whom_the_folder_allows(tmp_path):
+    (tmp_path / "plain").write_bytes(b"")
+    fx.ModalDamping(0.01).save(tmp_path / "value")
+    modes = [(tmp_path / name).stat().st_mode for name in ("plain", "value")]
+    assert modes[0] == modes[1]
+
+
+def test_every_dataclass_field_is_saved():
+    """A value without the dataclass decorator would save those of its base only."""
+    for cls in all_values():
+        if public(cls):
+            notes = get_annotations(cls)
+            own = {name for name, kind in notes.items() if "ClassVar" not in str(kind)}
+            assert own <= {field.name for field in fields(cls)}, cls
