@@ -89,3 +89,25 @@ def matched_filter(poles, zeros, gain, h, z):
         [z - p for p in np.exp(poles * h)], axis=0
     )
     return gain * value
+
+
+def peak_by_search(A, B, C, D, dt):
+    """Largest gain of light modes: a dense sweep around every pole, then golden section."""
+
+    def size(f):
+        s = np.exp(2j * np.pi * f * dt) if dt else 2j * np.pi * f
+        return float(np.linalg.norm(gain_at(A, B, C, D, s), 2))
+
+    poles = np.linalg.eigvals(A)
+    poles = np.log(poles[poles.imag > 0]) / dt if dt else poles[poles.imag > 0]
+    best = (0.0, 0.0, 0.0)
+    for pole in poles:
+        for f in np.abs(pole.imag + pole.real * np.linspace(-3, 3, 25)) / (2 * np.pi):
+            if not dt or f < 0.5 / dt:
+                best = max(best, (size(f), f, abs(pole.real) / (2 * np.pi)))
+    low, high = best[1] - 0.3 * best[2], best[1] + 0.3 * best[2]
+    ratio = (np.sqrt(5) - 1) / 2
+    for _ in range(40):
+        a, b = high - ratio * (high - low), low + ratio * (high - low)
+        low, high = (low, b) if size(a) > size(b) else (a, high)
+    return max(best[0], size(0.5 * (low + high)))
