@@ -17,6 +17,7 @@ from flexplant.plant import (
     Sensor,
     StandardPlant,
     assemble_plant,
+    lowpass,
 )
 from flexplant.plant.zeros import axis_zeros
 from flexplant.structure import FEModel
@@ -142,6 +143,34 @@ def test_what_a_sensor_measures_does_not_change_how_well_it_sees(quantity):
     np.testing.assert_allclose(found, row / row.max(), rtol=1e-6, atol=1e-9)
 
 
+def test_dynamics_of_ports_count_at_the_mode():
+    """An actuator and a sensor that roll off reach and see a mode by their gain at its pole."""
+    modes = some_modes()
+    u, y = ports().u[0].replace(dynamics=lowpass(300.0)), ports().y[0].replace(dynamics=lag(500.0))
+    plant = assemble_plant(modes, ports(u=[u], y=[y]))
+    poles = modes.poles[3:]
+    H = {"u": lowpass(300.0), "y": lag(500.0)}
+    for side, port in (("u", u), ("y", y)):
+        gain = [abs(H[side].evaluated(pole)[0, 0]) for pole in poles]
+        share = np.abs(modes.at(port.at)[3:]) * gain
+        found = [mode.shares[side] for mode in plant.check().modes]
+        np.testing.assert_allclose(found, share / share.max(), rtol=1e-6, atol=1e-9)
+    assert not plant.check()["detectable"].holds  # one sensor, three rigid-body modes
+    assert "rotation rx" in plant.check()["detectable"].finding
+    both = ports(u=[p.replace(dynamics=lowpass(300.0)) for p in ports().u],
+                 y=[p.replace(dynamics=lag(500.0)) for p in ports().y])  # fmt: skip
+    full = assemble_plant(modes, both).check()
+    assert all(full[key].holds for key in KEYS[:4])
+    line_of_three = [Actuator(f"u{i}", at=p, dynamics=lag(400.0)) for i, p in enumerate(MIDDLE)]
+    text = assemble_plant(modes, ports(u=line_of_three)).check()["stabilisable"].finding
+    assert text.startswith("u does not reach the rigid-body rotation rx (channels")
+
+
+def lag(hz):
+    corner = 2 * np.pi * hz
+    return StateSpace([[-corner]], [[corner]], [[1.0]], [[0.0]])
+
+
 def test_weak_modes_are_noted_in_words():
     model = chain((1.0, 1.0, 1.0), ground=0.0, damping=1e-4)
     report = assemble_plant(model, line(y="2:z")).check()
@@ -260,6 +289,21 @@ def test_zeros_that_were_built_in(dt, p, m, on):
         assert np.min(np.abs(found - s0)) < 1e-6 * abs(s0)
     else:
         assert not found.size or np.min(np.abs(found - s0)) > 1e-3 * abs(s0)
+
+
+def test_a_double_zero_at_the_origin_in_any_coordinates():
+    """A free mass that z does not see, its states mixed with those of an oscillator."""
+    A = np.zeros((4, 4))
+    A[0, 1] = 1.0
+    A[2:, 2:] = [[0.0, 30.0], [-30.0, -1.0]]
+    B, C = np.array([[0.0], [1.0], [0.0], [1.0]]), np.array([[0, 0, 1.0, 0], [0, 0, 0, 0]])
+    Q = np.linalg.qr(np.random.default_rng(6).standard_normal((4, 4)))[0]
+    for seen in (0.0, 1e-2):
+        C[0, 0] = seen
+        g = StateSpace(Q @ A @ Q.T, Q @ B, C @ Q.T, [[0.0], [1.0]])
+        found = axis_zeros(g)
+        assert found.size == (1 if seen == 0.0 else 0)
+        assert np.all(np.abs(found) < 1e-4)
 
 
 def test_units_do_not_move_zeros():

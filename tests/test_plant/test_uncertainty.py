@@ -193,6 +193,8 @@ def within_monte_carlo(values, wanted, sigmas=4.5):
 def test_machines_of_a_fit_spread_as_its_covariance_says():
     fit, unknowns = fitted(0.1)
     plant = updated(0.1)
+    std = np.sqrt(np.diag(fit.covariance))
+    fit = fit.replace(covariance=np.outer(std, std) * [[1.0, -0.9], [-0.9, 1.0]])
     uncertain = plant.uncertain(fit, unknowns, modes=[6, 7])
     machines = uncertain.sample(4, 300)
     poles = np.array(
@@ -204,6 +206,8 @@ def test_machines_of_a_fit_spread_as_its_covariance_says():
     assert within_monte_carlo(values, wanted)
     assert not within_monte_carlo(values, 2.0 * wanted)
     assert not within_monte_carlo(values, np.diag(np.diag(wanted)))
+    apart = fit.replace(covariance=np.diag(std**2))
+    assert not within_monte_carlo(values, propagated(apart, unknowns, np.array(nominal)))
     assert all(m.w == plant.w and m.n_rigid == 3 for m in machines)
 
 

@@ -229,10 +229,7 @@ def _lacks(plant: StandardPlant, pole: _Pole, case: _Case) -> list[str]:
         if rigid.size == basis.shape[1]:  # one vector for each rigid-body mode
             basis = basis @ np.linalg.inv(basis[rigid])
     rows = g.B[:, g.input_index(case.names)].T if case.pushes else g.C[g.output_index(case.names)]
-    # l^H B and (C r)^H: one column for each channel
-    missing = _missing(_part(rows, basis.conj() if case.pushes else basis).T)
-    if not case.pushes:
-        missing = missing.conj()
+    missing = _missing(_part(rows, basis).T)  # one column for each channel
     if not missing.shape[1]:
         return []
     if rigid.size:

@@ -19,7 +19,7 @@ def axis_zeros(g: StateSpace) -> ComplexArray:
 
     Where ``[A - s I, B; C, D]`` loses column rank. With more outputs than inputs they are among
     the generalised eigenvalues of the pencil with its outputs mixed down to as many as inputs;
-    poles on the limit are candidates as well. The rank of the whole matrix, states, inputs and
+    candidates near the limit are moved onto it. The rank of the whole matrix, states, inputs and
     outputs scaled to unit size, decides.
 
     Parameters
@@ -45,8 +45,8 @@ def axis_zeros(g: StateSpace) -> ComplexArray:
     alpha, beta = la.eig(pencil, E, right=False, homogeneous_eigvals=True)
     finite = np.abs(beta) > 1e-14 * np.abs(alpha)
     speed = _speed(g)
-    zeros = np.concatenate([alpha[finite] / beta[finite], g.poles() / speed])
-    size = np.maximum(np.abs(zeros), 1e-6)
+    zeros = alpha[finite] / beta[finite]
+    size = np.maximum(np.abs(zeros), 0.1)  # double zeros at 0 come out at the root of rounding
     off = np.abs(np.abs(zeros) - 1) if g.dt else np.abs(zeros.real) / size
     near = zeros[(off < _NEAR) & (zeros.imag >= 0)]
     on = near / np.abs(near) if g.dt else 1j * near.imag
@@ -66,7 +66,7 @@ def _speed(g: StateSpace) -> float:
     if g.dt or not g.n_states:
         return 1.0
     sizes = np.abs(g.poles())
-    moving = sizes[sizes > 1e-9 * sizes.max(initial=0.0)]
+    moving = sizes[sizes > 1e-6 * sizes.max(initial=0.0)]  # free masses come out at rounding
     return float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
 
 
