@@ -212,10 +212,10 @@ def test_minimal_does_not_confuse_units_with_smallness():
     g = machine(0, 6, m=2, p=2)
     units = g.replace(B=g.B * [1e-9, 1e3], C=g.C * np.array([[1e9], [1e-6]]))
     assert minimal(units) is units
-    # one output in nanometres sees a mode that the other, in metres, does not
+    # one output in tiny units sees a mode that the other, in metres, does not
     only = g.C.copy()
     only[0, 4], only[1] = 0.0, 0.0
-    only[1, 4] = 1e-9
+    only[1, 4] = 1e-14
     assert minimal(g.replace(C=only)).n_states == g.n_states
     silent = only.copy()
     silent[1] = 0.0
