@@ -1,4 +1,4 @@
-"""Dense references for ports with filters and delays, from M, D, K alone. Never imports flexplant."""
+"""Dense references for ports with filters and delays, from M, D, K. Never imports flexplant."""
 
 import numpy as np
 import scipy.linalg as la
@@ -83,7 +83,7 @@ def late_run(A, B, C, u, h, late_in, late_out, fine):
 
 
 def noise_of_late_outputs(A, root, C, h, late, steps=4000):
-    """Covariance of (C x(h), c_j x(h - late_j)) from rest under white noise of intensity root root'.
+    """Covariance of (C x(h), c_j x(h - late_j)) from rest under white noise.
 
     Trapezoidal sum over the moment s at which the noise acts, the map by one small exponential.
     """

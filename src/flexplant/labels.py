@@ -56,7 +56,8 @@ class DofSet(Value):
     xyz : (n, 3) array [m]
         Coordinates of each DOF's node.
     interpolation : Interpolation, optional
-        Element shape functions; without them only points at nodes are known.
+        Element shape functions, or those of `interpolated`; without them only points at nodes are
+        known.
 
     Raises
     ------

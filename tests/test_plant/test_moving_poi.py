@@ -32,7 +32,7 @@ def test_rows_along_are_those_of_the_plant_at_each_point(model):
 
 
 def test_rows_along_against_the_dense_plate():
-    """The response at 200 Hz at each point of the path, from M, D, K and the element's polynomial."""
+    """The response at 200 Hz at each point, from M, D, K and the element's polynomial."""
     from oracles_plant import machine
 
     plant = assemble_plant(full(), ports())

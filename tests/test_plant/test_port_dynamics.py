@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
-from flexplant.errors import AssumptionError, LabelError, ModelError
+from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.estimation import design_kalman
 from flexplant.labels import DofSet
 from flexplant.lti import StateSpace, frequency_response
@@ -22,6 +22,7 @@ from flexplant.plant import (
     assemble_plant,
     lowpass,
     pade,
+    stage_weights,
     suspend,
 )
 from flexplant.plant.propagation import Flow
@@ -36,6 +37,7 @@ from oracles_ports import (
     machine_with_filters,
     noise_of_late_outputs,
 )
+from stages import NOISE, L, ports, some_modes
 
 M, D, K = chain()
 E = np.eye(5)
@@ -325,7 +327,11 @@ def test_static_gains_are_filters_without_states():
 def test_the_structural_plant_has_static_gains_in_place_of_filters():
     base = channels()
     twice = StateSpace(*companion([18000.0], [1.0, 9000.0]))
-    ports = base.replace(u=[base.u[0].replace(dynamics=twice), base.u[1]])
+    thrice = StateSpace(*companion([1.2e8], [1.0, 8000.0, 4e7]))
+    ports = base.replace(
+        u=[base.u[0].replace(dynamics=twice), base.u[1]],
+        y=[base.y[0].replace(dynamics=thrice), base.y[1]],
+    )
     plant = assemble_plant(model(), ports).discretized(5e3, delay=1)
     s = 2j
     found = plant.structural.select(OUTPUTS, INPUTS).evaluated(s)
@@ -334,6 +340,55 @@ def test_the_structural_plant_has_static_gains_in_place_of_filters():
     assert plant.structural.n_states == 10
     assert plant.check()["stabilisable"].holds
     assert plant.check()["detectable"].holds
+
+
+def plate_with_filters(**changes):
+    """The paper's plate, a filter on each sensor (states before the modes) and each actuator."""
+    base = ports(**changes)
+    return base.replace(
+        y=[s.replace(dynamics=lowpass(3e3, order=2), delay=3e-5) for s in base.y],
+        u=[a.replace(dynamics=lowpass(4e3)) for a in base.u],
+    )
+
+
+def test_check_names_rigid_motions_behind_filters():
+    """The same words with filters and without, for places with no symmetry."""
+    one = [Disturbance("mid", at=(0.2, 0.1, 0.0), asd=1e-3)]
+    two = [Sensor("a", at=(L / 2, 0.1, 0.0), asd=NOISE), Sensor("b", at=(0.2, 0.5, 0.0), asd=NOISE)]
+    reports = [
+        assemble_plant(some_modes(), channels_of(w=one, y=two)).check()
+        for channels_of in (ports, plate_with_filters)
+    ]
+    for key in ("excited", "detectable"):
+        assert not reports[0][key].holds
+        assert reports[1][key].finding == reports[0][key].finding
+    assert "the rigid-body rotation rx + rotation ry (" in reports[0]["detectable"].finding
+
+
+def test_visibility_of_modes_behind_filters():
+    """What sensors' filters add stands before the modes: w sees them as it does without."""
+    plain = assemble_plant(some_modes(), ports()).check().modes
+    found = assemble_plant(some_modes(), plate_with_filters()).check().modes
+    assert len(found) == len(plain) == 21
+    for a, b in zip(found, plain, strict=True):
+        assert a.shares["w"] == pytest.approx(b.shares["w"], rel=1e-9)
+
+
+def test_weights_of_a_stage_with_every_kind_of_disturbance():
+    w = [*ports().w, BaseAcceleration("floor", "z"), BaseAcceleration("tilt", "rx"),
+         OutputDisturbance("drift", "y1")]  # fmt: skip
+    plant = assemble_plant(some_modes(), ports(w=w))
+    weights = stage_weights(plant, 50.0, disturbance=0.4, noise=0.01)
+    crossing = 2 * np.pi * 1.6 * 50.0
+    # the same motion of the body as 0.4 f0: 0.4 w_c^2 times a length of one
+    assert weights.w["floor"] == pytest.approx(0.4 * crossing**2, rel=1e-9)
+    assert weights.w["drift"] == 0.01
+    arm = np.hypot(L / 2, 0.0)  # corners, rms along y
+    assert weights.w["tilt"] == pytest.approx(weights.w["floor"] / arm, rel=1e-6)
+    shown = plant.weighted(z=weights.z, w=weights.w)
+    assert shown.w == plant.w
+    changed = weights.replace(w={**weights.w, "floor": None})
+    assert "floor" not in plant.weighted(z=changed.z, w=changed.w).w
 
 
 def test_a_continuous_plant_names_the_delays_it_leaves_out():
@@ -387,6 +442,9 @@ def test_refusals():
     for kind in (Actuator, Sensor):
         with pytest.raises(ModelError, match="delay of 'p' must be zero or positive"):
             kind("p", at="1:x", delay=-1e-3)
+    for kind in (Actuator, Sensor, Poi, Disturbance):
+        with pytest.raises(ShapeError, match=r"a point of 'p' must have shape \(3\)"):
+            kind("p", at={(0.1, 0.2): 1.0})
     with pytest.raises(LabelError, match="no sensor 'y9'"):
         channels(w=[OutputDisturbance("d", "y9")])
     with pytest.raises(LabelError, match="direction"):

@@ -224,9 +224,11 @@ def _noise(
     if not loud.size or not g.n_states:
         return np.zeros((layout.size, 0))
     force = g.B[:, loud] * (np.asarray(asd)[loud] / np.sqrt(2.0))
-    partly = np.flatnonzero(outputs.fraction > 0)
-    instants = h - outputs.fraction[partly]
-    edges = np.unique(np.concatenate([[0.0, h], instants]))
+    # late outputs by the instant within the sample at which they are taken
+    taken: dict[float, list[int]] = {}
+    for j in np.flatnonzero(outputs.fraction > 0).tolist():
+        taken.setdefault(h - float(outputs.fraction[j]), []).append(j)
+    edges = np.unique([0.0, h, *taken])
     fastest = float(np.max(np.abs(g.poles()), initial=0.0))
     states = slice(layout.first, layout.first + g.n_states)
     parts = []
@@ -238,9 +240,10 @@ def _noise(
         ):
             column = np.zeros((layout.size, loud.size))
             column[states] = flow.at(h - s) @ force
-            for j, instant in zip(partly, instants, strict=True):
+            for instant, seen in taken.items():
                 if s < instant:
-                    column[layout.line(int(j))[-1]] = g.C[j] @ flow.at(instant - s) @ force
+                    moved = flow.at(instant - s) @ force
+                    column[[layout.line(j)[-1] for j in seen]] = g.C[seen] @ moved
             parts.append(np.sqrt(weight) * column)
     G = np.hstack(parts)
     if G.shape[1] <= G.shape[0]:
