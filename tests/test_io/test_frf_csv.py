@@ -49,6 +49,7 @@ def test_the_table_as_others_read_it(tmp_path):
 @pytest.mark.parametrize("known", [True, False])
 def test_it_comes_back(tmp_path, quantity, known):
     frf = an_frf(quantity=quantity, coherence=np.full((2, 2, 3), 1 / 3) if known else None)
+    frf = frf.replace(variance=np.arange(12.0).reshape(2, 2, 3) / 7 if known else None)
     write_frf_csv(tmp_path / "frf.csv", frf)
     found = read_frf_csv(tmp_path / "frf.csv")
     assert np.array_equal(found.freq, frf.freq)
@@ -58,6 +59,7 @@ def test_it_comes_back(tmp_path, quantity, known):
     assert (found.coherence is not None) == known
     if known:
         assert np.array_equal(found.coherence, frf.coherence)
+        assert np.array_equal(found.variance, frf.variance)
 
 
 NUMBERS = st.floats(allow_nan=False, allow_infinity=False)

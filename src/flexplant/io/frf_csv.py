@@ -13,10 +13,11 @@ import numpy as np
 from ..errors import FlexplantError, LabelError, ModelError
 from ..lti.frequency import Frf
 from ..store import written
+from ..values import FloatArray
 
 _FREQ = "frequency [Hz]"
 _ARROW = " <- "
-_COLUMN = re.compile(r"(.+) <- (.+) (real|imag|coherence)(?: \[(.*)\])?")
+_COLUMN = re.compile(r"(.+) <- (.+) (real|imag|coherence|variance)(?: \[(.*)\])?")
 _UNITS = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
 
 
@@ -24,8 +25,9 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     """Write frequency response functions as a CSV file.
 
     A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
-    y1 <- u1 imag [m/N], ...` (and `... coherence` where known), then one line a frequency, with
-    all digits.
+    y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where
+    known), then one line a frequency, with
+    all digits. The correlation between outputs stays behind: `.save` keeps it.
 
     Parameters
     ----------
@@ -65,6 +67,9 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
             if frf.coherence is not None:
                 header.append(f"{output}{_ARROW}{name} coherence")
                 columns.append(frf.coherence[i, j])
+            if frf.variance is not None:
+                header.append(f"{output}{_ARROW}{name} variance")
+                columns.append(frf.variance[i, j])
     text = io.StringIO()
     text.write(f"# quantity: {frf.quantity or 'unknown'}\n")
     table = csv.writer(text, lineterminator="\n")
@@ -126,16 +131,20 @@ def read_frf_csv(path: str | Path) -> Frf:
         raise FlexplantError(f"{str(path)!r} lacks or doubles columns: {missing[:3]}.")
     pairs = [[(a, b) for b in inputs] for a in outputs]
     data = np.array([[column[*p, "real"] + 1j * column[*p, "imag"] for p in row] for row in pairs])
-    known = all((a, b, "coherence") in column for a in outputs for b in inputs)
+
+    def known(part: str) -> FloatArray | None:
+        if any((*pair, part) not in column for row in pairs for pair in row):
+            return None
+        return np.array([[column[*pair, part] for pair in row] for row in pairs])
+
     return Frf(
         table[:, 0],
         data,
         inputs=inputs,
         outputs=outputs,
         quantity=None if quantity == "unknown" else quantity,
-        coherence=np.array([[column[*p, "coherence"] for p in row] for row in pairs])
-        if known
-        else None,
+        coherence=known("coherence"),
+        variance=known("variance"),
     )
 
 
