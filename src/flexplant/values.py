@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import fields, replace
 from pathlib import Path
@@ -165,7 +166,7 @@ def check_names(names: Sequence[str], side: str) -> None:
                 f"{name!r} cannot name one of the {side}: names are not empty, hold no '.' and do "
                 "not begin with '-' (python-control refuses those). Rename it."
             )
-    doubled = sorted({name for name in names if list(names).count(name) > 1})
+    doubled = sorted(name for name, count in Counter(names).items() if count > 1)
     if doubled:
         raise LabelError(
             f"the {side} hold {doubled} more than once: names select channels, so each must be "

@@ -57,7 +57,8 @@ class StaticEstimator(Value):
         LabelError
             When it is no motion of a POI.
         AssumptionError
-            When the plant is continuous: a sample of white sensor noise has no variance then.
+            When the plant is continuous (a sample of white sensor noise has no variance then), or
+            its ports have dynamics of their own.
         SolverError
             When an elastic mode is not damped.
         """
@@ -66,6 +67,11 @@ class StaticEstimator(Value):
         if not plant.dt:
             raise AssumptionError(
                 "the rms needs a sampled plant: design_static(plant.discretized(rate))."
+            )
+        if plant.ports is not None and plant.ports.has_dynamics:
+            raise AssumptionError(
+                "the static relation's rms is known for sensors and actuators without dynamics or "
+                "delay of their own. Simulate instead, or leave the dynamics out of the ports."
             )
         g = plant.system
         weights = self.gain[row]
@@ -133,7 +139,7 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
     kinds = {s.name: s.quantity for s in ports.y} if ports is not None else {}
     used = [name for name in sensors(plant) if kinds.get(name) == "displacement"]
     channels = poi_channels(plant)
-    g = (plant.continuous or plant).system
+    g = plant.structural  # filters of sensors and amplifiers count as their static gains
     positions = np.arange(plant.n_rigid) * 2
     R_y = g.C[np.ix_(g.output_index(used), positions)]
     R_z = g.C[np.ix_(g.output_index(channels), positions)]

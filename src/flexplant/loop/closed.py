@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.frequency import Frf, frequency_response

@@ -10,6 +10,8 @@ from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
 from .forces import OutputDisturbance as OutputDisturbance
 from .moving import Along as Along
+from .neglected import NeglectedModes as NeglectedModes
+from .neglected import neglected_modes as neglected_modes
 from .ports import Poi as Poi
 from .ports import Ports as Ports
 from .ports import Reference as Reference
@@ -22,6 +24,9 @@ from .stage import stage_weights as stage_weights
 from .standard import StandardPlant as StandardPlant
 from .suspension import GroundSpring as GroundSpring
 from .suspension import suspend as suspend
+from .uncertainty import Delta as Delta
+from .uncertainty import UncertainPlant as UncertainPlant
+from .visibility import ModeVisibility as ModeVisibility
 from .weights import highpass as highpass
 from .weights import inverse_sensitivity as inverse_sensitivity
 from .weights import leadlag as leadlag

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError
+from ..errors import AssumptionError, ModelError
 from ..lti.discretisation import tustin
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
@@ -167,6 +167,11 @@ def stage_weights(
     first = ports.z[0].channel(ports.z[0].axes[0])
     push = np.linalg.norm(rigid_gain(plant, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")
+    if plant.dt and crossing * plant.dt > 0.2:
+        raise ModelError(
+            f"bandwidth {bandwidth:g} Hz is not well below the rate, {1 / plant.dt:g} Hz: the "
+            "weights could not be sampled. Ask for less, or raise the rate."
+        )
     force = (2.0 * np.pi * crossing) ** 2 / float(push)
     arm = _arm(plant, ports)
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)

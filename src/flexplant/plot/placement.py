@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 
 from ..placement import SensorMap
 from ..plant import Ports
+from ..values import FloatArray
 from ._axes import MEASURED, UPDATED, axes, finish
 
 
@@ -36,7 +37,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     ax.plot(x, y, ".", color="white", markersize=1.5)
     there = [port.at for port in ports.y if isinstance(port.at, tuple)] if ports else []
     if there:
-        points = np.array(there)
+        points: FloatArray = np.array(there, dtype=np.float64)
         ax.plot(points[:, 0], points[:, 1], "P", color=MEASURED, label="sensors", clip_on=False)
     ax.plot(*found.best[:2], "*", color=UPDATED, markersize=14, label="best place", clip_on=False)
     ax.set_aspect("equal")

@@ -80,8 +80,7 @@ def _point(dofs: DofSet, at: Any) -> Any:
     if isinstance(at, str):
         return dofs.xyz[dofs.index(at)]
     if isinstance(at, Mapping):
-        rows = dofs.indices(at)
-        return dofs.xyz[rows].mean(axis=0)
+        return np.mean([_point(dofs, place) for place in at], axis=0)
     return np.asarray(at)
 
 

@@ -249,12 +249,14 @@ class WaferStage(Value):
             shaken = np.array([_lines(wave, samples, periods, lines) for wave in signal])
             forces[:, experiment] = shaken + lag * commands
             motions[:, experiment] = [_lines(run[s.name], samples, periods, lines) for s in ports.y]
+        kinds = {sensor.quantity for sensor in ports.y}
         data: Any = np.linalg.solve(forces.transpose(2, 1, 0), motions.transpose(2, 1, 0))
         return Frf(
             lines / period,
             data.transpose(2, 1, 0),
             inputs=tuple(port.name for port in ports.u),
             outputs=tuple(port.name for port in ports.y),
+            quantity=kinds.pop() if len(kinds) == 1 else None,
         )
 
 

@@ -1,0 +1,66 @@
+"""What ports with dynamics mean to the rooms above: static relation, servo, placement, pictures."""
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import AssumptionError, ModelError
+from stages import CORNERS, NOISE, RATE, ports, some_modes
+
+
+@pytest.fixture(scope="module")
+def filtered():
+    shaped = fx.lowpass(3000.0)
+    sensors = [
+        fx.Sensor(f"y{i}", at=p, asd=NOISE, dynamics=shaped) for i, p in enumerate(CORNERS, 1)
+    ]
+    return fx.assemble_plant(some_modes(), ports(y=sensors)).discretized(RATE, delay=1)
+
+
+def test_static_gains_see_the_structure_not_the_filters(filtered):
+    # oracle: the same relation without filters, whose static gain is one
+    plain = fx.design_static(fx.assemble_plant(some_modes(), ports()).discretized(RATE, delay=1))
+    found = fx.design_static(filtered)
+    np.testing.assert_allclose(found.system.D, plain.system.D, rtol=1e-9, atol=1e-9)
+    assert np.abs(plain.system.D).max() > 0.1
+    with pytest.raises(AssumptionError, match="without dynamics"):
+        found.rms("die")
+
+
+def test_a_servo_on_filtered_sensors_is_stable(filtered):
+    observer, servo = fx.design_kalman(filtered), fx.design_servo(filtered, bandwidth=40.0)
+    assert fx.close_loop(filtered, observer, servo).is_stable
+
+
+def test_a_filtered_candidate_is_scored_by_its_own_filter(filtered):
+    slow = fx.Sensor("slow", at=(0.3, 0.3, 0.0), asd=NOISE, dynamics=fx.lowpass(50.0))
+    fast = fx.Sensor("fast", at=(0.3, 0.3, 0.0), asd=NOISE)
+    layouts = [["y1", "y2", "y3", name] for name in ("fast", "slow")]
+    scores = fx.score_sensors(filtered, layouts, candidates=[*filtered.ports.y, slow, fast])
+    value = dict(zip(scores.layouts, scores.values, strict=True))
+    rebuilt = filtered.with_ports(filtered.ports.replace(y=[*filtered.ports.y[:3], slow]))
+    truth = fx.design_kalman(rebuilt).rms("die") ** 2
+    assert value["y1", "y2", "y3", "slow"] == pytest.approx(truth, rel=1e-6, abs=0.0)
+    assert value["y1", "y2", "y3", "fast"] < value["y1", "y2", "y3", "slow"]
+
+
+def test_disturbances_that_are_no_forces_at_a_place_can_be_placed_against():
+    noisy = [*ports().w, fx.BaseAcceleration("floor", direction="z", asd=1e-6)]
+    plant = fx.assemble_plant(some_modes(), ports(w=noisy)).discretized(RATE, delay=1)
+    found = fx.place_sensors(plant, plant.ports.y, count=3)
+    assert len(found.chosen) == 3
+    rebuilt = plant.with_ports(plant.ports.replace(y=found.ports))
+    truth = fx.design_kalman(rebuilt).rms("die") ** 2
+    assert found.value == pytest.approx(truth, rel=1e-6, abs=0.0)
+
+
+def test_weights_near_half_the_rate_are_refused(filtered):
+    with pytest.raises(ModelError, match="not well below the rate"):
+        fx.stage_weights(filtered, 2000.0)
+
+
+def test_points_as_keys_are_drawn():
+    pair = fx.Sensor("pair", at={CORNERS[0]: 0.5, CORNERS[3]: 0.5}, asd=NOISE)
+    ax = fx.plot.layout(some_modes().dofs, ports=fx.Ports(y=[pair]))
+    drawn = [line.get_xydata() for line in ax.lines if line.get_label() == "sensors y"]
+    np.testing.assert_allclose(drawn[0], [[0.3, 0.3]])
