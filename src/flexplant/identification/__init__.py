@@ -1,3 +1,15 @@
-"""What the hardware says: measured poles and mode shapes."""
+"""What the hardware says: frequency responses, measured poles and mode shapes."""
 
+from .diagram import PoleSelection as PoleSelection
+from .diagram import StabilisationDiagram as StabilisationDiagram
+from .estimate import estimate_frf as estimate_frf
+from .identified import IdentifiedModes as IdentifiedModes
+from .identify import identify_modes as identify_modes
+from .identify import stabilisation_diagram as stabilisation_diagram
 from .measured import MeasuredModes as MeasuredModes
+from .numbering import numbered as numbered
+from .periodic import Periodic as Periodic
+from .periodic import multisine as multisine
+from .spectra import H1 as H1
+from .spectra import H2 as H2
+from .spectra import Hv as Hv

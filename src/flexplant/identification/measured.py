@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
-from ..values import ComplexArray, FloatArray, Value, real_array
+from ..values import ComplexArray, FloatArray, Value, check_names, real_array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -28,16 +28,20 @@ class MeasuredModes(Value):
     covariance : (m,) or (2m, 2m) array [(rad/s)^2], optional
         Variance E|d lambda|^2 of each pole, its real and imaginary parts equally uncertain and
         independent, or the covariance matrix of [Re lambda; Im lambda]; stored as the latter.
+    shapes : (n, m) complex array, optional
+        The mode shapes at n measured DOFs; conjugated where the pole is.
+    dofs : sequence of n str, optional
+        Labels of these DOFs (`"41:z"`), or names of the channels where no DOF is known.
 
     Raises
     ------
     ShapeError
-        When lengths differ.
+        When lengths differ, or only one of shapes and dofs is given.
     ModelError
-        When poles are not finite, real (overdamped or rigid) or unstable, or the covariance is
-        not positive definite.
+        When poles are not finite, real (overdamped or rigid) or unstable, a shape is zero or not
+        finite, or the covariance is not positive definite.
     LabelError
-        When mode numbers are not whole numbers from 1 or appear twice.
+        When mode numbers are not whole numbers from 1, or numbers or labels appear twice.
 
     Examples
     --------
@@ -48,9 +52,12 @@ class MeasuredModes(Value):
     poles: ComplexArray
     modes: tuple[int, ...] | None = field(default=None, kw_only=True)
     covariance: FloatArray | None = field(default=None, kw_only=True)
+    shapes: ComplexArray | None = field(default=None, kw_only=True)
+    dofs: tuple[str, ...] | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         poles = _checked_poles(self.poles)
+        shapes, dofs = _checked_shapes(self.shapes, self.dofs, poles)
         numbers = None if self.modes is None else _checked_numbers(self.modes, poles.size)
         covariance = self.covariance
         if covariance is not None:
@@ -58,7 +65,8 @@ class MeasuredModes(Value):
             # a conjugated pole carries the opposite error in its imaginary part
             signs = np.concatenate([np.ones(poles.size), np.sign(poles.imag)])
             covariance = covariance * np.outer(signs, signs)
-        self._set(poles=poles.real + 1j * np.abs(poles.imag), modes=numbers, covariance=covariance)
+        poles = poles.real + 1j * np.abs(poles.imag)
+        self._set(poles=poles, modes=numbers, covariance=covariance, shapes=shapes, dofs=dofs)
 
     def __len__(self) -> int:
         return int(self.poles.size)
@@ -81,6 +89,44 @@ class MeasuredModes(Value):
     def zeta(self) -> FloatArray:
         """Modal damping ratios -Re lambda / |lambda|."""
         return np.asarray(-self.poles.real / np.abs(self.poles), dtype=np.float64)
+
+    @property
+    def std(self) -> ComplexArray | None:
+        """Standard deviations of the poles, of the real part + i of the imaginary one [rad/s]."""
+        if self.covariance is None:
+            return None
+        deviation = np.sqrt(np.diag(self.covariance))
+        return np.asarray(deviation[: len(self)] + 1j * deviation[len(self) :])
+
+    def select(self, poles: Iterable[int]) -> Self:
+        """Return some of the poles, with all that is known of them, in the order given.
+
+        Parameters
+        ----------
+        poles : iterable of int
+            Their places, from 0.
+
+        Raises
+        ------
+        LabelError
+            When there is no such pole, or it is asked for twice.
+        """
+        places = list(poles)
+        if not places or len(set(places)) < len(places) or not set(places) <= set(range(len(self))):
+            raise LabelError(
+                f"select takes different places between 0 and {len(self) - 1} of the poles, got "
+                f"{places!r:.80}."
+            )
+        return self.replace(**self._picked(places))
+
+    def _picked(self, places: list[int]) -> dict[str, Any]:
+        both = np.array(places + [place + len(self) for place in places])
+        return {
+            "poles": self.poles[places],
+            "modes": None if self.modes is None else tuple(self.modes[i] for i in places),
+            "covariance": None if self.covariance is None else self.covariance[np.ix_(both, both)],
+            "shapes": None if self.shapes is None else self.shapes[:, places],
+        }
 
 
 def _listed(numbers: Iterable[float], form: str) -> str:
@@ -155,3 +201,23 @@ def _checked_covariance(value: Any, count: int) -> FloatArray:
             "weight. Give every pole a positive variance in (rad/s)^2."
         ) from None
     return (matrix + matrix.T) / 2
+
+
+def _checked_shapes(
+    shapes: Any, dofs: Any, poles: ComplexArray
+) -> tuple[ComplexArray | None, tuple[str, ...] | None]:
+    if shapes is None and dofs is None:
+        return None, None
+    if shapes is None or dofs is None or isinstance(dofs, str):
+        raise ShapeError("shapes= and the list dofs= of their rows' labels belong together.")
+    array = np.array(shapes, dtype=np.complex128)
+    labels = tuple(str(label) for label in dofs)
+    if array.shape != (len(labels), poles.size) or not labels:
+        raise ShapeError(
+            f"shapes must have shape ({len(labels)}, {poles.size}) for {len(labels)} DOFs and "
+            f"{poles.size} poles, got {array.shape}."
+        )
+    check_names(labels, "dofs")
+    if not np.all(np.isfinite(array)) or not np.all(np.any(array, axis=0)):
+        raise ModelError("every mode shape must be finite and not zero everywhere.")
+    return np.where(poles.imag < 0, array.conj(), array), labels

@@ -1,0 +1,105 @@
+"""The answer of an identification: scaled shapes, and the covariance of its poles."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import SolverError
+from ..lti.frequency import Frf
+from ..values import ComplexArray, FloatArray
+from .diagram import StabilisationDiagram
+from .identified import IdentifiedModes
+from .refine import Fit, Lines
+from .support import freedom
+from .weights import Prepared
+
+
+def answer(
+    frf: Frf,
+    ready: Prepared,
+    lines: Lines,
+    fit: Fit,
+    band: tuple[float, float],
+    labels: Mapping[str, str],
+    diagram: StabilisationDiagram | None,
+) -> IdentifiedModes:
+    """Return the identified modes of a fit, sorted, those inside the band."""
+    misfit = fit.cost / freedom(lines, fit.poles.size)
+    covariance = _covariance(fit, ready) * max(1.0, misfit)
+    shapes, part, terms = fit.shapes, fit.participation, fit.terms
+    if ready.swapped:
+        shapes, part, terms = part, shapes, terms.transpose(1, 0, 2)
+    outputs = tuple(labels.get(name, name) for name in frf.outputs)
+    inputs = tuple(labels.get(name, name) for name in frf.inputs)
+    shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
+    shapes, part, normalised = _scaled(fit.poles, shapes, part, shared if labels else [])
+    freq = np.abs(fit.poles) / (2 * np.pi)
+    order = np.argsort(freq, kind="stable")
+    inside = np.array([k for k in order if band[0] <= freq[k] <= band[1]], dtype=np.int64)
+    outside = np.array([k for k in order if not band[0] <= freq[k] <= band[1]], dtype=np.int64)
+    if not inside.size:
+        raise SolverError("the fit moved every pole out of the band: widen it.")
+    both = np.concatenate([inside, inside + fit.poles.size])
+    return IdentifiedModes(
+        fit.poles[inside],
+        covariance=covariance[np.ix_(both, both)],
+        shapes=shapes[:, inside],
+        dofs=outputs,
+        participation=part[:, inside],
+        inputs=tuple(frf.inputs),
+        outputs=tuple(frf.outputs),
+        terms=terms,
+        lower=lines.lower,
+        top=float(lines.freq[-1]),
+        hold=lines.hold,
+        unreported=(fit.poles[outside], shapes[:, outside], part[:, outside]),
+        mass_normalised=normalised,
+        misfit=misfit,
+        diagram=diagram,
+    )
+
+
+def _covariance(fit: Fit, ready: Prepared) -> FloatArray:
+    """Return the covariance of [Re lambda; Im lambda] of all poles."""
+    size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
+    # participation of repeated poles is known up to a rotation only: no doubt is asked of it
+    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
+    both = 2 * fit.poles.size
+    if ready.correlation is None or ready.data.shape[0] == 1:
+        chosen = inverse[:both, :both]
+    else:
+        gain = inverse[:both]
+        meat = np.zeros((both, both))
+        slopes = [np.einsum("ifp,qp->ifq", J, gain) for J in fit.jacobian]
+        if ready.swapped:
+            for J in slopes:
+                mixed = np.einsum("abf,bfq->afq", ready.correlation, J)
+                meat += np.einsum("afp,afq->pq", J.conj(), mixed).real
+        else:
+            for a, J in enumerate(slopes):
+                for b, other in enumerate(slopes):
+                    line = ready.correlation[a, b][None, :, None] * other
+                    flat = J.reshape(-1, both)
+                    meat += (flat.conj().T @ line.reshape(-1, both)).real
+        chosen = meat
+    return np.asarray((chosen + chosen.T) / 2)
+
+
+def _scaled(
+    poles: ComplexArray, shapes: ComplexArray, part: ComplexArray, shared: list[tuple[int, int]]
+) -> tuple[ComplexArray, ComplexArray, bool]:
+    """Return shapes mass-normalised by shared DOFs, or with a largest entry of 1."""
+    columns = np.arange(poles.size)
+    if shared:
+        rows, places = (list(side) for side in zip(*shared, strict=True))
+        driven = shapes[rows]
+        ratio = np.sum(driven.conj() * part[places], axis=0) / np.sum(np.abs(driven) ** 2, axis=0)
+        factor = np.sqrt(2j * poles.imag * ratio)
+        large = np.argmax(np.abs(shapes), axis=0)
+        factor = factor * np.where((factor * shapes[large, columns]).real < 0, -1.0, 1.0)
+    else:
+        factor = 1.0 / shapes[np.argmax(np.abs(shapes), axis=0), columns]
+    return shapes * factor, part / factor, bool(shared)

@@ -1,0 +1,252 @@
+"""The stabilisation diagram: poles over model orders, which of them stay, and their selection."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.optimize as so
+
+from ..errors import ModelError, ShapeError, SolverError
+from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
+from .plscf import OrderPoles
+
+#: flags of a pole, each including the ones before
+NEW, FREQUENCY, DAMPING, STABLE = 0, 1, 2, 3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PoleSelection(Value):
+    """Poles picked from a stabilisation diagram, to start a fit from.
+
+    Parameters
+    ----------
+    poles : (m,) complex array [rad/s]
+        With positive imaginary parts.
+    participation : (n_in, m) complex array
+        How each input (each output, where those are fewer) excites them; independent columns
+        tell repeated poles apart.
+    """
+
+    poles: ComplexArray
+    participation: ComplexArray
+
+    def __post_init__(self) -> None:
+        poles = np.array(self.poles, dtype=np.complex128)
+        participation = np.array(self.participation, dtype=np.complex128)
+        if poles.ndim != 1 or participation.ndim != 2 or participation.shape[1:] != poles.shape:
+            raise ShapeError(
+                f"poles (m,) and participation (n_in, m) belong together, got {poles.shape} and "
+                f"{participation.shape}."
+            )
+        if not (np.all(np.isfinite(poles)) and np.all(np.isfinite(participation))):
+            raise ModelError("poles and participation must be finite.")
+        if np.any(poles.imag <= 0) or not np.all(np.any(participation, axis=0)):
+            raise ModelError("poles need positive imaginary parts, and some participation each.")
+        self._set(poles=poles, participation=participation)
+
+    def __len__(self) -> int:
+        return int(self.poles.size)
+
+    def __repr__(self) -> str:
+        listed = ", ".join(f"{pole.imag / 2 / np.pi:.4g}" for pole in self.poles[:6].tolist())
+        return f"<PoleSelection: {len(self)} poles at {listed}{', ...' * (len(self) > 6)} Hz>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StabilisationDiagram(Value):
+    """Poles of all model orders, and whether each was there at the order before.
+
+    Parameters
+    ----------
+    orders : (n,) int array
+        Model order of each pole.
+    poles : (n,) complex array [rad/s]
+        Stable ones inside the band.
+    flags : (n,) int array
+        0: new, 1: its frequency was there before, 2: its damping too, 3: its shape too (stable).
+    tracks : (n,) int array
+        Poles that continue each other over the orders share a number.
+    shapes, participation : (n_out, n), (n_in, n) complex array
+        Of each pole, of unit length; exchanged where there are fewer outputs than inputs.
+    band : (2,) array [Hz]
+        Where a pole counts.
+    """
+
+    orders: IntArray
+    poles: ComplexArray
+    flags: IntArray
+    tracks: IntArray
+    shapes: ComplexArray = field(kw_only=True)
+    participation: ComplexArray = field(kw_only=True)
+    band: FloatArray = field(kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._set(**self._fields())
+
+    def __len__(self) -> int:
+        return int(self.poles.size)
+
+    def __repr__(self) -> str:
+        known = np.unique(self.orders)
+        span = f"{known[0]} .. {known[-1]}" if known.size else "none"
+        return (
+            f"<StabilisationDiagram: orders {span}, {len(self)} poles, "
+            f"{int(np.sum(self.flags == STABLE))} stable>"
+        )
+
+    @property
+    def freq(self) -> FloatArray:
+        """Frequencies |lambda|/(2 pi) [Hz]."""
+        return np.abs(self.poles) / (2 * np.pi)
+
+    @property
+    def zeta(self) -> FloatArray:
+        """Damping ratios."""
+        return np.asarray(-self.poles.real / np.abs(self.poles), dtype=np.float64)
+
+    def automatic(self, *, presence: float = 0.5) -> PoleSelection:
+        """Return the poles that stay over the orders.
+
+        A track counts that is stable at a share `presence` of the orders from its first to the
+        highest one, but at least at four. All poles come from the order at which most tracks
+        are present, so that the participation vectors of repeated poles belong together.
+
+        Parameters
+        ----------
+        presence : float
+            Between 0 and 1.
+
+        Raises
+        ------
+        ModelError
+            When presence is out of range.
+        SolverError
+            When no pole stays.
+        """
+        if not 0 < positive(presence, "presence") <= 1:
+            raise ModelError(f"presence must lie between 0 and 1, got {presence:g}.")
+        known = np.unique(self.orders)
+        kept = []
+        for track in np.unique(self.tracks):
+            mine = self.tracks == track
+            span = np.sum(known >= self.orders[mine].min())
+            stable = int(np.sum(mine & (self.flags == STABLE)))
+            if stable >= max(4, presence * span):
+                kept.append(int(track))
+        if not kept:
+            raise SolverError(
+                f"no pole stays over the orders {known.tolist()!r:.60}: raise the orders, narrow "
+                "the band to where resonances stand out of the noise, or pick poles by hand with "
+                "diagram.select(freq=[...])."
+            )
+        return self._chosen(kept)
+
+    def select(self, freq: Sequence[float] | FloatArray) -> PoleSelection:
+        """Return the poles nearest to some frequencies, as read off the diagram.
+
+        Parameters
+        ----------
+        freq : (m,) array [Hz]
+            A frequency given twice picks two poles there.
+
+        Raises
+        ------
+        ModelError
+            When there are no frequencies, or no pole lies within 3 % of one.
+        """
+        wanted = real_array(freq, "freq", (None,))
+        if not wanted.size:
+            raise ModelError("select needs at least one frequency.")
+        known = np.unique(self.tracks)
+        centres = np.array([np.median(self.freq[self.tracks == track]) for track in known])
+        lengths = np.array([np.sum(self.tracks == track) for track in known])
+        away: Any = np.abs(centres[None, :] / np.maximum(wanted, 1e-300)[:, None] - 1.0)
+        # a long track is meant rather than a short one a hair nearer
+        cost = np.where(away < 0.03, away + 0.01 / np.maximum(lengths, 1)[None, :], 1e3)
+        if cost.shape[1] < wanted.size:
+            raise ModelError(f"{wanted.size} frequencies, but only {known.size} poles are there.")
+        rows, columns = so.linear_sum_assignment(cost)
+        lost = [float(wanted[i]) for i, j in zip(rows, columns, strict=True) if cost[i, j] > 1]
+        if lost:
+            raise ModelError(
+                f"no pole of its own within 3 % of {lost} Hz: look at "
+                "plot.stabilisation(diagram), raise the orders or leave these out."
+            )
+        return self._chosen([int(known[j]) for j in columns])
+
+    def _chosen(self, tracks: Sequence[int]) -> PoleSelection:
+        inside = np.isin(self.tracks, tracks)
+        orders, counts = np.unique(self.orders[inside], return_counts=True)
+        best = orders[np.flatnonzero(counts == counts.max())[-1]]
+        places = []
+        for track in tracks:
+            mine = np.flatnonzero(self.tracks == track)
+            places.append(mine[np.argmin(np.abs(self.orders[mine] - best))])
+        places.sort(key=lambda i: float(self.poles[i].imag))
+        return PoleSelection(self.poles[places], self.participation[:, places])
+
+
+def built_diagram(
+    results: Sequence[OrderPoles], band: FloatArray, tolerances: tuple[float, float, float]
+) -> StabilisationDiagram:
+    """Return the diagram of results by ascending order: flags and tracks."""
+    poles, orders, flags, tracks, shapes, parts = [], [], [], [], [], []
+    before: OrderPoles | None = None
+    before_tracks = np.zeros(0, dtype=np.int64)
+    count = 0
+    for result in results:
+        flag = np.zeros(result.poles.size, dtype=np.int64)
+        track = np.full(result.poles.size, -1, dtype=np.int64)
+        if before is not None and before.poles.size and result.poles.size:
+            pairs, flag = _followed(before, result, tolerances)
+            for old, new in pairs:
+                track[new] = before_tracks[old]
+        fresh = track < 0
+        track[fresh] = count + np.arange(fresh.sum())
+        count += int(fresh.sum())
+        before, before_tracks = result, track
+        poles.append(result.poles)
+        orders.append(np.full(result.poles.size, result.order))
+        flags.append(flag)
+        tracks.append(track)
+        shapes.append(result.shapes)
+        parts.append(result.participation)
+    return StabilisationDiagram(
+        np.concatenate(orders),
+        np.concatenate(poles),
+        np.concatenate(flags),
+        np.concatenate(tracks),
+        shapes=np.concatenate(shapes, axis=1),
+        participation=np.concatenate(parts, axis=1),
+        band=band,
+    )
+
+
+def _followed(
+    old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
+) -> tuple[list[tuple[int, int]], IntArray]:
+    """Return which new pole continues which old one, and the flags of the new ones."""
+    tol_freq, tol_damping, tol_mac = tolerances
+    f_old, f_new = np.abs(old.poles), np.abs(new.poles)
+    z_old, z_new = -old.poles.real / f_old, -new.poles.real / f_new
+    near = np.abs(f_new[:, None] / f_old - 1.0) <= tol_freq
+    damped = near & (np.abs(z_new[:, None] / z_old - 1.0) <= tol_damping)
+    alike = np.zeros_like(near)
+    for i, pole in enumerate(new.poles):
+        # shapes of (nearly) repeated poles are arbitrary within their span
+        reach = np.maximum(-3.0 * np.maximum(old.poles.real, pole.real), 1e-4 * abs(pole))
+        group = np.flatnonzero(near[i] & (np.abs(old.poles - pole) <= reach))
+        if group.size:
+            basis = np.linalg.qr(old.shapes[:, group])[0]
+            alike[i, group] = np.linalg.norm(basis.conj().T @ new.shapes[:, i]) ** 2 >= tol_mac
+    stable = damped & alike
+    flag = np.max(near * 1 + damped * 1 + stable * 1, axis=1)
+    distance = np.abs(new.poles[:, None] - old.poles) / (f_old + 1e-300)
+    cost = np.where(stable, distance, np.where(near, 10.0 + distance, 1e3))
+    rows, columns = so.linear_sum_assignment(cost)
+    # a pole whose damping jumps is followed, but is not stable
+    pairs = [(int(j), int(i)) for i, j in zip(rows, columns, strict=True) if cost[i, j] < 100.0]
+    return pairs, flag

@@ -1,0 +1,225 @@
+"""From measured FRFs to poles, mode shapes and their doubt."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..lti.frequency import Frf
+from ..values import positive, real_array
+from .answer import answer
+from .diagram import PoleSelection, StabilisationDiagram
+from .identified import IdentifiedModes
+from .refine import Lines, refined
+from .support import freedom, supported
+from .weights import Prepared, prepared
+from .windows import diagram_of, weighted_by_remainder, windows
+
+
+def stabilisation_diagram(
+    frf: Frf,
+    *,
+    band: tuple[float, float] | None = None,
+    orders: Iterable[int] | None = None,
+    tolerances: tuple[float, float, float] = (0.01, 0.05, 0.95),
+    max_zeta: float = 0.2,
+) -> StabilisationDiagram:
+    """Return the poles of matrix-fraction models of rising order, by pLSCF.
+
+    Model: ``H(z) = B(z) A(z)^-1`` with complex coefficients on the band, see
+    `flexplant.identification.plscf`.
+
+    Parameters
+    ----------
+    frf : Frf
+        Measured; weighted by its variance where it has one. Velocity and acceleration are
+        integrated; no quantity is taken for displacement.
+    band : (low, high) [Hz], optional
+        What to look at; all by default.
+    orders : iterable of int, optional
+        Model orders; each has order * min(n_in, n_out) poles. 2 to 40 by default.
+    tolerances : (float, float, float)
+        Relative change of frequency and of damping from one order to the next, and the MAC,
+        for a pole to be called stable.
+    max_zeta : float
+        Poles with more damping are left out.
+
+    Returns
+    -------
+    StabilisationDiagram
+        Choose with `.automatic()` or `.select(freq=[...])`; draw with `plot.stabilisation`.
+
+    Raises
+    ------
+    ModelError
+        When the band holds less than 20 lines, or orders or tolerances are out of range.
+
+    References
+    ----------
+    Peeters, Van der Auweraer, Guillaume, Leuridan, "The PolyMAX frequency-domain method: a new
+    standard for modal parameter estimation?", Shock and Vibration 11 (2004) 395-409.
+    """
+    first, second, third = real_array(tolerances, "tolerances", (3,)).tolist()
+    limits = (first, second, third)
+    if min(limits) <= 0 or third >= 1:
+        raise ModelError(
+            "tolerances are (frequency, damping, MAC), positive, the MAC below 1, got "
+            f"{tolerances!r}."
+        )
+    top = positive(max_zeta, "max_zeta")
+    if top >= 1:
+        raise ModelError(f"max_zeta must be below 1, where nothing oscillates, got {top:g}.")
+    ready, listed = prepared(frf, band), _checked_orders(orders)
+    if not ready.known:
+        ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
+    return diagram_of(ready, _affordable(listed, ready), limits, top)
+
+
+def identify_modes(
+    frf: Frf,
+    *,
+    band: tuple[float, float] | None = None,
+    orders: Iterable[int] | None = None,
+    start: PoleSelection | None = None,
+    lower: int = 2,
+    upper: int = 3,
+    hold: float | None = None,
+    dofs: Mapping[str, str] | None = None,
+    max_iterations: int = 60,
+) -> IdentifiedModes:
+    r"""Return poles, mode shapes and their covariance from measured FRFs.
+
+    Poles that stay over the orders of a stabilisation diagram start a maximum likelihood fit of
+
+    .. math:: H(s) = \sum_k \frac{\psi_k l_k^T}{s - \lambda_k} +
+        \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k}
+        + \sum_{p=1}^{lower} \frac{E_{-p}}{s^p} + \sum_{p=0}^{upper-1} E_p s^p
+
+    with residues of rank one, so that close and repeated modes are told apart by several inputs
+    and outputs. Rigid-body modes and modes below the band are in 1/s and 1/s^2, those above in
+    the powers of s. Chosen poles that the data do not support (Bayesian information criterion)
+    are left out, unless `start` is given.
+
+    Parameters
+    ----------
+    frf : Frf
+        Measured. With a variance, errors are weighted by it and the covariance follows from it
+        (and from the correlation between outputs where known); without, both come from what
+        the fit leaves, averaged over 41 lines.
+    band : (low, high) [Hz], optional
+        What to fit and report; all by default.
+    orders : iterable of int, optional
+        Of the stabilisation diagram; 2 to 40 by default.
+    start : PoleSelection, optional
+        Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
+    lower, upper : int
+        Numbers of residual terms.
+    hold : float [Hz], optional
+        Rate of the zero-order hold between the inputs and the machine, where the FRF is that of
+        a sampled plant.
+    dofs : mapping {channel: DOF label}, optional
+        Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
+        input and an output share a DOF.
+    max_iterations : int
+        Of the fit.
+
+    Returns
+    -------
+    IdentifiedModes
+        A `MeasuredModes`, sorted by frequency, without mode numbers (see `numbered`). Its
+        covariance is enlarged by the misfit where that exceeds one.
+
+    Raises
+    ------
+    ModelError, ShapeError, LabelError
+        When an argument is out of range or does not belong to this FRF.
+    SolverError
+        When no pole is found, or the fit does not settle.
+
+    References
+    ----------
+    Golub, Pereyra, "Separable nonlinear least squares: the variable projection method and its
+    applications", Inverse Problems 19 (2003) R1-R26.
+    Pintelon, Schoukens, "System Identification: A Frequency Domain Approach", 2012, ch. 9.
+    Pintelon, Guillaume, Schoukens, "Uncertainty calculation in (operational) modal analysis",
+    Mechanical Systems and Signal Processing 21 (2007) 2359-2373.
+    """
+    ready = prepared(frf, band)
+    low, high = float(ready.freq[0]), float(ready.freq[-1])
+    for name, number, least in (
+        ("lower", lower, 0),
+        ("upper", upper, 0),
+        ("max_iterations", max_iterations, 1),
+    ):
+        if not isinstance(number, int | np.integer) or number < least:
+            raise ModelError(f"{name} must be a whole number, {least} or more, got {number!r}.")
+    rate = None if hold is None else positive(hold, "hold")
+    if rate is not None and high > rate / 2 * (1 + 1e-12):
+        raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
+    labels = checked_channels(dofs, frf)
+    listed = _checked_orders(orders)
+    if not ready.known:
+        ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
+    diagram = None
+    if start is None:
+        diagram = diagram_of(ready, _affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
+        chosen = diagram.automatic()
+    elif not isinstance(start, PoleSelection):
+        raise ModelError(f"start is a PoleSelection, got {type(start).__name__}.")
+    elif start.participation.shape[0] != ready.data.shape[1]:
+        raise ShapeError(
+            f"start was chosen with {start.participation.shape[0]} references, this FRF has "
+            f"{ready.data.shape[1]}: make the diagram from the same channels."
+        )
+    else:
+        chosen = start
+    poles, part = chosen.poles, chosen.participation
+    for _ in range(1 if ready.known else 2):
+        lines = Lines(ready.freq, ready.data, ready.weight, int(lower), int(upper), rate)
+        if start is None:
+            poles, part = supported(lines, poles, part)
+        fit = refined(lines, poles, part, steps=max_iterations)
+        if start is None:
+            fewer, part = supported(lines, fit.poles, fit.participation)
+            if fewer.size < fit.poles.size:
+                fit = refined(lines, fewer, part, steps=max_iterations)
+        poles, part = fit.poles, fit.participation
+        if not ready.known:
+            share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
+            ready = ready.from_residuals(ready.data - fit.model, share)
+    return answer(frf, ready, lines, fit, (low, high), labels, diagram)
+
+
+def _affordable(orders: list[int], ready: Prepared) -> list[int]:
+    fewest = min(window.seen.stop - window.seen.start for window in windows(ready))
+    if 2 * (orders[-1] + 1) > fewest:
+        raise ModelError(
+            f"order {orders[-1]} needs more lines than the {ready.freq.size} of the band: lower "
+            "the orders or measure longer."
+        )
+    return orders
+
+
+def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
+    """Return {channel: DOF label}, checked."""
+    if dofs is None:
+        return {}
+    if not isinstance(dofs, Mapping):
+        raise LabelError(f"dofs is a mapping from channels to DOF labels, got {dofs!r:.60}.")
+    known = {*frf.inputs, *frf.outputs}
+    for name in dofs:
+        if name not in known:
+            raise unknown_label("channel", name, sorted(known))
+    return {str(name): str(label) for name, label in dofs.items()}
+
+
+def _checked_orders(orders: Iterable[int] | None) -> list[int]:
+    listed = sorted(set(range(2, 41) if orders is None else orders))
+    if len(listed) < 4 or not all(isinstance(n, int | np.integer) and n >= 1 for n in listed):
+        raise ModelError(
+            f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."
+        )
+    return [int(n) for n in listed]

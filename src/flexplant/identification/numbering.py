@@ -1,0 +1,127 @@
+"""Which mode of a model a measured pole is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import scipy.optimize as so
+
+from ..errors import LabelError, ModelError
+from ..labels import Place
+from ..reduction import Modes
+from ..values import ComplexArray, FloatArray, positive
+from .measured import MeasuredModes
+
+#: modes of a model nearer than this share are one family, whose shapes are known as a span only
+FAMILY = 5e-3
+
+
+def numbered(
+    measured: MeasuredModes,
+    model: Any,
+    *,
+    at: Mapping[str, Place] | None = None,
+    tolerance: float = 0.15,
+    least_mac: float = 0.5,
+    partial: bool = False,
+) -> MeasuredModes:
+    r"""Return measured modes with the numbers of the model's modes that they are.
+
+    Pairs minimise the sum of ``(ln(f / f_model) / tolerance)^2 + 1 - MAC`` (Hungarian method),
+
+    .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
+
+    over the measured DOFs; for repeated modes of the model (within 0.5 %) it is the MAC with the
+    nearest shape of their span.
+
+    Parameters
+    ----------
+    measured : MeasuredModes
+        With shapes, or paired by frequency alone.
+    model : Modes, or a model with `.modes()`
+        Its modes are numbered from 1, rigid-body modes included.
+    at : mapping {label of a shape's row: place}, optional
+        Where the rows of the shapes are; by default their labels are DOFs of the model.
+    tolerance : float
+        Largest relative difference of frequencies in a pair.
+    least_mac : float
+        Smallest MAC in a pair.
+    partial : bool
+        Leave out poles without a partner instead of refusing them: modes above half the
+        sampling rate fold into the band of a sampled measurement, and no model has them there.
+
+    Returns
+    -------
+    MeasuredModes
+        Of the same kind, in the same order, with `modes`.
+
+    Raises
+    ------
+    ModelError
+        When a pole has no partner (all of them, when `partial`), or an argument is out of range.
+    LabelError
+        When a shape's row is not known to the model.
+
+    References
+    ----------
+    Allemang, "The Modal Assurance Criterion - twenty years of use and abuse", Sound and Vibration
+    37 (2003) 14-21.
+    """
+    if not isinstance(measured, MeasuredModes):
+        raise ModelError(f"numbered takes MeasuredModes, got {type(measured).__name__}.")
+    modes = model.modes() if hasattr(model, "modes") and not isinstance(model, Modes) else model
+    if not isinstance(modes, Modes):
+        raise ModelError(
+            f"numbered compares with Modes or a model that has .modes(), got "
+            f"{type(model).__name__}. Solve it first: solve_modes(model, count=...)."
+        )
+    width = positive(tolerance, "tolerance")
+    if not 0 <= positive(least_mac, "least_mac", zero=True) < 1:
+        raise ModelError(f"least_mac must be below 1, got {least_mac:g}.")
+    elastic = np.flatnonzero(modes.omega > 0)
+    if not elastic.size:
+        raise ModelError("the model has no elastic modes to compare with.")
+    distance = np.abs(np.log(measured.freq[:, None] / modes.freq[elastic]))
+    alike = _likeness(measured, modes, elastic, at)
+    allowed = (distance <= width) & (alike >= least_mac)
+    cost = np.where(allowed, (distance / width) ** 2 + 1.0 - alike, 1e6)
+    rows, columns = so.linear_sum_assignment(cost)
+    pairs = {
+        int(i): int(elastic[j]) + 1 for i, j in zip(rows, columns, strict=True) if allowed[i, j]
+    }
+    lost = [i for i in range(len(measured)) if i not in pairs]
+    if lost and (not partial or not pairs):
+        worst = lost[0]
+        near = elastic[int(np.argmin(distance[worst]))]
+        raise ModelError(
+            f"no mode of the model of its own within {width:.0%} and a MAC of {least_mac:g} for "
+            f"the poles at {[round(float(measured.freq[i]), 2) for i in lost[:6]]} Hz; nearest to "
+            f"the first is mode {near + 1} at {modes.freq[near]:.5g} Hz with a MAC of "
+            f"{alike[worst, int(np.argmin(distance[worst]))]:.2f}. Add modes to the model, loosen "
+            "tolerance=, or leave these poles out with partial=True."
+        )
+    kept = sorted(pairs)
+    chosen = measured if len(kept) == len(measured) else measured.select(kept)
+    return chosen.replace(modes=tuple(pairs[i] for i in kept))
+
+
+def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
+    if measured.shapes is None or measured.dofs is None:
+        return np.ones((len(measured), elastic.size))
+    if at is not None and not isinstance(at, Mapping):
+        raise LabelError(f"at is a mapping from the labels of shapes to places, got {at!r:.60}.")
+    places = [(at or {}).get(label, label) for label in measured.dofs]
+    phi: ComplexArray = np.array(
+        [modes.at(place)[elastic] for place in places], dtype=np.complex128
+    )
+    unit = measured.shapes / np.linalg.norm(measured.shapes, axis=0)
+    alike = np.zeros((len(measured), elastic.size))
+    omega = modes.omega[elastic]
+    for j in range(elastic.size):
+        family = np.flatnonzero(np.abs(omega / omega[j] - 1.0) <= FAMILY)
+        basis, size, _ = np.linalg.svd(phi[:, family], full_matrices=False)
+        basis = basis[:, size > 1e-9 * max(float(size[0]), 1e-300)]
+        alike[:, j] = np.linalg.norm(basis.conj().T @ unit, axis=0) ** 2
+    return alike

@@ -1,0 +1,214 @@
+"""Periodic excitation: no leakage, and the noise is what changes from period to period."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..lti.frequency import Frf
+from ..values import ComplexArray, FloatArray, Value, positive
+from .records import Records
+from .spectra import error_statistics
+
+#: a line counts as excited when the weakest direction of the inputs is not this much below the rest
+EXCITED = 1e-3
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class Periodic(Value):
+    """Averages over periods of a multisine (or any periodic signal).
+
+    Parameters
+    ----------
+    period : float [s]
+        A whole number of samples; its inverse is the resolution.
+    discard : int
+        Periods at the start that are dropped, for transients to die out.
+    band : (low, high) [Hz], optional
+        Lines to use; by default all lines that are excited.
+    """
+
+    period: float
+    discard: int = 1
+    band: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        positive(self.period, "period")
+        if not isinstance(self.discard, int | np.integer) or self.discard < 0:
+            raise ModelError(f"discard must be a whole number from 0, got {self.discard!r}.")
+        if self.band is not None and not 0 <= self.band[0] < self.band[1]:
+            raise ModelError(f"band must be (low, high) in Hz, got {self.band!r}.")
+
+    def __repr__(self) -> str:
+        return f"Periodic(period of {self.period:g} s, {self.discard} discarded)"
+
+
+def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
+    r"""Return ``G = Y X^H (U X^H)^-1`` from the mean periods; X is U, or R of a reference.
+
+    With one experiment per input this is Y U^-1. Noise e = y - G u is what changes between
+    periods; its spectrum C_e gives the variance of every entry,
+
+    .. math:: \sigma^2_{oi} = \frac{[C_e]_{oo}}{P}\,\bigl[(U U^H)^{-1}\bigr]_{ii}
+
+    (Pintelon and Schoukens 2012, sec. 2.7).
+    """
+    n_exp, n_in, n_time = data.u.shape
+    samples = round(method.period * data.rate)
+    if abs(samples - method.period * data.rate) > 1e-6 * samples or samples < 4:
+        raise ModelError(
+            f"a period of {method.period:g} s is {method.period * data.rate:g} samples at "
+            f"{data.rate:g} Hz: it must be a whole number from 4, or the spectrum leaks."
+        )
+    periods = n_time // samples - int(method.discard)
+    if periods < 1:
+        raise ModelError(
+            f"the record holds {n_time / samples:.3g} periods, {method.discard} are discarded: "
+            "measure longer, or discard less."
+        )
+    if n_exp < n_in:
+        raise ModelError(
+            f"{n_exp} experiments cannot tell {n_in} periodic inputs apart: make one per input, "
+            "with the phases of `multisine`."
+        )
+    Y, U = (_spectra(side, samples, periods) for side in (data.y, data.u))
+    lines = np.arange(1, (samples + 1) // 2)
+    freq = lines / method.period
+    keep = _excited(U if data.r is None else _spectra(data.r, samples, periods))
+    if method.band is not None:
+        keep &= (freq >= method.band[0]) & (freq <= method.band[1])
+    if not np.any(keep):
+        raise ModelError("no line is excited in all directions of the inputs: check the records.")
+    Y, U = Y[..., keep], U[..., keep]
+    y, u = _mean(Y), _mean(U)
+    x = u if data.r is None else _mean(_spectra(data.r, samples, periods)[..., keep])
+    xh = x.conj().transpose(0, 2, 1)
+    back = u @ xh
+    G = np.linalg.solve(back.transpose(0, 2, 1), (y @ xh).transpose(0, 2, 1))
+    G = np.asarray(G.transpose(0, 2, 1), dtype=np.complex128)
+    variance: FloatArray | None = None
+    correlation: ComplexArray | None = None
+    left, freedom = _noise(Y, U, y, u, G)
+    if freedom > 0:
+        # the excitation's part of the inputs: U X^H (X X^H)^-1 X U^H
+        inverse: Any = np.linalg.inv(back @ np.linalg.solve(x @ xh, back.conj().transpose(0, 2, 1)))
+        variance, correlation = error_statistics(left, inverse)
+        if not np.all(variance > 0):
+            variance = correlation = None  # no noise at all: nothing to weight by
+    return Frf(
+        freq[keep],
+        G.transpose(1, 2, 0),
+        inputs=data.inputs,
+        outputs=data.outputs,
+        quantity=quantity,
+        coherence=_coherence(Y, left, periods, n_in) if variance is not None else None,
+        variance=variance,
+        correlation=correlation,
+    )
+
+
+def _spectra(signals: FloatArray, samples: int, periods: int) -> ComplexArray:
+    """Return the spectra (n_exp, n_channel, periods, lines) of the last periods."""
+    tail = signals[:, :, signals.shape[2] - periods * samples :]
+    cut = tail.reshape(*signals.shape[:2], periods, samples)
+    return np.asarray(np.fft.rfft(cut, axis=3)[..., 1 : (samples + 1) // 2])
+
+
+def _mean(spectra: ComplexArray) -> ComplexArray:
+    """Return means over periods (lines, n_channel, n_exp)."""
+    return np.asarray(spectra.mean(axis=2).transpose(2, 1, 0))
+
+
+def _excited(spectra: ComplexArray) -> Any:
+    singular = np.linalg.svd(_mean(spectra), compute_uv=False)[:, -1]
+    return singular > EXCITED * singular.max(initial=0.0)
+
+
+def _noise(
+    Y: ComplexArray, U: ComplexArray, y: ComplexArray, u: ComplexArray, G: ComplexArray
+) -> tuple[ComplexArray, int]:
+    """Return the noise spectrum of a mean period (lines, n_out, n_out) and its freedom."""
+    n_exp, periods, n_in = Y.shape[0], Y.shape[2], U.shape[1]
+    if periods > 1:
+        e = Y - np.einsum("foi,eipf->eopf", G, U)
+        e = e - e.mean(axis=2, keepdims=True)
+        freedom = n_exp * (periods - 1)
+        return np.einsum("eapf,ebpf->fab", e, e.conj()) / (freedom * periods), freedom
+    error = y - G @ u
+    freedom = n_exp - n_in
+    return error @ error.conj().transpose(0, 2, 1) / max(freedom, 1), freedom
+
+
+def _coherence(Y: ComplexArray, left: ComplexArray, periods: int, n_in: int) -> FloatArray:
+    """Return the share of the outputs' power in a period that is not noise."""
+    power = np.mean(np.abs(Y) ** 2, axis=(0, 2))
+    noise = np.einsum("foo->of", left).real * periods
+    coherence = np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
+    return np.repeat(coherence[:, None, :], n_in, axis=1)
+
+
+def multisine(
+    count: int,
+    *,
+    rate: float,
+    period: float,
+    periods: int = 1,
+    band: tuple[float, float] | None = None,
+    rms: float = 1.0,
+    rng: int | np.random.Generator | None = None,
+) -> FloatArray:
+    r"""Return random-phase multisines for `count` inputs in as many orthogonal experiments.
+
+    Input i in experiment e has the spectrum ``U(f) exp(2 pi i e k / count)`` with a common random
+    phase per line, so that U U^H is diagonal at every line (Dobrowiecki, Schoukens and Guillaume,
+    IEEE Trans. Instrumentation and Measurement 55 (2006) 1778-1786).
+
+    Parameters
+    ----------
+    count : int
+        Number of inputs.
+    rate : float [Hz]
+        Sampling rate.
+    period : float [s]
+        A whole number of samples.
+    periods : int
+        Repetitions.
+    band : (low, high) [Hz], optional
+        Excited lines; all below half the rate by default.
+    rms : float
+        Of each signal.
+    rng : int or Generator, optional
+        Of the phases.
+
+    Returns
+    -------
+    (count, count, n_time) array
+        By experiment, input and time.
+
+    Raises
+    ------
+    ModelError
+        When a number is out of range or no line lies in the band.
+    """
+    for name, number in (("count", count), ("periods", periods)):
+        if not isinstance(number, int | np.integer) or number < 1:
+            raise ModelError(f"{name} must be a whole number from 1, got {number!r}.")
+    exact = positive(period, "period") * positive(rate, "rate")
+    samples = round(exact)
+    if abs(samples - exact) > 1e-6 * exact or samples < 4:
+        raise ModelError(f"a period must be a whole number of samples from 4, got {exact:g}.")
+    lines = np.arange(1, (samples + 1) // 2)
+    if band is not None:
+        lines = lines[(lines >= band[0] * period) & (lines <= band[1] * period)]
+    if not lines.size:
+        raise ModelError(f"no line of a period of {period:g} s lies in the band {band!r} Hz.")
+    phases = np.exp(2j * np.pi * np.random.default_rng(rng).random(lines.size))
+    turns = np.exp(2j * np.pi * np.outer(np.arange(count), np.arange(count)) / count)
+    full = np.zeros((count, count, samples // 2 + 1), dtype=np.complex128)
+    full[:, :, lines] = turns[:, :, None] * phases
+    waves = np.fft.irfft(full, samples, axis=2)
+    waves *= positive(rms, "rms") / np.sqrt(np.mean(waves**2, axis=2, keepdims=True))
+    return np.asarray(np.tile(waves, (1, 1, int(periods))))

@@ -1,0 +1,69 @@
+"""Time records of experiments: checked arrays with names."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import ShapeError
+from ..values import FloatArray, real_array, signal_names
+
+
+@dataclass(frozen=True, eq=False)
+class Records:
+    """Inputs, outputs and references (n_exp, n_channel, n_time) of the same experiments."""
+
+    u: FloatArray
+    y: FloatArray
+    r: FloatArray | None
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    rate: float
+
+
+def records(inputs: Any, outputs: Any, reference: Any, rate: float) -> Records:
+    """Return records of arrays or mappings by name."""
+    u, in_names = _signals(inputs, "inputs", "u")
+    y, out_names = _signals(outputs, "outputs", "y")
+    sides = {"outputs": y}
+    r = None
+    if reference is not None:
+        r, _ = _signals(reference, "reference", "r")
+        sides["reference"] = r
+        if r.shape[1] != u.shape[1]:
+            raise ShapeError(
+                f"joint input-output needs one reference per input, got {r.shape[1]} for "
+                f"{u.shape[1]}: the inputs' response to the references must be invertible."
+            )
+    for name, side in sides.items():
+        if (side.shape[0], side.shape[2]) != (u.shape[0], u.shape[2]):
+            raise ShapeError(
+                f"inputs have {u.shape[0]} experiments of {u.shape[2]} samples, {name} "
+                f"{side.shape[0]} of {side.shape[2]}: they must be the same experiments."
+            )
+    return Records(u, y, r, in_names, out_names, rate)
+
+
+def _signals(value: Any, side: str, prefix: str) -> tuple[FloatArray, tuple[str, ...]]:
+    names: tuple[str, ...] = ()
+    if isinstance(value, Mapping):
+        names = tuple(str(name) for name in value)
+        parts = [real_array(part, f"{side}[{name!r}]") for name, part in value.items()]
+        if len({part.shape for part in parts}) != 1:
+            raise ShapeError(f"all {side} must have the same shape.")
+        array = np.stack(parts, axis=-2)
+    else:
+        array = real_array(value, side)
+    if array.ndim == 1:
+        array = array[None, :]
+    if array.ndim == 2:
+        array = array[None]
+    if array.ndim != 3 or 0 in array.shape:
+        raise ShapeError(
+            f"{side} must have shape (n_channel, n_time) or (n_exp, n_channel, n_time), or be a "
+            f"mapping from names to (n_time,) or (n_exp, n_time), got {array.shape}."
+        )
+    return array, signal_names(names, array.shape[1], prefix, side)

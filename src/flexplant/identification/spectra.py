@@ -1,0 +1,241 @@
+"""Averaged spectra of records, and what FRFs follow from them: H1, H2, Hv, joint input-output."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from ..lti.frequency import Frf
+from ..values import ComplexArray, FloatArray, Value, positive
+from .records import Records
+
+
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
+class SpectralMethod(Value):
+    """Averages of windowed, overlapping segments (Welch); the base of `H1`, `H2` and `Hv`.
+
+    Parameters
+    ----------
+    segment : float, optional
+        Length of a segment [s]; its inverse is the resolution. An eighth of the record by default.
+    overlap : float
+        Share of a segment that the next one sees again, 0 to below 1.
+    window : str or tuple
+        As `scipy.signal.get_window` knows; "boxcar" where all signals are periodic in a segment.
+    """
+
+    segment: float | None = None
+    overlap: float = 0.5
+    window: str | tuple[Any, ...] = "hann"
+
+    def __post_init__(self) -> None:
+        overlap = positive(self.overlap, "overlap", zero=True)
+        if overlap >= 0.95:
+            raise ModelError(f"overlap must be below 0.95, got {overlap:g}: it brings nothing new.")
+        if self.segment is not None:
+            positive(self.segment, "segment")
+        from scipy.signal import get_window  # costs a third of a second that few need
+
+        try:
+            get_window(self.window, 16)
+        except (ValueError, TypeError) as error:
+            raise ModelError(
+                f"window {self.window!r} is not one of scipy.signal: {error}"
+            ) from error
+
+    def __repr__(self) -> str:
+        length = "an eighth of the record" if self.segment is None else f"{self.segment:g} s"
+        return f"{type(self).__name__}(segments of {length}, window {self.window!r})"
+
+
+class H1(SpectralMethod):
+    """``G = S_yu S_uu^-1``: unbiased with noise on outputs, in open loop."""
+
+
+class H2(SpectralMethod):
+    """``G = S_yy S_uy^-1``: unbiased with noise on inputs; for one input, or n_out = n_in."""
+
+
+class Hv(SpectralMethod):
+    """Total least squares of every output and all inputs, each scaled to unit power per line.
+
+    For one input its size is the geometric mean of those of H1 and H2.
+    """
+
+
+@dataclass(frozen=True, eq=False)
+class Averages:
+    """Spectra (n_freq, n, n) of [y; u; r] over `count` effective averages."""
+
+    freq: FloatArray
+    S: ComplexArray
+    count: float
+    n_out: int
+    n_in: int
+
+    def block(self, a: str, b: str) -> ComplexArray:
+        """Return the cross spectra of two of "y", "u", "r"."""
+        n, m = self.n_out, self.n_in
+        sides = {"y": slice(0, n), "u": slice(n, n + m), "r": slice(n + m, n + 2 * m)}
+        return self.S[:, sides[a], sides[b]]
+
+
+def averages(data: Records, method: SpectralMethod) -> Averages:
+    """Return Welch averages over segments and experiments; zero frequency is left out."""
+    from scipy.signal import get_window
+
+    n_time = data.u.shape[2]
+    length = n_time // 8 if method.segment is None else round(method.segment * data.rate)
+    if not 8 <= length <= n_time:
+        raise ModelError(
+            f"a segment of {length} samples in a record of {n_time}: choose segment= between "
+            f"{8 / data.rate:g} and {n_time / data.rate:g} s."
+        )
+    window = np.asarray(get_window(method.window, length), dtype=np.float64)
+    hop = max(1, round(length * (1.0 - method.overlap)))
+    starts = range(0, n_time - length + 1, hop)
+    sides = [data.y, data.u] + ([] if data.r is None else [data.r])
+    signals = np.concatenate(sides, axis=1)
+    lines = length // 2 + 1
+    S = np.zeros((lines, signals.shape[1], signals.shape[1]), dtype=np.complex128)
+    for start in starts:
+        part = signals[:, :, start : start + length]
+        part = (part - part.mean(axis=2, keepdims=True)) * window
+        spectrum = np.fft.rfft(part, axis=2)
+        S += np.einsum("eaf,ebf->fab", spectrum, spectrum.conj())
+    total = len(starts) * signals.shape[0]
+    count = signals.shape[0] * _effective(window, hop, len(starts))
+    freq: FloatArray = np.asarray(np.fft.rfftfreq(length, 1.0 / data.rate), dtype=np.float64)
+    # at zero and at half the rate a spectrum is real, and the mean was taken off
+    keep = slice(1, (length + 1) // 2)
+    return Averages(freq[keep], S[keep] / total, count, data.y.shape[1], data.u.shape[1])
+
+
+def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) -> Frf:
+    """Return the FRF of averaged spectra, with multiple coherence and variance."""
+    found = averages(data, method)
+    n_ref = found.n_in
+    if found.count <= n_ref + 1:
+        raise ModelError(
+            f"{found.count:.1f} independent averages cannot tell {n_ref} inputs and noise apart: "
+            "shorten segment=, or measure longer."
+        )
+    if data.r is None:
+        G = _open_loop(found, method)
+        explained = _solved(found.block("u", "u"), found.block("u", "y"))
+        inverse = _inverse(found.block("u", "u"))
+        coherent = np.einsum("fyu,fuy->fy", found.block("y", "u"), explained).real
+    else:
+        if type(method) is not H1:
+            raise ModelError(
+                "with a reference the estimate is joint input-output, G = S_yr S_ur^-1: pass "
+                "method=H1(...) or Periodic(...)."
+            )
+        back = found.block("u", "r")
+        G = _right_divided(found.block("y", "r"), back)
+        explained = _solved(found.block("r", "r"), found.block("r", "y"))
+        inverse = _inverse(back @ _solved(found.block("r", "r"), back.conj().transpose(0, 2, 1)))
+        coherent = np.einsum("fyu,fuy->fy", found.block("y", "r"), explained).real
+    power = np.einsum("fyy->fy", found.block("y", "y")).real
+    coherence = np.clip(coherent / np.maximum(power, 1e-300), 0.0, 1.0)
+    left = _left_over(found, G, with_reference=data.r is not None)
+    left = left * (found.count / (found.count - n_ref))
+    variance, correlation = error_statistics(left, inverse / found.count)
+    return Frf(
+        found.freq,
+        G.transpose(1, 2, 0),
+        inputs=data.inputs,
+        outputs=data.outputs,
+        quantity=quantity,
+        coherence=np.repeat(coherence.T[:, None, :], found.n_in, axis=1),
+        variance=variance,
+        correlation=correlation,
+    )
+
+
+def error_statistics(left: ComplexArray, inverse: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+    """Return variance (o, i, f) and correlation (o, o, f) from noise and inverse input spectra."""
+    noise = np.maximum(np.einsum("foo->fo", left).real, 0.0)
+    gain = np.einsum("fii->fi", inverse).real
+    variance = noise[:, :, None] * gain[:, None, :]
+    size = np.sqrt(np.maximum(noise, 1e-300))
+    correlation = left / (size[:, :, None] * size[:, None, :])
+    correlation = (correlation + correlation.conj().transpose(0, 2, 1)) / 2
+    correlation /= np.maximum(1.0, np.abs(correlation))
+    rows = np.arange(left.shape[1])
+    correlation[:, rows, rows] = 1.0
+    return variance.transpose(1, 2, 0), correlation.transpose(1, 2, 0)
+
+
+def _left_over(found: Averages, G: ComplexArray, *, with_reference: bool) -> ComplexArray:
+    """Return the spectrum (n_freq, n_out, n_out) of the part of y - G u that is noise."""
+    n = found.n_out + found.n_in
+    S = found.S[:, :n, :n]
+    if with_reference:
+        known = found.S[:, n:, :n]
+        S = S - known.conj().transpose(0, 2, 1) @ _solved(found.block("r", "r"), known)
+    row = np.concatenate(
+        [np.broadcast_to(np.eye(found.n_out), G.shape[:1] + (found.n_out,) * 2), -G], 2
+    )
+    return np.asarray(row @ S @ row.conj().transpose(0, 2, 1))
+
+
+def _open_loop(found: Averages, method: SpectralMethod) -> ComplexArray:
+    yu, uu, yy = found.block("y", "u"), found.block("u", "u"), found.block("y", "y")
+    if isinstance(method, H2):
+        if found.n_in == 1:
+            power = np.einsum("foo->fo", yy)[:, :, None]
+            return np.asarray(power / yu.conj())
+        if found.n_in != found.n_out:
+            raise ShapeError(
+                f"H2 inverts the cross spectra of outputs and inputs, got {found.n_out} and "
+                f"{found.n_in}: take as many outputs as inputs, or H1 or Hv."
+            )
+        return _right_divided(yy, yu.conj().transpose(0, 2, 1))
+    if isinstance(method, Hv):
+        rows = [_total(found, o) for o in range(found.n_out)]
+        return np.stack(rows, axis=1)
+    return _right_divided(yu, uu)
+
+
+def _total(found: Averages, output: int) -> ComplexArray:
+    places = np.array([output, *range(found.n_out, found.n_out + found.n_in)])
+    S = found.S[:, places[:, None], places]
+    size = np.sqrt(np.maximum(np.einsum("faa->fa", S).real, 1e-300))
+    vectors = np.linalg.eigh(S / (size[:, :, None] * size[:, None, :]))[1][:, :, 0].conj()
+    # of the smallest eigenvalue: v_y y + v_u u = 0
+    vectors = vectors / size
+    return np.asarray(-vectors[:, 1:] / vectors[:, :1])
+
+
+def _effective(window: FloatArray, hop: int, count: int) -> float:
+    """Return the number of independent averages of overlapping segments (Welch 1967)."""
+    power, doubled = float(np.sum(window**2)), 0.0
+    for lag in range(1, count):
+        shift = lag * hop
+        if shift >= window.size:
+            break
+        shared = float(np.sum(window[shift:] * window[:-shift])) / power
+        doubled += (1.0 - lag / count) * shared**2
+    return count / (1.0 + 2.0 * doubled)
+
+
+def _right_divided(a: ComplexArray, b: ComplexArray) -> ComplexArray:
+    return _solved(b.transpose(0, 2, 1), a.transpose(0, 2, 1)).transpose(0, 2, 1)
+
+
+def _inverse(a: ComplexArray) -> ComplexArray:
+    return _solved(a, np.broadcast_to(np.eye(a.shape[1], dtype=np.complex128), a.shape))
+
+
+def _solved(a: ComplexArray, b: ComplexArray) -> ComplexArray:
+    size = np.linalg.svd(a, compute_uv=False)
+    if np.any(size[:, -1] <= 1e-12 * size[:, 0]):
+        raise ModelError(
+            "the inputs (or references) are dependent at some lines: excite all inputs there, "
+            "independently or in as many experiments as there are inputs."
+        )
+    return np.asarray(np.linalg.solve(a, b))

@@ -1,0 +1,105 @@
+"""Which lines count how much: from the variance of a measurement, or from what a fit left over."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy.ndimage as ndi
+
+from ..errors import ModelError
+from ..lti.frequency import Frf
+from ..values import ComplexArray, FloatArray, real_array
+
+#: lines over which what a fit leaves is averaged to a variance
+WINDOW = 41
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """Displacement responses of the band, the smaller side as references (second axis)."""
+
+    freq: FloatArray
+    data: ComplexArray
+    weight: FloatArray
+    correlation: ComplexArray | None
+    known: bool  # whether the weights come from a variance
+    swapped: bool
+
+    @property
+    def line_weight(self) -> FloatArray:
+        """Weights (n_out, n_freq) of whole rows, as a matrix fraction needs them."""
+        mean = 1.0 / np.sqrt(np.mean(self.weight**-2.0, axis=1))
+        return np.asarray(mean / mean.max())
+
+    def from_errors(self, power: FloatArray, fitted_share: float) -> Prepared:
+        """Return the same with weights from the squared errors of a rough fit."""
+        # at sharp peaks such a fit leaves more than noise; the median does not see them
+        power = ndi.median_filter(power, (1, 1, WINDOW), mode="nearest") / np.log(2.0)
+        return self._weighted(power, fitted_share)
+
+    def from_residuals(self, error: ComplexArray, fitted_share: float) -> Prepared:
+        """Return the same with weights from what a fit left, averaged over lines."""
+        power = ndi.uniform_filter1d(np.abs(error) ** 2, WINDOW, axis=2, mode="nearest")
+        return self._weighted(power, fitted_share)
+
+    def _weighted(self, power: FloatArray, fitted_share: float) -> Prepared:
+        floor = 1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True)
+        variance = np.maximum(power / (1.0 - fitted_share), floor)
+        return replace(self, weight=np.sqrt(2.0 / variance))
+
+
+def prepared(frf: Any, band: Any) -> Prepared:
+    """Return what is fitted of an FRF, checked."""
+    if not isinstance(frf, Frf):
+        raise ModelError(
+            f"modes are identified from an Frf, got {type(frf).__name__}. Make one of time data "
+            "with estimate_frf, or of arrays with Frf(freq, data)."
+        )
+    low, high = checked_band(band, frf.freq)
+    inside = (frf.freq >= low) & (frf.freq <= high) & (frf.freq > 0)
+    if np.sum(inside) < 20:
+        raise ModelError(
+            f"only {int(np.sum(inside))} lines lie in the band {low:g} .. {high:g} Hz: at least 20 "
+            "are needed, and several per resonance. Widen the band or measure longer."
+        )
+    freq, data = frf.freq[inside], frf.data[:, :, inside]
+    order = {"velocity": 1, "acceleration": 2}.get(frf.quantity or "", 0)
+    factor = (2j * np.pi * freq) ** -float(order)
+    known = frf.variance is not None
+    if frf.variance is not None:
+        variance = frf.variance[:, :, inside]
+        if np.any(variance <= 0):
+            raise ModelError(
+                "the FRF's variance is zero at some lines, which would count infinitely: leave "
+                "them out, or drop the variance with frf.replace(variance=None)."
+            )
+    else:
+        power = np.abs(data) ** 2
+        if not np.all(np.any(power, axis=2)):
+            raise ModelError("a channel of the FRF is zero at all lines: leave it out.")
+        # relative errors above the median response, absolute ones below: a start, no more
+        variance = 1e-4 * (power + np.median(power[power > 0]) * 1e-2)
+    weight = np.sqrt(2.0 / variance) / np.abs(factor)
+    data = data * factor
+    correlation = None if frf.correlation is None else frf.correlation[:, :, inside]
+    swapped = data.shape[0] < data.shape[1]
+    if swapped:
+        data, weight = data.transpose(1, 0, 2), weight.transpose(1, 0, 2)
+    return Prepared(freq, data, weight, correlation, known, swapped)
+
+
+def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:
+    """Return (low, high) [Hz]; all of the measurement when None."""
+    if not freq.size:
+        raise ModelError("the Frf has no frequencies.")
+    if band is None:
+        return float(freq[0]), float(freq[-1])
+    low, high = real_array(band, "band", (2,)).tolist()
+    if not 0 <= low < high or high < freq[0] or low > freq[-1]:
+        raise ModelError(
+            f"band must be (low, high) in Hz within {freq[0]:g} .. {freq[-1]:g}, got "
+            f"({low:g}, {high:g})."
+        )
+    return low, high
