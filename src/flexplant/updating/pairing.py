@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.sparse import csr_array
-from scipy.sparse.csgraph import connected_components
 
 from ..values import ComplexArray, FloatArray, IntArray
 from .pencil import groups
@@ -58,10 +56,18 @@ def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     """Return the new modes of a cluster in the order of its old ones."""
     s = old.size
     new = np.sort(new)
-    graph = np.zeros((2 * s, 2 * s), dtype=np.int8)
-    graph[:s, s:] = shapes[np.ix_(old, new)] > FOREIGN
-    count, part = connected_components(csr_array(graph), directed=False)
-    sides = [(np.flatnonzero(part[:s] == c), np.flatnonzero(part[s:] == c)) for c in range(count)]
+    linked = shapes[np.ix_(old, new)] > FOREIGN
+    # what a mode reaches through shapes in common: a few rounds of union
+    reach = linked @ linked.T | np.eye(s, dtype=bool)
+    for _ in range(int(s).bit_length()):
+        reach = reach @ reach
+    sides, seen = [], np.zeros(s, dtype=bool)
+    for i in range(s):
+        if not seen[i]:
+            seen |= reach[i]
+            sides.append((np.flatnonzero(reach[i]), np.flatnonzero(linked[reach[i]].any(axis=0))))
+    if sum(b.size for _, b in sides) != s:
+        return new
     if any(a.size != b.size for a, b in sides):
         return new
     found = new.copy()

@@ -19,11 +19,14 @@ Derivatives: TypeAlias = "tuple[FloatArray | None, FloatArray | None, FloatArray
 class Parameter(Value):
     """One unknown p on which M, D and K depend affinely: M(p) = M + p dM, and so on.
 
-    A subclass has a unique `name`, a `unit` and says its matrices.
+    A subclass has a unique `name`, a `unit` and says its matrices; `bounds` (lowest, highest) and
+    `prior` (mean, standard deviation) may say what is known of p beforehand.
     """
 
     name: str
-    unit: ClassVar[str] = ""
+    unit: str
+    bounds: tuple[float, float] | None
+    prior: tuple[float, float] | None
 
     def matrices(self, model: Any) -> Derivatives:
         """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero.
@@ -52,16 +55,27 @@ class PointParameter(Parameter):
         Of the motion at a point; labels carry their own.
     name : str, optional
         For results; made from the place when not given.
+    to : str, (3,) array [m] or mapping, optional
+        The other end; the ground when not given. Then r = row(at) - row(to).
+    bounds : (lowest, highest), optional
+        The parameter is kept between them; None or an infinity is no bound.
+    prior : (mean, standard deviation), optional
+        What is known beforehand, a normal distribution.
 
     Raises
     ------
     LabelError
-        When the direction is unknown or `at` is no place.
+        When the direction is unknown or `at` or `to` is no place.
+    ModelError
+        When bounds or prior make no sense.
     """
 
     at: Place
     direction: str = field(default="z", kw_only=True)
     name: str = field(default="", kw_only=True)
+    to: Place | None = field(default=None, kw_only=True)
+    bounds: tuple[float, float] | None = field(default=None, kw_only=True)
+    prior: tuple[float, float] | None = field(default=None, kw_only=True)
 
     quantity: ClassVar[str] = ""
     acts_on: ClassVar[int] = 0
@@ -70,8 +84,13 @@ class PointParameter(Parameter):
         if self.direction not in DIRECTIONS:
             raise unknown_label("direction", self.direction, DIRECTIONS)
         place, text = _checked_place(self.at, self.direction)
+        other = self.to
+        if other is not None:
+            other, end = _checked_place(other, self.direction, "to")
+            text += f" to {end}"
         name = str(self.name or f"{self.quantity} at {text}")
-        self._set(at=place, direction=self.direction, name=name)
+        self._set(at=place, direction=self.direction, name=name, to=other)
+        self._set(bounds=checked_bounds(self.bounds, name), prior=checked_prior(self.prior, name))
 
     def __repr__(self) -> str:
         return f"<{type(self).__name__}: {self.name} [{self.unit}]>"
@@ -86,6 +105,8 @@ class PointParameter(Parameter):
         """
         rows = model if hasattr(model, "row") else model.dofs
         row = np.asarray(rows.row(self.at, self.direction), dtype=np.float64)
+        if self.to is not None:
+            row = row - np.asarray(rows.row(self.to, self.direction), dtype=np.float64)
         if not np.any(row):
             raise ModelError(
                 f"{self.name} acts on nothing: its weights are all zero. Give a place with motion."
@@ -107,6 +128,12 @@ class AddedMass(PointParameter):
         Of the motion at a point; labels carry their own.
     name : str, optional
         For results; made from the place when not given.
+    to : str, (3,) array [m] or mapping, optional
+        The other end; the ground when not given.
+    bounds : (lowest, highest), optional
+        The parameter is kept between them.
+    prior : (mean, standard deviation), optional
+        What is known beforehand, a normal distribution.
 
     Examples
     --------
@@ -120,7 +147,7 @@ class AddedMass(PointParameter):
 
 
 class AddedDamping(PointParameter):
-    """A viscous damper [N s/m] between a place and the ground: D + p r r^T.
+    """A viscous damper [N s/m] between a place and the ground, or another: D + p r r^T.
 
     Parameters
     ----------
@@ -131,6 +158,12 @@ class AddedDamping(PointParameter):
         Of the motion at a point; labels carry their own.
     name : str, optional
         For results; made from the place when not given.
+    to : str, (3,) array [m] or mapping, optional
+        The other end; the ground when not given.
+    bounds : (lowest, highest), optional
+        The parameter is kept between them.
+    prior : (mean, standard deviation), optional
+        What is known beforehand, a normal distribution.
 
     Examples
     --------
@@ -144,7 +177,7 @@ class AddedDamping(PointParameter):
 
 
 class AddedStiffness(PointParameter):
-    """A spring [N/m] between a place and the ground: K + p r r^T.
+    """A spring [N/m] between a place and the ground, or another: K + p r r^T.
 
     On a free structure a spring to the ground takes away the rigid-body modes that move it; they
     become suspension modes, with sqrt(p) as frequency, so they can only be fitted from a start
@@ -159,6 +192,12 @@ class AddedStiffness(PointParameter):
         Of the motion at a point; labels carry their own.
     name : str, optional
         For results; made from the place when not given.
+    to : str, (3,) array [m] or mapping, optional
+        The other end; the ground when not given.
+    bounds : (lowest, highest), optional
+        The parameter is kept between them.
+    prior : (mean, standard deviation), optional
+        What is known beforehand, a normal distribution.
 
     Examples
     --------
@@ -171,18 +210,48 @@ class AddedStiffness(PointParameter):
     acts_on = 2
 
 
-def _checked_place(at: Any, direction: str) -> tuple[Place, str]:
+def _checked_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str]:
     if isinstance(at, str):
         if not at:
-            raise LabelError("at='' is no place: give a DOF label such as '41:z', or a point.")
+            raise LabelError(f"{what}='' is no place: give a DOF label such as '41:z', or a point.")
         return at, at
     if isinstance(at, Mapping):
         if not at:
-            raise LabelError("at={} is no place: give {DOF label: weight}.")
+            raise LabelError(f"{what}={{}} is no place: give {{DOF label: weight}}.")
         weights = {
             str(label): float(real_array(weight, f"weight of {label!r}", ()))
             for label, weight in at.items()
         }
         return weights, " ".join(f"{weight:+g}*{label}" for label, weight in weights.items())
-    point = tuple(real_array(at, "at", (3,)).tolist())
+    point = tuple(real_array(at, what, (3,)).tolist())
     return point, "(" + ", ".join(f"{x:g}" for x in point) + f") {direction}"
+
+
+def checked_bounds(value: Any, name: str) -> tuple[float, float] | None:
+    """Return (lowest, highest), None when there are none."""
+    if value is None:
+        return None
+    pair = np.asarray(value, dtype=object)
+    if pair.shape != (2,):
+        raise ModelError(f"bounds of {name} must be (lowest, highest), got {value!r:.60}.")
+    try:
+        low = -np.inf if pair[0] is None else float(pair[0])
+        high = np.inf if pair[1] is None else float(pair[1])
+    except (TypeError, ValueError) as error:
+        raise ModelError(f"bounds of {name} must be two numbers, got {value!r:.60}.") from error
+    if not low < high:
+        raise ModelError(f"bounds of {name} must be lowest < highest, got ({low:g}, {high:g}).")
+    return low, high
+
+
+def checked_prior(value: Any, name: str) -> tuple[float, float] | None:
+    """Return (mean, standard deviation), None when there is no prior."""
+    if value is None:
+        return None
+    mean, std = real_array(value, f"prior of {name}", (2,)).tolist()
+    if std <= 0:
+        raise ModelError(
+            f"the prior of {name} needs a positive standard deviation, got {std:g}: a parameter "
+            "that is known exactly belongs to the model."
+        )
+    return mean, std

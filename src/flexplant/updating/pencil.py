@@ -3,23 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
 from ..errors import ModelError
 from ..structure.eigen import elastic_modes
 from ..structure.factor import dense
 from ..structure.rigid import orthonormalised
-from ..values import ComplexArray, FloatArray
+from ..values import ComplexArray, FloatArray, IntArray
 from .parameters import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
 REPEATED = 1e-8
 #: share of a spring's deflection below which a rigid-body motion leaves it alone
 HELD = 1e-9
+#: coupling of modes by damping, relative to the diagonal, below which it is none
+UNCOUPLED = 1e-13
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,7 @@ class Eigen:
     M: FloatArray
     D: FloatArray
     n_rigid: int
+    K: FloatArray | None = None
 
     def scale(self, columns: Sequence[int]) -> ComplexArray:
         """Return y^H (2 lambda M + D) x of every mode of `columns` with every other."""
@@ -44,7 +49,7 @@ class Eigen:
         X, Y = self.X.copy(), self.Y.copy()
         X[:, columns] = X[:, columns] @ Q
         Y[:, columns] = Y[:, columns] @ la.inv(Q).conj().T
-        return Eigen(self.poles, X, Y, self.M, self.D, self.n_rigid)
+        return Eigen(self.poles, X, Y, self.M, self.D, self.n_rigid, self.K)
 
 
 class Family:
@@ -52,10 +57,24 @@ class Family:
 
     In SI a reduced pencil's rigid-body modes come out at 1e-4 rad/s and its lowest elastic modes
     lose digits to the highest; in the modal coordinates of the start, the rigid-body basis
-    deflated, neither happens.
+    deflated, neither happens. DOFs that no mass and no damper touches (rotations of a lumped mass
+    matrix) are condensed statically at each value of the parameters; then the coordinates are the
+    model's own.
+
+    Parameters
+    ----------
+    model : ReducedModel or FEModel
+        The model.
+    parameters : sequence of q Parameter
+        What changes.
+    highest : int, optional
+        The highest mode number that will be asked for; an undamped model with condensed DOFs is
+        solved no further.
     """
 
-    def __init__(self, model: Any, parameters: Sequence[Parameter]) -> None:
+    def __init__(
+        self, model: Any, parameters: Sequence[Parameter], *, highest: int | None = None
+    ) -> None:
         if not all(hasattr(model, part) for part in ("M", "D", "K", "dofs", "rigid_body")):
             raise ModelError(
                 f"the model must have M, D, K, a rigid_body basis and dofs, as FEModel and "
@@ -63,19 +82,40 @@ class Family:
             )
         M, D, K = (_dense(part, model) for part in (model.M, model.D, model.K))
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
-        omega, V = _modal_basis(M, K, rigid)
+        self.model = model
         self.parameters = tuple(parameters)
         self.n_rigid = rigid.shape[1]
-        self.omega2 = omega**2
-        self.D = V.T @ D @ V
-        self.V = V
+        self.highest = highest
         k, q = M.shape[0], len(self.parameters)
         self.physical = [np.zeros((q, k, k)) for _ in range(3)]
         for b, parameter in enumerate(self.parameters):
             for stack, part in zip(self.physical, parameter.matrices(model), strict=True):
                 if part is not None:
                     stack[b] = part
-        self.dM, self.dD, self.dK = (V.T @ stack @ V for stack in self.physical)
+        self.massive = _massive(M, D, self.physical)
+        if self.massive.size < k and not self.n_rigid:
+            self.V = np.eye(k)
+            self.M, self.D, self.K = M, D, K
+            self.dM, self.dD, self.dK = self.physical
+        else:
+            self.massive = np.arange(k)
+            omega, self.V = _modal_basis(M, K, rigid)
+            self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
+            self.dM, self.dD, self.dK = (self.V.T @ stack @ self.V for stack in self.physical)
+        self.condensed = self.massive.size < k
+        self._stacks = [_stacked(stack) for stack in (self.dM, self.dD, self.dK)]
+        self._weight: FloatArray | None = None
+
+    def of(self, parameters: Sequence[int]) -> Family:
+        """Return the family of some of the parameters, by position; coordinates are shared."""
+        part = copy(self)
+        part.parameters = tuple(self.parameters[b] for b in parameters)
+        part.physical = [stack[list(parameters)] for stack in self.physical]
+        part.dM, part.dD, part.dK = (
+            stack[list(parameters)] for stack in (self.dM, self.dD, self.dK)
+        )
+        part._stacks = [_stacked(stack) for stack in (part.dM, part.dD, part.dK)]
+        return part
 
     def text(self, p: FloatArray) -> str:
         """Return the parameters with values and units."""
@@ -102,31 +142,89 @@ class Family:
         ModelError
             When M is not positive definite there, or K is indefinite.
         """
-        k = self.omega2.size
-        M = np.eye(k) + np.tensordot(p, self.dM, axes=1)
-        D = self.D + np.tensordot(p, self.dD, axes=1)
-        K = np.diag(self.omega2) + np.tensordot(p, self.dK, axes=1)
-        rigid = np.zeros((k, 0))
+        M, D, K = self.matrices(p)
+        k = K.shape[0]
+        rigid = np.zeros((self.massive.size, 0))
         if self.n_rigid:
             rigid = np.eye(k)[:, : self.n_rigid] @ self.rigid_left(p)
         try:
+            if self.condensed:
+                return self._condensed(M, D, K)
             omega, W = _modal_basis(M, K, rigid)
         except ModelError as error:
             raise ModelError(f"with {self.text(p)}: {error}") from None
         poles, velocities = _oscillating(omega, W.T @ D @ W, rigid.shape[1])
-        X = W @ velocities
+        X = np.asarray(W @ velocities, dtype=np.complex128)
         # M, D, K symmetric: the left eigenvectors are the conjugated right ones
-        return Eigen(poles, X, X.conj(), M, D, rigid.shape[1])
+        return Eigen(poles, X, X.conj(), M, D, rigid.shape[1], K)
+
+    def matrices(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return M, D and K at `p` in the coordinates of the family."""
+        M, D, K = (
+            start if stack is None else start + np.tensordot(p, change, axes=1)
+            for start, stack, change in zip(
+                (self.M, self.D, self.K),
+                self._stacks,
+                (self.dM, self.dD, self.dK),
+                strict=True,
+            )
+        )
+        return M, D, K
+
+    def moved(self, X: ComplexArray, factors: Sequence[ComplexArray]) -> ComplexArray:
+        """Return ``f0 dM X + f1 dD X + f2 dK X`` (q, k, m), each column with its own factors."""
+        k, m = X.shape
+        total = np.zeros((len(self.parameters), k, m), dtype=np.complex128)
+        for stack, factor in zip(self._stacks, factors, strict=True):
+            if stack is not None:
+                part = stack @ X.real
+                if np.any(X.imag):
+                    part = part + 1j * (stack @ X.imag)
+                total += part.reshape(-1, k, m) * factor
+        return total
+
+    def _condensed(self, M: FloatArray, D: FloatArray, K: FloatArray) -> Eigen:
+        """Return the modes with the DOFs without mass condensed statically."""
+        m = self.massive
+        s = np.setdiff1d(np.arange(M.shape[0]), m)
+        try:
+            follow = la.cho_solve(la.cho_factor(K[np.ix_(s, s)]), K[np.ix_(s, m)])
+        except la.LinAlgError:
+            raise ModelError(
+                "K is not positive definite in the DOFs without mass: they could move freely. "
+                "Look at negative stiffnesses."
+            ) from None
+        Mm, Dm = M[np.ix_(m, m)], D[np.ix_(m, m)]
+        Km = K[np.ix_(m, m)] - K[np.ix_(m, s)] @ follow
+        count = None
+        if self.highest is not None and not np.any(Dm):
+            count = self.highest + 6
+        omega, W = _modal_basis(Mm, (Km + Km.T) / 2, np.zeros((m.size, 0)), count)
+        poles, velocities = _oscillating(omega, W.T @ Dm @ W, 0)
+        X = np.zeros((M.shape[0], poles.size), dtype=np.complex128)
+        X[m] = W @ velocities
+        X[s] = -follow @ X[m]
+        return Eigen(poles, X, X.conj(), M, D, 0, K)
+
+    def weighted(self, X: ComplexArray) -> ComplexArray:
+        """Return shapes in coordinates where the start's mass matrix is the unit matrix."""
+        if not self.condensed:
+            return X
+        if self._weight is None:
+            self._weight = la.cholesky(self.M[np.ix_(self.massive, self.massive)])
+        return np.asarray(self._weight @ X[self.massive], dtype=np.complex128)
 
     def derivatives(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
         """Return y^H (lambda^2 dM + lambda dD + dK) x for all pairs of `columns`, (q, m, m)."""
         X, poles = eigen.X[:, columns], eigen.poles[columns]
-        moved = self.dM @ (X * poles**2) + self.dD @ (X * poles) + self.dK @ X
+        moved = self.moved(X, (poles**2, poles, np.ones_like(poles)))
         return np.asarray(eigen.Y[:, columns].conj().T @ moved, dtype=np.complex128)
 
     def sensitivity(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
         """Return d lambda / d p (m, q) of distinct modes, each by its own vectors."""
-        change = np.diagonal(self.derivatives(eigen, columns), axis1=1, axis2=2)
+        X, poles = eigen.X[:, columns], eigen.poles[columns]
+        moved = self.moved(X, (poles**2, poles, np.ones_like(poles)))
+        change = np.sum(eigen.Y[:, columns].conj() * moved, axis=1)
         return np.asarray(-(change / np.diag(eigen.scale(columns))).T, dtype=np.complex128)
 
     def group_derivative(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
@@ -170,7 +268,26 @@ def _dense(part: Any, model: Any) -> FloatArray:
     return np.zeros(model.M.shape) if part is None else dense(part)
 
 
-def _modal_basis(M: FloatArray, K: FloatArray, rigid: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _stacked(stack: FloatArray) -> Any:
+    """Return (q, k, k) matrices below each other, sparse where that saves work, None if zero."""
+    q, k, _ = stack.shape
+    filled = np.count_nonzero(stack)
+    if not filled:
+        return None
+    flat = stack.reshape(q * k, k)
+    return sp.csr_array(flat) if k > 60 and filled < 0.2 * flat.size else flat
+
+
+def _massive(M: FloatArray, D: FloatArray, stacks: Sequence[FloatArray]) -> IntArray:
+    """Return the DOFs that some mass or damper touches."""
+    touched = np.any(M != 0, axis=0) | np.any(D != 0, axis=0)
+    touched |= np.any(stacks[0] != 0, axis=(0, 1)) | np.any(stacks[1] != 0, axis=(0, 1))
+    return np.flatnonzero(touched).astype(np.int64)
+
+
+def _modal_basis(
+    M: FloatArray, K: FloatArray, rigid: FloatArray, count: int | None = None
+) -> tuple[FloatArray, FloatArray]:
     """Return omega and M-orthonormal modes [rigid, elastic], the rigid ones deflated."""
     try:
         la.cholesky(M)
@@ -180,7 +297,7 @@ def _modal_basis(M: FloatArray, K: FloatArray, rigid: FloatArray) -> tuple[Float
             "Look at negative masses."
         ) from None
     rigid = orthonormalised(M, rigid)
-    omega, phi = elastic_modes(M, K, rigid)
+    omega, phi = elastic_modes(M, K, rigid, count)
     return np.concatenate([np.zeros(rigid.shape[1]), omega]), np.hstack([rigid, phi])
 
 
@@ -192,6 +309,14 @@ def _oscillating(omega: FloatArray, D: FloatArray, r: int) -> tuple[ComplexArray
     """
     k = omega.size
     e = k - r
+    size = np.abs(D)
+    if np.sum(size) - np.trace(size) <= UNCOUPLED * np.max(size, initial=0.0):
+        half = np.diag(D) / 2
+        root = np.sqrt(np.maximum(omega**2 - half**2, 0.0))
+        keep = np.flatnonzero(root > 1e-7 * np.max(omega, initial=0.0))
+        keep = keep[keep >= r]
+        poles = -half[keep] + 1j * root[keep]
+        return poles, np.eye(k, dtype=np.complex128)[:, keep]
     A = np.zeros((e + k, e + k))
     A[np.arange(e), e + r + np.arange(e)] = omega[r:]
     A[e + r + np.arange(e), np.arange(e)] = -omega[r:]

@@ -7,14 +7,19 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
 from ..errors import LabelError, ModelError
 from ..identification import MeasuredModes
-from ..values import ComplexArray, FloatArray, Value, real_array
+from ..values import ComplexArray, FloatArray, positive, real_array
+from .pencil import Family, groups
+from .point import Point
+from .residuals_base import Bound, Residual, split_parts
+from .shapes import chosen_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Eigenvalues(Value):
+class Eigenvalues(Residual):
     """Residuals of complex eigenvalues, ``lambda_exp - lambda_num``, weighted by W.
 
     The paper, eqs. (10) and (12): ``e = d lambda^H W d lambda`` with W real, positive and
@@ -27,6 +32,9 @@ class Eigenvalues(Value):
     weights : (m,) array [(s/rad)^2], optional
         Diagonal of W. When not given: one over the variance of each pole where `measured` has a
         covariance, else ones.
+    clusters : float
+        Modes whose measured poles are closer than this, relatively (0.02, say), are compared by
+        their mean, which does not care how they turn into each other. Zero: each by itself.
 
     Raises
     ------
@@ -43,6 +51,7 @@ class Eigenvalues(Value):
 
     measured: MeasuredModes
     weights: FloatArray | None = field(default=None, kw_only=True)
+    clusters: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.measured, MeasuredModes):
@@ -64,6 +73,7 @@ class Eigenvalues(Value):
                     "definite. Leave a pole out of the measurement instead of weighting it zero."
                 )
             self._set(weights=weights)
+        self._set(clusters=positive(self.clusters, "clusters", zero=True))
 
     def __repr__(self) -> str:
         numbers = ", ".join(str(number) for number in self.measured.modes or ())
@@ -86,6 +96,57 @@ class Eigenvalues(Value):
             return np.ones(m)
         variance = np.diag(self.measured.covariance)
         return np.asarray(1 / (variance[:m] + variance[m:]), dtype=np.float64)
+
+    def select(self, modes: Sequence[int]) -> Eigenvalues:
+        """Return the residual of some of its modes, by number.
+
+        Raises
+        ------
+        LabelError
+            When a mode was not measured.
+        """
+        chosen, columns = chosen_modes(self.measured, modes)
+        weights = None if self.weights is None else self.weights[columns]
+        return self.replace(measured=chosen, weights=weights)
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to a family."""
+        return _BoundEigenvalues(self)
+
+
+class _BoundEigenvalues(Bound):
+    """Poles (or means of clusters) whitened by the factor of their covariance, or by W^(1/2)."""
+
+    def __init__(self, residual: Eigenvalues) -> None:
+        measured = residual.measured
+        self.numbers = measured.modes or ()
+        m = len(measured)
+        self.clusters = groups(measured.poles, gap=residual.clusters) if residual.clusters else []
+        alone = [[i] for i in range(m) if not any(i in group for group in self.clusters)]
+        self.mean = np.zeros((len(alone) + len(self.clusters), m))
+        for row, group in zip(self.mean, [*alone, *self.clusters], strict=True):
+            row[group] = 1 / len(group)
+        self.target = measured.poles
+        self.noisy = residual.weights is None and measured.covariance is not None
+        both = np.kron(np.eye(2), self.mean)
+        covariance = np.diag(np.tile(1 / residual.W, 2))
+        if self.noisy and measured.covariance is not None:
+            covariance = measured.covariance
+        factor = la.cholesky(both @ covariance @ both.T, lower=True)
+        self.white = la.solve_triangular(factor, both, lower=True)
+        self.name = f"poles of modes {', '.join(map(str, self.numbers))}"
+
+    def values(self, point: Point) -> FloatArray:
+        gap = self.target - point.eigen.poles[point.columns(self.numbers)]
+        return np.asarray(self.white @ split_parts(gap), dtype=np.float64)
+
+    def slopes(self, point: Point) -> FloatArray:
+        S = point.sensitivity(self.numbers)
+        for group in self.clusters:
+            # the trace does not depend on the vectors chosen in the subspace
+            _, change = point.subspace([self.numbers[i] for i in group])
+            S[group] = np.trace(change, axis1=1, axis2=2) / len(group)
+        return np.asarray(-(self.white @ split_parts(S)), dtype=np.float64)
 
 
 @dataclass(frozen=True)

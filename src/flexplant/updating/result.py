@@ -6,10 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from scipy.special import ndtri
 
-from ..errors import unknown_label
+from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
-from ..values import ComplexArray, FloatArray, Value
+from ..values import ComplexArray, FloatArray, Value, positive
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,6 +55,32 @@ class History(Value):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
+class Starts(Value):
+    """What several starts led to.
+
+    Parameters
+    ----------
+    begin, end : (s, q) array
+        Parameters at the start and at the end, NaN where a search failed.
+    cost : (s,) array
+        Half the sum of squares at the end, infinite where a search failed.
+    """
+
+    begin: FloatArray
+    end: FloatArray
+    cost: FloatArray
+
+    def __post_init__(self) -> None:
+        self._set(begin=self.begin, end=self.end, cost=self.cost)
+
+    def __repr__(self) -> str:
+        best = float(np.min(self.cost))
+        same = int(np.sum(self.cost <= best + 1e-6 * max(abs(best), 1e-12)))
+        failed = int(np.sum(~np.isfinite(self.cost)))
+        return f"<Starts: {same} of {self.cost.size} at the least cost {best:.3g}, {failed} failed>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
 class UpdateResult(Value):
     """What `update` found.
 
@@ -82,6 +109,11 @@ class UpdateResult(Value):
         Whether a tolerance was met.
     reason : str
         Why the iteration ended.
+    at_bound : sequence of str
+        Names of the parameters that ended at one of their bounds: the data pull beyond it, and
+        the covariance does not know of it.
+    starts : Starts or None
+        What every start led to, when there were several.
     """
 
     parameters: tuple[str, ...]
@@ -93,6 +125,8 @@ class UpdateResult(Value):
     history: History
     converged: bool
     reason: str
+    at_bound: tuple[str, ...] = ()
+    starts: Starts | None = None
 
     def __post_init__(self) -> None:
         self._set(values=self.values, covariance=self.covariance, correlation=self.correlation)
@@ -118,9 +152,61 @@ class UpdateResult(Value):
         ]
         if len(self.parameters) > 5:
             lines.append(f"  ... and {len(self.parameters) - 5} more")
+        if self.at_bound:
+            lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
         said = "converged" if self.converged else "NOT CONVERGED"
         head = f"<UpdateResult: {said} in {len(self.history)} steps ({self.reason})"
         return "\n".join([head, *lines]) + ">"
+
+    def interval(self, level: float = 0.95) -> FloatArray:
+        """Return confidence (credible) intervals (q, 2) of the parameters.
+
+        Of the normal distribution where the noise was given; of a normal distribution too (not
+        Student's t) where its size came from the residuals.
+
+        Parameters
+        ----------
+        level : float
+            Between 0 and 1.
+
+        Raises
+        ------
+        ModelError
+            When the covariance is not known, or the level is no probability.
+        """
+        share = positive(level, "level")
+        if share >= 1:
+            raise ModelError(f"level must be below 1, got {share:g}.")
+        std = self._known_std()
+        half = float(ndtri((1 + share) / 2)) * std
+        return np.column_stack([self.values - half, self.values + half])
+
+    def sample(self, count: int, *, seed: int = 0) -> FloatArray:
+        """Return draws (count, q) from Laplace's approximation of the posterior.
+
+        Normal with mean `values` and `covariance`.
+
+        Raises
+        ------
+        ModelError
+            When the covariance is not known, or the count is no whole number from 1.
+        """
+        std = self._known_std()
+        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
+            raise ModelError(f"count must be a whole number from 1, got {count!r}.")
+        white = np.random.default_rng(seed).standard_normal((int(count), std.size))
+        values, vectors = np.linalg.eigh(np.asarray(self.covariance) / np.outer(std, std))
+        root = vectors * np.sqrt(np.maximum(values, 0.0))
+        return np.asarray(self.values + (white @ root.T) * std, dtype=np.float64)
+
+    def _known_std(self) -> FloatArray:
+        std = self.std
+        if std is None:
+            raise ModelError(
+                "the covariance of this update is not known: give the measurement's noise "
+                "(covariance=, std=, variance=) or more data than parameters."
+            )
+        return std
 
     def modes(self) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.

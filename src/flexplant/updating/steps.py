@@ -53,7 +53,9 @@ def slopes(family: Family, data: Data, now: Iterate) -> tuple[ComplexArray, Iter
     best = (np.inf, S, now.eigen)
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
         S, eigen = _along(family, now, S, way)
-        scaled, *_ = np.linalg.lstsq(data.stacked(S) / scale, data.stacked(gap), rcond=SINGULAR)
+        # rounding in the row of a vector that stays would ask for a step without bounds
+        felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
+        scaled, *_ = np.linalg.lstsq(data.stacked(felt) / scale, data.stacked(gap), rcond=SINGULAR)
         step = scaled / scale
         if np.any(step):
             S, eigen = _along(family, now, S, step)
@@ -128,7 +130,7 @@ def advance(
 def _followed(family: Family, now: Iterate, p: FloatArray) -> Iterate:
     """Return the iterate at `p` with the labels of the modes it continues."""
     eigen = family.at(p)
-    found = pair(now.eigen.poles, now.eigen.X, eigen.X)
+    found = pair(now.eigen.poles, family.weighted(now.eigen.X), family.weighted(eigen.X))
     columns = found[now.columns]
     if np.any(columns < 0):
         lost = [int(now.labels[c]) for c in now.columns if found[c] < 0]

@@ -1,4 +1,4 @@
-"""Gauss-Newton on complex eigenvalues: the paper's equations (9) to (14)."""
+"""The update of a model from measurements: the paper's equations (9) to (14), and beyond."""
 
 from __future__ import annotations
 
@@ -7,14 +7,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError
-from ..structure.rigid import orthonormalised
-from ..values import ComplexArray, FloatArray, Matrix, positive
+from ..values import ComplexArray, FloatArray, positive
+from .general import changed_model, general_update
+from .methods import GaussNewton, Method, TrustRegion
+from .objective import checked_residuals
 from .parameters import Parameter
 from .pencil import Family
 from .residuals import Data, Eigenvalues, checked_data
+from .residuals_base import Residual
 from .result import History, UpdateResult
 from .sensitivity import checked_parameters, checked_values, mode_columns
 from .steps import Iterate, advance, slopes, solve
@@ -23,22 +25,31 @@ from .steps import Iterate, advance, slopes, solve
 def update(
     model: Any,
     parameters: Sequence[Parameter],
-    residuals: Sequence[Eigenvalues],
+    residuals: Sequence[Residual],
     *,
+    method: Method | None = None,
     start: Sequence[float] | FloatArray | None = None,
-    max_iterations: int = 20,
+    starts: int | FloatArray | None = None,
+    seed: int = 0,
+    max_iterations: int | None = None,
     tolerance: float = 1e-10,
 ) -> UpdateResult:
-    """Find the parameters with which the model has the measured eigenvalues.
+    """Find the parameters with which the model reproduces the measurement.
 
-    Gauss-Newton with real unknowns in complex equations, the paper's (13) and (14)::
+    With eigenvalues alone, without bounds and priors: the paper's (13) and (14), Gauss-Newton with
+    real unknowns in complex equations::
 
         Re[S^H W S] dp = Re[S^H W d lambda],    p <- p + dp
 
+    Otherwise ``1/2 |r(p)|^2 + 1/2 |(p - mean)/std|^2``, r the whitened residuals of all kinds, in a
+    trust region within the bounds. The second term, of the parameters with a prior, takes part
+    where the noise of every residual is known (the answer is then the maximum a posteriori).
+
     Modes are found by their number in the model at `start` and followed by shape (see
-    `flexplant.updating.pairing`), so they may swap order on the way. Modes that are exactly
+    `flexplant.updating.pairing`), so they may swap order on the way; those with measured shapes
+    are assigned by MAC at each step. Modes that are exactly
     repeated there are first turned to the vectors in which the step splits them, the lower mode
-    number going to the lower frequency. Steps are halved while M or K would become indefinite,
+    number going to the lower frequency. Steps are shortened while M or K would become indefinite,
     a measured mode would cease to oscillate, or the error (12) would grow.
 
     Parameters
@@ -46,13 +57,21 @@ def update(
     model : ReducedModel or FEModel
         The model; an FEModel is treated densely.
     parameters : sequence of q Parameter
-        `AddedMass`, `AddedDamping`, `AddedStiffness`.
-    residuals : sequence of Eigenvalues
-        What to fit: m eigenvalues altogether.
+        `AddedMass`, `AddedDamping`, `AddedStiffness`, `ModeDamping`, `MatrixParameter`.
+    residuals : sequence of Residual
+        What to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
+        `StaticCompliance`, mixed freely.
+    method : Method, optional
+        `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: as said above.
     start : (q,) array [kg, N s/m, N/m], optional
-        Values to begin with; zeros when not given.
-    max_iterations : int
-        Most Gauss-Newton steps.
+        Values to begin with; when not given zeros, or the means of priors, inside the bounds.
+    starts : int or (s, q) array, optional
+        Search from several starts, drawn between the bounds (or from the priors), and keep
+        the best; `start` is one of them.
+    seed : int
+        For drawn starts.
+    max_iterations : int, optional
+        Most steps from one start; 20 for Gauss-Newton, 200 for the others when not given.
     tolerance : float
         Done when a full step, or the residual, changes no eigenvalue by more than this,
         relatively.
@@ -70,16 +89,54 @@ def update(
     LabelError
         When a mode number or a place is unknown.
     SolverError
-        When no part of a step keeps the model physical.
+        When no part of a step keeps the model physical, or no start leads anywhere.
 
     References
     ----------
     The paper, section 3.
     """
     listed = checked_parameters(parameters)
-    data = checked_data(residuals)
-    most = _checked_count(max_iterations)
+    given = checked_residuals(residuals)
+    if method is not None and not isinstance(method, Method):
+        raise ModelError(
+            f"method must be GaussNewton(), TrustRegion(), Tikhonov() or Lasso(), got {method!r}."
+        )
+    if max_iterations is not None:
+        _checked_count(max_iterations)
     enough = positive(tolerance, "tolerance")
+    bounded = any(getattr(q, "bounds", None) is not None for q in listed)
+    known = any(getattr(q, "prior", None) is not None for q in listed)
+    plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given)
+    newton = isinstance(method, GaussNewton)
+    if isinstance(method, GaussNewton) and bounded:
+        raise ModelError("GaussNewton knows no bounds: use TrustRegion(), or drop bounds=.")
+    direct = not (isinstance(method, GaussNewton) and method.truncate)
+    direct = direct and (method is None or newton)
+    if plain and direct and not bounded and not known and starts is None:
+        return _paper(model, listed, given, start, max_iterations or 20, enough)
+    return general_update(
+        model,
+        listed,
+        given,
+        method=method or TrustRegion(),
+        start=start,
+        starts=starts,
+        seed=seed,
+        most=max_iterations or (20 if newton else 200),
+        tolerance=enough,
+    )
+
+
+def _paper(
+    model: Any,
+    listed: tuple[Parameter, ...],
+    residuals: Sequence[Any],
+    start: Any,
+    most: int,
+    enough: float,
+) -> UpdateResult:
+    """Return the answer of the paper's iteration."""
+    data = checked_data(residuals)
     family = Family(model, listed)
     p = checked_values(start, listed, "start")
     eigen = family.at(p)
@@ -114,7 +171,7 @@ def update(
             f"{trail[-1][2]:.3g} from {trail[0][2]:.3g}. Look at .history; try other mode "
             "numbers, start= or more iterations.",
             FlexplantWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     covariance, correlation = _doubt(data, S, now)
     return UpdateResult(
@@ -123,7 +180,7 @@ def update(
         values=now.p,
         covariance=covariance,
         correlation=correlation,
-        model=_changed(model, family, now.p),
+        model=changed_model(model, family, now.p),
         history=History(*(np.array(part) for part in zip(*trail, strict=True))),
         converged=converged,
         reason=reason,
@@ -150,33 +207,6 @@ def _doubt(data: Data, S: ComplexArray, now: Iterate) -> tuple[FloatArray | None
         covariance = unit * data.error(now.poles) / spare
     std = np.sqrt(np.diag(unit))
     return covariance, unit / np.outer(std, std)
-
-
-def _changed(model: Any, family: Family, p: FloatArray) -> Any:
-    """Return the model with the parameters at `p`; its own rigid-body basis, as far as left."""
-    changes: dict[str, Any] = {
-        name: _sum(getattr(model, name), change)
-        for name, change in zip("MDK", family.changes(p), strict=True)
-    }
-    if hasattr(model, "T"):
-        # Gram-Schmidt keeps translations first and moves the rotations to the new centre
-        left = model.rigid_body @ family.rigid_left(p)
-        changes["rigid_body"] = orthonormalised(changes["M"], left)
-    try:
-        return model.replace(**changes)
-    except ModelError as error:
-        raise ModelError(
-            f"the update ended at {family.text(p)}, which the {type(model).__name__} refuses: "
-            f"{error}"
-        ) from None
-
-
-def _sum(part: Matrix | None, change: FloatArray) -> Matrix | None:
-    if not np.any(change):
-        return part
-    if part is None:
-        return change
-    return sp.csc_array(part + sp.csc_array(change)) if sp.issparse(part) else part + change
 
 
 def _checked_count(value: Any) -> int:

@@ -1,0 +1,220 @@
+"""How alike model and measurement are: frequencies, MAC, FRAC, FDAC."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from ..identification import MeasuredModes
+from ..values import ComplexArray, FloatArray, Value
+from .frf_residual import FrfResidual
+from .objective import Objective, checked_residuals
+from .pairing import mac as _mac
+from .shapes import ModeShapes
+
+
+def mac(X: Any, Y: Any) -> FloatArray:
+    """Return the modal assurance criterion (m, m') of each shape of X with each of Y.
+
+    ``|x^H y|^2 / (x^H x  y^H y)``, 1 for shapes that differ by a factor only.
+
+    Parameters
+    ----------
+    X, Y : (n, m), (n, m') real or complex arrays
+        Shapes in columns.
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When sizes differ, entries are not finite, or a shape is zero.
+
+    References
+    ----------
+    Allemang, Brown: A correlation coefficient for modal vector analysis, IMAC 1982.
+    """
+    left, right = _shapes(X, "X"), _shapes(Y, "Y")
+    if left.shape[0] != right.shape[0]:
+        raise ShapeError(f"X has {left.shape[0]} rows and Y {right.shape[0]}.")
+    return _mac(left, right)
+
+
+def frac(H: Any, G: Any) -> FloatArray:
+    """Return the frequency response assurance criterion of each channel pair, from 0 to 1.
+
+    ``|sum_f H* G|^2 / (sum |H|^2  sum |G|^2)`` over the frequency lines.
+
+    Parameters
+    ----------
+    H, G : (..., n_freq) complex arrays
+        Measured and computed responses.
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When sizes differ or a response is zero.
+
+    References
+    ----------
+    Heylen, Lammens: FRAC, a consistent way of comparing frequency response functions, 1996.
+    """
+    a, b = _responses(H, G)
+    product = np.abs(np.sum(a.conj() * b, axis=-1)) ** 2
+    size = np.sum(np.abs(a) ** 2, axis=-1) * np.sum(np.abs(b) ** 2, axis=-1)
+    if np.any(size == 0):
+        raise ModelError("a response is zero at all lines: its FRAC is not defined.")
+    return np.asarray(product / size, dtype=np.float64)
+
+
+def fdac(H: Any, G: Any) -> FloatArray:
+    """Return the frequency domain assurance criterion of all pairs of lines, from -1 to 1.
+
+    ``Re(h_f^H g_g) / (|h_f| |g_g|)`` with h_f all channels of H at line f: a frequency shift shows
+    as a ridge beside the diagonal.
+
+    Parameters
+    ----------
+    H, G : (..., n_freq), (..., n_freq') complex arrays
+        Measured and computed responses of the same channels.
+
+    Returns
+    -------
+    (n_freq, n_freq') array
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When sizes differ or a line is zero.
+
+    References
+    ----------
+    Pascual, Golinval, Razeto: A frequency domain correlation technique for model correlation and
+    updating, IMAC 1997.
+    """
+    a, b = np.asarray(H, dtype=complex), np.asarray(G, dtype=complex)
+    if a.shape[:-1] != b.shape[:-1] or a.ndim < 1:
+        raise ShapeError(f"H has channels {a.shape[:-1]} and G {b.shape[:-1]}.")
+    a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])
+    size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
+    if not np.all(np.isfinite(size)) or np.any(size == 0):
+        raise ModelError("a line is zero or not finite at all channels: leave it out.")
+    return np.asarray(np.real(a.conj().T @ b) / size, dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Correlation(Value):
+    """How alike a model and a measurement are.
+
+    Parameters
+    ----------
+    modes : (m,) sequence of int
+        Numbers of the measured modes.
+    freq_error : (m,) array [-]
+        Relative error of the model's undamped frequencies.
+    zeta_error : (m,) array [-]
+        Error of its damping ratios.
+    mac : (m, m) array
+        Of measured shapes (rows) with the model's; empty without shapes.
+    frac : (n_out, n_in) array
+        Of the responses; empty without.
+    fdac : (n_freq, n_freq) array
+        Of the responses; empty without.
+    """
+
+    modes: tuple[int, ...]
+    freq_error: FloatArray
+    zeta_error: FloatArray
+    mac: FloatArray
+    frac: FloatArray
+    fdac: FloatArray
+
+    def __post_init__(self) -> None:
+        self._set(
+            freq_error=self.freq_error,
+            zeta_error=self.zeta_error,
+            mac=self.mac,
+            frac=self.frac,
+            fdac=self.fdac,
+        )
+
+    def __repr__(self) -> str:
+        parts = []
+        if self.freq_error.size:
+            parts.append(f"frequencies within {100 * np.abs(self.freq_error).max():.3g} %")
+        if self.mac.size:
+            parts.append(f"least MAC {np.diag(self.mac).min():.4f}")
+        if self.frac.size:
+            parts.append(f"least FRAC {self.frac.min():.4f}")
+        return f"<Correlation: {', '.join(parts) or 'nothing compared'}>"
+
+
+def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
+    """Compare a model with measurements: once before the update, once after.
+
+    Parameters
+    ----------
+    model : ReducedModel or FEModel
+        Before or after an update (`UpdateResult.model`).
+    residuals : sequence of Residual
+        The measurements: poles, shapes and responses are compared; of several kinds the last.
+
+    Returns
+    -------
+    Correlation
+
+    Raises
+    ------
+    ModelError, LabelError
+        When a mode or place is unknown to the model.
+    """
+    listed = checked_residuals(residuals)
+    objective = Objective(model, [], listed)
+    point = objective.begin(np.zeros(0))
+    poles: ComplexArray = np.zeros(0, complex)
+    found = poles
+    modes: tuple[int, ...] = ()
+    shapes = responses = spectrum = np.zeros((0, 0))
+    for residual, bound in zip(listed, objective.bounds, strict=True):
+        tied: Any = bound
+        measured = getattr(residual, "measured", None)
+        if isinstance(measured, MeasuredModes):
+            modes, poles = measured.modes or (), measured.poles
+            columns = point.columns(modes)
+            found = point.eigen.poles[columns]
+            if isinstance(residual, ModeShapes):
+                shapes = mac(residual.shapes, tied.rows @ point.eigen.X[:, columns])
+        if isinstance(residual, FrfResidual):
+            H = tied.responses(point)[0]
+            responses = frac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
+            spectrum = fdac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
+    return Correlation(
+        modes=modes,
+        freq_error=np.abs(found) / np.abs(poles) - 1,
+        zeta_error=poles.real / np.abs(poles) - found.real / np.abs(found),
+        mac=shapes,
+        frac=responses,
+        fdac=spectrum,
+    )
+
+
+def _shapes(value: Any, name: str) -> ComplexArray:
+    array = np.asarray(value, dtype=np.complex128)
+    if array.ndim != 2:
+        raise ShapeError(f"{name} must have shape (n, m), got {array.shape}.")
+    if not np.all(np.isfinite(array)):
+        raise ModelError(f"{name} has NaN or infinite entries.")
+    if np.any(np.all(array == 0, axis=0)):
+        raise ModelError(f"{name} holds a zero shape: its MAC is not defined.")
+    return array
+
+
+def _responses(H: Any, G: Any) -> tuple[ComplexArray, ComplexArray]:
+    a, b = np.asarray(H, dtype=np.complex128), np.asarray(G, dtype=np.complex128)
+    if a.shape != b.shape or a.ndim < 1:
+        raise ShapeError(f"H has shape {a.shape} and G {b.shape}: they must be equal.")
+    if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
+        raise ModelError("responses have NaN or infinite entries: leave those lines out.")
+    return a, b

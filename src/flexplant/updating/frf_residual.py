@@ -1,0 +1,203 @@
+"""Residuals of measured frequency responses."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from ..labels import Place
+from ..lti import Frf
+from ..values import ComplexArray, FloatArray, real_array
+from .pencil import Family
+from .point import Point
+from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
+
+#: time derivatives of each quantity
+ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
+#: lines whose response is below so many standard deviations of the noise are left out
+SIGNAL = 3.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FrfResidual(Residual):
+    """Residuals of measured frequency responses, complex or of the logarithm of their magnitude.
+
+    ``r = (H_exp - H(p)) / sigma`` as [Re; Im], or ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)``,
+    with ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B`` and ``sigma^2 = variance / 2``.
+
+    Parameters
+    ----------
+    measured : Frf
+        Responses of outputs to inputs [quantity / N]; `measured.quantity` says displacement
+        (also when None), velocity or acceleration.
+    variance : float or array that spreads to (n_out, n_in, n_freq), optional
+        ``E|noise|^2`` of each entry; that of the Frf when not given. Where neither is known,
+        entries count by their size, each divided by the rms of its channel pair.
+    lines : sequence of int or (n_freq,) bool array, optional
+        Frequency lines to use. None: those where the median over the channels of
+        ``|H|^2 / variance`` is above 9 (all without a variance), and none at 0 Hz.
+    places : mapping {channel: place}, optional
+        Where channels are; a channel that is not named here is a DOF label itself.
+    direction : str
+        Of the motion and force at points.
+    magnitude : bool
+        Compare ln |H| instead of H: forgiving of phase errors, convergent from farther away.
+
+    Raises
+    ------
+    ModelError, ShapeError, LabelError
+        When no line is left, the variance is not positive, or channels are unknown.
+
+    Examples
+    --------
+    >>> frf = Frf([1.0, 2.0], [[[1.0, 0.5j]]], inputs=["1:z"], outputs=["2:z"])
+    >>> FrfResidual(frf, variance=1e-4)
+    <FrfResidual: 1 x 1 channels, 2 of 2 lines, complex, noise known>
+    """
+
+    measured: Frf
+    variance: FloatArray | None = field(default=None, kw_only=True)
+    lines: Any = field(default=None, kw_only=True)
+    places: Mapping[str, Place] | None = field(default=None, kw_only=True)
+    direction: str = field(default="z", kw_only=True)
+    magnitude: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        frf = self.measured
+        if not isinstance(frf, Frf):
+            raise ModelError(f"FrfResidual needs an Frf, got {type(frf).__name__}.")
+        if (frf.quantity or "displacement") not in ORDERS:
+            raise ModelError(f"quantity {frf.quantity!r} is none of {', '.join(ORDERS)}.")
+        variance = self.variance
+        if variance is None:
+            variance = getattr(frf, "variance", None)
+        if variance is not None:
+            given = real_array(variance, "variance")
+            try:
+                variance = np.broadcast_to(given, frf.data.shape).copy()
+            except ValueError:
+                raise ShapeError(
+                    f"variance of shape {given.shape} does not spread to the data's "
+                    f"{frf.data.shape}."
+                ) from None
+            if variance.min() <= 0:
+                raise ModelError(f"variance must be positive, got {variance.min():g}.")
+        channel_places([*frf.outputs, *frf.inputs], self.places)
+        self._set(variance=variance, lines=_checked_lines(self.lines, frf, variance))
+
+    def __repr__(self) -> str:
+        frf = self.measured
+        kind = "log-magnitude" if self.magnitude else "complex"
+        known = "not known" if self.variance is None else "known"
+        return (
+            f"<FrfResidual: {len(frf.outputs)} x {len(frf.inputs)} channels, {self.lines.size} of "
+            f"{frf.freq.size} lines, {kind}, noise {known}>"
+        )
+
+    def select(self, lines: Sequence[int]) -> FrfResidual:
+        """Return the residual on some of the lines (numbers in the measured Frf)."""
+        return self.replace(lines=np.asarray(lines, dtype=np.int64))
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to a family."""
+        return _BoundFrf(self, family)
+
+
+class _BoundFrf(Bound):
+    def __init__(self, residual: FrfResidual, family: Family) -> None:
+        frf, lines = residual.measured, residual.lines
+        places = channel_places([*frf.outputs, *frf.inputs], residual.places)
+        count = len(frf.outputs)
+        self.C = place_rows(family, places[:count], residual.direction)
+        self.B = place_rows(family, places[count:], residual.direction).T
+        self.omega = 2 * np.pi * frf.freq[lines]
+        self.factor = (1j * self.omega) ** ORDERS[frf.quantity or "displacement"]
+        self.data = np.moveaxis(frf.data[:, :, lines], 2, 0)
+        self.magnitude = residual.magnitude
+        self.noisy = residual.variance is not None
+        if residual.variance is not None:
+            sigma = np.sqrt(np.moveaxis(residual.variance[:, :, lines], 2, 0) / 2)
+        else:
+            rms = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0))
+            sigma = np.broadcast_to(np.where(rms > 0, rms, 1.0), self.data.shape)
+            if self.magnitude:
+                sigma = np.abs(self.data)
+        if self.magnitude:
+            sigma = sigma / np.abs(self.data)
+        self.sigma = sigma
+        self.name = f"{lines.size} lines of FRFs"
+        self._last: tuple[Point, ComplexArray, ComplexArray, ComplexArray] | None = None
+
+    def responses(self, point: Point) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return H (l, o, i), the motions X (l, k, i) and adjoint motions Y (l, k, o)."""
+        if self._last is None or self._last[0] is not point:
+            X, Y = motions(point, self.omega, self.B, self.C)
+            H = np.matmul(self.C, X) * self.factor[:, None, None]
+            self._last = (point, H, X, Y)
+        return self._last[1:]
+
+    def values(self, point: Point) -> FloatArray:
+        H, _, _ = self.responses(point)
+        if self.magnitude:
+            return np.asarray((np.log(np.abs(self.data / H)) / self.sigma).ravel())
+        return split_parts(((self.data - H) / self.sigma).ravel())
+
+    def slopes(self, point: Point) -> FloatArray:
+        H, X, Y = self.responses(point)
+        dH = response_slopes(point, self.omega, X, Y) * self.factor[:, None, None]
+        q = point.p.size
+        if self.magnitude:
+            return np.asarray(-(np.real(dH / H) / self.sigma).reshape(q, -1).T)
+        return split_parts(-(dH / self.sigma).reshape(q, -1).T)
+
+
+def motions(
+    point: Point, omega: FloatArray, B: FloatArray, C: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return ``Z^-1 B`` and ``Z^-T C^T`` (l, k, ...) at all lines; Z is symmetric."""
+    M, D, K = point.matrices
+    w = omega[:, None, None]
+    loads = np.hstack([B, C.T])
+    solved: Any = np.linalg.solve(K - w**2 * M + 1j * w * D, loads[None] + 0j)
+    return solved[:, :, : B.shape[1]], solved[:, :, B.shape[1] :]
+
+
+def response_slopes(
+    point: Point, omega: FloatArray, X: ComplexArray, Y: ComplexArray
+) -> ComplexArray:
+    """Return dH / dp (q, l, o, i) = -Y^T (dK + i omega dD - omega^2 dM) X."""
+    family, q = point.family, point.p.size
+    lines, k, n_in = X.shape
+    flat = np.moveaxis(X, 0, 1).reshape(k, lines * n_in)
+    s = np.repeat(1j * omega, n_in)
+    moved = family.moved(flat, (s**2, s, np.ones_like(s))).reshape(q, k, lines, n_in)
+    slopes: ComplexArray = -np.matmul(Y.transpose(0, 2, 1), moved.transpose(0, 2, 1, 3))
+    return slopes
+
+
+def _checked_lines(lines: Any, frf: Frf, variance: FloatArray | None) -> Any:
+    count = frf.freq.size
+    if lines is None:
+        size = np.abs(frf.data) ** 2
+        keep = np.any(size > 0, axis=(0, 1)) & (frf.freq > 0)
+        if variance is not None:
+            keep &= np.median(size / variance, axis=(0, 1)) > SIGNAL**2
+        chosen = np.flatnonzero(keep)
+    else:
+        chosen = np.asarray(lines)
+        if chosen.dtype == bool and chosen.shape == (count,):
+            chosen = np.flatnonzero(chosen)
+        if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu"):
+            raise ModelError(f"lines must be numbers of lines or {count} booleans.")
+        if chosen.size and (chosen.min() < 0 or chosen.max() >= count):
+            raise ModelError(f"lines must lie between 0 and {count - 1}.")
+        chosen = np.unique(chosen)
+    if not chosen.size:
+        raise ModelError(
+            "no frequency line is left: all are in the noise, or none was chosen. Give lines=."
+        )
+    return chosen.astype(np.int64)

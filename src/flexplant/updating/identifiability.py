@@ -1,0 +1,191 @@
+"""What a measurement could say about the parameters, before anything is solved."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..values import FloatArray, Value
+from .objective import Objective, checked_residuals
+from .parameters import Parameter
+from .sensitivity import checked_parameters, checked_values
+
+#: correlations beyond this are told
+CORRELATED = 0.99
+#: a combination of parameters with a singular value below this part of the largest is lost
+LOST = 1e-6
+#: modes that are named as missing
+NAMED = 3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Identifiability(Value):
+    """What can be told of the parameters from the residuals, to first order.
+
+    Parameters
+    ----------
+    parameters : sequence of q str
+        Names.
+    singular_values : (q,) array
+        Of the sensitivities, each column scaled to length one: sqrt(q) to zero.
+    combinations : (q, q) array
+        Columns: the combinations of (scaled) parameters of each singular value.
+    std : (q,) array
+        Standard deviations to be expected where the noise is known (else for unit noise of the
+        weighted residuals); infinite where a parameter cannot be found.
+    correlation : (q, q) array
+        Of the errors to be expected; zero with parameters that cannot be found.
+    unseen : sequence of str
+        Parameters that no residual depends on.
+    mixed : sequence of (str, ...)
+        Groups of parameters of which a combination cannot be told.
+    missing : mapping {str: (int, ...)}
+        For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
+        depend on them most.
+    """
+
+    parameters: tuple[str, ...]
+    singular_values: FloatArray
+    combinations: FloatArray
+    std: FloatArray
+    correlation: FloatArray
+    unseen: tuple[str, ...]
+    mixed: tuple[tuple[str, ...], ...]
+    missing: dict[str, tuple[int, ...]]
+
+    def __post_init__(self) -> None:
+        self._set(
+            singular_values=self.singular_values,
+            combinations=self.combinations,
+            std=self.std,
+            correlation=self.correlation,
+            missing=self.missing,
+        )
+
+    @property
+    def rank(self) -> int:
+        """Number of combinations of parameters that can be told."""
+        return int(np.sum(self.singular_values > LOST * self.singular_values[0]))
+
+    def __repr__(self) -> str:
+        lines = [
+            (
+                f"<Identifiability: {self.rank} of {len(self.parameters)} combinations, singular "
+                f"values {self.singular_values[0]:.3g} to {self.singular_values[-1]:.3g}"
+            )
+        ]
+        if self.unseen:
+            lines.append(f"  unseen: {', '.join(self.unseen[:4])}")
+        lines += [f"  not told apart: {', '.join(group[:4])}" for group in self.mixed[:2]]
+        q = len(self.parameters)
+        close = [
+            f"{self.parameters[i]} and {self.parameters[j]} {self.correlation[i, j]:+.3f}"
+            for i in range(q)
+            for j in range(i)
+            if abs(self.correlation[i, j]) > CORRELATED
+        ]
+        lines += [f"  correlated: {text}" for text in close[:2]]
+        lines += [
+            f"  measure modes {', '.join(map(str, modes))} for {name}"
+            for name, modes in list(self.missing.items())[:2]
+        ]
+        return "\n".join(lines) + ">"
+
+
+def identifiability(
+    model: Any,
+    parameters: Sequence[Parameter],
+    residuals: Sequence[Any],
+    *,
+    start: Sequence[float] | FloatArray | None = None,
+) -> Identifiability:
+    """Return what the residuals can say about the parameters at a start, before solving.
+
+    The singular values of the weighted sensitivities S, the correlation
+    ``(S^T S)^-1`` of the estimate, and which modes are missing. Priors take no part.
+
+    Parameters
+    ----------
+    model : ReducedModel or FEModel
+        The model.
+    parameters : sequence of q Parameter
+        Unknowns.
+    residuals : sequence of Residual
+        Data; the values are not used, only what they would depend on (and their noise).
+    start : (q,) array, optional
+        Where; as in `update`.
+
+    Returns
+    -------
+    Identifiability
+
+    Raises
+    ------
+    ModelError, LabelError, ShapeError
+        As `update`.
+    """
+    listed = checked_parameters(parameters)
+    objective = Objective(model, listed, checked_residuals(residuals), prior=False)
+    p = objective.default_start if start is None else checked_values(start, listed, "start")
+    point = objective.begin(p)
+    J = objective.slopes(point, prior=False)
+    names = tuple(q.name for q in listed)
+    length = np.linalg.norm(J, axis=0)
+    own = np.abs(J).max(initial=0.0) * 1e-12
+    omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
+    reach = objective.family.strength(omega)
+    # a column far below what the parameter can do to this model is rounding
+    strongest = float(np.max(length / reach, initial=0.0))
+    seen = (length > own) & (length > 1e-9 * strongest * reach)
+    scaled = np.where(seen, J / np.where(seen, length, 1.0), 0.0)
+    _, s, Vt = np.linalg.svd(scaled, full_matrices=True)
+    s = np.concatenate([s, np.zeros(len(names) - s.size)])
+    told = s > LOST * s[0]
+    half = Vt[told].T / s[told]
+    unit = half @ half.T
+    lost = np.sum(Vt[~told] ** 2, axis=0) > 1e-6
+    std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / np.where(seen, length, 1.0))
+    size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), 1e-300)))
+    correlation = np.where(np.outer(~lost, ~lost), unit / np.outer(size, size), np.eye(lost.size))
+    mixed = []
+    for vector in Vt[~told]:
+        group = tuple(
+            n for n, part, ok in zip(names, vector, seen, strict=True) if ok and abs(part) > 0.1
+        )
+        if len(group) > 1:
+            mixed.append(group)
+    unseen = tuple(n for n, ok in zip(names, seen, strict=True) if not ok)
+    poor = list(dict.fromkeys([*unseen, *(n for group in mixed for n in group)]))
+    return Identifiability(
+        parameters=names,
+        singular_values=s,
+        combinations=Vt.T,
+        std=std,
+        correlation=correlation,
+        unseen=unseen,
+        mixed=tuple(mixed),
+        missing=_missing(objective, point, names, poor),
+    )
+
+
+def _missing(
+    objective: Objective, point: Any, names: tuple[str, ...], poor: list[str]
+) -> dict[str, tuple[int, ...]]:
+    """Return for each poorly known parameter the unmeasured modes that move most, relatively."""
+    numbers = [int(n) for n in point.labels if n and n not in objective.numbers]
+    if not numbers or not poor:
+        return {}
+    columns = point.columns(numbers)
+    S = objective.family.sensitivity(point.eigen, columns)
+    moved = np.abs(S) / np.abs(point.eigen.poles[columns])[:, None]
+    found = {}
+    for name in poor:
+        share = moved[:, names.index(name)]
+        order = np.argsort(-share)[:NAMED]
+        felt = [numbers[i] for i in order if share[i] > 1e-6 * share.max(initial=0.0) > 0]
+        if felt:
+            found[name] = tuple(felt)
+    return found

@@ -1,0 +1,241 @@
+"""Parameters of whole matrices: groups of elements, sizes of the full model, modal damping."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import LabelError, ModelError, ShapeError
+from ..structure.eigen import elastic_modes
+from ..structure.factor import dense
+from ..values import FloatArray, Matrix, positive, real_array
+from .parameters import Derivatives, Parameter, checked_bounds, checked_prior
+
+#: entries of a symmetric matrix differ by less than this, relatively, from their mirror images
+SYMMETRIC = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MatrixParameter(Parameter):
+    """A parameter with given derivatives of the matrices: M + p dM, D + p dD, K + p dK.
+
+    A group of elements (the stiffness of a region, say, with p its relative change) is the sum of
+    its element matrices. Matrices of the full structure are projected once, ``T^T dK T``.
+
+    Parameters
+    ----------
+    name : str
+        For results.
+    dM, dD, dK : (k, k) or (n, n) array or sparse matrix, optional
+        Symmetric; of the model's own DOFs or of the full structure's.
+    unit : str
+        Of p; none for a relative change.
+    bounds : (lowest, highest), optional
+        The parameter is kept between them.
+    prior : (mean, standard deviation), optional
+        What is known beforehand, a normal distribution.
+
+    Raises
+    ------
+    ModelError, ShapeError, LabelError
+        When no matrix is given, or one is not square, finite and symmetric, or the name is empty.
+
+    Examples
+    --------
+    >>> MatrixParameter("joint", dK=[[2.0, -2.0], [-2.0, 2.0]])
+    <MatrixParameter: joint of K>
+    """
+
+    name: str
+    dM: Matrix | None = field(default=None, kw_only=True)
+    dD: Matrix | None = field(default=None, kw_only=True)
+    dK: Matrix | None = field(default=None, kw_only=True)
+    unit: str = field(default="", kw_only=True)
+    bounds: tuple[float, float] | None = field(default=None, kw_only=True)
+    prior: tuple[float, float] | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str) or not self.name:
+            raise LabelError(f"a MatrixParameter needs a name, got {self.name!r}.")
+        parts = {
+            label: _checked_matrix(getattr(self, label), f"{label} of {self.name}")
+            for label in ("dM", "dD", "dK")
+        }
+        if all(part is None for part in parts.values()):
+            raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
+        bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
+        self._set(**parts, bounds=bounds, prior=prior)
+
+    def __repr__(self) -> str:
+        parts = ", ".join(a[1] for a in ("dM", "dD", "dK") if getattr(self, a) is not None)
+        unit = f" [{self.unit}]" if self.unit else ""
+        return f"<MatrixParameter: {self.name}{unit} of {parts}>"
+
+    @classmethod
+    def from_difference(
+        cls,
+        name: str,
+        build: Callable[[float], Any],
+        *,
+        value: float,
+        step: float | None = None,
+        unit: str = "",
+        bounds: tuple[float, float] | None = None,
+        prior: tuple[float, float] | None = None,
+    ) -> MatrixParameter:
+        """Return the parameter p = v - value of a full model `build(v)`, by central differences.
+
+        For anything that changes elements: a thickness, a density, a length. The matrices are
+        taken as affine in p; where they are not (a bending stiffness goes with thickness^3),
+        build the model anew at the answer and update once more.
+
+        Parameters
+        ----------
+        name : str
+            For results.
+        build : callable
+            From the value to an FEModel; the same DOFs at every value.
+        value : float
+            Of the model that is updated.
+        step : float, optional
+            Of the difference; 1e-3 of the value when not given.
+        unit, bounds, prior
+            As of the class; bounds and prior of p, the change.
+
+        Raises
+        ------
+        ModelError
+            When the step is not positive or the matrices do not change.
+        ShapeError
+            When the DOFs change.
+        """
+        middle = float(real_array(value, "value", ()))
+        h = positive(1e-3 * abs(middle) if step is None else step, "step")
+        low, high = build(middle - h), build(middle + h)
+        if tuple(low.dofs) != tuple(high.dofs):
+            raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
+        parts: dict[str, Any] = {}
+        for label in "MDK":
+            before, after = getattr(low, label), getattr(high, label)
+            if before is not None and after is not None:
+                parts["d" + label] = (after - before) / (2 * h)
+        return cls(name, **parts, unit=unit, bounds=bounds, prior=prior)
+
+    def matrices(self, model: Any) -> Derivatives:
+        """Return (dM, dD, dK) in the model's DOFs.
+
+        Raises
+        ------
+        ShapeError
+            When the matrices belong neither to the model nor to its full structure.
+        """
+        return (
+            self._projected(self.dM, model),
+            self._projected(self.dD, model),
+            self._projected(self.dK, model),
+        )
+
+    def _projected(self, part: Matrix | None, model: Any) -> FloatArray | None:
+        if part is None:
+            return None
+        k, n = len(model.dofs), len(getattr(model, "full_dofs", model.dofs))
+        if part.shape[0] == k:
+            return dense(part)
+        if part.shape[0] != n:
+            raise ShapeError(
+                f"{self.name} has matrices of {part.shape[0]} DOFs; the model has {k}, its full "
+                f"structure {n}."
+            )
+        product = np.asarray(model.T.T @ (part @ model.T), dtype=np.float64)
+        return (product + product.T) / 2
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModeDamping(Parameter):
+    """A change of the damping ratio of one mode: ``D + p 2 omega (M phi)(M phi)^T``.
+
+    Parameters
+    ----------
+    mode : int
+        Number from 1, rigid-body modes included, of the undamped model that is updated.
+    name : str, optional
+        For results.
+    bounds : (lowest, highest), optional
+        The parameter is kept between them.
+    prior : (mean, standard deviation), optional
+        What is known beforehand, a normal distribution.
+
+    Raises
+    ------
+    LabelError
+        When the mode number is no whole number from 1.
+
+    Examples
+    --------
+    >>> ModeDamping(6)
+    <ModeDamping: damping ratio of mode 6>
+    """
+
+    mode: int
+    name: str = field(default="", kw_only=True)
+    bounds: tuple[float, float] | None = field(default=None, kw_only=True)
+    prior: tuple[float, float] | None = field(default=None, kw_only=True)
+
+    unit = ""
+
+    def __post_init__(self) -> None:
+        number = self.mode
+        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
+            raise LabelError(f"mode must be a whole number from 1, got {number!r}.")
+        name = str(self.name or f"damping ratio of mode {number}")
+        bounds, prior = checked_bounds(self.bounds, name), checked_prior(self.prior, name)
+        self._set(mode=int(number), name=name, bounds=bounds, prior=prior)
+
+    def __repr__(self) -> str:
+        return f"<ModeDamping: {self.name}>"
+
+    def matrices(self, model: Any) -> Derivatives:
+        """Return (None, dD, None).
+
+        Raises
+        ------
+        LabelError
+            When the model has no such elastic mode.
+        """
+        rigid = np.asarray(model.rigid_body, dtype=np.float64)
+        k, r = rigid.shape
+        if not r < self.mode <= k:
+            raise LabelError(
+                f"no elastic mode {self.mode}: the model has {r} rigid-body modes, which are "
+                f"undamped, and elastic ones to {k}."
+            )
+        M, K = dense(model.M), dense(model.K)
+        omega, phi = elastic_modes(M, K, rigid, self.mode - r)
+        force = M @ phi[:, -1]
+        return None, 2 * float(omega[-1]) * np.outer(force, force), None
+
+
+def _checked_matrix(value: Any, name: str) -> Matrix | None:
+    if value is None:
+        return None
+    given: Any = value
+    matrix: Any = sp.csc_array(given) if sp.issparse(value) else real_array(value, name)
+    if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
+        raise ShapeError(f"{name} must be a square matrix, got shape {matrix.shape}.")
+    if sp.issparse(value):
+        real_array(matrix.data, f"stored entries of {name}")
+    largest = float(abs(matrix).max()) if matrix.shape[0] else 0.0
+    if largest == 0:
+        return None
+    if float(abs(matrix - matrix.T).max()) > SYMMETRIC * largest:
+        raise ModelError(
+            f"{name} is not symmetric: reciprocity would not hold. Symmetrise it, "
+            "0.5 * (A + A.T), when the difference is only rounding."
+        )
+    half: Any = (matrix + matrix.T) / 2
+    checked: Matrix = sp.csc_array(half) if sp.issparse(value) else half
+    return checked

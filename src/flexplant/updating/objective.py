@@ -1,0 +1,175 @@
+"""All residuals and priors as one least-squares problem over the parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import ComplexArray, FloatArray
+from .parameters import Parameter
+from .pencil import Family, repeated_groups
+from .point import Point, first_point
+from .residuals import Data, Eigenvalues, checked_data
+from .residuals_base import Residual
+from .sensitivity import mode_columns
+from .steps import Iterate, slopes
+
+
+class Objective:
+    """``1/2 |r(p)|^2`` with r the whitened residuals and ``(p - mean) / std`` of the priors.
+
+    The priors take part where the noise of every residual is known (else their weight against
+    the data would not be).
+
+    Parameters
+    ----------
+    model : ReducedModel or FEModel
+        The model.
+    parameters : sequence of q Parameter
+        Unknowns.
+    residuals : sequence of Residual
+        Data.
+    prior : bool
+        Whether priors take part.
+    family : Family, optional
+        Of the same model and parameters, to save making it again.
+    """
+
+    def __init__(
+        self,
+        model: Any,
+        parameters: Sequence[Parameter],
+        residuals: Sequence[Residual],
+        *,
+        prior: bool = True,
+        family: Family | None = None,
+    ) -> None:
+        self.parameters = tuple(parameters)
+        self.residuals = checked_residuals(residuals)
+        numbers = [n for r in self.residuals for n in _numbers(r)]
+        if family is None:
+            family = Family(model, parameters, highest=max(numbers, default=6))
+        self.family = family
+        self.bounds = [residual.bound(family) for residual in self.residuals]
+        self.numbers = tuple(dict.fromkeys(n for b in self.bounds for n in b.numbers))
+        self.noisy = all(bound.noisy for bound in self.bounds)
+        priors = [getattr(q, "prior", None) for q in parameters]
+        self.has_prior = np.array([known is not None for known in priors])
+        self.prior_mean = np.array([0.0 if known is None else known[0] for known in priors])
+        self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
+        self.uses_prior = bool(prior and self.noisy and self.has_prior.any())
+        limits = [getattr(q, "bounds", None) or (-np.inf, np.inf) for q in parameters]
+        self.lower = np.array([low for low, _ in limits], dtype=np.float64)
+        self.upper = np.array([high for _, high in limits], dtype=np.float64)
+        self.data = _pole_data(self.residuals)
+        self.reference: Point | None = None
+        self._point: Point | None = None
+
+    @property
+    def default_start(self) -> FloatArray:
+        """Prior means, zeros without, moved between the bounds."""
+        middle = np.clip(self.prior_mean, self.lower, self.upper)
+        return np.asarray(middle, dtype=np.float64)
+
+    def begin(self, p: FloatArray) -> Point:
+        """Return the model at a start, its modes numbered there."""
+        point = first_point(self.family, p)
+        mode_columns(self.numbers, point.eigen) if self.numbers else None
+        return self._set(self._assigned(self._turned(point)), refer=True)
+
+    def at(self, p: FloatArray, *, refer: bool = False) -> Point:
+        """Return the model at `p`, its modes paired with those of the reference point.
+
+        Parameters
+        ----------
+        p : (q,) array
+            Values of the parameters.
+        refer : bool
+            Whether it becomes the reference: a point the search has moved to.
+
+        Raises
+        ------
+        ModelError
+            When the matrices are indefinite there, or a mode is lost.
+        """
+        if self._point is not None and np.array_equal(self._point.p, p):
+            return self._set(self._point, refer=refer)
+        if self.reference is None:
+            return self.begin(p)
+        if np.array_equal(self.reference.p, p):
+            return self._set(self.reference, refer=refer)
+        point = self.reference.continued(np.array(p))
+        return self._set(self._assigned(self._turned(point)), refer=refer)
+
+    def _set(self, point: Point, *, refer: bool) -> Point:
+        self._point = point
+        if refer:
+            self.reference = point
+        return point
+
+    def _assigned(self, point: Point) -> Point:
+        for bound in self.bounds:
+            point = bound.assigned(point)
+        point.columns(self.numbers)
+        return point
+
+    def _turned(self, point: Point) -> Point:
+        """Return the point with exactly repeated modes turned to the split of the next step."""
+        if self.data is None or not repeated_groups(point.eigen.poles):
+            return point
+        try:
+            columns = point.columns(self.data.modes)
+        except ModelError:
+            return point
+        now = Iterate(point.p, point.eigen, point.labels, columns)
+        S, now = slopes(self.family, self.data, now)
+        turned = Point(self.family, point.p, now.eigen, point.labels)
+        turned.turned = dict(zip(self.data.modes, S, strict=True))
+        return turned
+
+    def values(self, point: Point, *, prior: bool = True) -> FloatArray:
+        """Return the residuals, then those of the priors."""
+        rows = [bound.values(point) for bound in self.bounds]
+        if prior and self.uses_prior:
+            gap = (self.prior_mean - point.p) / self.prior_std
+            rows.append(gap[self.has_prior])
+        return np.concatenate(rows)
+
+    def slopes(self, point: Point, *, prior: bool = True) -> FloatArray:
+        """Return the derivatives of `values`."""
+        rows = [bound.slopes(point) for bound in self.bounds]
+        if prior and self.uses_prior:
+            rows.append(-np.diag(1 / self.prior_std)[self.has_prior])
+        return np.vstack(rows)
+
+    def poles(self, point: Point) -> ComplexArray:
+        """Return the eigenvalues of the modes that are followed."""
+        return point.eigen.poles[point.columns(self.numbers)]
+
+
+def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
+    """Return the residuals as a tuple, checked."""
+    listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
+    for residual in listed:
+        if not isinstance(residual, Residual):
+            raise ModelError(
+                "residuals must be a list of Eigenvalues, ModeShapes, FrfResidual, Antiresonances "
+                f"or StaticCompliance, got {type(residual).__name__}: wrap the measurement, "
+                "[Eigenvalues(measured)]."
+            )
+    if not listed:
+        raise ModelError("residuals is empty: nothing was measured to update from.")
+    return listed
+
+
+def _numbers(residual: Residual) -> tuple[int, ...]:
+    measured = getattr(residual, "measured", None)
+    return tuple(getattr(measured, "modes", None) or ())
+
+
+def _pole_data(residuals: Sequence[Residual]) -> Data | None:
+    poles = [r for r in residuals if isinstance(r, Eigenvalues)]
+    return checked_data(poles) if poles else None

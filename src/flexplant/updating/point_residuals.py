@@ -1,0 +1,222 @@
+"""Residuals of transmission zeros and of static compliance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+from scipy.optimize import linear_sum_assignment
+
+from ..errors import ModelError, ShapeError
+from ..labels import Place
+from ..values import ComplexArray, FloatArray, positive, real_array
+from .pencil import Family
+from .point import Point
+from .residuals_base import Bound, Residual, place_rows, split_parts
+
+#: generalised eigenvalues beyond this multiple of the largest frequency are infinite
+INFINITE = 1e3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Antiresonances(Residual):
+    """Residuals of complex transmission zeros of one response, ``z_exp - z``.
+
+    Zeros of ``c (s^2 M + s D + K)^-1 b``: eigenvalues of ``[P(s) b; c 0]``, with
+    ``dz/dp = -y^T P_p x / (y^T (2 z M + D) x)``. The measured zeros are paired with the nearest
+    of the model, one to one.
+
+    Parameters
+    ----------
+    zeros : (m,) complex array [rad/s]
+        Of one half plane each; stored with Im > 0. Any sign of the real part.
+    output, input : place
+        Between which the response was measured.
+    direction : str
+        Of the motion and the force at points.
+    std : float or (m,) array [rad/s], optional
+        ``E|noise|^2 = std^2`` of each.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When zeros are not finite or real.
+    """
+
+    zeros: ComplexArray
+    output: Place
+    input: Place
+    direction: str = field(default="z", kw_only=True)
+    std: FloatArray | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        real = real_array(np.real(self.zeros), "zeros", (None,))
+        imag = real_array(np.imag(self.zeros), "the imaginary part of zeros", (None,))
+        if not real.size:
+            raise ShapeError("zeros is empty: leave the residual out.")
+        if np.any(imag == 0):
+            raise ModelError("zeros must have an imaginary part: an antiresonance oscillates.")
+        self._set(zeros=real + 1j * np.abs(imag), std=_checked_std(self.std, real.size))
+
+    def __repr__(self) -> str:
+        freq = ", ".join(f"{f:.1f}" for f in np.abs(self.zeros[:4]) / (2 * np.pi))
+        return f"<Antiresonances: {self.input} -> {self.output} at {freq} Hz>"
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to a family."""
+        return _BoundZeros(self, family)
+
+
+class _BoundZeros(Bound):
+    def __init__(self, residual: Antiresonances, family: Family) -> None:
+        places = [residual.output, residual.input]
+        self.c, self.b = place_rows(family, places, residual.direction)
+        self.target = residual.zeros
+        self.noisy = residual.std is not None
+        std = np.ones(self.target.size) if residual.std is None else residual.std / np.sqrt(2)
+        self.std = std
+        self.name = f"{self.target.size} antiresonances"
+
+    def _found(self, point: Point) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        """Return the zeros nearest to the measured ones with right and left vectors."""
+        M, D, K = point.matrices
+        k = K.shape[0]
+        w0 = float(np.median(np.abs(self.target)))
+        c, b = self.c / np.abs(self.c).max(), self.b / np.abs(self.b).max()
+        size = np.abs(K).max()
+        # states (q, s q / w0, force): first order in s / w0
+        E = np.zeros((2 * k + 1, 2 * k + 1))
+        A = np.zeros_like(E)
+        eye = np.eye(k)
+        A[:k, k : 2 * k] = eye
+        E[:k, :k] = eye
+        A[k : 2 * k, :k], A[k : 2 * k, k : 2 * k] = -K / size, -D * w0 / size
+        A[k : 2 * k, 2 * k], A[2 * k, :k] = b, c
+        E[k : 2 * k, k : 2 * k] = M * w0**2 / size
+        solve: Any = la.eig
+        (alpha, beta), left, right = solve(A, E, left=True, homogeneous_eigvals=True)
+        finite = np.abs(beta) * INFINITE * np.sqrt(np.abs(K).max() / np.abs(M).max()) > (
+            np.abs(alpha) * w0
+        )
+        s = np.where(finite, alpha, 0) / np.where(finite, beta, 1) * w0
+        finite &= s.imag > 1e-6 * w0
+        columns = np.flatnonzero(finite)
+        if columns.size < self.target.size:
+            raise ModelError(
+                f"the model has {columns.size} antiresonances there, {self.target.size} were "
+                "measured."
+            )
+        gap = np.abs(self.target[:, None] - s[columns])
+        _, found = linear_sum_assignment(gap)
+        columns = columns[found]
+        zeros = np.asarray(s[columns], dtype=np.complex128)
+        return zeros, right[:k, columns], left[k : 2 * k, columns].conj()
+
+    def values(self, point: Point) -> FloatArray:
+        zeros, _, _ = self._found(point)
+        return split_parts((self.target - zeros) / self.std)
+
+    def slopes(self, point: Point) -> FloatArray:
+        zeros, x, y = self._found(point)
+        M, D, _ = point.matrices
+        family = point.family
+        moved = family.moved(x, (zeros**2, zeros, np.ones_like(zeros)))
+        change = np.sum(y * moved, axis=1)
+        scale = np.sum(y * (2 * (M @ (x * zeros)) + D @ x), axis=0)
+        return split_parts((change / scale / self.std).T)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StaticCompliance(Residual):
+    """Residuals of a static compliance, ``g_exp - c K^-1 b``.
+
+    Of a free structure the elastic part (inertia relief): ``u`` of ``[K, M R; R^T M, 0]`` with the
+    rigid-body motions R, which a machine shows between its suspension and its first mode.
+
+    Parameters
+    ----------
+    value : float [m/N]
+        Measured.
+    output, input : place
+        Where the motion and the force are.
+    direction : str
+        At points.
+    std : float [m/N], optional
+        Standard deviation. None: not known; the residual is relative to `value`.
+
+    Raises
+    ------
+    ModelError
+        When the value is zero or not finite.
+    """
+
+    value: float
+    output: Place
+    input: Place
+    direction: str = field(default="z", kw_only=True)
+    std: float | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        value = float(real_array(self.value, "value", ()))
+        if value == 0:
+            raise ModelError("a compliance of zero cannot be compared relatively: check the value.")
+        self._set(value=value, std=None if self.std is None else positive(self.std, "std"))
+
+    def __repr__(self) -> str:
+        return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to a family."""
+        return _BoundStatic(self, family)
+
+
+class _BoundStatic(Bound):
+    def __init__(self, residual: StaticCompliance, family: Family) -> None:
+        places = [residual.output, residual.input]
+        self.c, self.b = place_rows(family, places, residual.direction)
+        self.value = residual.value
+        self.noisy = residual.std is not None
+        self.std = abs(residual.value) if residual.std is None else residual.std
+        self.name = "a static compliance"
+
+    def _solved(self, point: Point) -> tuple[Any, FloatArray, FloatArray]:
+        M, _, K = point.matrices
+        k, r = K.shape[0], point.family.n_rigid
+        R = np.zeros((k, 0))
+        if r:
+            R = np.eye(k)[:, :r] @ point.family.rigid_left(point.p)
+        border = M @ R
+        size = np.abs(K).max() / max(float(np.abs(border).max(initial=0.0)), 1e-300) if r else 1.0
+        system = np.block([[K, border * size], [border.T * size, np.zeros((R.shape[1],) * 2)]])
+        loads = np.zeros((system.shape[0], 2))
+        loads[:k, 0], loads[:k, 1] = self.b, self.c
+        try:
+            solved = la.solve(system, loads, assume_a="sym")
+        except la.LinAlgError:
+            raise ModelError("K is singular beyond the rigid-body motions.") from None
+        return (R * size, k), solved[:, 0], solved[:, 1]
+
+    def values(self, point: Point) -> FloatArray:
+        (_, k), u, _ = self._solved(point)
+        return np.array([(self.value - self.c @ u[:k]) / self.std])
+
+    def slopes(self, point: Point) -> FloatArray:
+        (R, k), u, y = self._solved(point)
+        family = point.family
+        moved = y[:k] @ (family.dK @ u[:k]).T
+        if R.shape[1]:
+            loaded = family.dM @ R
+            moved = moved + y[:k] @ (loaded @ u[k:]).T + (y[k:] @ np.swapaxes(loaded, 1, 2)) @ u[:k]
+        return np.asarray(moved / self.std)[None, :]
+
+
+def _checked_std(value: Any, count: int) -> FloatArray | None:
+    if value is None:
+        return None
+    std = real_array(value, "std")
+    std = np.full(count, float(std)) if std.ndim == 0 else real_array(std, "std", (count,))
+    if std.min() <= 0:
+        raise ModelError(f"std must be positive, got {std.min():g}.")
+    return std

@@ -1,0 +1,175 @@
+"""The posterior of the parameters by sampling, where Laplace's approximation is not enough."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import FloatArray, Value
+from .objective import Objective, checked_residuals
+from .parameters import Parameter
+from .result import UpdateResult
+from .sensitivity import checked_parameters
+
+#: stretch of the moves
+STRETCH = 2.0
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Posterior(Value):
+    """Draws from the posterior distribution of the parameters.
+
+    Parameters
+    ----------
+    parameters : sequence of q str
+        Names.
+    draws : (n, q) array
+        In order, walkers next to each other.
+    acceptance : float
+        Share of moves that were accepted; 0.2 to 0.6 is healthy.
+    walkers : int
+        Number of walkers.
+    """
+
+    parameters: tuple[str, ...]
+    draws: FloatArray
+    acceptance: float
+    walkers: int
+
+    def __post_init__(self) -> None:
+        self._set(draws=self.draws)
+
+    @property
+    def mean(self) -> FloatArray:
+        """Means (q,) of the parameters."""
+        return np.asarray(self.draws.mean(axis=0), dtype=np.float64)
+
+    @property
+    def covariance(self) -> FloatArray:
+        """Covariance (q, q) of the parameters."""
+        return np.atleast_2d(np.cov(self.draws.T))
+
+    def interval(self, level: float = 0.95) -> FloatArray:
+        """Return the central credible intervals (q, 2).
+
+        Raises
+        ------
+        ModelError
+            When the level is no probability.
+        """
+        if not 0 < level < 1:
+            raise ModelError(f"level must lie between 0 and 1, got {level!r}.")
+        return np.quantile(self.draws, [(1 - level) / 2, (1 + level) / 2], axis=0).T
+
+    def __repr__(self) -> str:
+        text = ", ".join(
+            f"{name} = {value:.5g} +- {std:.2g}"
+            for name, value, std in zip(
+                self.parameters[:4], self.mean, self.draws.std(axis=0), strict=False
+            )
+        )
+        return f"<Posterior: {text}; {len(self.draws)} draws, acceptance {self.acceptance:.2f}>"
+
+
+def sample_posterior(
+    model: Any,
+    parameters: Sequence[Parameter],
+    residuals: Sequence[Any],
+    fit: UpdateResult,
+    *,
+    steps: int = 400,
+    walkers: int | None = None,
+    discard: float = 0.3,
+    seed: int = 0,
+) -> Posterior:
+    """Draw from the posterior ``exp(-1/2 |r(p)|^2)`` (with priors, inside bounds).
+
+    An ensemble of walkers with stretch moves: no tuning, and scale does not matter. They begin
+    spread by Laplace's approximation about the fit.
+
+    Parameters
+    ----------
+    model, parameters, residuals
+        As given to `update`; the noise of all residuals must be known.
+    fit : UpdateResult
+        Of `update`.
+    steps : int
+        Moves of each walker.
+    walkers : int, optional
+        Even, twice the number of parameters at least; four times (at least 10) if not given.
+    discard : float
+        Share of the first steps left out.
+    seed : int
+        Of all random numbers.
+
+    Returns
+    -------
+    Posterior
+
+    Raises
+    ------
+    ModelError
+        When the noise is not known, or the counts make no sense.
+
+    References
+    ----------
+    Goodman, Weare: Ensemble samplers with affine invariance, Comm. App. Math. Comp. Sci. 5, 2010.
+    """
+    listed = checked_parameters(parameters)
+    objective = Objective(model, listed, checked_residuals(residuals))
+    q = len(listed)
+    if not objective.noisy:
+        raise ModelError("the posterior needs the noise of all residuals: give covariance or std.")
+    if not isinstance(fit, UpdateResult) or fit.parameters != tuple(p.name for p in listed):
+        raise ModelError("fit must be the UpdateResult of the same parameters.")
+    count = max(10, 4 * q) if walkers is None else walkers
+    if count % 2 or count < 2 * q or count < 4 or steps < 2 or not 0 <= discard < 1:
+        raise ModelError(
+            f"{count} walkers and {steps} steps: walkers must be even and at least "
+            f"{max(4, 2 * q)}, steps 2, discard between 0 and 1."
+        )
+    rng = np.random.default_rng(seed)
+    objective.begin(fit.history.parameters[0])
+    for p in fit.history.parameters[1:]:
+        objective.at(p, refer=True)
+    objective.at(fit.values, refer=True)
+
+    def density(p: FloatArray) -> float:
+        if np.any(p < objective.lower) or np.any(p > objective.upper):
+            return -np.inf
+        try:
+            r = objective.values(objective.at(p))
+        except ModelError:
+            return -np.inf
+        return -0.5 * float(r @ r)
+
+    begin = np.clip(fit.sample(count, seed=seed), objective.lower, objective.upper)
+    height = np.array([density(p) for p in begin])
+    begin[~np.isfinite(height)] = fit.values
+    height = np.array([density(p) for p in begin])
+    kept, accepted = [], 0
+    half = count // 2
+    for step in range(steps):
+        for move in (np.arange(half), np.arange(half, count)):
+            other = np.setdiff1d(np.arange(count), move)
+            z = ((STRETCH - 1) * rng.random(half) + 1) ** 2 / STRETCH
+            partner = begin[rng.choice(other, half)]
+            trial = partner + z[:, None] * (begin[move] - partner)
+            reached = np.array([density(p) for p in trial])
+            with np.errstate(invalid="ignore"):
+                odds = (q - 1) * np.log(z) + reached - height[move]
+            take = np.log(rng.random(half)) < odds
+            begin[move[take]], height[move[take]] = trial[take], reached[take]
+            accepted += int(take.sum())
+        if step >= discard * steps:
+            kept.append(begin.copy())
+    return Posterior(
+        parameters=tuple(p.name for p in listed),
+        draws=np.concatenate(kept),
+        acceptance=accepted / (steps * count),
+        walkers=count,
+    )

@@ -1,0 +1,69 @@
+"""What every residual has in common: it is bound to a family of models, then gives r and dr/dp."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError
+from ..labels import Place
+from ..values import ComplexArray, FloatArray, Value
+from .pencil import Family
+from .point import Point
+
+
+class Residual(Value):
+    """A measurement that the model should reproduce."""
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to the rows of one family of models."""
+        raise NotImplementedError
+
+
+class Bound:
+    """Residuals of unit covariance (where the noise is known), and their exact gradients."""
+
+    #: numbers of the modes that are followed for it
+    numbers: tuple[int, ...] = ()
+    #: whether the covariance of the measurement is known
+    noisy: bool = False
+    name: str = ""
+
+    def values(self, point: Point) -> FloatArray:
+        """Return the real residuals (m,) at a point, measured minus model, whitened."""
+        raise NotImplementedError
+
+    def slopes(self, point: Point) -> FloatArray:
+        """Return their derivatives (m, q)."""
+        raise NotImplementedError
+
+    def assigned(self, point: Point) -> Point:
+        """Return the point with modes relabelled by the measurement, where it can tell."""
+        return point
+
+
+def place_rows(family: Family, places: Sequence[Place], direction: str = "z") -> FloatArray:
+    """Return the rows (m, k) of places in the coordinates of the family."""
+    model: Any = family.model
+    rows = model if hasattr(model, "row") else model.dofs
+    return np.array([rows.row(place, direction) for place in places]) @ family.V
+
+
+def channel_places(
+    channels: Sequence[str], places: Mapping[str, Place] | None
+) -> tuple[Place, ...]:
+    """Return the place of each channel: of `places` where named there, else its name."""
+    known = dict(places or {})
+    unknown = sorted(set(known) - set(channels))
+    if unknown:
+        raise LabelError(
+            f"places names {unknown}, which are no channels: {', '.join(channels[:6])}."
+        )
+    return tuple(known.get(channel, channel) for channel in channels)
+
+
+def split_parts(rows: ComplexArray) -> FloatArray:
+    """Return [Re; Im] along the first axis."""
+    return np.concatenate([rows.real, rows.imag])

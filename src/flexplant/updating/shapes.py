@@ -1,0 +1,257 @@
+"""Residuals of mode shapes, their unknown scale and phase taken out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ..errors import LabelError, ModelError, ShapeError
+from ..identification import MeasuredModes
+from ..labels import Place
+from ..values import ComplexArray, FloatArray, real_array
+from .pairing import CLUSTER, mac
+from .pencil import Family, groups
+from .point import Point
+from .residuals_base import Bound, Residual, place_rows, split_parts
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModeShapes(Residual):
+    """Residuals of measured mode shapes psi at some places, scale and phase removed.
+
+    ``r = (I - P) psi``, P the projector on the model's shape there: what no complex factor of the
+    model's shape explains (the maximum-likelihood residual with the factor as a nuisance;
+    ``|r|^2 = (1 - MAC) |psi|^2``). Modes whose measured poles are closer than 2 % are compared
+    with the subspace of their cluster, which does not turn. While fitting, the model's modes are
+    assigned to the measured ones by MAC.
+
+    Parameters
+    ----------
+    measured : MeasuredModes
+        Poles with their mode numbers.
+    shapes : (m, modes) real or complex array
+        In the order of the poles; any scale.
+    at : sequence of m places
+        DOF labels, points or mappings.
+    std : float or (m, modes) array, optional
+        Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in their own
+        scale. None: all equal, not known.
+    assign : bool
+        Whether modes are assigned by MAC with the measured shapes; False: by continuation.
+
+    Raises
+    ------
+    ModelError, ShapeError, LabelError
+        When sizes do not match, a shape is zero, or mode numbers are missing.
+
+    Examples
+    --------
+    >>> measured = MeasuredModes([-1 + 20j, -2 + 60j], modes=[1, 2])
+    >>> ModeShapes(measured, [[1.0, 1.0], [1.4, -0.7]], ["1:z", "2:z"])
+    <ModeShapes: modes 1, 2 at 2 places, noise not known>
+    """
+
+    measured: MeasuredModes
+    shapes: FloatArray | ComplexArray
+    at: Sequence[Place]
+    direction: str = field(default="z", kw_only=True)
+    std: FloatArray | None = field(default=None, kw_only=True)
+    assign: bool = field(default=True, kw_only=True)
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        if not isinstance(self.measured, MeasuredModes):
+            raise ModelError(f"{name} needs MeasuredModes, got {type(self.measured).__name__}.")
+        if self.measured.modes is None:
+            raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
+        at = [self.at] if isinstance(self.at, str) else list(self.at)
+        shape = (len(at), len(self.measured))
+        real = real_array(np.real(self.shapes), "shapes", shape)
+        imag = real_array(np.imag(self.shapes), "the imaginary part of shapes", shape)
+        if len(at) < 2:
+            raise ShapeError(f"{name} needs two places at least: the scale of one is not known.")
+        shapes: Any = real + 1j * imag if np.iscomplexobj(self.shapes) else real
+        empty = np.flatnonzero(np.all(shapes == 0, axis=0))
+        if empty.size:
+            raise ModelError(f"the shape of mode {self.measured.modes[empty[0]]} is zero.")
+        std = self.std
+        if std is not None:
+            std = np.broadcast_to(real_array(std, "std"), shape).copy() if np.ndim(std) < 2 else std
+            std = real_array(std, "std", shape)
+            if std.min() <= 0:
+                raise ModelError(f"std must be positive, got {std.min():g}.")
+        self._set(shapes=shapes, at=tuple(at), std=std)
+
+    def __repr__(self) -> str:
+        numbers = ", ".join(str(n) for n in self.measured.modes or ())
+        known = "not known" if self.std is None else "known"
+        return f"<{type(self).__name__}: modes {numbers} at {len(self.at)} places, noise {known}>"
+
+    def select(self, modes: Sequence[int]) -> ModeShapes:
+        """Return the residual of some of its modes, by number.
+
+        Raises
+        ------
+        LabelError
+            When a mode was not measured.
+        """
+        chosen, columns = chosen_modes(self.measured, modes)
+        std = None if self.std is None else self.std[:, columns]
+        return self.replace(measured=chosen, shapes=self.shapes[:, columns], std=std)
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to a family."""
+        return _BoundShapes(self, family)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ShapeCorrelation(ModeShapes):
+    """Residuals ``(1 - sqrt(MAC)) / sqrt(MAC)`` of measured mode shapes, one for each mode.
+
+    Blind to first order near a perfect fit: `ModeShapes` says more with the same data. For
+    comparison with published studies.
+
+    Parameters
+    ----------
+    measured : MeasuredModes
+        Poles with their mode numbers.
+    shapes : (m, modes) real or complex array
+        In the order of the poles; any scale.
+    at : sequence of m places
+        DOF labels, points or mappings.
+    assign : bool
+        Whether modes are assigned by MAC with the measured shapes.
+
+    Raises
+    ------
+    ModelError, ShapeError, LabelError
+        As `ModeShapes`.
+    """
+
+    def bound(self, family: Family) -> Bound:
+        """Return the residual tied to a family."""
+        return _BoundMac(self, family)
+
+
+class _BoundShapes(Bound):
+    def __init__(self, residual: ModeShapes, family: Family) -> None:
+        measured = residual.measured
+        own = measured.modes or ()
+        near = groups(measured.poles, gap=CLUSTER)
+        alone = [[i] for i in range(len(own)) if not any(i in group for group in near)]
+        #: columns of the measurement that are compared together
+        self.sets = [*alone, *near]
+        self.own = own
+        self.numbers = own
+        self.noisy = residual.std is not None
+        self.rows = place_rows(family, residual.at, residual.direction)
+        self.psi = np.asarray(residual.shapes)
+        size = np.linalg.norm(self.psi, axis=0)
+        # Re and Im of complex noise have half the variance each
+        part = np.sqrt(2.0) if np.iscomplexobj(self.psi) else 1.0
+        std = size * np.ones(self.psi.shape) if residual.std is None else residual.std / part
+        self.weight = 1 / std
+        self.assign = residual.assign
+        self.name = f"shapes of modes {', '.join(map(str, own))}"
+
+    def assigned(self, point: Point) -> Point:
+        if not self.assign:
+            return point
+        score = mac(self.psi.astype(complex), self.rows @ point.eigen.X)
+        measured, columns = linear_sum_assignment(-score)
+        labels = point.labels.copy()
+        for i, column in zip(measured.tolist(), columns.tolist(), strict=True):
+            here = np.flatnonzero(labels == self.own[i])
+            if here.size and here[0] != column:
+                labels[here[0]], labels[column] = labels[column], labels[here[0]]
+            labels[column] = self.own[i]
+        changed = Point(point.family, point.p, point.eigen, labels)
+        changed.turned = point.turned
+        return changed
+
+    def _parts(self, point: Point, group: list[int], i: int) -> tuple[Any, Any, Any]:
+        """Return the whitened model shapes of a group (m, s), its basis Q and the measured one."""
+        columns = point.columns([self.own[j] for j in group])
+        weight = self.weight[:, i]
+        Phi = weight[:, None] * (self.rows @ point.eigen.X[:, columns])
+        if not np.any(Phi.imag):
+            Phi = Phi.real
+        Q = np.linalg.qr(Phi)[0]
+        return Phi, Q, weight * self.psi[:, i]
+
+    def values(self, point: Point) -> FloatArray:
+        found = []
+        for group in self.sets:
+            for i in group:
+                _, Q, psi = self._parts(point, group, i)
+                found.append(self._stacked(psi - Q @ (Q.conj().T @ psi)))
+        return np.concatenate(found)
+
+    def slopes(self, point: Point) -> FloatArray:
+        found = []
+        for group in self.sets:
+            dX, _ = point.subspace([self.own[j] for j in group])
+            dY = self.rows @ dX
+            for i in group:
+                Phi, Q, psi = self._parts(point, group, i)
+                dPhi = self.weight[:, i][:, None] * (dY if np.iscomplexobj(Phi) else dY.real)
+                plus = np.linalg.pinv(Phi)
+                left = psi - Q @ (Q.conj().T @ psi)
+                inner = dPhi @ (plus @ psi)
+                inner = inner - (inner @ Q.conj()) @ Q.T
+                outer = (dPhi.conj().transpose(0, 2, 1) @ left) @ plus.conj()
+                found.append(self._stacked(-(inner + outer).T))
+        return np.concatenate(found)
+
+    def _stacked(self, part: Any) -> FloatArray:
+        complex_data = np.iscomplexobj(self.psi)
+        return split_parts(np.asarray(part, dtype=complex)) if complex_data else np.real(part)
+
+
+class _BoundMac(_BoundShapes):
+    """sqrt(MAC) = |Q^H psi| / |psi|; r = 1/sqrt(MAC) - 1, with the sign that vanishes at a fit."""
+
+    def values(self, point: Point) -> FloatArray:
+        found = []
+        for group in self.sets:
+            for i in group:
+                _, Q, psi = self._parts(point, group, i)
+                found.append(np.linalg.norm(psi) / np.linalg.norm(Q.conj().T @ psi) - 1)
+        return np.array(found)
+
+    def slopes(self, point: Point) -> FloatArray:
+        found = []
+        for group in self.sets:
+            dX, _ = point.subspace([self.own[j] for j in group])
+            dY = self.rows @ dX
+            for i in group:
+                Phi, Q, psi = self._parts(point, group, i)
+                dPhi = self.weight[:, i][:, None] * dY
+                plus = np.linalg.pinv(Phi)
+                left = psi - Q @ (Q.conj().T @ psi)
+                # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
+                change = np.real((dPhi @ (plus @ psi)) @ left.conj())
+                inside = float(np.linalg.norm(Q.conj().T @ psi))
+                found.append(-float(np.linalg.norm(psi)) * change / inside**3)
+        return np.array(found)
+
+
+def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
+    """Return the measured modes of some numbers, and their positions."""
+    known = measured.modes or ()
+    wanted = [int(n) for n in modes]
+    missing = [n for n in wanted if n not in known]
+    if missing or not wanted:
+        raise LabelError(f"modes {missing or '[]'} were not measured; measured are {list(known)}.")
+    columns = [known.index(n) for n in wanted]
+    covariance = measured.covariance
+    if covariance is not None:
+        at = columns + [c + len(measured) for c in columns]
+        covariance = covariance[np.ix_(at, at)]
+    return MeasuredModes(
+        measured.poles[columns], modes=tuple(wanted), covariance=covariance
+    ), columns
