@@ -32,7 +32,7 @@ def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
     shape = len(g.outputs), len(g.inputs)
     if not g.n_states or not g.D.size:
         return lambda freq: np.repeat(g.D[:, :, None], freq.size, axis=2).astype(np.complex128)
-    modal = _modal(g)
+    modal = _modal(g) or _fed_by_lines(g)
     if modal is not None:
         return lambda freq: _finite(modal(_points(g, freq)), freq)
     solve = _solver(g)
@@ -158,6 +158,65 @@ def _modal(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | None:
         return data
 
     return found
+
+
+def _fed_by_lines(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | None:
+    """Modes fed by a few further states, such as the delay lines of a sampled plant.
+
+    With A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
+    sparse (a line belongs to one input), and the head is again one matrix product: that of the
+    inputs [B_h, A_ht].
+    """
+    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+        return None
+    ends = np.cumsum(g.blocks)
+    starts = ends - np.asarray(g.blocks)
+    tied = np.array([np.any(g.A[:i, i:j]) for i, j in zip(starts, ends, strict=True)])
+    cut = int(np.argmax(tied))
+    head = int(starts[cut]) if np.any(tied) else 0
+    n, m = g.B.shape
+    if not head or 4 * (n - head) > n:
+        return None
+    blocks, rest = list(g.blocks[:cut]), list(g.blocks[cut:])
+    feeding = np.flatnonzero(np.any(g.A[:head, head:], axis=0))
+    names = [f"x{i}" for i in range(m + feeding.size)]
+    inputs = np.hstack([g.B[:head], g.A[:head, head + feeding]])
+    through = np.hstack([g.D, g.C[:, head + feeding]])
+    driven = _modal(
+        StateSpace(g.A[:head, :head], inputs, g.C[:, :head], through, g.dt, names, blocks=blocks)
+    )
+    if driven is None:
+        return None
+    lines = StateSpace(
+        g.A[head:, head:], g.B[head:], np.eye(n - head), np.zeros((n - head, m)), g.dt, blocks=rest
+    )
+    tail = _solver(lines)
+    reached = _reached(g.A[head:, head:], g.B[head:])
+    direct = np.setdiff1d(np.flatnonzero(np.any(g.C[:, head:], axis=0)), feeding)
+
+    def found(s: ComplexArray) -> ComplexArray:
+        X = np.zeros((n - head, m, s.size), dtype=np.complex128)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            tail(s, X)
+        both = driven(s)
+        data = np.ascontiguousarray(both[:, :m])
+        for i, line in enumerate(feeding):
+            for j in np.flatnonzero(reached[line]):
+                data[:, j] += both[:, m + i] * X[line, j]
+        for line in direct:
+            for j in np.flatnonzero(reached[line]):
+                data[:, j] += g.C[:, head + line, None] * X[line, j]
+        return data
+
+    return found
+
+
+def _reached(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
+    """Return which states (n, m) each input can move at all."""
+    now = B != 0
+    for _ in range(A.shape[0]):
+        now = now | ((A != 0).astype(float) @ now.astype(float) > 0)
+    return np.asarray(now)
 
 
 def _closed_form(
