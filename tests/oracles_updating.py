@@ -136,7 +136,7 @@ def central_difference(M, D, K, parts, value, step, mode):
 
 
 def complex_step(M, D, K, parts, mode, step=1e-20):
-    """d lambda / d p at zero to rounding, by a complex step through real Newton equations.
+    """Lambda and d lambda / d p at zero to rounding, by a complex step through Newton equations.
 
     Re and Im of (lambda^2 M + lambda D + K) x = 0, c^T x = 1 are real equations in real
     unknowns, so the step's imaginary part carries the derivative without any cancellation.
@@ -170,3 +170,41 @@ def complex_step(M, D, K, parts, mode, step=1e-20):
         )
         u = u - la.solve(J, residual)
     return lam, (u[-2].imag + 1j * u[-1].imag) / step
+
+
+def complex_step_vector(M, D, K, parts, mode, step=1e-20):
+    """d lambda / d p and dx / dp with the largest entry of x held at 1; see `complex_step`.
+
+    Re and Im of (lambda^2 M + lambda D + K) x = 0, c^T x = 1 are real equations in real
+    unknowns, so the step's imaginary part carries the derivative without any cancellation.
+    """
+    n = M.shape[0]
+    A = np.block([[np.zeros((n, n)), np.eye(n)], [-la.solve(M, K), -la.solve(M, D)]])
+    values, vectors = la.eig(A)
+    values, vectors = values[values.imag > 1e-6], vectors[:, values.imag > 1e-6]
+    order = np.argsort(np.abs(values))
+    lam, x = values[order[mode]], vectors[:n, order[mode]]
+    c = np.argmax(np.abs(x))
+    x = x / x[c]
+    u = np.concatenate([x.real, x.imag, [lam.real, lam.imag]]).astype(complex)
+    pin = np.zeros(n)
+    pin[c] = 1.0
+    for k in range(12):
+        p = 1j * step if k > 5 else 0.0
+        Mp, Dp, Kp = (a + p * b for a, b in zip((M, D, K), parts, strict=True))
+        xr, xi, a, b = u[:n], u[n : 2 * n], u[-2], u[-1]
+        P = (a * a - b * b) * Mp + a * Dp + Kp
+        Q = 2 * a * b * Mp + b * Dp
+        residual = np.concatenate([P @ xr - Q @ xi, Q @ xr + P @ xi, [pin @ xr - 1, pin @ xi]])
+        Pa, Pb, Qa, Qb = 2 * a * Mp + Dp, -2 * b * Mp, 2 * b * Mp, 2 * a * Mp + Dp
+        J = np.block(
+            [
+                [P, -Q, (Pa @ xr - Qa @ xi)[:, None], (Pb @ xr - Qb @ xi)[:, None]],
+                [Q, P, (Qa @ xr + Pa @ xi)[:, None], (Qb @ xr + Pb @ xi)[:, None]],
+                [pin[None], 0 * pin[None], np.zeros((1, 2))],
+                [0 * pin[None], pin[None], np.zeros((1, 2))],
+            ]
+        )
+        u = u - la.solve(J, residual)
+    slope = (u[-2].imag + 1j * u[-1].imag) / step
+    return slope, (u[:n].imag + 1j * u[n : 2 * n].imag) / step

@@ -19,8 +19,9 @@ from .parameters import Parameter
 from .pencil import Family
 from .residuals_base import Residual
 from .result import History, Starts, UpdateResult
-from .search import Found, gauss_newton, lasso, tikhonov, trust_region
+from .search import Found, gauss_newton, tikhonov, trust_region
 from .sensitivity import checked_values
+from .sparse_search import lasso
 
 #: a parameter this close to its bound, relative to their distance, is at it
 AT_BOUND = 1e-6
@@ -37,11 +38,12 @@ def general_update(
     start: Any,
     starts: Any,
     seed: int,
+    prior: bool,
     most: int,
     tolerance: float,
 ) -> UpdateResult:
     """Return the answer of a search with any residuals; see `update`."""
-    objective = Objective(model, parameters, residuals)
+    objective = Objective(model, parameters, residuals, prior=prior)
     first = objective.default_start
     if start is not None:
         first = checked_values(start, parameters, "start")

@@ -14,8 +14,9 @@ from ..values import FloatArray, Value
 from .methods import TrustRegion
 from .objective import Objective, checked_residuals
 from .parameters import Parameter
-from .search import bic, trust_region
+from .search import trust_region
 from .sensitivity import checked_parameters
+from .sparse_search import bic
 
 #: pairs of the best so many candidates are all tried
 PAIRS = 4

@@ -21,8 +21,10 @@ from .steps import Iterate, slopes
 class Objective:
     """``1/2 |r(p)|^2`` with r the whitened residuals and ``(p - mean) / std`` of the priors.
 
-    The priors take part where the noise of every residual is known (else their weight against
-    the data would not be).
+    A parameter with two finite bounds and no prior has one from them: normal, the model itself
+    (zero, or the bound nearest to it) the most probable, the farther bound three standard
+    deviations away. The priors take part where the noise of every residual is known (else their
+    weight against the data would not be).
 
     Parameters
     ----------
@@ -56,7 +58,7 @@ class Objective:
         self.bounds = [residual.bound(family) for residual in self.residuals]
         self.numbers = tuple(dict.fromkeys(n for b in self.bounds for n in b.numbers))
         self.noisy = all(bound.noisy for bound in self.bounds)
-        priors = [getattr(q, "prior", None) for q in parameters]
+        priors = [getattr(q, "prior", None) or _from_bounds(q) for q in parameters]
         self.has_prior = np.array([known is not None for known in priors])
         self.prior_mean = np.array([0.0 if known is None else known[0] for known in priors])
         self.prior_std = np.array([1.0 if known is None else known[1] for known in priors])
@@ -163,6 +165,14 @@ def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
     if not listed:
         raise ModelError("residuals is empty: nothing was measured to update from.")
     return listed
+
+
+def _from_bounds(parameter: Parameter) -> tuple[float, float] | None:
+    low, high = getattr(parameter, "bounds", None) or (-np.inf, np.inf)
+    if not np.isfinite(high - low):
+        return None
+    mean = float(np.clip(0.0, low, high))
+    return mean, max(high - mean, mean - low) / 3
 
 
 def _numbers(residual: Residual) -> tuple[int, ...]:

@@ -1,4 +1,4 @@
-"""The searches behind `update`: trust region with bounds, L-curve, Gauss-Newton, l1."""
+"""The searches behind `update`: trust region with bounds, L-curve, Gauss-Newton."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any
 
 import numpy as np
 from scipy.optimize import least_squares
-from scipy.optimize._lsq.least_squares import IMPLEMENTED_LOSSES
 
 from ..errors import ModelError, SolverError
 from ..values import FloatArray
 from .methods import Loss, TrustRegion
 from .objective import Objective
 
-#: weights tried for an L-curve or a path of l1 weights
+#: weights tried for an L-curve
 PATH = 13
 
 
@@ -126,7 +125,8 @@ def _within(
         bounds=(low, high),
         method="trf",
         x_scale=units(objective, objective.slopes(point, prior=False)),
-        ftol=tolerance**2 if tolerance**2 > 2.3e-16 else 2.3e-16,
+        # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
+        ftol=max(1e-2 * tolerance, 2.3e-16),
         xtol=max(tolerance, 2.3e-16),
         gtol=1e-15,
         loss=loss,
@@ -144,11 +144,27 @@ def _within(
 
 
 def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
-    """Return rho, rho', rho'' with the named loss on the first rows and squares on the others."""
+    """Return rho, rho', rho'' with the named loss on the first rows and squares on the others.
+
+    A prior is no outlier, however far the data pull.
+    """
 
     def rho(z: FloatArray) -> FloatArray:
         out = np.vstack([z, np.ones_like(z), np.zeros_like(z)])
-        IMPLEMENTED_LOSSES[name](z[:rows], out[:, :rows], False)
+        t = 1 + z[:rows]
+        if name == "cauchy":
+            parts = np.log(t), 1 / t, -1 / t**2
+        elif name == "soft_l1":
+            parts = 2 * (np.sqrt(t) - 1), t**-0.5, -0.5 * t**-1.5
+        else:
+            root = np.sqrt(np.maximum(z[:rows], 1.0))
+            far = z[:rows] > 1
+            parts = (
+                np.where(far, 2 * root - 1, z[:rows]),
+                1 / root,
+                np.where(far, -0.5 / root**3, 0),
+            )
+        out[:, :rows] = parts
         return out
 
     return rho
@@ -255,125 +271,3 @@ def gauss_newton(
             converged, reason = True, "step below the tolerance"
             break
     return Found(p, float(r @ r) / 2, trail, converged, reason)
-
-
-def lasso(
-    objective: Objective, start: FloatArray, weight: float | None, *, most: int, tolerance: float
-) -> Found:
-    """Minimise with an l1 penalty on the change; None: the weight of least BIC, refitted."""
-    J = objective.slopes(objective.begin(start), prior=False)
-    r = objective.values(objective.at(start), prior=False)
-    unit = units(objective, J)
-    if weight is not None:
-        return _sparse(objective, start, unit, weight, most, tolerance)
-    largest = float(np.abs((J * unit).T @ r).max())
-    best: tuple[float, Found] | None = None
-    tried: set[tuple[int, ...]] = set()
-    for size in np.geomspace(0.9 * largest, 1e-3 * largest, PATH).tolist():
-        found = _sparse(objective, start, unit, size, most, tolerance)
-        active = np.abs(found.p - start) > 1e-6 * unit * max(
-            1e-300, float(np.abs((found.p - start) / unit).max())
-        )
-        key = tuple(np.flatnonzero(active).tolist())
-        if key in tried or not key or len(key) >= r.size:
-            continue
-        tried.add(key)
-        found = refitted(objective, start, found.p, active, most, tolerance)
-        score = bic(found.trail.error[-1], r.size, len(key), objective.noisy)
-        if best is None or score < best[0]:
-            best = (score, found)
-    if best is None:
-        raise SolverError("no weight of the l1 penalty leaves a sparse change: nothing differs.")
-    return best[1]
-
-
-def bic(error: float, rows: int, count: int, noisy: bool) -> float:
-    """Return ``chi^2 + k ln n``, or ``n ln(e/n) + k ln n`` where the noise is not known."""
-    misfit = error if noisy else rows * float(np.log(max(error, 1e-300) / rows))
-    return misfit + count * float(np.log(rows))
-
-
-def refitted(
-    objective: Objective,
-    start: FloatArray,
-    begin: FloatArray,
-    active: Any,
-    most: int,
-    tolerance: float,
-) -> Found:
-    """Minimise over some parameters, the others held at the start."""
-    lower, upper = objective.lower, objective.upper
-    held = 1e-9 * np.maximum(np.abs(start), 1e-9)
-    try:
-        objective.lower = np.where(active, lower, start - held)
-        objective.upper = np.where(active, upper, start + held)
-        p = np.where(active, begin, start)
-        found = trust_region(objective, p, TrustRegion(), most=most, tolerance=tolerance)
-    finally:
-        objective.lower, objective.upper = lower, upper
-    found.p = np.where(active, found.p, start)
-    objective.at(found.p, refer=True)
-    return found
-
-
-def _sparse(
-    objective: Objective,
-    start: FloatArray,
-    unit: FloatArray,
-    weight: float,
-    most: int,
-    tolerance: float,
-) -> Found:
-    """Solve a sequence of convex problems, each linear in the residuals, steps halved."""
-    import cvxpy
-
-    cp: Any = cvxpy
-
-    trail = Trail()
-    point = objective.begin(start)
-    trail.add(objective, start, 0.0)
-    p = start
-    converged, reason = False, "max_iterations reached"
-
-    def total(r: FloatArray, p: FloatArray) -> float:
-        return float(r @ r) / 2 + weight * float(np.abs((p - start) / unit).sum())
-
-    r = objective.values(point)
-    for _ in range(most):
-        J = objective.slopes(point) * unit
-        x = cp.Variable(p.size)
-        now = (p - start) / unit
-        limits = (
-            [x <= (objective.upper - start) / unit] if np.isfinite(objective.upper).all() else []
-        )
-        if np.isfinite(objective.lower).all():
-            limits.append(x >= (objective.lower - start) / unit)
-        loss = cp.sum_squares(r + J @ (x - now)) / 2 + weight * cp.norm1(x)
-        problem = cp.Problem(cp.Minimize(loss), limits)
-        problem.solve(solver=cp.CLARABEL)
-        if x.value is None:
-            raise SolverError(f"the l1 problem was not solved: {problem.status}.")
-        aim = np.where(np.abs(x.value) > 1e-7 * np.abs(x.value).max(), x.value, 0.0)
-        step, fraction = (aim - now) * unit, 1.0
-        for _ in range(20):
-            try:
-                trial = objective.at(p + fraction * step)
-                changed = objective.values(trial)
-            except ModelError:
-                fraction /= 2
-                continue
-            if total(changed, trial.p) <= total(r, p) * (1 + 1e-12):
-                break
-            fraction /= 2
-        else:
-            converged, reason = True, "no part of a step helps"
-            break
-        size = float(np.abs(step / unit).max())
-        p = start + aim * unit if fraction == 1.0 else p + fraction * step
-        point = objective.at(p, refer=True)
-        r = objective.values(point)
-        trail.add(objective, p, fraction)
-        if size < max(tolerance, 1e-6):
-            converged, reason = True, "step below the tolerance"
-            break
-    return Found(p, total(r, p), trail, converged, reason)

@@ -31,6 +31,7 @@ def update(
     start: Sequence[float] | FloatArray | None = None,
     starts: int | FloatArray | None = None,
     seed: int = 0,
+    prior: bool = True,
     max_iterations: int | None = None,
     tolerance: float = 1e-10,
 ) -> UpdateResult:
@@ -70,6 +71,10 @@ def update(
         the best; `start` is one of them.
     seed : int
         For drawn starts.
+    prior : bool
+        Whether priors take part. A parameter with two finite bounds and no prior has one from
+        them: zero (or the bound nearest to it) most probable, the farther bound three standard
+        deviations away.
     max_iterations : int, optional
         Most steps from one start; 20 for Gauss-Newton, 200 for the others when not given.
     tolerance : float
@@ -122,6 +127,7 @@ def update(
         start=start,
         starts=starts,
         seed=seed,
+        prior=bool(prior),
         most=max_iterations or (20 if newton else 200),
         tolerance=enough,
     )

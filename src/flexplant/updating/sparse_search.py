@@ -1,0 +1,153 @@
+"""Sparse changes: an l1 penalty on linearised problems, subsets by BIC."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, SolverError
+from ..values import FloatArray
+from .methods import TrustRegion
+from .objective import Objective
+from .search import Found, Trail, trust_region, units
+
+#: weights on the path
+PATH = 13
+#: convex problems for each weight of the path
+PATH_STEPS = 5
+#: a change of less than so many units is the solver's rounding
+NOTHING = 1e-9
+
+
+def lasso(
+    objective: Objective, start: FloatArray, weight: float | None, *, most: int, tolerance: float
+) -> Found:
+    """Minimise with an l1 penalty on the change; None: the weight of least BIC, refitted."""
+    J = objective.slopes(objective.begin(start), prior=False)
+    r = objective.values(objective.at(start), prior=False)
+    unit = units(objective, J)
+    if weight is not None:
+        return _sparse(objective, start, unit, weight, most, tolerance)
+    largest = float(np.abs((J * unit).T @ r).max())
+    best: tuple[float, tuple[int, ...], Found] | None = None
+    tried: set[tuple[int, ...]] = set()
+
+    def judged(key: tuple[int, ...], begin: FloatArray) -> None:
+        nonlocal best
+        if key in tried or not key or len(key) >= r.size:
+            return
+        tried.add(key)
+        active = np.isin(np.arange(start.size), key)
+        found = refitted(objective, start, begin, active, most, tolerance)
+        score = bic(found.trail.error[-1], r.size, len(key), objective.noisy)
+        if best is None or score < best[0]:
+            best = (score, key, found)
+
+    for size in np.geomspace(0.9 * largest, 1e-3 * largest, PATH).tolist():
+        # the path only has to say which parameters change; these are fitted anew
+        found = _sparse(objective, start, unit, size, PATH_STEPS, 1e-4)
+        change = np.abs((found.p - start) / unit)
+        judged(tuple(np.flatnonzero(change > 1e-6 * change.max()).tolist()), found.p)
+    if best is None:
+        raise SolverError("no weight of the l1 penalty leaves a sparse change: nothing differs.")
+    # a path that entered by a wrong parameter keeps it: drop what the criterion can spare
+    while len(best[1]) > 1:
+        before = best[1]
+        for out in before:
+            judged(tuple(i for i in before if i != out), best[2].p)
+        if best[1] == before:
+            break
+    return best[2]
+
+
+def bic(error: float, rows: int, count: int, noisy: bool) -> float:
+    """Return ``chi^2 + k ln n``, or ``n ln(e/n) + k ln n`` where the noise is not known."""
+    misfit = error if noisy else rows * float(np.log(max(error, 1e-300) / rows))
+    return misfit + count * float(np.log(rows))
+
+
+def refitted(
+    objective: Objective,
+    start: FloatArray,
+    begin: FloatArray,
+    active: Any,
+    most: int,
+    tolerance: float,
+) -> Found:
+    """Minimise over some parameters, the others held at the start."""
+    lower, upper = objective.lower, objective.upper
+    held = 1e-9 * np.maximum(np.abs(start), 1e-9)
+    try:
+        objective.lower = np.where(active, lower, start - held)
+        objective.upper = np.where(active, upper, start + held)
+        p = np.where(active, begin, start)
+        found = trust_region(objective, p, TrustRegion(), most=most, tolerance=tolerance)
+    finally:
+        objective.lower, objective.upper = lower, upper
+    found.p = np.where(active, found.p, start)
+    objective.at(found.p, refer=True)
+    return found
+
+
+def _sparse(
+    objective: Objective,
+    start: FloatArray,
+    unit: FloatArray,
+    weight: float,
+    most: int,
+    tolerance: float,
+) -> Found:
+    """Solve a sequence of convex problems, each linear in the residuals, steps halved."""
+    import cvxpy
+
+    cp: Any = cvxpy
+
+    trail = Trail()
+    point = objective.begin(start)
+    trail.add(objective, start, 0.0)
+    p = start
+    converged, reason = False, "max_iterations reached"
+
+    def total(r: FloatArray, p: FloatArray) -> float:
+        return float(r @ r) / 2 + weight * float(np.abs((p - start) / unit).sum())
+
+    r = objective.values(point)
+    for _ in range(most):
+        J = objective.slopes(point) * unit
+        x = cp.Variable(p.size)
+        now = (p - start) / unit
+        limits = (
+            [x <= (objective.upper - start) / unit] if np.isfinite(objective.upper).all() else []
+        )
+        if np.isfinite(objective.lower).all():
+            limits.append(x >= (objective.lower - start) / unit)
+        loss = cp.sum_squares(r + J @ (x - now)) / 2 + weight * cp.norm1(x)
+        problem = cp.Problem(cp.Minimize(loss), limits)
+        problem.solve(solver=cp.CLARABEL)
+        if x.value is None:
+            raise SolverError(f"the l1 problem was not solved: {problem.status}.")
+        aim = np.where(np.abs(x.value) > max(1e-7 * np.abs(x.value).max(), NOTHING), x.value, 0.0)
+        step, fraction = (aim - now) * unit, 1.0
+        for _ in range(20):
+            try:
+                trial = objective.at(p + fraction * step)
+                changed = objective.values(trial)
+            except ModelError:
+                fraction /= 2
+                continue
+            if total(changed, trial.p) <= total(r, p) * (1 + 1e-12):
+                break
+            fraction /= 2
+        else:
+            converged, reason = True, "no part of a step helps"
+            break
+        size = float(np.abs(step / unit).max())
+        p = start + aim * unit if fraction == 1.0 else p + fraction * step
+        point = objective.at(p, refer=True)
+        r = objective.values(point)
+        trail.add(objective, p, fraction)
+        if size < max(tolerance, 1e-6) * max(1.0, float(np.abs(aim).max())):
+            converged, reason = True, "step below the tolerance"
+            break
+    return Found(p, total(r, p), trail, converged, reason)

@@ -1,0 +1,521 @@
+"""Updates with bounds, priors, mixed residuals and other methods; what they say of themselves."""
+
+import numpy as np
+import pytest
+
+import oracles_updating as oracle
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
+from flexplant.identification import MeasuredModes
+from flexplant.lti import Frf
+from flexplant.store import load
+from flexplant.updating import (
+    AddedDamping,
+    AddedMass,
+    AddedStiffness,
+    Antiresonances,
+    Eigenvalues,
+    FrfResidual,
+    GaussNewton,
+    Lasso,
+    MatrixParameter,
+    ModeDamping,
+    ModeShapes,
+    StaticCompliance,
+    Tikhonov,
+    TrustRegion,
+    correlate,
+    fdac,
+    frac,
+    identifiability,
+    localise,
+    mac,
+    sample_posterior,
+    split,
+    update,
+    validate,
+)
+from flexplant.updating.search import _data_loss
+
+LINKS = [(0, None, 90), (0, 1, 110), (1, 2, 70), (2, 3, 130), (3, None, 60)]
+MASSES = [1, 2, 1.5, 1.2]
+
+
+@pytest.fixture
+def chain(make):
+    return make(MASSES, LINKS, beta=2e-3)
+
+
+def changed(model, mass=(), stiffness=()):
+    M, D, K = (np.array(part) for part in (model.M, model.D, model.K))
+    for i, value in mass:
+        M[i, i] += value
+    for i, value in stiffness:
+        K[i, i] += value
+    return M, D, K
+
+
+def measured(parts, noise=None, seed=0, modes=(1, 2, 3, 4)):
+    poles = oracle.poles(*parts)[np.array(modes) - 1]
+    if noise is None:
+        return MeasuredModes(poles, modes=modes)
+    rng = np.random.default_rng(seed)
+    error = rng.normal(size=poles.size) + 1j * rng.normal(size=poles.size)
+    std = noise * np.abs(poles)
+    noisy = poles + error * std / np.sqrt(2)
+    return MeasuredModes(noisy, modes=modes, covariance=std**2)
+
+
+def responses(parts, freq, places):
+    M, D, K = parts
+    s = 2j * np.pi * freq
+    H = np.array([np.linalg.inv(z * z * M + z * D + K) for z in s])
+    names = [f"{i + 1}:z" for i in places]
+    return Frf(freq, np.moveaxis(H[:, places][:, :, [0]], 0, 2), inputs=["1:z"], outputs=names)
+
+
+MASS = [AddedMass("2:z"), AddedMass("3:z")]
+
+
+# ---- every kind of residual finds the change
+
+
+def test_every_residual_finds_the_change_and_all_together(chain):
+    parts = changed(chain, mass=[(1, 0.3)], stiffness=[(3, 8.0)])
+    M, D, K = parts
+    _, V = np.linalg.eigh(np.linalg.solve(np.sqrt(M), np.linalg.solve(np.sqrt(M), K).T))
+    shapes = np.linalg.solve(np.sqrt(M), V)
+    poles = measured(parts)
+    held = np.ix_([1, 2, 3], [1, 2, 3])
+    zeros = oracle.poles(M[held], D[held], K[held])
+    given = {
+        "poles": [Eigenvalues(poles)],
+        "frf": [FrfResidual(responses(parts, np.linspace(0.4, 3.2, 15), [0, 2]))],
+        "zeros": [Antiresonances(zeros, "1:z", "1:z")],
+    }
+    given["all"] = [
+        *(r for listed in given.values() for r in listed),
+        StaticCompliance(np.linalg.inv(K)[0, 2], "1:z", "3:z"),
+    ]
+    parameters = [AddedMass("2:z"), AddedStiffness("4:z")]
+    for residuals in given.values():
+        fit = update(chain, parameters, residuals, method=TrustRegion())
+        assert fit.converged
+        np.testing.assert_allclose(fit.values, [0.3, 8.0], rtol=1e-6)
+    assert np.all(np.isfinite(shapes))
+
+
+def test_shapes_alone_find_a_spring(chain):
+    undamped = chain.replace(D=None)
+    M, _, K = changed(undamped.replace(D=0 * np.eye(4)), stiffness=[(1, 15.0)])
+    omega2, phi = oracle.la.eigh(K, M)
+    poles = MeasuredModes(1j * np.sqrt(omega2), modes=[1, 2, 3, 4])
+    at = [f"{i}:z" for i in range(1, 5)]
+    residual = ModeShapes(poles, phi * [1, -2, 3e3, 1e-3], at)
+    fit = update(undamped, [AddedStiffness("2:z")], [residual])
+    assert fit.values[0] == pytest.approx(15.0, rel=1e-7)
+
+
+def test_trust_region_and_gauss_newton_agree_with_the_paper(plate):
+    target = oracle.truth(0.01)
+    rom = plate.reduced(0.01, True)
+    parameters = [AddedMass(plate.z8), AddedDamping(plate.z8)]
+    residuals = [Eigenvalues(MeasuredModes(target, modes=[6, 7]))]
+    paper = update(rom, parameters, residuals)
+    assert len(paper.history) <= 5
+    for method in (TrustRegion(), GaussNewton(truncate=1e-12)):
+        fit = update(rom, parameters, residuals, method=method)
+        np.testing.assert_allclose(fit.values, paper.values, rtol=1e-7, atol=1e-7)
+        np.testing.assert_allclose(fit.history.eigenvalues[-1], target, rtol=1e-8)
+
+
+# ---- parameters
+
+
+def test_stiffness_between_dofs_and_matrix_and_mode_parameters(chain):
+    K = np.array(chain.K)
+    spring = np.zeros((4, 4))
+    spring[np.ix_([1, 2], [1, 2])] = [[1, -1], [-1, 1]]
+    _, phi = oracle.la.eigh(K, chain.M)
+    omega = np.sqrt(oracle.la.eigh(K, chain.M)[0])
+    force = chain.M @ phi[:, 1]
+    D = chain.D + 2 * 0.01 * omega[1] * np.outer(force, force)
+    parts = (np.array(chain.M), D, K + 12.0 * spring + 0.1 * K)
+    parameters = [
+        AddedStiffness("2:z", to="3:z"),
+        MatrixParameter("all", dK=K),
+        ModeDamping(2),
+    ]
+    fit = update(chain, parameters, [Eigenvalues(measured(parts))])
+    np.testing.assert_allclose(fit.values, [12.0, 0.1, 0.01], rtol=1e-6)
+    assert parameters[0].name == "stiffness at 2:z to 3:z"
+
+
+def test_a_full_matrix_is_projected_through_T(plate):
+    rom = plate.reduced(0.01, True)
+    full = MatrixParameter("all", dK=plate.model.K).matrices(rom)[2]
+    np.testing.assert_allclose(full, rom.T.T @ (plate.model.K @ rom.T), rtol=1e-12)
+    with pytest.raises(ShapeError, match="7 DOFs"):
+        MatrixParameter("odd", dK=np.eye(7)).matrices(rom)
+
+
+def test_a_size_by_differences_of_the_full_model(plate, thicker_plate):
+    from plates import PLATE, make_plate
+
+    thickness = PLATE["thickness"]
+    density = MatrixParameter.from_difference(
+        "density", lambda v: make_plate(density=v), value=PLATE["density"]
+    )
+    rom = plate.reduced(0.01, False)
+    dM, dD, dK = density.matrices(rom)
+    np.testing.assert_allclose(dM, rom.M / PLATE["density"], rtol=1e-7, atol=1e-9 * rom.M.max())
+    assert dD is None
+    assert dK is None
+    size = MatrixParameter.from_difference(
+        "thickness", lambda v: make_plate(thickness=v), value=thickness, unit="m"
+    )
+    np.testing.assert_allclose(
+        size.matrices(rom)[2], 3 * rom.T.T @ plate.model.K @ rom.T / thickness, rtol=1e-5, atol=1e-3
+    )
+    with pytest.raises(ShapeError, match="DOFs"):
+        MatrixParameter.from_difference(
+            "n", lambda v: make_plate(elements=(4, 4) if v > 1 else (2, 2)), value=1.0
+        )
+
+
+# ---- bounds, priors, starts
+
+
+def test_bounds_hold_and_are_flagged(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    residuals = [Eigenvalues(measured(parts, 1e-4))]
+    free = update(chain, MASS, residuals, prior=False)
+    assert free.at_bound == ()
+    tight = [AddedMass("2:z", bounds=(0.0, 0.2)), AddedMass("3:z", bounds=(0.0, None))]
+    fit = update(chain, tight, residuals)
+    assert fit.at_bound == ("mass at 2:z",)
+    assert fit.values[0] == pytest.approx(0.2, abs=1e-6)
+    assert "at a bound: mass at 2:z" in repr(fit)
+    inside = [AddedMass("2:z", bounds=(0.0, 2.0)), AddedMass("3:z", bounds=(0.0, 2.0))]
+    np.testing.assert_allclose(
+        update(chain, inside, residuals, prior=False).values, free.values, rtol=1e-6
+    )
+
+
+def test_a_prior_is_one_more_measurement(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    residuals = [Eigenvalues(measured(parts, 0.02))]
+    plain = update(chain, MASS, residuals, method=TrustRegion())
+    known = [AddedMass("2:z", prior=(0.25, 1e-5)), AddedMass("3:z", prior=(0.0, 1e3))]
+    fit = update(chain, known, residuals)
+    assert fit.values[0] == pytest.approx(0.25, abs=1e-4)
+    assert fit.std[0] == pytest.approx(1e-5, rel=1e-3)
+    assert abs(plain.values[0] - 0.25) > 1e-3
+    off = update(chain, known, residuals, prior=False)
+    assert np.abs((off.values - plain.values) / plain.std).max() < 1e-5
+    # without noise nothing weighs the prior against the data
+    exact = update(chain, known, [Eigenvalues(measured(parts))])
+    np.testing.assert_allclose(exact.values, [0.3, 0.2], rtol=1e-7)
+    # bounds alone: the model itself, a third of the farther bound
+    bounded = [AddedMass("2:z", bounds=(-0.03, 0.06)), AddedMass("3:z", prior=(0.2, 1e-4))]
+    stated = [AddedMass("2:z", prior=(0.0, 0.02), bounds=(-0.03, 0.06)), bounded[1]]
+    weak = [Eigenvalues(measured(changed(chain, mass=[(1, 0.02), (2, 0.2)]), 0.02))]
+    np.testing.assert_allclose(
+        update(chain, bounded, weak).values, update(chain, stated, weak).values, rtol=1e-9
+    )
+
+
+def test_posterior_covariance_is_that_of_the_linear_problem(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    known = [AddedMass("2:z", prior=(0.25, 0.05)), AddedMass("3:z", prior=(0.1, 0.1))]
+    poles = measured(parts, 0.02)
+    fit = update(chain, known, [Eigenvalues(poles)])
+    M = np.array(chain.M) + np.diag([0, *fit.values, 0])
+    J = np.empty((8, 2))
+    for b in range(2):
+        unit = np.zeros((4, 4))
+        unit[b + 1, b + 1] = 1.0
+        slope = [
+            oracle.complex_step(M, chain.D, chain.K, [unit, 0 * unit, 0 * unit], a)[1]
+            for a in range(4)
+        ]
+        J[:, b] = np.concatenate([np.real(slope), np.imag(slope)])
+    information = J.T @ np.linalg.inv(poles.covariance) @ J + np.diag([0.05**-2, 0.1**-2])
+    np.testing.assert_allclose(fit.covariance, np.linalg.inv(information), rtol=1e-6)
+    low, high = fit.interval(0.95)[0]
+    assert (high - low) / 2 == pytest.approx(1.959964 * fit.std[0], rel=1e-6)
+
+
+def test_laplace_and_ensemble_draws_agree(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    residuals = [Eigenvalues(measured(parts, 0.005))]
+    fit = update(chain, MASS, residuals, method=TrustRegion())
+    draws = fit.sample(4000, seed=1)
+    np.testing.assert_allclose(np.cov(draws.T), fit.covariance, rtol=0.15, atol=3e-6)
+    chainwise = sample_posterior(chain, MASS, residuals, fit, steps=150, seed=2)
+    assert 0.2 < chainwise.acceptance < 0.9
+    assert np.all(np.abs(chainwise.mean - fit.values) < 0.4 * fit.std)
+    np.testing.assert_allclose(np.sqrt(np.diag(chainwise.covariance)), fit.std, rtol=0.3)
+    assert "acceptance" in repr(chainwise)
+    with pytest.raises(ModelError, match="noise"):
+        sample_posterior(chain, MASS, [Eigenvalues(measured(parts))], fit)
+    with pytest.raises(ModelError, match="walkers"):
+        sample_posterior(chain, MASS, residuals, fit, walkers=3)
+
+
+def test_several_starts_keep_the_best(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    inside = [AddedMass("2:z", bounds=(-1.5, 3.0)), AddedMass("3:z", bounds=(-1.2, 3.0))]
+    residuals = [Eigenvalues(measured(parts))]
+    fit = update(chain, inside, residuals, starts=4, seed=3)
+    np.testing.assert_allclose(fit.values, [0.3, 0.2], rtol=1e-6)
+    assert fit.starts.begin.shape == (4, 2)
+    assert fit.starts.cost.min() < 1e-10
+    again = update(chain, inside, residuals, starts=[[0.1, 0.1], [0.5, 0.0]])
+    np.testing.assert_allclose(again.values, [0.3, 0.2], rtol=1e-6)
+    with pytest.raises(ModelError, match="cannot be drawn"):
+        update(chain, MASS, residuals, starts=3)
+    with pytest.raises(ShapeError, match="starts"):
+        update(chain, inside, residuals, starts=[[0.1]])
+    with pytest.raises(ModelError, match="outside its bounds"):
+        update(chain, inside, residuals, start=[9.0, 0.0])
+
+
+# ---- other methods
+
+
+def test_a_robust_loss_shrugs_off_an_outlier(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    poles = measured(parts, 1e-3)
+    wrong = np.array(poles.poles)
+    wrong[2] *= 1.05
+    residuals = [Eigenvalues(MeasuredModes(wrong, modes=[1, 2, 3, 4], covariance=poles.covariance))]
+    plain = update(chain, MASS, residuals, method=TrustRegion())
+    truth = np.array([0.3, 0.2])
+    for loss, share in [("cauchy", 0.2), ("soft_l1", 0.3), ("huber", 0.3)]:
+        robust = update(chain, MASS, residuals, method=TrustRegion(loss=loss))
+        assert np.abs(robust.values - truth).max() < share * np.abs(plain.values - truth).max()
+
+
+@pytest.mark.parametrize("name", ["huber", "soft_l1", "cauchy"])
+def test_losses_have_the_derivatives_they_state(name):
+    rho = _data_loss(name, 4)
+    z = np.array([0.3, 0.9, 1.7, 40.0, 9.0])
+    near, far = rho(z + 1e-5), rho(z - 1e-5)
+    np.testing.assert_allclose((near[:2] - far[:2]) / 2e-5, rho(z)[1:], rtol=1e-6, atol=1e-9)
+    # priors are no outliers; small residuals count as squares
+    assert rho(z)[:, 4].tolist() == [9.0, 1.0, 0.0]
+    np.testing.assert_allclose(rho(np.full(5, 1e-6))[:2], [[1e-6] * 5, [1.0] * 5], rtol=1e-5)
+
+
+def test_lasso_finds_the_one_changed_spring(chain):
+    pytest.importorskip("cvxpy")
+    parts = changed(chain, stiffness=[(2, 12.0)])
+    candidates = [AddedStiffness(f"{i}:z") for i in range(1, 5)]
+    fit = update(chain, candidates, [Eigenvalues(measured(parts, 1e-4, seed=1))], method=Lasso())
+    assert np.count_nonzero(fit.values) == 1
+    assert fit.values[2] == pytest.approx(12.0, rel=0.1)
+    heavy = update(
+        chain, candidates, [Eigenvalues(measured(parts, 1e-4))], method=Lasso(weight=1e9)
+    )
+    assert not np.any(heavy.values)
+
+
+def test_tikhonov_and_truncation_bound_what_cannot_be_told(chain):
+    parts = changed(chain, mass=[(1, 0.3)])
+    # a mass everywhere from one pole: the sum of all effects is known, nothing else
+    everywhere = [AddedMass(f"{i}:z") for i in range(1, 5)]
+    residuals = [Eigenvalues(measured(parts, 1e-4, modes=(1, 2)))]
+    curve = update(chain, everywhere, residuals, method=Tikhonov())
+    strong = update(chain, everywhere, residuals, method=Tikhonov(weight=1e6))
+    assert np.linalg.norm(strong.values) < 1e-3 * np.linalg.norm(curve.values)
+    assert curve.history.error[-1] < 0.05 * curve.history.error[0] + 50
+    assert curve.covariance is None
+    short = update(chain, everywhere, residuals, method=GaussNewton(truncate=1e-3))
+    assert np.linalg.norm(short.values) < 1.0
+    assert short.history.error[-1] < 1e-2 * short.history.error[0]
+
+
+# ---- before and after
+
+
+def test_identifiability_names_what_is_missing(chain, plate):
+    poles = measured(changed(chain, mass=[(1, 0.3)]), 1e-3, modes=(1,))
+    everywhere = [AddedMass(f"{i}:z") for i in range(1, 5)]
+    answer = identifiability(chain, everywhere, [Eigenvalues(poles)])
+    assert answer.rank == 1 or answer.rank == 2
+    assert answer.mixed
+    assert "not told apart" in repr(answer)
+    full = measured(changed(chain, mass=[(1, 0.3)]), 1e-3)
+    good = identifiability(chain, MASS, [Eigenvalues(full)])
+    assert good.rank == 2
+    assert not good.mixed
+    assert not good.unseen
+    fit = update(chain, MASS, [Eigenvalues(full)], method=TrustRegion(), start=[1e-9, 0])
+    assert np.all(good.std / fit.std > 0.3)
+    assert np.all(good.std / fit.std < 3)
+    # the torsion mode does not see a mass on its nodal line; others do
+    rom = plate.reduced(0.01, True)
+    torsion = Eigenvalues(MeasuredModes([-15 + 1530j], modes=[4]))
+    blind = identifiability(rom, [AddedMass(plate.z8), AddedMass(plate.grid[0])], [torsion])
+    assert blind.unseen == (f"mass at {plate.z8}",)
+    assert 4 not in blind.missing[f"mass at {plate.z8}"]
+    assert np.isinf(blind.std[0])
+
+
+def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
+    M, K = oracle.plate()
+    D = oracle.modal_damping(M, K, 0.01)
+    at = oracle.z_dof(0.3, 0.15)
+    M[at, at] += 0.5
+    rom = plate.reduced(0.01, True)
+    candidates = [AddedMass(label) for label in plate.grid]
+    hidden = f"mass at {plate.z8}"
+    poles = oracle.poles(M, D, K)[:6]
+    rng = np.random.default_rng(2)
+    std = 2e-5 * np.abs(poles)
+    noise = (rng.normal(size=6) + 1j * rng.normal(size=6)) * std / np.sqrt(2)
+    data = MeasuredModes(poles + noise, modes=range(4, 10), covariance=std**2)
+    found = localise(rom, [Eigenvalues(data)], candidates, most=2)
+    assert found.chosen == (hidden,)
+    assert found.chosen_values[0] == pytest.approx(0.5, rel=1e-3)
+    # its three mirror images come next, all others far behind
+    nearest = plate.model.dofs.nearest
+    images = {
+        f"mass at {nearest((x, y, 0), 'z')}" for x, y in [(0.15, 0.3), (0.45, 0.3), (0.3, 0.45)]
+    }
+    assert set(found.ranking[:4]) == {hidden} | images
+    assert found[hidden] > 1 - 1e-4
+    assert found[found.ranking[4]] < 0.99
+    # as much noise as hides the truncated compliance: poles cannot tell mirror images
+    std = 1e-3 * np.abs(poles)
+    loud = MeasuredModes(poles + 50 * noise, modes=range(4, 10), covariance=std**2)
+    found = localise(rom, [Eigenvalues(loud)], candidates, most=1)
+    assert set(found.alike) == {hidden} | images
+    assert "4 alike" in repr(found)
+
+
+def test_localisation_says_when_nothing_changed(chain):
+    data = Eigenvalues(measured(changed(chain), 1e-3, seed=4))
+    found = localise(chain, [data], [AddedMass(f"{i}:z") for i in range(1, 5)])
+    assert found.chosen == ()
+    assert "no change" in repr(found)
+    two = changed(chain, mass=[(0, 0.2)], stiffness=[(3, 9.0)])
+    pool = [
+        *(AddedMass(f"{i}:z") for i in range(1, 5)),
+        *(AddedStiffness(f"{i}:z") for i in (2, 4)),
+    ]
+    found = localise(chain, [Eigenvalues(measured(two, 1e-4))], pool)
+    assert set(found.chosen) == {"mass at 1:z", "stiffness at 4:z"}
+    with pytest.raises(ModelError, match="most"):
+        localise(chain, [data], MASS, most=0)
+    with pytest.raises(LabelError, match="candidate"):
+        found["mass at 9:z"]
+
+
+def test_validation_on_unused_data(chain):
+    parts = changed(chain, mass=[(1, 0.03), (2, 0.02)])
+    frf = responses(parts, np.linspace(0.4, 3.2, 30), [0, 2])
+    first, rest = split(FrfResidual(frf), share=0.5, seed=1)
+    assert sorted([*first.lines, *rest.lines]) == list(range(30))
+    good = validate(chain, MASS, [first], [rest])
+    assert good.helped
+    assert good.unused[1] < 1e-6 < good.unused[0]
+    assert good.after.frac.min() > 1 - 1e-9 > good.before.frac.max()
+    assert "unused data" in repr(good)
+    # a parameter that is not to blame fits its own mode and spoils the others
+    poles = Eigenvalues(measured(parts))
+    bad = validate(chain, [AddedStiffness("1:z")], [poles.select([1])], [poles.select([2, 3, 4])])
+    assert bad.fitted[1] < 1e-2 * bad.fitted[0]
+    assert not bad.unused[1] < 0.3 * bad.unused[0]
+    with pytest.raises(ModelError, match="empty"):
+        split(poles, share=0.01)
+    with pytest.raises(ModelError, match="apart"):
+        split(StaticCompliance(1.0, "1:z", "2:z"))
+
+
+def test_correlation_before_and_after(chain):
+    parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
+    poles = measured(parts)
+    before = correlate(chain, [Eigenvalues(poles)])
+    expected = np.abs(oracle.poles(chain.M, chain.D, chain.K)) / np.abs(poles.poles) - 1
+    np.testing.assert_allclose(before.freq_error, expected, rtol=1e-6)
+    fit = update(chain, MASS, [Eigenvalues(poles)])
+    after = correlate(fit.model, [Eigenvalues(poles)])
+    assert np.abs(after.freq_error).max() < 1e-9
+    assert "frequencies within" in repr(after)
+
+
+def test_criteria_by_hand():
+    X = np.array([[1.0, 1.0], [0.0, 1.0]])
+    np.testing.assert_allclose(mac(X, 3j * X), [[1, 0.5], [0.5, 1]])
+    H = np.array([[1.0, 1j, -1.0], [1.0, 0.0, 0.0]])
+    np.testing.assert_allclose(frac(H, [[2.0, 2j, -2.0], [1.0, 1.0, 0.0]]), [1.0, 0.5])
+    np.testing.assert_allclose(fdac(H[:1], H[:1]), [[1, 0, -1], [0, 1, 0], [-1, 0, 1]], atol=1e-15)
+    with pytest.raises(ModelError, match="zero shape"):
+        mac(X, 0 * X)
+    with pytest.raises(ShapeError):
+        frac(H, H[:, :2])
+    with pytest.raises(ModelError, match="zero"):
+        fdac(0 * H, H)
+
+
+def test_results_are_stored(chain, tmp_path):
+    parts = changed(chain, mass=[(1, 0.3)])
+    inside = [AddedMass("2:z", bounds=(0.0, 1.0))]
+    fit = update(chain, inside, [Eigenvalues(measured(parts, 1e-3))], starts=2)
+    for value in (
+        fit,
+        inside[0],
+        Eigenvalues(measured(parts)),
+        localise(chain, [Eigenvalues(measured(parts, 1e-3))], MASS),
+    ):
+        value.save(tmp_path / "value.npz")
+        assert repr(load(tmp_path / "value.npz")) == repr(value)
+
+
+def test_bad_input_is_refused(chain):
+    residuals = [Eigenvalues(measured(changed(chain)))]
+    with pytest.raises(ModelError, match="method"):
+        update(chain, MASS, residuals, method="lm")
+    with pytest.raises(ModelError, match="knows no bounds"):
+        update(chain, [AddedMass("2:z", bounds=(0, 1))], residuals, method=GaussNewton())
+    with pytest.raises(ModelError, match="bounds"):
+        AddedMass("2:z", bounds=(1, 0))
+    with pytest.raises(ModelError, match="prior"):
+        AddedMass("2:z", prior=(0.0, 0.0))
+    with pytest.raises(LabelError):
+        AddedMass("2:z", to="")
+    with pytest.raises(ModelError, match="acts on nothing"):
+        update(chain, [AddedMass("2:z", to="2:z")], residuals)
+    with pytest.raises(ModelError, match="changes nothing"):
+        MatrixParameter("x", dM=np.zeros((4, 4)))
+    with pytest.raises(ModelError, match="symmetric"):
+        MatrixParameter("x", dM=np.triu(np.ones((4, 4))))
+    with pytest.raises(LabelError, match="name"):
+        MatrixParameter("", dM=np.eye(4))
+    with pytest.raises(LabelError, match="mode"):
+        ModeDamping(0)
+    with pytest.raises(LabelError, match="no elastic mode 9"):
+        update(chain, [ModeDamping(9)], residuals)
+    with pytest.raises(ModelError, match="loss"):
+        TrustRegion(loss="l3")
+    with pytest.raises(ModelError, match="truncate"):
+        GaussNewton(truncate=1.0)
+    for method in (Tikhonov, Lasso):
+        with pytest.raises(ModelError, match="weight"):
+            method(weight=0.0)
+    fit = update(chain, MASS, residuals)
+    with pytest.raises(ModelError, match="level"):
+        fit.interval(1.0)
+    with pytest.raises(ModelError, match="count"):
+        fit.sample(0)
+    with pytest.raises(ModelError, match="residuals must be a list"):
+        identifiability(chain, MASS, [3])
+    with pytest.warns(FlexplantWarning, match="did not converge"):
+        update(
+            chain,
+            MASS,
+            [Eigenvalues(measured(changed(chain, mass=[(1, 0.3)])))],
+            method=TrustRegion(),
+            max_iterations=1,
+        )
