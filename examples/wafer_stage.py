@@ -8,6 +8,10 @@ The paper says 0.1 % modal damping, but its printed eigenvalues have 1 %; both a
 """
 
 # %% Names and numbers
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes share the work: one thread each
+
 from concurrent.futures import ProcessPoolExecutor
 from itertools import combinations
 from pathlib import Path

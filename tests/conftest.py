@@ -4,6 +4,10 @@ import os
 import sys
 from pathlib import Path
 
+# before NumPy is loaded: the matrices here are small, and BLAS threads would wait for each other
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 from hypothesis import HealthCheck, settings
 
 os.environ.setdefault("MPLBACKEND", "Agg")
