@@ -1,5 +1,6 @@
 """What the hardware says: frequency responses, measured poles and mode shapes."""
 
+from .average import average_frfs as average_frfs
 from .diagram import PoleSelection as PoleSelection
 from .diagram import StabilisationDiagram as StabilisationDiagram
 from .estimate import estimate_frf as estimate_frf

@@ -24,7 +24,7 @@ def numbered(
     *,
     at: Mapping[str, Place] | None = None,
     tolerance: float = 0.15,
-    least_mac: float = 0.5,
+    least_mac: float = 0.7,
     partial: bool = False,
 ) -> MeasuredModes:
     r"""Return measured modes with the numbers of the model's modes that they are.

@@ -74,7 +74,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
             f"{n_exp} experiments cannot tell {n_in} periodic inputs apart: make one per input, "
             "with the phases of `multisine`."
         )
-    Y, U = (_spectra(side, samples, periods) for side in (data.y, data.u))
+    Y, U = _spectra(data.y, samples, periods), _spectra(data.u, samples, periods)
     lines = np.arange(1, (samples + 1) // 2)
     freq = lines / method.period
     keep = _excited(U if data.r is None else _spectra(data.r, samples, periods))
@@ -87,8 +87,8 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     x = u if data.r is None else _mean(_spectra(data.r, samples, periods)[..., keep])
     xh = x.conj().transpose(0, 2, 1)
     back = u @ xh
-    G = np.linalg.solve(back.transpose(0, 2, 1), (y @ xh).transpose(0, 2, 1))
-    G = np.asarray(G.transpose(0, 2, 1), dtype=np.complex128)
+    G: Any = np.linalg.solve(back.transpose(0, 2, 1), (y @ xh).transpose(0, 2, 1))
+    G = G.transpose(0, 2, 1)
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
     left, freedom = _noise(Y, U, y, u, G)

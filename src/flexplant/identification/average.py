@@ -1,0 +1,81 @@
+"""Repeated measurements of the same FRF: their mean, and the doubt that they show."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ..errors import ModelError, ShapeError
+from ..lti.frequency import Frf
+from ..values import ComplexArray
+
+
+def average_frfs(repeated: Iterable[Frf]) -> Frf:
+    r"""Return the mean of repeated FRFs, with variance and correlation from their spread.
+
+    .. math:: \sigma^2_{oi} = \frac{1}{R (R-1)} \sum_r |G^{(r)}_{oi} - \bar G_{oi}|^2
+
+    Noise of an output is the same whichever input shakes, so that variances are of product form:
+    a few repetitions are averaged to ``mean_i(sigma^2_oi) mean_o(sigma^2_oi) / mean(sigma^2)``.
+    The correlation of the errors of two outputs is pooled over the inputs.
+
+    Parameters
+    ----------
+    repeated : iterable of at least two Frf
+        Of the same channels, frequencies and quantity, with independent noise; four or more
+        for weights that are worth something.
+
+    Returns
+    -------
+    Frf
+        What `identify_modes` weights by.
+
+    Raises
+    ------
+    ShapeError
+        When they have different channels or frequencies.
+    ModelError
+        When there are fewer than two, they differ in quantity or do not differ at all.
+    """
+    frfs = list(repeated)
+    if len(frfs) < 2 or not all(isinstance(frf, Frf) for frf in frfs):
+        raise ModelError(
+            f"average_frfs takes at least two Frf, got {len(frfs)} items: one measurement says "
+            "nothing about its noise."
+        )
+    first = frfs[0]
+    for frf in frfs[1:]:
+        same = (frf.inputs, frf.outputs) == (first.inputs, first.outputs)
+        if not same or not np.array_equal(frf.freq, first.freq):
+            raise ShapeError(
+                f"repeated measurements have the same channels and frequencies, got {first!r} and "
+                f"{frf!r}."
+            )
+        if frf.quantity != first.quantity:
+            raise ModelError(
+                f"quantities differ: {first.quantity!r} and {frf.quantity!r}. Convert first."
+            )
+    data = np.array([frf.data for frf in frfs])
+    mean: ComplexArray = data.mean(axis=0)
+    error = data - mean
+    count = len(frfs)
+    spread = np.sum(np.abs(error) ** 2, axis=0) / (count * (count - 1))
+    if not np.all(spread > 0):
+        raise ModelError("the measurements are identical at some lines: repeat with new noise.")
+    over_inputs, over_outputs = spread.mean(axis=1), spread.mean(axis=0)
+    variance = over_inputs[:, None] * over_outputs[None] / spread.mean(axis=(0, 1))
+    shared = np.einsum("raif,rbif->abf", error, error.conj())
+    size = np.sqrt(np.einsum("aaf->af", shared).real)
+    correlation = shared / (size[:, None] * size[None])
+    rows = np.arange(data.shape[1])
+    correlation[rows, rows] = 1.0
+    return Frf(
+        first.freq,
+        mean,
+        inputs=first.inputs,
+        outputs=first.outputs,
+        quantity=first.quantity,
+        variance=variance,
+        correlation=correlation,
+    )

@@ -1,0 +1,92 @@
+"""Numbers of measured poles, on a plate whose modes 7 and 8 are a repeated pair."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError
+from flexplant.identification import MeasuredModes, numbered
+from flexplant.reduction import solve_modes
+from flexplant.structure import ModalDamping
+from plates import make_plate
+
+SPOTS = [(0.0, 0.0), (0.6, 0.0), (0.0, 0.6), (0.6, 0.6), (0.3, 0.0), (0.0, 0.3)]
+
+
+@cache
+def modes():
+    return solve_modes(make_plate(), count=14, damping=ModalDamping(0.01))
+
+
+def answer(numbers, shift=1.0, mix=0.3):
+    """Poles of some modes, 3 % away by default, modes 7 and 8 turned within their span."""
+    labels = [modes().dofs.nearest((*p, 0.0), "z") for p in SPOTS]
+    phi = np.array([modes().at(label) for label in labels])
+    turned = phi.copy()
+    turned[:, 6] = np.cos(mix) * phi[:, 6] + np.sin(mix) * phi[:, 7]
+    turned[:, 7] = np.cos(mix) * phi[:, 7] - np.sin(mix) * phi[:, 6]
+    places = np.array(numbers) - 1
+    return MeasuredModes(
+        modes().poles[places] * shift, shapes=(1 + 2j) * turned[:, places], dofs=labels
+    )
+
+
+@pytest.mark.parametrize("shift", [0.97, 1.0, 1.03])
+def test_numbers_are_those_of_the_model(shift):
+    found = numbered(answer([9, 4, 7, 8, 6], shift), modes())
+    assert found.modes[:2] == (9, 4)
+    assert sorted(found.modes[2:4]) == [7, 8]
+    assert found.modes[4] == 6
+
+
+def test_shapes_decide_where_frequencies_would_mislead():
+    """Mode 4 measured at mode 5's frequency and the other way round."""
+    right = answer([4, 5])
+    crossed = right.replace(poles=right.poles[::-1])
+    assert numbered(crossed, modes(), tolerance=0.5).modes == (4, 5)
+    bare = MeasuredModes(crossed.poles)
+    assert numbered(bare, modes(), tolerance=0.5).modes == (5, 4)
+
+
+def test_poles_without_partner_are_refused_or_left_out():
+    good = answer([4, 6])
+    stranger = MeasuredModes(
+        [*good.poles, -30 + 3300j],
+        shapes=np.column_stack([good.shapes, np.arange(6.0) - 2.2]),
+        dofs=good.dofs,
+        covariance=[1.0, 2.0, 3.0],
+    )
+    with pytest.raises(ModelError, match="525"):
+        numbered(stranger, modes())
+    found = numbered(stranger, modes(), partial=True)
+    assert found.modes == (4, 6)
+    assert np.allclose(np.diag(found.covariance), [0.5, 1.0, 0.5, 1.0])
+    with pytest.raises(ModelError, match="no mode"):
+        numbered(stranger.select([2]), modes(), partial=True)
+
+
+def test_places_may_be_given_by_point():
+    found = answer([4, 6, 9])
+    named = found.replace(dofs=[f"y{i}" for i in range(1, 7)])
+    at = {f"y{i}": (*p, 0.0) for i, p in enumerate(SPOTS, 1)}
+    assert numbered(named, modes(), at=at).modes == (4, 6, 9)
+    with pytest.raises(LabelError, match="y1"):
+        numbered(named, modes())
+
+
+@pytest.mark.parametrize(
+    ("measured", "model", "options", "error"),
+    [
+        ("poles", modes, {}, ModelError),
+        (answer, lambda: 3, {}, ModelError),
+        (answer, modes, {"tolerance": 0.0}, ModelError),
+        (answer, modes, {"least_mac": 1.0}, ModelError),
+        (answer, modes, {"at": ["1:z"]}, LabelError),
+        (answer, lambda: solve_modes(make_plate(), count=3), {}, ModelError),
+    ],
+)
+def test_bad_arguments_are_refused(measured, model, options, error):
+    value = measured([4, 6]) if callable(measured) else measured
+    with pytest.raises(error):
+        numbered(value, model(), **options)
