@@ -181,6 +181,32 @@ def test_scale_and_phase_of_a_shape_do_not_matter(plate):
     assert r @ r == pytest.approx((1 - mac) * float((other**2).sum()) / 1e-4, rel=1e-9)
 
 
+def test_noise_of_the_stated_size_has_residuals_of_one(plate):
+    rom = plate.reduced(0.01, True)
+    rng = np.random.default_rng(3)
+    at, modes = plate.grid[:20], rom.modes()
+    measured = MeasuredModes(modes.poles[[3, 4, 5]], modes=[4, 5, 6])
+    exact = modes.phi[:20, [3, 4, 5]]
+    noise = rng.normal(size=exact.shape) + 1j * rng.normal(size=exact.shape)
+    real = ModeShapes(measured, exact + 0.01 * noise.real, at, std=0.01)
+    # E|n|^2 = std^2 of a complex entry
+    turned = ModeShapes(measured, 1j * exact + 0.01 * noise, at, std=0.01 * np.sqrt(2))
+    freq = np.linspace(100, 700, 200)
+    s = 2j * np.pi * freq
+    load = np.eye(25)[0]
+    H = np.array([np.linalg.solve(z * z * rom.M + z * rom.D + rom.K, load)[3] for z in s])
+    error = 1e-10 * (rng.normal(size=200) + 1j * rng.normal(size=200))
+    frf = Frf(freq, (H + error)[None, None], inputs=[plate.grid[0]], outputs=[plate.grid[3]])
+    keep = np.abs(H) > 1e-9
+    linear = FrfResidual(frf, variance=2e-20, lines=keep)
+    logarithm = FrfResidual(frf, variance=2e-20, lines=keep, magnitude=True)
+    for residual in (real, turned, linear, logarithm):
+        objective = Objective(rom, [AddedMass(plate.z8)], [residual])
+        r = objective.values(objective.begin(np.zeros(1)))
+        # four standard errors of a mean square; a scale per shape is fitted away
+        assert abs(np.mean(r**2) - 1) < 4 * np.sqrt(2 / r.size) + 0.05
+
+
 def test_responses_zeros_and_compliance_of_a_chain(make):
     model = make([1, 2, 1.5], [(0, None, 90), (0, 1, 110), (1, 2, 70)], D=np.diag([0.5, 0.0, 0.2]))
     freq = np.array([0.5, 1.0, 2.0])

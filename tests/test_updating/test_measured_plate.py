@@ -81,7 +81,7 @@ def test_interval_from_responses_covers_the_mass(plate, campaign):
 def test_interval_from_poles_covers_the_mass(plate):
     rom = plate.reduced(0.01, True)
     poles = oracle.poles(*with_mass())[:6]
-    std = 1e-3 * np.abs(poles)
+    std = 2e-4 * np.abs(poles)
     rng = np.random.default_rng(6)
     fits = []
     for _ in range(TRIALS):
@@ -103,16 +103,16 @@ def test_speed_of_updates(plate, campaign):
     objective.begin(np.full(10, 0.01))
     taken = []
     for k in range(40):
-        begun = time.perf_counter()
+        begun = time.process_time()
         point = objective.at(np.full(10, 0.01 + 1e-4 * k), refer=True)
         J, r = objective.slopes(point), objective.values(point)
         np.linalg.lstsq(J, r, rcond=None)
-        taken.append(time.perf_counter() - begun)
+        taken.append(time.process_time() - begun)
     rng = np.random.default_rng(5)
-    begun = time.perf_counter()
+    begun = time.process_time()
     for _ in range(100):
         fit(plate, campaign, rng)
-    four_hundred = 4 * (time.perf_counter() - begun)
+    four_hundred = 4 * (time.process_time() - begun)
     print(f"iteration: {1e3 * np.median(taken):.2f} ms; 400 updates on FRFs: {four_hundred:.1f} s")
     assert np.median(taken) < 2e-3
     assert four_hundred < 20

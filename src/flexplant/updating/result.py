@@ -24,7 +24,8 @@ class History(Value):
     eigenvalues : (i + 1, m) complex array [rad/s]
         The model's eigenvalues, paired with the measured ones.
     error : (i + 1,) array
-        ``e_i`` of the paper's (12).
+        ``e_i`` of the paper's (12); with other residuals the sum of their whitened squares, without
+        priors.
     fraction : (i + 1,) array
         The part of the Gauss-Newton step that was taken; 1 but where the safeguard halved it,
         0 for the start.

@@ -37,6 +37,8 @@ class ModeShapes(Residual):
         In the order of the poles; any scale.
     at : sequence of m places
         DOF labels, points or mappings.
+    direction : str
+        Of the motion at points.
     std : float or (m, modes) array, optional
         Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in their own
         scale. None: all equal, not known.
@@ -123,6 +125,10 @@ class ShapeCorrelation(ModeShapes):
         In the order of the poles; any scale.
     at : sequence of m places
         DOF labels, points or mappings.
+    direction : str
+        Of the motion at points.
+    std : float or (m, modes) array, optional
+        Weighs the entries in the MAC by 1/std; the residuals themselves have no known noise.
     assign : bool
         Whether modes are assigned by MAC with the measured shapes.
 
@@ -213,7 +219,11 @@ class _BoundShapes(Bound):
 
 
 class _BoundMac(_BoundShapes):
-    """sqrt(MAC) = |Q^H psi| / |psi|; r = 1/sqrt(MAC) - 1, with the sign that vanishes at a fit."""
+    """sqrt(MAC) = |Q^H psi| / |psi|; r = 1/sqrt(MAC) - 1."""
+
+    def __init__(self, residual: ModeShapes, family: Family) -> None:
+        super().__init__(residual, family)
+        self.noisy = False
 
     def values(self, point: Point) -> FloatArray:
         found = []

@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import ModelError
 from ..values import FloatArray, Value
 from .correlation import Correlation, correlate
+from .methods import Method
 from .objective import Objective, checked_residuals
 from .parameters import Parameter
 from .residuals_base import Residual
@@ -61,7 +62,12 @@ def validate(
     parameters: Sequence[Parameter],
     residuals: Sequence[Residual],
     unused: Sequence[Residual],
-    **options: Any,
+    *,
+    method: Method | None = None,
+    start: Sequence[float] | FloatArray | None = None,
+    starts: int | FloatArray | None = None,
+    seed: int = 0,
+    prior: bool = True,
 ) -> Validation:
     """Update with some data and report the error on others.
 
@@ -76,7 +82,7 @@ def validate(
         does `split`.
     unused : sequence of Residual
         To judge by.
-    **options
+    method, start, starts, seed, prior
         Of `update`.
 
     Returns
@@ -90,12 +96,21 @@ def validate(
     """
     listed = checked_parameters(parameters)
     given, kept = checked_residuals(residuals), checked_residuals(unused)
-    fit = update(model, listed, given, **options)
-    start = fit.history.parameters[0]
+    fit = update(
+        model,
+        listed,
+        given,
+        method=method,
+        start=start,
+        starts=starts,
+        seed=seed,
+        prior=prior,
+    )
+    begin = np.asarray(fit.history.parameters[0], dtype=np.float64)
     return Validation(
         fit=fit,
-        fitted=_rms(model, listed, given, start, fit.values),
-        unused=_rms(model, listed, kept, start, fit.values),
+        fitted=_rms(model, listed, given, begin, fit.values),
+        unused=_rms(model, listed, kept, begin, fit.values),
         before=correlate(model, kept),
         after=correlate(fit.model, kept),
     )
