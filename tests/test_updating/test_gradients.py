@@ -203,8 +203,8 @@ def test_noise_of_the_stated_size_has_residuals_of_one(plate):
     for residual in (real, turned, linear, logarithm):
         objective = Objective(rom, [AddedMass(plate.z8)], [residual])
         r = objective.values(objective.begin(np.zeros(1)))
-        # four standard errors of a mean square; a scale per shape is fitted away
-        assert abs(np.mean(r**2) - 1) < 4 * np.sqrt(2 / r.size) + 0.05
+        # 2.5 standard errors of a mean square; a scale per shape is fitted away
+        assert abs(np.mean(r**2) - 1) < 2.5 * np.sqrt(2 / r.size) + 0.05
 
 
 def test_responses_zeros_and_compliance_of_a_chain(make):
