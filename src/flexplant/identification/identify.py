@@ -88,7 +88,7 @@ def identify_modes(
     upper: int = 3,
     hold: float | None = None,
     dofs: Mapping[str, str] | None = None,
-    max_iterations: int = 60,
+    max_iterations: int = 150,
 ) -> IdentifiedModes:
     r"""Return poles, mode shapes and their covariance from measured FRFs.
 

@@ -74,8 +74,8 @@ def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, s
         predicted = float(g @ step)
         poles, participation = trial
         now, damping = better, damping / 10.0
-        # a step of 1e-4 standard deviations of what is left is none
-        if gained <= 1e-12 * now.cost or predicted <= 1e-8 * now.cost / (2 * lines.data.size):
+        # a step of 3e-3 standard deviations of what is left is none
+        if gained <= 1e-12 * now.cost or predicted <= 1e-5 * now.cost / (2 * lines.data.size):
             break
     else:
         raise SolverError(
