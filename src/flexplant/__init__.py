@@ -18,7 +18,20 @@ from .estimation import KalmanEstimator as KalmanEstimator
 from .estimation import StaticEstimator as StaticEstimator
 from .estimation import design_kalman as design_kalman
 from .estimation import design_static as design_static
+from .identification import H1 as H1
+from .identification import H2 as H2
+from .identification import Hv as Hv
+from .identification import IdentifiedModes as IdentifiedModes
 from .identification import MeasuredModes as MeasuredModes
+from .identification import Periodic as Periodic
+from .identification import PoleSelection as PoleSelection
+from .identification import StabilisationDiagram as StabilisationDiagram
+from .identification import average_frfs as average_frfs
+from .identification import estimate_frf as estimate_frf
+from .identification import identify_modes as identify_modes
+from .identification import multisine as multisine
+from .identification import numbered as numbered
+from .identification import stabilisation_diagram as stabilisation_diagram
 from .labels import DofSet as DofSet
 from .loop import ClosedLoop as ClosedLoop
 from .loop import bandwidth as bandwidth
@@ -121,9 +134,35 @@ from .synthesis import design_servo as design_servo
 from .updating import AddedDamping as AddedDamping
 from .updating import AddedMass as AddedMass
 from .updating import AddedStiffness as AddedStiffness
+from .updating import Antiresonances as Antiresonances
+from .updating import Correlation as Correlation
 from .updating import Eigenvalues as Eigenvalues
+from .updating import FrfResidual as FrfResidual
+from .updating import GaussNewton as GaussNewton
+from .updating import Identifiability as Identifiability
+from .updating import Lasso as Lasso
+from .updating import Localisation as Localisation
+from .updating import MatrixParameter as MatrixParameter
+from .updating import ModeDamping as ModeDamping
+from .updating import ModeShapes as ModeShapes
+from .updating import Posterior as Posterior
+from .updating import ShapeCorrelation as ShapeCorrelation
+from .updating import StaticCompliance as StaticCompliance
+from .updating import Tikhonov as Tikhonov
+from .updating import TrustRegion as TrustRegion
 from .updating import UpdateResult as UpdateResult
+from .updating import Validation as Validation
+from .updating import correlate as correlate
+from .updating import eigenvalue_sensitivities as eigenvalue_sensitivities
+from .updating import fdac as fdac
+from .updating import frac as frac
+from .updating import identifiability as identifiability
+from .updating import localise as localise
+from .updating import mac as mac
+from .updating import sample_posterior as sample_posterior
+from .updating import split as split
 from .updating import update as update
+from .updating import validate as validate
 
 __version__ = "0.1.0"
 

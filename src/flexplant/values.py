@@ -84,6 +84,8 @@ def frozen(value: Any) -> Any:
         value.sum_duplicates()
         for part in (value.data, value.indices, value.indptr):
             part.flags.writeable = False
+    elif type(value) is tuple and value and isinstance(value[0], np.ndarray):
+        value = tuple(frozen(item) for item in value)
     elif isinstance(value, Mapping) and not isinstance(value, MappingProxyType | Value):
         value = MappingProxyType({key: frozen(item) for key, item in value.items()})
     return value

@@ -80,6 +80,7 @@ def made():
     yield from (normal_form(rom.M, rom.D, rom.K, rom.rigid_body), fx.ModalDamping(0.01))
     yield from (fx.Rayleigh(1.0, 1e-6), fx.AddedStiffness(at), *unknowns, residual, poles, fit)
     yield eigenvalue_sensitivities(rom, unknowns, modes=[6])
+    yield from of_updates(rom, unknowns, residual, fit)
     yield from (plant, sampled, sampled.weighted(z={"die:z": 2.0}), uncertain, plant.check())
     yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
     yield from (static, fx.design_kalman(sampled), servo, loop, point, response)
@@ -95,6 +96,34 @@ def made():
     yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
     yield structure.interpolated(modes.dofs).interpolation
     yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
+
+
+def of_updates(rom, unknowns, residual, fit):
+    """One of each value around an update and an identification."""
+    at = unknowns[0].at
+    poles = residual.measured
+    shapes = fit.model.modes()
+    rows = shapes.dofs.indices(rom.dofs.labels[:5])
+    seen = np.asarray(shapes.phi)[np.ix_(rows, np.array(poles.modes) - 1)]
+    force = fx.assemble_plant(rom, ports()).Gyu.select([f"y{i}" for i in range(1, 5)])
+    frf = fx.frequency_response(force, np.linspace(200, 800, 200))
+    yield from (fx.MatrixParameter("spring", dK=np.eye(25)), fx.ModeDamping(6))
+    yield from (fx.FrfResidual(frf, variance=np.ones(frf.data.shape), lines=[0, 1]),)
+    yield from (fx.ModeShapes(poles, seen, rom.dofs.labels[:5]),)
+    yield from (fx.ShapeCorrelation(poles, seen, rom.dofs.labels[:5]),)
+    yield from (fx.Antiresonances([-5 + 1300j], at, at), fx.StaticCompliance(1e-6, at, at))
+    yield from (fx.GaussNewton(), fx.TrustRegion(), fx.Tikhonov(), fx.Lasso())
+    yield fx.identifiability(rom, unknowns, [residual])
+    yield fx.localise(rom, [residual], [fx.AddedMass(label) for label in rom.dofs.labels[:4]])
+    yield fx.correlate(fit.model, [residual])
+    bounded = [fx.AddedMass(at, bounds=(0.0, 1.0)), fx.AddedDamping(at, bounds=(-1.0, 1.0))]
+    yield fx.update(rom, bounded, [residual], method=fx.TrustRegion(), starts=2)
+    yield fx.sample_posterior(rom, unknowns, [residual], fit, steps=20)
+    yield fx.validate(rom, unknowns[:1], [residual.select([6])], [residual.select([7])])
+    yield from (fx.H1(), fx.H2(), fx.Hv(), fx.Periodic(period=1.0))
+    diagram = fx.stabilisation_diagram(frf, band=(400.0, 700.0), orders=range(2, 12, 2))
+    yield from (diagram, fx.identify_modes(frf, band=(400.0, 700.0), orders=range(2, 12, 2)))
+    yield diagram.select([463.1])
 
 
 def a_system():

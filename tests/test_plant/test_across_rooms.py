@@ -5,7 +5,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
-from stages import CORNERS, NOISE, RATE, ports, some_modes
+from stages import CORNERS, NOISE, RATE, Z8, ports, reduced, some_modes
 
 
 @pytest.fixture(scope="module")
@@ -64,3 +64,15 @@ def test_points_as_keys_are_drawn():
     ax = fx.plot.layout(some_modes().dofs, ports=fx.Ports(y=[pair]))
     drawn = [line.get_xydata() for line in ax.lines if line.get_label() == "sensors y"]
     np.testing.assert_allclose(drawn[0], [[0.3, 0.3]])
+
+
+def test_a_fit_alone_opens_its_uncertainty():
+    rom = reduced()
+    at = rom.full_dofs.nearest(Z8, "z")
+    poles = fx.testbeds.wafer_stage().poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+    unknowns = [fx.AddedMass(at), fx.AddedDamping(at)]
+    fit = fx.update(rom, unknowns, [fx.Eigenvalues(poles)])
+    plant = fx.assemble_plant(fit.model, ports())
+    alone, told = plant.uncertain(fit, modes=[6]), plant.uncertain(fit, unknowns, modes=[6])
+    np.testing.assert_array_equal(alone.system.A, told.system.A)
+    assert [p.name for p in fit.unknowns] == list(fit.parameters)

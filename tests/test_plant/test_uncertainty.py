@@ -301,7 +301,7 @@ def test_what_cannot_be_opened_is_said():
     fit, unknowns = fitted()
     plant = updated()
     with pytest.raises(LabelError, match=r"got the parameters \[\].*given to update"):
-        plant.uncertain(fit)
+        plant.uncertain(fit.replace(unknowns=()))
     with pytest.raises(LabelError, match="same order"):
         plant.uncertain(fit, unknowns[::-1])
     with pytest.raises(ModelError, match="no covariance"):

@@ -52,17 +52,61 @@ class SpectralMethod(Value):
 
 
 class H1(SpectralMethod):
-    """``G = S_yu S_uu^-1``: unbiased with noise on outputs, in open loop."""
+    """``G = S_yu S_uu^-1``: unbiased with noise on outputs, in open loop.
+
+    Parameters
+    ----------
+    segment : float, optional
+        Length of a segment [s]; an eighth of the record when not given.
+    overlap : float
+        Share of a segment that the next one sees again, 0 to below 1.
+    window : str or tuple
+        As `scipy.signal.get_window` knows.
+
+    Raises
+    ------
+    ModelError
+        When a value is out of range.
+    """
 
 
 class H2(SpectralMethod):
-    """``G = S_yy S_uy^-1``: unbiased with noise on inputs; for one input, or n_out = n_in."""
+    """``G = S_yy S_uy^-1``: unbiased with noise on inputs; for one input, or n_out = n_in.
+
+    Parameters
+    ----------
+    segment : float, optional
+        Length of a segment [s]; an eighth of the record when not given.
+    overlap : float
+        Share of a segment that the next one sees again, 0 to below 1.
+    window : str or tuple
+        As `scipy.signal.get_window` knows.
+
+    Raises
+    ------
+    ModelError
+        When a value is out of range.
+    """
 
 
 class Hv(SpectralMethod):
     """Total least squares of every output and all inputs, each scaled to unit power per line.
 
     For one input its size is the geometric mean of those of H1 and H2.
+
+    Parameters
+    ----------
+    segment : float, optional
+        Length of a segment [s]; an eighth of the record when not given.
+    overlap : float
+        Share of a segment that the next one sees again, 0 to below 1.
+    window : str or tuple
+        As `scipy.signal.get_window` knows.
+
+    Raises
+    ------
+    ModelError
+        When a value is out of range.
     """
 
 

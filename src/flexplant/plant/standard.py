@@ -413,7 +413,7 @@ class StandardPlant(Value):
             A fit whose `model` this plant was assembled from, or measured poles with mode numbers
             and a covariance.
         parameters : sequence of Parameter, optional
-            Those that were given to `update`, in its order; for a fit.
+            Those that were given to `update`, in its order; those the fit keeps when not given.
         modes : sequence of int, optional
             Numbers from 1, rigid-body modes included; all elastic (or all measured) ones when not
             given.

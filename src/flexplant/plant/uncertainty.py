@@ -197,6 +197,7 @@ def uncertain(
     realisation = _structure(plant)
     many = positive(deviations, "deviations")
     if isinstance(source, UpdateResult):
+        parameters = source.unknowns if parameters is None else parameters
         numbers, poles, doubt = _fitted(realisation, source, parameters, modes)
     elif isinstance(source, MeasuredModes):
         numbers, poles, doubt = _measured(source, modes)

@@ -2,6 +2,8 @@
 
 from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity
+from .identification import identified as identified
+from .identification import stabilisation as stabilisation
 from .placement import sensor_map as sensor_map
 from .response import response as response
 from .structure import layout as layout

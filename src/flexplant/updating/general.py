@@ -95,6 +95,7 @@ def general_update(
         reason=best.reason,
         at_bound=tuple(q.name for q, flag in zip(parameters, at, strict=True) if flag),
         starts=None if len(begins) == 1 else _summary(begins, ends),
+        unknowns=tuple(parameters),
     )
 
 

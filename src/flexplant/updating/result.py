@@ -11,6 +11,7 @@ from scipy.special import ndtri
 from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Value, positive
+from .parameters import Parameter
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -115,6 +116,8 @@ class UpdateResult(Value):
         the covariance does not know of it.
     starts : Starts or None
         What every start led to, when there were several.
+    unknowns : sequence of Parameter
+        What was estimated, as it was given to `update`.
     """
 
     parameters: tuple[str, ...]
@@ -128,6 +131,7 @@ class UpdateResult(Value):
     reason: str
     at_bound: tuple[str, ...] = ()
     starts: Starts | None = None
+    unknowns: tuple[Parameter, ...] = ()
 
     def __post_init__(self) -> None:
         self._set(values=self.values, covariance=self.covariance, correlation=self.correlation)

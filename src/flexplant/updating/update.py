@@ -190,6 +190,7 @@ def _paper(
         history=History(*(np.array(part) for part in zip(*trail, strict=True))),
         converged=converged,
         reason=reason,
+        unknowns=tuple(listed),
     )
 
 
