@@ -1,0 +1,216 @@
+"""From a noisy measurement to a model with known parameters and known doubt.
+
+Run it: ``python examples/measured_frf.py``. The virtual machine floats under a slow servo and is
+shaken by multisines; its frequency responses (FRFs) give poles, the poles say what its drawing has
+wrong, and responses that were not used say whether that is true. The machine differs from the
+drawing in three things: 0.5 kg at z8 that no drawing shows, Young's modulus 70 instead of 69 GPa,
+and 1 % modal damping instead of 0.7 %. Pictures go to ``examples/out``.
+"""
+
+# %% Names and numbers
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # matrices are small: more threads only wait
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import flexplant as fx
+
+OUT = Path(__file__).parent / "out"
+L = 0.6
+RATE = 10e3  # Hz
+BAND = (150.0, 1400.0)  # Hz, where modes are identified
+ABOVE = (1400.0, 2000.0)  # Hz, lines that nothing is fitted to
+RUNS = 6
+SENSOR = 1e-9  # m rms per sample
+CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
+INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
+UNUSED = "y5"  # a sensor that nothing is fitted to
+ACTUATORS = {f"u{i}": point for i, point in enumerate(INSET, 1)}
+SENSORS = {f"y{i}": point for i, point in enumerate([*CORNERS, (3 * L / 4, L, 0.0)], 1)}
+FITTED = [name for name in SENSORS if name != UNUSED]
+PORTS = fx.Ports(
+    w=[fx.Disturbance(f"{name}:amp", at=p, asd=1e-3) for name, p in ACTUATORS.items()],
+    u=[fx.Actuator(name, at=p) for name, p in ACTUATORS.items()],
+    z=[fx.Poi("die", at=(L / 2, L / 2, 0.0))],
+    y=[fx.Sensor(name, at=p, asd=SENSOR / np.sqrt(RATE / 2)) for name, p in SENSORS.items()],
+)
+# what the machine really has, the answers to be found
+TRUTH = {"mass": 0.5, "stiffness": 70 / 69 - 1, "damping": 0.01 / 0.007 * np.sqrt(70 / 69) - 1}
+
+
+# %% The drawing, reduced to 49 DOFs: 24 modes and the compliance at 25 places in question
+SHAPE = {"size": (L, L), "thickness": 0.0272, "elements": (8, 8)}
+plate = fx.kirchhoff_plate(**SHAPE, density=2702, youngs_modulus=69e9, poisson_ratio=0.35)
+z8 = plate.dofs.nearest((L / 2, L / 4, 0.0), "z")
+grid = np.linspace(0.0, L, 5)
+places = [plate.dofs.nearest((x, y, 0.0), "z") for y in grid for x in grid]
+modes = fx.solve_modes(plate, count=24, damping=fx.ModalDamping(0.007), compliance_at=places)
+drawing = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 49, required=places).labels))
+masses = {place: fx.AddedMass(place) for place in places}
+stiffness = fx.MatrixParameter("stiffness", dK=drawing.K)  # relative changes of all of K and D
+damping = fx.MatrixParameter("damping", dD=drawing.D)
+
+
+# %% The measurement: six runs, whose spread is the variance
+def measured(machine: Any) -> fx.Frf:
+    """Return the mean FRFs of some noisy runs."""
+    return fx.average_frfs(
+        machine.measure_frf(PORTS, period=0.5, periods=1, discard=2, amplitude=5.0, rng=seed)
+        for seed in range(RUNS)
+    )
+
+
+def poles(frf: fx.Frf) -> tuple[fx.IdentifiedModes, fx.MeasuredModes]:
+    """Return the identified modes of the sensors that are used, and those the drawing knows."""
+    found = fx.identify_modes(frf.select(outputs=FITTED), band=BAND, hold=RATE)
+    at = {name: SENSORS[name] for name in FITTED}
+    return found, fx.numbered(found, drawing, at=at, partial=True, least_mac=0.8)
+
+
+def without_hold(frf: fx.Frf) -> fx.Frf:
+    """Return the FRFs of the sensors that are used, from force instead of from command."""
+    used = frf.select(outputs=FITTED)
+    turn = 2j * np.pi * used.freq / RATE
+    hold = (1.0 - np.exp(-turn)) / turn
+    return used.replace(data=used.data / hold, variance=used.variance / np.abs(hold) ** 2)
+
+
+# %% Where is the mass? Stiffness and damping are found along with it
+def scaled(fit: fx.UpdateResult) -> fx.ReducedModel:
+    """Return the drawing with the stiffness and damping of a fit, but without its mass."""
+    more_stiffness, more_damping = fit.values[-2:]
+    K, D = (1.0 + more_stiffness) * drawing.K, (1.0 + more_damping) * drawing.D
+    return drawing.replace(K=K, D=D)
+
+
+def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[fx.Localisation, fx.Localisation]:
+    """Return where the mass may be: by the poles, then by FRFs at the places left."""
+    fit = fx.update(drawing, [stiffness, damping], [eigenvalues])
+    for _ in range(2):  # the mass biases the first stiffness: once more without it
+        by_poles = fx.localise(scaled(fit), [eigenvalues], [*masses.values()], most=1, screen=8)
+        best = masses[place_of(by_poles.ranking[0])]
+        fit = fx.update(drawing, [best, stiffness, damping], [eigenvalues])
+    force = without_hold(frf)
+    low = np.flatnonzero((force.freq > BAND[0]) & (force.freq < 700.0))[::4]
+    where = {**{name: SENSORS[name] for name in FITTED}, **ACTUATORS}
+    residual = fx.FrfResidual(force, lines=low, places=where)
+    left = [masses[place_of(name)] for name in by_poles.alike]
+    return by_poles, fx.localise(scaled(fit), [residual], left, most=1)
+
+
+def place_of(name: str) -> str:
+    """Return the DOF label of a mass by its name."""
+    return next(place for place, mass in masses.items() if mass.name == name)
+
+
+# %% What the model says about responses that were not used
+def predicted(model: Any, freq: np.ndarray) -> fx.Frf:
+    """Return a model's FRFs, behind the machine's zero-order hold."""
+    plant = fx.assemble_plant(model, PORTS).discretized(RATE)
+    return fx.frequency_response(plant.Gyu, freq)
+
+
+def merit(frf: fx.Frf, model: Any) -> dict[str, tuple[float, float]]:
+    """Return relative errors, and errors per standard deviation of the noise (both rms)."""
+    error, seen = predicted(model, frf.freq).data - frf.data, {}
+    for lines, (low, high) in (("identified band", BAND), ("unused lines above", ABOVE)):
+        inside = (frf.freq > low) & (frf.freq < high)
+        for name in ("fitted sensors", "unused sensor"):
+            rows = [(output == UNUSED) == (name == "unused sensor") for output in frf.outputs]
+            size, power, noise = (
+                part[rows][..., inside]
+                for part in (np.abs(error) ** 2, np.abs(frf.data) ** 2, frf.variance)
+            )
+            relative = float(np.sqrt(size.sum() / power.sum()))
+            seen[f"{name}, {lines}"] = relative, float(np.sqrt(np.mean(size / noise)))
+    return seen
+
+
+# %% The run
+def main() -> dict[str, Any]:
+    """Return everything that the table and the pictures show."""
+    machine = fx.testbeds.wafer_stage(damping=0.01, rate=RATE)
+    frf = measured(machine)
+    identified, numbered = poles(frf)
+    eigenvalues = fx.Eigenvalues(numbered)
+    by_poles, by_frfs = located(frf, eigenvalues)
+    place = place_of(by_frfs.ranking[0])
+    fit = fx.update(drawing, [masses[place], stiffness, damping], [eigenvalues])
+    judged = {"drawing": merit(frf, drawing), "updated": merit(frf, fit.model)}
+    result = {"frf": frf, "identified": identified, "numbered": numbered, "fit": fit}
+    result |= {"by poles": by_poles, "by FRFs": by_frfs, "place": place, "merit": judged}
+    return {**result, "true poles": machine.poles(numbered.modes).poles}
+
+
+# %% The table
+def table(result: dict[str, Any]) -> str:
+    """Return all numbers as text."""
+    found, fit, frf = result["numbered"], result["fit"], result["frf"]
+    inside = (frf.freq > BAND[0]) & (frf.freq < BAND[1])
+    noise = np.median((np.abs(frf.data) ** 2 / frf.variance)[..., inside])
+    text = [f"FRFs: {RUNS} runs, signal to noise {10 * np.log10(noise):.0f} dB (median)", ""]
+    text.append(
+        f"{'mode':>4s}{'f [Hz]':>11s}{'+-':>8s}{'zeta [%]':>10s}{'+-':>8s}{'error/std':>16s}"
+    )
+    for i, mode in enumerate(found.modes):
+        gap, std, size = found.poles[i] - result["true poles"][i], found.std[i], abs(found.poles[i])
+        text.append(
+            f"{mode:4d}{found.freq[i]:11.3f}{std.imag / (2 * np.pi):8.3f}"
+            f"{100 * found.zeta[i]:10.4f}{100 * std.real / size:8.4f}"
+            f"{gap.real / std.real:+8.2f}{gap.imag / std.imag:+8.2f}"
+        )
+    for name, seen in (("poles", result["by poles"]), ("FRFs", result["by FRFs"])):
+        alike = ", ".join(sorted(place_of(one) for one in seen.alike))
+        text.append(f"mass by {name}: {len(seen.candidates)} places tried, alike: {alike}")
+    text.append(f"the mass is at {result['place']}; z8 is {z8}, by symmetry poles cannot tell")
+    text += ["", f"{'':12s}{'update':>10s}{'+- (1 std)':>12s}{'truth':>10s}{'error/std':>11s}"]
+    for (name, truth), value, std in zip(TRUTH.items(), fit.values, fit.std, strict=True):
+        off = (value - truth) / std
+        text.append(f"{name:12s}{value:10.5f}{std:12.5f}{truth:10.5f}{off:+11.2f}")
+    text += ["", f"{'FRF error (per noise)':36s}{'drawing':>19s}{'updated':>19s}"]
+    for name, before in result["merit"]["drawing"].items():
+        both = (before, result["merit"]["updated"][name])
+        text.append(f"{name:36s}" + "".join(f"{a:10.2%} ({b:6.2f})" for a, b in both))
+    return "\n".join(text)
+
+
+# %% The pictures
+def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
+    """Draw the poles' choice, the identified and the unused response, and the parameters."""
+    import matplotlib.pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    frf, fit, drawn = result["frf"], result["fit"], []
+
+    def keep(name: str) -> None:
+        drawn.append(folder / f"measured_{name}.png")
+        plt.savefig(drawn[-1], dpi=110)
+        plt.close("all")
+
+    used = frf.select(outputs=FITTED)
+    fx.plot.stabilisation(result["identified"].diagram, frf=used)
+    keep("stabilisation")
+    fx.plot.identified(used, result["identified"], "y1", "u1")
+    keep("identified")
+    models = {"drawing": drawing, "updated": fit.model}
+    shown = {name: predicted(model, frf.freq) for name, model in models.items()}
+    fx.plot.frf({"measured": frf, **shown}, UNUSED, "u1").set(xlim=(100.0, ABOVE[1]))
+    keep("unused_sensor")
+    axs = plt.subplots(3, 1, figsize=(6.0, 8.0), layout="constrained")[1]
+    truth = dict(zip(fit.parameters, TRUTH.values(), strict=True))
+    fx.plot.parameters(fit, truth=truth, axs=list(axs))
+    keep("parameters")
+    return drawn
+
+
+if __name__ == "__main__":
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    outcome = main()
+    print(table(outcome))
+    print(f"\npictures in {OUT}: {', '.join(path.stem for path in pictures(outcome))}")
