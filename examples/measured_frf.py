@@ -38,7 +38,6 @@ PORTS = fx.Ports(
     z=[fx.Poi("die", at=(L / 2, L / 2, 0.0))],
     y=[fx.Sensor(name, at=p, asd=SENSOR / np.sqrt(RATE / 2)) for name, p in SENSORS.items()],
 )
-# what the machine really has, the answers to be found
 TRUTH = {"mass": 0.5, "stiffness": 70 / 69 - 1, "damping": 0.01 / 0.007 * np.sqrt(70 / 69) - 1}
 
 
@@ -50,7 +49,7 @@ grid = np.linspace(0.0, L, 5)
 places = [plate.dofs.nearest((x, y, 0.0), "z") for y in grid for x in grid]
 modes = fx.solve_modes(plate, count=24, damping=fx.ModalDamping(0.007), compliance_at=places)
 drawing = fx.reduce(modes, fx.DesiredDofs(fx.select_dofs(modes, 49, required=places).labels))
-masses = {place: fx.AddedMass(place) for place in places}
+masses = {place: fx.AddedMass(place, name=place) for place in places}
 stiffness = fx.MatrixParameter("stiffness", dK=drawing.K)  # relative changes of all of K and D
 damping = fx.MatrixParameter("damping", dD=drawing.D)
 
@@ -71,20 +70,11 @@ def poles(frf: fx.Frf) -> tuple[fx.IdentifiedModes, fx.MeasuredModes]:
     return found, fx.numbered(found, drawing, at=at, partial=True, least_mac=0.8)
 
 
-def without_hold(frf: fx.Frf) -> fx.Frf:
-    """Return the FRFs of the sensors that are used, from force instead of from command."""
-    used = frf.select(outputs=FITTED)
-    turn = 2j * np.pi * used.freq / RATE
-    hold = (1.0 - np.exp(-turn)) / turn
-    return used.replace(data=used.data / hold, variance=used.variance / np.abs(hold) ** 2)
-
-
 # %% Where is the mass? Stiffness and damping are found along with it
 def scaled(fit: fx.UpdateResult) -> fx.ReducedModel:
     """Return the drawing with the stiffness and damping of a fit, but without its mass."""
-    more_stiffness, more_damping = fit.values[-2:]
-    K, D = (1.0 + more_stiffness) * drawing.K, (1.0 + more_damping) * drawing.D
-    return drawing.replace(K=K, D=D)
+    more_K, more_D = 1.0 + fit.values[-2:]
+    return drawing.replace(K=more_K * drawing.K, D=more_D * drawing.D)
 
 
 def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[fx.Localisation, fx.Localisation]:
@@ -92,26 +82,23 @@ def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[fx.Localisation, 
     fit = fx.update(drawing, [stiffness, damping], [eigenvalues])
     for _ in range(2):  # the mass biases the first stiffness: once more without it
         by_poles = fx.localise(scaled(fit), [eigenvalues], [*masses.values()], most=1, screen=8)
-        best = masses[place_of(by_poles.ranking[0])]
-        fit = fx.update(drawing, [best, stiffness, damping], [eigenvalues])
-    force = without_hold(frf)
+        best = [masses[by_poles.ranking[0]], stiffness, damping]
+        fit = fx.update(drawing, best, [eigenvalues])
+    force = frf.select(outputs=FITTED)
+    turn = 2j * np.pi * force.freq / RATE
+    hold = (1.0 - np.exp(-turn)) / turn  # taken out: this residual is of continuous models
+    force = force.replace(data=force.data / hold, variance=force.variance / np.abs(hold) ** 2)
     low = np.flatnonzero((force.freq > BAND[0]) & (force.freq < 700.0))[::4]
     where = {**{name: SENSORS[name] for name in FITTED}, **ACTUATORS}
     residual = fx.FrfResidual(force, lines=low, places=where)
-    left = [masses[place_of(name)] for name in by_poles.alike]
+    left = [masses[place] for place in by_poles.alike]
     return by_poles, fx.localise(scaled(fit), [residual], left, most=1)
-
-
-def place_of(name: str) -> str:
-    """Return the DOF label of a mass by its name."""
-    return next(place for place, mass in masses.items() if mass.name == name)
 
 
 # %% What the model says about responses that were not used
 def predicted(model: Any, freq: np.ndarray) -> fx.Frf:
     """Return a model's FRFs, behind the machine's zero-order hold."""
-    plant = fx.assemble_plant(model, PORTS).discretized(RATE)
-    return fx.frequency_response(plant.Gyu, freq)
+    return fx.frequency_response(fx.assemble_plant(model, PORTS).discretized(RATE).Gyu, freq)
 
 
 def merit(frf: fx.Frf, model: Any) -> dict[str, tuple[float, float]]:
@@ -125,8 +112,8 @@ def merit(frf: fx.Frf, model: Any) -> dict[str, tuple[float, float]]:
                 part[rows][..., inside]
                 for part in (np.abs(error) ** 2, np.abs(frf.data) ** 2, frf.variance)
             )
-            relative = float(np.sqrt(size.sum() / power.sum()))
-            seen[f"{name}, {lines}"] = relative, float(np.sqrt(np.mean(size / noise)))
+            both = np.sqrt([size.sum() / power.sum(), np.mean(size / noise)])
+            seen[f"{name}, {lines}"] = float(both[0]), float(both[1])
     return seen
 
 
@@ -138,7 +125,7 @@ def main() -> dict[str, Any]:
     identified, numbered = poles(frf)
     eigenvalues = fx.Eigenvalues(numbered)
     by_poles, by_frfs = located(frf, eigenvalues)
-    place = place_of(by_frfs.ranking[0])
+    place = by_frfs.ranking[0]  # masses have the names of their places
     fit = fx.update(drawing, [masses[place], stiffness, damping], [eigenvalues])
     judged = {"drawing": merit(frf, drawing), "updated": merit(frf, fit.model)}
     result = {"frf": frf, "identified": identified, "numbered": numbered, "fit": fit}
@@ -151,26 +138,24 @@ def table(result: dict[str, Any]) -> str:
     """Return all numbers as text."""
     found, fit, frf = result["numbered"], result["fit"], result["frf"]
     inside = (frf.freq > BAND[0]) & (frf.freq < BAND[1])
-    noise = np.median((np.abs(frf.data) ** 2 / frf.variance)[..., inside])
-    text = [f"FRFs: {RUNS} runs, signal to noise {10 * np.log10(noise):.0f} dB (median)", ""]
-    text.append(
-        f"{'mode':>4s}{'f [Hz]':>11s}{'+-':>8s}{'zeta [%]':>10s}{'+-':>8s}{'error/std':>16s}"
-    )
+    noise = 10 * np.log10(np.median((np.abs(frf.data) ** 2 / frf.variance)[..., inside]))
+    text = [f"FRFs: {RUNS} runs, signal to noise {noise:.0f} dB (median)", ""]
+    text.append(f"mode{'f [Hz]':>11s}{'+-':>8s}{'zeta [%]':>10s}{'+-':>8s}{'error/std':>16s}")
+    gap, std, size = found.poles - result["true poles"], found.std, np.abs(found.poles)
     for i, mode in enumerate(found.modes):
-        gap, std, size = found.poles[i] - result["true poles"][i], found.std[i], abs(found.poles[i])
         text.append(
-            f"{mode:4d}{found.freq[i]:11.3f}{std.imag / (2 * np.pi):8.3f}"
-            f"{100 * found.zeta[i]:10.4f}{100 * std.real / size:8.4f}"
-            f"{gap.real / std.real:+8.2f}{gap.imag / std.imag:+8.2f}"
+            f"{mode:4d}{found.freq[i]:11.3f}{std[i].imag / (2 * np.pi):8.3f}"
+            f"{100 * found.zeta[i]:10.4f}{100 * std[i].real / size[i]:8.4f}"
+            f"{gap[i].real / std[i].real:+8.2f}{gap[i].imag / std[i].imag:+8.2f}"
         )
     for name, seen in (("poles", result["by poles"]), ("FRFs", result["by FRFs"])):
-        alike = ", ".join(sorted(place_of(one) for one in seen.alike))
+        alike = ", ".join(sorted(seen.alike))
         text.append(f"mass by {name}: {len(seen.candidates)} places tried, alike: {alike}")
     text.append(f"the mass is at {result['place']}; z8 is {z8}, by symmetry poles cannot tell")
     text += ["", f"{'':12s}{'update':>10s}{'+- (1 std)':>12s}{'truth':>10s}{'error/std':>11s}"]
-    for (name, truth), value, std in zip(TRUTH.items(), fit.values, fit.std, strict=True):
-        off = (value - truth) / std
-        text.append(f"{name:12s}{value:10.5f}{std:12.5f}{truth:10.5f}{off:+11.2f}")
+    for (name, truth), value, doubt in zip(TRUTH.items(), fit.values, fit.std, strict=True):
+        off = (value - truth) / doubt
+        text.append(f"{name:12s}{value:10.5f}{doubt:12.5f}{truth:10.5f}{off:+11.2f}")
     text += ["", f"{'FRF error (per noise)':36s}{'drawing':>19s}{'updated':>19s}"]
     for name, before in result["merit"]["drawing"].items():
         both = (before, result["merit"]["updated"][name])
@@ -196,13 +181,12 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
     keep("stabilisation")
     fx.plot.identified(used, result["identified"], "y1", "u1")
     keep("identified")
-    models = {"drawing": drawing, "updated": fit.model}
-    shown = {name: predicted(model, frf.freq) for name, model in models.items()}
-    fx.plot.frf({"measured": frf, **shown}, UNUSED, "u1").set(xlim=(100.0, ABOVE[1]))
+    before, after = (predicted(model, frf.freq) for model in (drawing, fit.model))
+    shown = {"measured": frf, "drawing": before, "updated": after}
+    fx.plot.frf(shown, UNUSED, "u1").set(xlim=(100.0, ABOVE[1]))
     keep("unused_sensor")
-    axs = plt.subplots(3, 1, figsize=(6.0, 8.0), layout="constrained")[1]
-    truth = dict(zip(fit.parameters, TRUTH.values(), strict=True))
-    fx.plot.parameters(fit, truth=truth, axs=list(axs))
+    axs = list(plt.subplots(3, 1, figsize=(6.0, 8.0), layout="constrained")[1])
+    fx.plot.parameters(fit, truth=dict(zip(fit.parameters, TRUTH.values(), strict=True)), axs=axs)
     keep("parameters")
     return drawn
 

@@ -39,9 +39,9 @@ def test_the_mass_is_found_and_its_mirror_images_are_named(example, result):
     length, dofs = example.L, example.plate.dofs
     points = [(0.5, 0.25), (0.25, 0.5), (0.75, 0.5), (0.5, 0.75)]
     images = {dofs.nearest((length * x, length * y, 0.0), "z") for x, y in points}
-    assert {example.place_of(name) for name in result["by poles"].alike} == images
+    assert set(result["by poles"].alike) == images
     assert len(result["by poles"].candidates) == 25
-    assert result["by FRFs"].alike == ("mass at 23:z",)
+    assert result["by FRFs"].alike == ("23:z",)
     assert result["place"] == example.z8 == "23:z"
 
 
