@@ -113,8 +113,13 @@ class Continuous:
         for factor in (1.0, 1.7, 0.6, 3.1, 0.33):
             shift = float(typical * factor)
             moved = p.A.T - shift * np.eye(n)
-            inner = moved + p.G @ np.linalg.solve(moved.T, p.Q)
-            condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
+            try:
+                inner = moved + p.G @ np.linalg.solve(moved.T, p.Q)
+                condition = float(np.linalg.cond(moved) * np.linalg.cond(inner))
+            except np.linalg.LinAlgError:
+                continue  # a pole lies at the shift: the next one misses it
+            if not np.isfinite(condition):
+                continue
             if best is None or condition < best[0]:
                 inverse = np.linalg.inv(inner)
                 A = np.eye(n) + 2 * shift * inverse
@@ -123,7 +128,11 @@ class Continuous:
                 best = condition, (A, 0.5 * (Q + Q.T), 0.5 * (G + G.T), shift)
             if best[0] < 1e8:
                 break
-        assert best is not None  # noqa: S101 - the loop ran
+        if best is None:
+            raise SolverError(
+                "continuous Riccati equation: no shift makes its Cayley transform regular, so it "
+                "has no stabilising solution. Is an unstable mode without input or output?"
+            )
         return best[1]
 
     def gain(self, p: Problem, P: FloatArray) -> FloatArray:

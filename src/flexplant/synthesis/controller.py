@@ -22,7 +22,7 @@ class Controller(Value):
     gamma : float, optional
         The norm that its closed loop was verified to stay below.
     lower : float, optional
-        A lower bound: no controller does better.
+        A bound from below on what controllers reach; see the method for its conditions.
     certificate : mapping {str: float}
         Numbers computed after the design by another route.
     """

@@ -61,7 +61,8 @@ def design_hinf(
     Returns
     -------
     Controller
-        `gamma` is the verified norm, `lower` a bound that no controller beats, `certificate` what
+        `gamma` is the verified norm, `lower` a bound from below on what any controller reaches (by
+        `Lmi` for controllers whose X and Y are no larger than its own), `certificate` what
         was checked.
 
     Raises
