@@ -294,3 +294,10 @@ def test_bad_input(solve, change, error, message):
     given_ = {"A": 0.5 * EYE, "C": EYE, "Q": EYE, "R": EYE} | change
     with pytest.raises(error, match=message):
         solve(given_.pop("A"), given_.pop("C"), **given_)
+
+
+@pytest.mark.parametrize("A", [[[1.0]], [[2.0, 0.0], [0.0, -1.0]]])
+def test_an_unstable_mode_that_nothing_reaches_is_named(A):
+    A = np.array(A)
+    with pytest.raises(SolverError, match="cannot be seen"):
+        control_care(A, np.zeros((len(A), 1)), Q=np.eye(len(A)), R=np.eye(1))
