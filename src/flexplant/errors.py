@@ -64,6 +64,10 @@ def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = ""
     no DOF '41:zz' (2 known). Close matches: '41:z', '4:z'.
     """
     known = list(known)
+    if not known:
+        return LabelError(
+            f"no {kind} {name!r}{f' in {owner}' if owner else ''}: there is none yet."
+        )
     close = get_close_matches(str(name), known, n=3, cutoff=0.5)
     shown = close or known[:6]
     listed = ", ".join(repr(label) for label in shown) + (

@@ -76,3 +76,8 @@ def test_a_fit_alone_opens_its_uncertainty():
     alone, told = plant.uncertain(fit, modes=[6]), plant.uncertain(fit, unknowns, modes=[6])
     np.testing.assert_array_equal(alone.system.A, told.system.A)
     assert [p.name for p in fit.unknowns] == list(fit.parameters)
+
+
+def test_a_reference_without_any_poi_says_so():
+    with pytest.raises(fx.errors.LabelError, match="there is none yet"):
+        fx.Ports(references=[fx.Reference("die")])
