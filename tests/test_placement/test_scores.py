@@ -157,6 +157,7 @@ def test_a_criterion_that_fails_on_a_layout_gives_its_reason(make):
     assert scores.reasons == ("", "four do not converge.", "the criterion is infinite.")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_executors_give_the_same_to_the_bit(make, kind, send_everything):
     plant, sensors, _ = make(5)

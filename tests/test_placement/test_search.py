@@ -148,6 +148,7 @@ def test_a_criterion_without_finite_values(make):
         place_sensors(plant, sensors[:5], 3, lambda p: np.inf, method=Exchange(starts=1))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["threads", "processes"])
 def test_executors_give_the_same_to_the_bit(make, kind, send_everything):
     plant, sensors, _ = make(12)

@@ -96,6 +96,7 @@ def test_without_back_off_the_optimum_is_met_within_the_tolerance():
     assert found.lower >= scalar_optimum(1.0) * 0.9998
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6), n=st.integers(1, 6), m=st.integers(1, 3), p=st.integers(1, 2))
 def test_normalised_coprime_factors_have_glover_and_mcfarlanes_optimum(seed, n, m, p):
     """A Nehari problem with D11 not zero: (1 + lambda_max(X Y))^(1/2), stable plants or not."""
@@ -109,6 +110,7 @@ def test_normalised_coprime_factors_have_glover_and_mcfarlanes_optimum(seed, n, 
     assert best * (1 - 1e-5) <= found.gamma <= 1.06 * best
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 10**6), unit=st.floats(-9, 9), dt=st.sampled_from([0.0, 0.1]))
 def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
     """D11 and D22 not zero; gamma is linear in the unit of w."""

@@ -161,6 +161,7 @@ def test_a_measured_frf_is_the_truths_within_noise():
     assert np.abs((thick - wanted) / size).max() > 0.2
 
 
+@pytest.mark.slow
 def test_a_frf_without_noise_is_exact():
     # what is left is the transient of the servo that holds the machine
     quiet = ports(asd=0.0, sensor_asd=0.0)
@@ -173,6 +174,7 @@ def test_a_frf_without_noise_is_exact():
     np.testing.assert_array_equal(again.data, frf.data)
 
 
+@pytest.mark.slow
 def test_kalman_study_in_closed_form(zeta):
     """0.1 nm, 1e-3 N/sqrt(Hz); at 0.1 %: (c) beats (b) by 1.3, (b) beats (a) by 2."""
     static, nominal, updated = errors_on_the_machine(zeta)
@@ -234,6 +236,7 @@ def servo_on(zeta):
     return found["updated"], design_servo(found["plants"][1], bandwidth=50.0, notches=[bowl])
 
 
+@pytest.mark.slow
 def test_the_servo_is_stable_on_the_machine(zeta):
     observer, servo = servo_on(zeta)
     loop = stage(zeta).loop(ports(), observer, servo)
