@@ -118,6 +118,37 @@ def test_the_closed_loops(result):
         assert 0 < loop["MSD"] < 20e-9
 
 
+def test_the_h_infinity_designs(example, result):
+    for case in result["cases"].values():
+        loop = case["loops"]["H-infinity"]
+        assert loop["blocks"][-1].gamma == pytest.approx(1.659, rel=5e-3)
+        for where in ("on model", "on machine"):
+            assert loop[where].spectral_radius < 1
+            assert 30.0 < example.reached(loop["S"][where]) < 36.0
+
+
+def test_the_example_fails_when_the_design_is_not_worth_it(example):
+    plant = example.study(0.01, ())["plant"]
+    comparison, weights = fx.reference_errors(plant), fx.stage_weights(plant, 30.0)
+    weighted = plant.through(comparison).weighted(z=weights.z, w=weights.w)
+    nothing = example.doing_nothing(weighted)
+    assert 2 * 1.66 < nothing < np.inf
+    with pytest.raises(RuntimeError, match="doing nothing scores"):
+        example.require_worth(nothing, 0.51 * nothing)
+    example.require_worth(nothing, 0.49 * nothing)
+    freq = np.array([10.0, 29.0, 40.0])
+    with pytest.raises(RuntimeError, match="lost below 30 Hz on machine"):
+        example.require_bandwidth({"on machine": (freq, np.array([0.1, 1.1, 1.2]))})
+    example.require_bandwidth({"on machine": (freq, np.array([0.1, 0.9, 1.2]))})
+
+
+def test_the_placement(result):
+    found = result["placement"]
+    assert np.sqrt(found["every"].values[0]) == pytest.approx(0.1214e-9, rel=5e-3)
+    assert found["best"].value == pytest.approx(found["every"].values[0], rel=1e-9, abs=0.0)
+    np.testing.assert_allclose(found["fifth"].best, [0.3, 0.3, 0.0], atol=1e-9)
+
+
 def test_the_table_has_the_papers_column(example, result):
     lines = "\n".join(["", *example.model_table(result)]).splitlines()
     assert lines[1].split()[-2:] == ["flexplant", "paper"]
