@@ -14,10 +14,14 @@ from flexplant.values import (
     Value,
     check_names,
     frozen,
+    generator,
+    name_list,
     positive,
     real_array,
     rebuild,
+    seed_sequence,
     signal_names,
+    whole,
 )
 
 
@@ -105,7 +109,12 @@ def test_values_are_known_by_name():
         ([1j], None, ModelError),
         (["a"], None, ModelError),
         (None, (), ModelError),
-        ([[1], [1, 2]], None, ValueError),
+        ([[1], [1, 2]], None, ModelError),
+        (["1", "2"], None, ModelError),
+        ([1, None], None, ModelError),
+        ([1, "2"], (2,), ModelError),
+        (np.array(["2026-01-01"], dtype="datetime64[D]"), None, ModelError),
+        ({"a": 1}, (), ModelError),
         ([1, 2], (3,), ShapeError),
         ([1, 2], (1, 2), ShapeError),
         (1.0, (None,), ShapeError),
@@ -126,10 +135,71 @@ def test_good_arrays():
         real_array([[0, 0], [np.nan, 0]], "x")
 
 
+@pytest.mark.parametrize(
+    ("value", "shape", "text"),
+    [
+        (None, (), "x must be one number, got None. Pass"),
+        ("3", (), "x must be one number, got '3'. Pass"),
+        ([1.0, 2.0], (), "x must be one number, got (2,). Pass"),
+        ([1.0, 2.0], (3,), "x must have shape (3,), got (2,). Pass"),
+        (1.0, (None,), "x must have shape (any,), got the number 1. Pass"),
+        (1.0, (None, 3), "x must have shape (any, 3), got the number 1. Pass"),
+        (np.nan, (), "x has a NaN or infinite value (nan): no result could be trusted. Pass a"),
+        ([1.0, None], None, "x must hold numbers, got [1.0, None]. Pass"),
+        (np.array(["a"] * 99), None, "x must hold numbers, got an array of shape (99,). Pass"),
+        ([[1], [1, 2]], None, "its rows have different lengths. Give"),
+    ],
+)
+def test_what_is_wrong_is_named_as_it_is(value, shape, text):
+    with pytest.raises(ValueError, match="x ") as caught:
+        real_array(value, "x", shape)
+    assert text in str(caught.value)
+
+
+def test_whole_numbers():
+    assert whole(3, "n") == 3
+    assert type(whole(np.int32(3), "n")) is int
+    assert whole(0, "n", minimum=0) == 0
+    assert whole(5, "n", maximum=5) == 5
+    for bad in (True, np.True_, 3.0, np.float64(3), "3", None, [3], np.nan, np.array(3)):
+        with pytest.raises(ModelError, match="n must be a whole number at least 1, got"):
+            whole(bad, "n")
+    for bad in (0, -1, 6):
+        with pytest.raises(ModelError, match=f"from 1 to 5, got {bad}. Choose"):
+            whole(bad, "n", maximum=5)
+
+
+def test_seeds():
+    for rng in (7, np.int64(7), np.random.SeedSequence(7)):
+        assert generator(rng).random() == np.random.default_rng(7).random()
+    assert generator([1, 2]).random() == np.random.default_rng([1, 2]).random()
+    assert generator(np.array([1, 2])).random() == np.random.default_rng([1, 2]).random()
+    given = np.random.default_rng(0)
+    assert generator(given) is given
+    assert generator(None).random() != generator(None).random()
+    # a Generator moves on: two calls with it differ, two with its copy do not
+    first, second = (seed_sequence(given).entropy for _ in range(2))
+    assert first != second
+    assert seed_sequence(np.random.default_rng(3)).entropy == (
+        seed_sequence(np.random.default_rng(3)).entropy
+    )
+    for bad in ("a", -1, 1.0, True, [1, -1], [1, True], {}, np.array([0.5])):
+        with pytest.raises(ModelError, match=r"seed must be a seed .* Pass an int"):
+            generator(bad, "seed")
+
+
+def test_lists_of_names():
+    assert name_list("a", "sensors") == ("a",)
+    assert name_list((n for n in "ab"), "sensors") == ("a", "b")
+    for bad in (None, 3, ["a", 3], b"a", [None]):
+        with pytest.raises(LabelError, match=r"sensors are chosen by name, got .* Pass a list"):
+            name_list(bad, "sensors")
+
+
 def test_positive():
     assert positive(np.float32(2), "x") == 2
     assert positive(0, "x", zero=True) == 0
-    for bad in (0, -1, np.nan, "a"):
+    for bad in (0, -1, np.nan, "a", "1", True, None):
         with pytest.raises(ModelError):
             positive(bad, "x")
     with pytest.raises(ModelError, match="zero or positive"):

@@ -99,30 +99,70 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = Non
     ShapeError
         When the shape differs.
     ModelError
-        When entries are complex, NaN or infinite.
+        When entries are no numbers, complex, NaN or infinite.
     """
-    array = np.asarray(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise ModelError(
+            f"{name} must be an array of numbers, got {short(value)}: its rows have different "
+            "lengths. Give every row the same number of entries."
+        ) from error
     if np.iscomplexobj(array):
-        raise ModelError(f"{name} must be real, got complex entries. Pass its real part if meant.")
+        raise ModelError(
+            f"{name} must be real, got complex entries. Pass its real part if that is meant."
+        )
+    if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and _holds_none(array)):
+        raise _no_numbers(value, name, shape)
     try:
         array = np.array(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ModelError(f"{name} must hold numbers, got {value!r:.80}.") from error
+        raise _no_numbers(value, name, shape) from error
     if shape is not None and (
         array.ndim != len(shape)
         or any(
             want is not None and want != got for want, got in zip(shape, array.shape, strict=True)
         )
     ):
-        wanted = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
-        raise ShapeError(f"{name} must have shape {wanted}, got {array.shape}.")
+        got = str(array.shape) if array.ndim else f"the number {array:g}"
+        raise ShapeError(f"{name} must {_form(shape)}, got {got}. Pass it in that form.")
     if not np.all(np.isfinite(array)):
-        where = tuple(int(i) for i in np.argwhere(~np.isfinite(array))[0])
+        if not array.ndim:
+            raise ModelError(
+                f"{name} has a NaN or infinite value ({array:g}): no result could be trusted. "
+                "Pass a finite number."
+            )
+        where = ", ".join(str(int(i)) for i in np.argwhere(~np.isfinite(array))[0])
         raise ModelError(
-            f"{name} has a NaN or infinite entry, the first at index {where}: "
+            f"{name} has a NaN or infinite entry, the first at index ({where}): "
             "no result could be trusted. Remove it at its source."
         )
     return array
+
+
+def _holds_none(array: npt.NDArray[Any]) -> bool:
+    return any(item is None or isinstance(item, str | bytes) for item in array.ravel())
+
+
+def _no_numbers(value: Any, name: str, shape: tuple[int | None, ...] | None) -> ModelError:
+    form = "be one number" if shape == () else "hold numbers"
+    return ModelError(f"{name} must {form}, got {short(value)}. Pass numbers, in SI units.")
+
+
+def _form(shape: tuple[int | None, ...]) -> str:
+    """Return in words what a shape asks for."""
+    if not shape:
+        return "be one number"
+    sizes = ", ".join("any" if n is None else str(n) for n in shape)
+    return f"have shape ({sizes}{',' if len(shape) == 1 else ''})"
+
+
+def short(value: Any) -> str:
+    """Return a value for a message: its repr, cut after 80 characters; arrays by their shape."""
+    if isinstance(value, np.ndarray) and value.size > 6:
+        return f"an array of shape {value.shape}"
+    text = " ".join(repr(value).split())
+    return text if len(text) <= 80 else text[:77] + "..."
 
 
 def positive(value: Any, name: str, *, zero: bool = False) -> float:
@@ -133,10 +173,87 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
     ModelError
         When it is not.
     """
+    if isinstance(value, bool | np.bool_):
+        raise ModelError(f"{name} must be one number, got {value}. Pass the number that is meant.")
     number = float(real_array(value, name, ()))
     if number < 0 or (number == 0 and not zero):
-        raise ModelError(f"{name} must be {'zero or ' if zero else ''}positive, got {number:g}.")
+        raise ModelError(
+            f"{name} must be {'zero or ' if zero else ''}positive, got {number:g}. "
+            "Check its sign and its unit (SI)."
+        )
     return number
+
+
+def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None) -> int:
+    """Return `value` as an int between bounds; 3.0 is none, nor is True.
+
+    Parameters
+    ----------
+    value : int or NumPy integer
+        What was given.
+    name : str
+        What the caller calls it.
+    minimum, maximum : int
+        Bounds, both allowed; no upper one when not given.
+
+    Raises
+    ------
+    ModelError
+        When it is no whole number, or out of bounds.
+
+    Examples
+    --------
+    >>> whole(np.int64(3), "count")
+    3
+    """
+    least = f"at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
+    if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
+        raise ModelError(f"{name} must be a whole number {least}, got {short(value)}. Pass an int.")
+    number = int(value)
+    if number < minimum or (maximum is not None and number > maximum):
+        raise ModelError(f"{name} must be a whole number {least}, got {number}. Choose one there.")
+    return number
+
+
+def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
+    """Return the SeedSequence that a seed, SeedSequence, Generator or None stands for.
+
+    A Generator is drawn from, so that two calls with the same one differ.
+
+    Raises
+    ------
+    ModelError
+        When `rng` is nothing that seeds.
+    """
+    if isinstance(rng, np.random.SeedSequence):
+        return rng
+    if isinstance(rng, np.random.Generator):
+        return np.random.SeedSequence(rng.integers(0, 2**32, size=4).tolist())
+    if rng is None:
+        return np.random.SeedSequence()
+    numbers = [rng] if isinstance(rng, int | np.integer) else rng
+    if isinstance(numbers, list | tuple | np.ndarray) and not isinstance(rng, bool):
+        entropy = [n for n in numbers if isinstance(n, int | np.integer) and n >= 0]
+        if len(entropy) == len(numbers) and not any(isinstance(n, bool) for n in numbers):
+            given = [int(n) for n in entropy]
+            return np.random.SeedSequence(given[0] if numbers is not rng else given)
+    raise ModelError(
+        f"{name} must be a seed (a whole number from 0, or several), a SeedSequence, a Generator "
+        f"or None, got {short(rng)}. Pass an int to have the same draw again."
+    )
+
+
+def generator(rng: Any, name: str = "rng") -> np.random.Generator:
+    """Return the Generator that a seed, SeedSequence, Generator or None stands for.
+
+    Raises
+    ------
+    ModelError
+        When `rng` is nothing that seeds.
+    """
+    if isinstance(rng, np.random.Generator):
+        return rng
+    return np.random.default_rng(seed_sequence(rng, name))
 
 
 def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tuple[str, ...]:
@@ -149,15 +266,37 @@ def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tu
     ShapeError
         When their number is not `count`.
     """
-    listed = (names,) if isinstance(names, str) else tuple(str(name) for name in names or ())
+    listed = name_list(names, side) if names is not None else ()
     if not listed:
         return tuple(f"{prefix}{i}" for i in range(1, count + 1))
     if len(listed) != count:
         raise ShapeError(
-            f"{count} {side} need {count} names, got {len(listed)}: {list(listed)!r:.120}."
+            f"{count} {side} need {count} names, got {len(listed)}: {short(listed)}. Name each "
+            f"once, or none to have {prefix}1, {prefix}2, ..."
         )
     check_names(listed, side)
     return listed
+
+
+def name_list(names: Any, what: str) -> tuple[str, ...]:
+    """Return names as a tuple of str; one str is one name.
+
+    Raises
+    ------
+    LabelError
+        When it is no sequence of names.
+    """
+    if isinstance(names, str):
+        return (names,)
+    if not isinstance(names, Iterable) or isinstance(names, bytes):
+        raise LabelError(f"{what} are chosen by name, got {short(names)}. Pass a list of names.")
+    listed = tuple(names)
+    wrong = [name for name in listed if not isinstance(name, str)]
+    if wrong:
+        raise LabelError(
+            f"{what} are chosen by name, got {short(wrong[0])} among them. Pass a list of names."
+        )
+    return tuple(str(name) for name in listed)
 
 
 def check_names(names: Sequence[str], side: str) -> None:

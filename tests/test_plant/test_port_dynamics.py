@@ -443,7 +443,7 @@ def test_refusals():
         with pytest.raises(ModelError, match="delay of 'p' must be zero or positive"):
             kind("p", at="1:x", delay=-1e-3)
     for kind in (Actuator, Sensor, Poi, Disturbance):
-        with pytest.raises(ShapeError, match=r"a point of 'p' must have shape \(3\)"):
+        with pytest.raises(ShapeError, match=r"a point of 'p' must have shape \(3,\)"):
             kind("p", at={(0.1, 0.2): 1.0})
     with pytest.raises(LabelError, match="no sensor 'y9'"):
         channels(w=[OutputDisturbance("d", "y9")])

@@ -61,14 +61,14 @@ KINDS = (Disturbance, Actuator, Sensor, Poi)
 @pytest.mark.parametrize(
     ("at", "error", "words"),
     [
-        ((0.1, 0.2), ShapeError, r"place of 'p' must have shape \(3\), got \(2,\)"),
+        ((0.1, 0.2), ShapeError, r"place of 'p' must have shape \(3,\), got \(2,\)"),
         ((0.1, np.nan, 0.0), ModelError, "place of 'p' has a NaN"),
         ((0.1, 1j, 0.0), ModelError, "must be real"),
         ((0.1, "x", 0.0), ModelError, "must hold numbers"),
-        (None, ShapeError, "shape"),
+        (None, ModelError, "must hold numbers, got None"),
         ({}, LabelError, "empty mapping: name at least one DOF"),
         ({"1:z": np.nan}, ModelError, "weight of '1:z'.*NaN"),
-        ({"1:z": "much"}, ModelError, "weight of '1:z'.*must hold numbers"),
+        ({"1:z": "much"}, ModelError, "weight of '1:z'.*must be one number"),
     ],
 )
 def test_bad_places(kind, at, error, words):

@@ -260,7 +260,7 @@ def test_assumptions_are_checked(loop):
         ({"reference": {"die:reff": 1.0}}, LabelError, "Close matches: 'die:ref'"),
         ({"reference": {"amp": 1.0}}, LabelError, "no reference 'amp'"),
         ({"disturbance": {"die:ref": 1.0}}, LabelError, "no disturbance 'die:ref'"),
-        ({"reference": np.zeros(7)}, ShapeError, "reference 'die:ref' must have shape \\(20\\)"),
+        ({"reference": np.zeros(7)}, ShapeError, "reference 'die:ref' must have shape \\(20,\\)"),
         ({"reference": lambda t: t[:3]}, ShapeError, "shape"),
         ({"reference": np.nan}, ModelError, "NaN"),
         ({"runs": 0}, ModelError, "runs must be at least 1"),
