@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import FlexplantWarning, ModelError
 from ..lti.discretisation import diagonal_pairs, discretized
 from ..lti.noise import noise_factor
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, positive
 from .dynamics import structure_system, with_filters, with_gains
 from .ports import Ports
-from .realisation import ModalRealisation, Structure, realised
+from .realisation import MODAL, ModalRealisation, Structure, realised
 from .residual import FastStates, Residual
 from .sampling import sampled_physical
 from .standard import StandardPlant
@@ -43,7 +44,7 @@ def assemble_plant(
     StandardPlant
         Continuous. w: disturbances, sensor noises `y1:noise`, references; u: actuators;
         z: POI axes `die:z`, errors `die:error`, efforts `u1:effort`; y: sensors, references.
-        Delays of ports act once it is sampled.
+        Delays of ports act once it is sampled. `plant.form` says whether A is in modal blocks.
 
     Raises
     ------
@@ -51,6 +52,15 @@ def assemble_plant(
         When a place is not on the structure.
     ModelError
         When the model or the ports have another type, or a side is empty.
+
+    Warns
+    -----
+    FlexplantWarning
+        When damping couples the modes so that blocks cannot hold it: an overdamped pair, two poles
+        that (nearly) coalesce, or a damper to ground that drags rigid-body motion at more than
+        1e-4 of the first elastic frequency (what drags less is left out: rigid-body modes are
+        undamped by convention). The undamped modes are then kept with all of D between them, the
+        dense form.
 
     References
     ----------
@@ -63,7 +73,16 @@ def assemble_plant(
         raise ModelError(
             f"residual must be FastStates() or Feedthrough(), got {type(residual).__name__}."
         )
-    return _assembled(way.applied(realised(model)), ports)
+    realisation = realised(model)
+    if realisation.form != MODAL and realisation is not model:
+        warnings.warn(
+            f"this plant is not in modal blocks but {realisation.form}. It is exact all the same; "
+            "the damping couples its modes, so that what costs O(n) a frequency or sample costs "
+            "O(n^2) or more, and mode by mode uncertainty is not defined. See plant.form.",
+            FlexplantWarning,
+            stacklevel=2,
+        )
+    return _assembled(way.applied(realisation), ports)
 
 
 def _assembled(realisation: ModalRealisation, ports: Ports) -> StandardPlant:

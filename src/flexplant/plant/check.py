@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from ..errors import AssumptionError, unknown_label
 from ..labels import DIRECTIONS
+from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, Value
@@ -22,6 +23,8 @@ from .zeros import axis_zeros
 _ABSENT = 1e-8
 #: a pole closer to the stability limit than this, relative to its size, counts as on it
 _AXIS = 1e-9
+#: findings of one kind that are written out
+_SHOWN = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +101,8 @@ class AssumptionReport(Value):
     def __repr__(self) -> str:
         lines = [f"<AssumptionReport: {'all hold' if self.ok else 'NOT all hold'}>"]
         lines += _lines(self.assumptions)
+        if self.plant.form.startswith("dense"):
+            lines.append(f"  note the plant is {self.plant.form}")
         weak = [text for mode in self.modes for text in mode.weak]
         lines += [f"  note {text}" for text in weak[:4]]
         if len(weak) > 4:
@@ -125,7 +130,10 @@ class AssumptionReport(Value):
         failed = [item for item in known if item.key in keys and not item.holds]
         if failed:
             said = " ".join(f"{item.finding} {item.remedy}" for item in failed)
-            table = "\n".join(["The plant's assumptions:", *_lines(known)])
+            # what was said is not said again
+            short = [item.replace(finding="as said.", remedy="") for item in failed]
+            told = tuple(short[failed.index(i)] if i in failed else i for i in known)
+            table = "\n".join(["The plant's assumptions:", *_lines(told)])
             raise AssumptionError(f"{purpose} is not possible: {said}\n{table}")
 
 
@@ -164,15 +172,18 @@ def _reach_and_sight(plant: StandardPlant) -> list[Assumption]:
     """Ask which modes that do not decay w and u reach, and y and z see (Hautus)."""
     bare = plant.unweighted or plant
     bare = bare.continuous or bare
+    if bare.realisation is None:  # states of a system made elsewhere have any units
+        bare = bare.replace(system=evened(bare.system))
     poles = _undying(bare.system)
     rigid = bare.n_rigid if bare.realisation is not None else 0
     found = []
     for case in _cases(bare, poles):
         texts = [text for pole in poles for text in _lacks(bare, pole, case)]
-        texts += _weights_without(plant, case.key)
+        texts = list(dict.fromkeys([*texts, *_weights_without(plant, case.key)]))
         listed = f"(channels: {', '.join(case.names) or 'none'})"
         if texts:
-            text = "; ".join(texts)
+            more = len(texts) - _SHOWN
+            text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
         else:
             count = sum(pole.left.shape[1] for pole in poles) - rigid
@@ -234,8 +245,7 @@ def _lacks(plant: StandardPlant, pole: _Pole, case: _Case) -> list[str]:
         return []
     if rigid.size:
         shapes = (basis @ missing)[rigid].real
-        motions = " and ".join(_described(plant, column) for column in shapes.T)
-        return [f"{case.verb} the rigid-body {motions}"]
+        return [f"{case.verb} the rigid-body {' and '.join(_described(plant, shapes))}"]
     return [f"{case.verb} {_named(plant, pole.value)}, which does not decay"]
 
 
@@ -281,22 +291,32 @@ def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
     return np.asarray(U[:, np.count_nonzero(s > _ABSENT * s[0]) :])
 
 
-def _described(plant: StandardPlant, combination: FloatArray) -> str:
-    """Return a rigid-body combination in words: `translation z`, `rotation rx`."""
+def _described(plant: StandardPlant, combinations: FloatArray) -> list[str]:
+    """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
     realisation = plant.realisation
     if realisation is None:
-        return "motion"
+        return ["motion"]
     dofs = realisation.model.dofs
-    shape = realisation.outputs[:, 0 : 2 * plant.n_rigid : 2] @ combination
+    shapes = realisation.outputs[:, 0 : 2 * plant.n_rigid : 2] @ combinations
     motions = rigid_motions(dofs.replace(xyz=dofs.xyz - dofs.xyz.mean(axis=0)))
-    part = np.linalg.lstsq(motions, shape, rcond=None)[0] * np.linalg.norm(motions, axis=0)
-    size = np.abs(part) / max(float(np.abs(part).max()), 1e-300)
+    sizes = np.linalg.norm(motions, axis=0)
+    parts = (np.linalg.lstsq(motions, shapes, rcond=None)[0] * sizes[:, None]).T
+    # one axis for each motion that is missing, taken out of the others: none is said twice
+    for i in range(parts.shape[0]):
+        k, axis = np.unravel_index(int(np.argmax(np.abs(parts[i:]))), parts[i:].shape)
+        parts[[i, i + k]] = parts[[i + k, i]]
+        parts[i] /= parts[i, axis] or 1.0
+        others = np.arange(parts.shape[0]) != i
+        parts[others] -= np.outer(parts[others, axis], parts[i])
     kinds = {True: "rotation", False: "translation"}
-    return " + ".join(
-        f"{kinds[name.startswith('r')]} {name}"
-        for name, share in zip(DIRECTIONS, size, strict=True)
-        if share > 0.05
-    )
+    return [
+        " + ".join(
+            f"{kinds[name.startswith('r')]} {name}"
+            for name, share in zip(DIRECTIONS, np.abs(part) / np.abs(part).max(), strict=True)
+            if share > 0.05
+        )
+        for part in sorted(parts, key=lambda part: int(np.argmax(np.abs(part))))
+    ]
 
 
 def _ranks(plant: StandardPlant) -> list[Assumption]:
@@ -335,6 +355,8 @@ def _zeros(plant: StandardPlant) -> list[Assumption]:
             text = f"{key} has {len(names[1])} inputs {fro} and {len(names[0])} outputs {to}."
             found.append(Assumption(key, False, text, "D12 and D21 cannot have full rank."))
             continue
+        if plant.realisation is None:
+            g = evened(g)
         zeros = axis_zeros(g if key == "P12" else _transposed(g))
         if zeros.size:
             listed = ", ".join(_frequency(plant, zero) for zero in zeros[:3])
@@ -344,6 +366,12 @@ def _zeros(plant: StandardPlant) -> list[Assumption]:
             text = f"{fro} -> {to} has no invariant zero on the stability limit."
             found.append(Assumption(key, True, text))
     return found
+
+
+def evened(g: StateSpace) -> StateSpace:
+    """Return the system with its states in even units: judgements then do not depend on them."""
+    d = state_scale(g.A, g.B, g.C) if g.n_states else np.ones(0)
+    return g.replace(A=g.A * d / d[:, None], B=g.B / d[:, None], C=g.C * d)
 
 
 def _transposed(g: StateSpace) -> StateSpace:

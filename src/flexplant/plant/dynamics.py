@@ -65,7 +65,7 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
         inputs=[port.name for port in ports.forces],
         outputs=outputs,
         states=realisation.names,
-        blocks=[2] * realisation.pairs.shape[0],
+        blocks=realisation.blocks,
     )
 
 

@@ -1,4 +1,4 @@
-"""The exponential of a structure between the filters of its ports, pair by pair."""
+"""The exponential of a structure between the filters of its ports, pair by pair if it can."""
 
 from __future__ import annotations
 
@@ -55,9 +55,20 @@ class Flow:
         driven = A[self.modes, self.tail].reshape(b, 2, t)
         self.small[:, :h, h : h + 2] = seen * self.up
         self.small[:, h : h + 2, h + 2 :] = driven * self.down
+        #: modes that see each other: no sum over pairs, the exponential of the whole
+        self.coupled = np.count_nonzero(A[self.modes, self.modes]) > np.count_nonzero(pairs)
+        if self.coupled:
+            size = np.ones(n)
+            size[self.head], size[self.tail] = self.up, 1.0 / self.down
+            self.size = size
+            self.whole = size[:, None] * A / size
+            self.reached = _closure(A != 0)
 
     def at(self, time: float) -> FloatArray:
         """Return ``e^(A time)`` (n, n)."""
+        if self.coupled:
+            E = np.where(self.reached, la.expm(self.whole * time), 0.0)
+            return np.asarray(E / self.size[:, None] * self.size)
         E = np.zeros((self.n, self.n))
         b, h = self.b, self.h
         blocks = np.zeros((b, 2, b, 2))
@@ -75,6 +86,46 @@ class Flow:
         )
         E[self.modes, self.tail] = parts[:, h : h + 2, h + 2 :].reshape(2 * b, self.t) / self.down
         return E
+
+    def noise(self, force: FloatArray, time: float) -> FloatArray:
+        """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
+
+        Gauss-Legendre quadrature over a piece so short that ten nodes are exact to rounding, then
+        ``G(2 t) = [G(t), e^(A t) G(t)]``: sums of squares, so that G G' is positive semidefinite
+        in any units (the block exponential of Van Loan loses that on large models).
+        """
+        speed = float(np.linalg.norm(self.whole, 1)) * time
+        doublings = max(0, int(np.ceil(np.log2(max(speed, 1e-300)))))
+        piece = time / 2**doublings
+        nodes, weights = np.polynomial.legendre.leggauss(10)
+        G = _compressed(
+            [
+                np.sqrt(0.5 * piece * weight) * (self.at(0.5 * piece * (node + 1.0)) @ force)
+                for node, weight in zip(nodes, weights, strict=True)
+            ]
+        )
+        E = self.at(piece)
+        for _ in range(doublings):
+            G, E = _compressed([G, E @ G]), E @ E
+        return G
+
+
+def _compressed(parts: list[FloatArray]) -> FloatArray:
+    """Return a factor (n, r <= n) of the sum of ``part part'``."""
+    G = np.hstack(parts)
+    if G.shape[1] <= G.shape[0]:
+        return G
+    return np.asarray(la.qr(G.T, mode="r")[0][: G.shape[0]].T)
+
+
+def _closure(direct: np.ndarray) -> np.ndarray:
+    """Return which states (n, n) act on which in the end: where an exponential may be non-zero."""
+    reached = direct | np.eye(direct.shape[0], dtype=bool)
+    while True:
+        wider = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0
+        if np.array_equal(wider, reached):
+            return reached
+        reached = wider
 
 
 class HeldFlow:

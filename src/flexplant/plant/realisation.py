@@ -6,11 +6,13 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..lti.discretisation import block_diagonal
-from ..reduction import Modes, ReducedModel, normal_form
+from ..reduction import Modes, NormalForm, ReducedModel
+from ..reduction.normal_form import PROPORTIONAL, RealForm, modal, real_form
 from ..structure import FEModel
 from ..values import ComplexArray, FloatArray, Value
 
@@ -19,6 +21,10 @@ Structure: TypeAlias = "FEModel | Modes | ReducedModel"
 
 #: a dense eigenproblem of more DOFs than this is refused: reduce first
 LARGEST_DENSE = 2500
+#: condition of a complex mode above which its block would cost too many digits
+ILL_CONDITIONED = 1e5
+#: the form of a realisation whose modes do not see each other
+MODAL = "modal blocks"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,6 +52,11 @@ class ModalRealisation(Value):
     static_outputs, static_inputs : (n, s) arrays, optional
         Factors of a flexibility ``static_outputs static_inputs'`` [m/N] that answers at once: that
         of modes left out by `Feedthrough`.
+    coupling : (b, b) array [1/s], optional
+        Damping between modes, zero on the diagonal: the velocity of block j decelerates that of
+        block i. None where every mode is damped by itself.
+    form : str
+        `modal blocks`, or `dense: ` and why the modes are coupled.
     """
 
     model: Structure
@@ -56,15 +67,31 @@ class ModalRealisation(Value):
     n_rigid: int
     static_outputs: FloatArray | None = None
     static_inputs: FloatArray | None = None
+    coupling: FloatArray | None = None
+    form: str = MODAL
 
     def __post_init__(self) -> None:
         self._set(pairs=self.pairs, inputs=self.inputs, outputs=self.outputs)
         self._set(static_outputs=self.static_outputs, static_inputs=self.static_inputs)
+        self._set(coupling=self.coupling)
 
     @property
     def A(self) -> FloatArray:
-        """The block-diagonal (2 b, 2 b) matrix of all pairs."""
-        return block_diagonal(self.pairs)
+        """The (2 b, 2 b) matrix: block-diagonal, but for coupled velocities."""
+        A = block_diagonal(self.pairs)
+        if self.coupling is not None:
+            A[1::2, 1::2] -= self.coupling
+        return A
+
+    @property
+    def blocks(self) -> list[int]:
+        """Sizes of the diagonal blocks of A: 2 for each mode by itself, coupled ones as one."""
+        b = self.pairs.shape[0]
+        if self.coupling is None or not np.any(self.coupling):
+            return [2] * b
+        coupled = np.flatnonzero(np.any(self.coupling, axis=0) | np.any(self.coupling, axis=1))
+        first, last = int(coupled[0]), int(coupled[-1])
+        return [2] * first + [2 * (last - first + 1)] + [2] * (b - 1 - last)
 
     def row(self, at: Place, direction: str) -> FloatArray:
         """Return the row over the model's DOFs for a place."""
@@ -83,7 +110,9 @@ class ModalRealisation(Value):
         """
         C = np.asarray(row @ self.outputs).reshape(-1, self.pairs.shape[0], 1, 2)
         for _ in range(derivative):
+            slowed = 0.0 if self.coupling is None else C[:, :, 0, 1] @ self.coupling
             C = C @ self.pairs
+            C[:, :, 0, 1] -= slowed
         return C.reshape(*np.shape(row)[:-1], -1)
 
     def at_once(self, see: FloatArray, push: FloatArray) -> FloatArray:
@@ -123,16 +152,83 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
                 f"a plant of all {model.M.shape[0]} DOFs needs a dense eigenproblem of that size. "
                 "Pass solve_modes(model, count=...) or a reduced model instead."
             )
-        form = normal_form(model.M, model.D, model.K, model.rigid_body)
-        if np.iscomplexobj(form.phi):
-            return _complex(model, form.poles, np.asarray(form.phi), form.n_rigid)
-        omega = np.abs(form.poles)
-        zeta = np.where(omega > 0, -form.poles.real / np.where(omega > 0, omega, 1.0), 0.0)
-        return _real(model, omega, zeta, np.real(form.phi), form.n_rigid, omega.size)
+        return _of_matrices(model, real_form(model.M, model.D, model.K, model.rigid_body))
     raise ModelError(
         f"a plant is assembled from an FEModel, Modes or ReducedModel, got {type(model).__name__}. "
         "A state-space model made elsewhere comes in through StandardPlant.from_statespace."
     )
+
+
+def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisation:
+    """Modal blocks where they hold the damping to working precision, the dense form else.
+
+    A mode that D damps by itself is a block whatever its damping: critical and overdamped too.
+    """
+    omega, r = real.omega, real.n_rigid
+    if real.drags:
+        why = f"dampers to ground drag rigid-body motion at up to {real.drag:.3g} 1/s"
+        return _dense(model, real, why)
+    if real.is_proportional:
+        zeta = np.zeros_like(omega)
+        zeta[r:] = 0.5 * np.diag(real.C)[r:] / omega[r:]
+        return _real(model, omega, zeta, real.phi, r, omega.size)
+    # rigid-body motions are undamped by convention, in both forms alike
+    C = real.C.copy()
+    C[:r], C[:, :r] = 0.0, 0.0
+    real = real._replace(C=C)
+    try:
+        form: NormalForm = modal(real)
+    except ModelError:
+        return _dense(model, real, f"an overdamped pair {_where(real, overdamped=True)}")
+    except SolverError:
+        return _dense(model, real, f"two poles coalesce {_where(real)}")
+    if real.condition(form) > ILL_CONDITIONED:
+        return _dense(model, real, f"two poles nearly coalesce {_where(real)}")
+    return _complex(model, form.poles, np.asarray(form.phi), r)
+
+
+def _where(real: RealForm, *, overdamped: bool = False) -> str:
+    """Return which undamped mode takes most part in the worst conditioned pole."""
+    r = real.n_rigid
+    omega, C = real.omega[r:], real.C[r:, r:]
+    k = omega.size
+    A = np.block([[np.zeros((k, k)), np.diag(omega)], [-np.diag(omega), -C]])
+    values, left, right = la.eig(A, left=True)
+    overlap = np.abs(np.sum(left.conj() * right, axis=0))
+    if overdamped:
+        overlap = np.where(np.abs(values.imag) <= 1e-9 * np.abs(values), overlap, 2.0)
+    worst = right[:, int(np.argmin(overlap))]
+    i = int(np.argmax(np.abs(worst[:k]) ** 2 + np.abs(worst[k:]) ** 2))
+    return f"near mode {r + i + 1} ({omega[i] / (2 * np.pi):.4g} Hz undamped)"
+
+
+def _dense(model: Structure, real: RealForm, why: str) -> ModalRealisation:
+    """Undamped modes, their velocities coupled by all of D.
+
+    Rigid-body motions that D does not touch stay double integrators by themselves, the others
+    have no stiffness and lose their speed: their position is an integrator still.
+    """
+    r, C, phi = real.n_rigid, real.C.copy(), real.phi.copy()
+    if r:
+        size = PROPORTIONAL * max(float(np.abs(C).max()), 1e-300)
+        rank, turned = _turned(C[:, :r], size)
+        phi[:, :r] = phi[:, :r] @ turned
+        C[:, :r] = C[:, :r] @ turned
+        C[:r] = turned.T @ C[:r]
+        C[: r - rank], C[:, : r - rank] = 0.0, 0.0
+    b = real.omega.size
+    blocks = _real(model, real.omega, np.zeros(b), phi, r, b)
+    pairs = np.array(blocks.pairs)
+    pairs[:, 1, 1] = -np.diag(C)
+    return blocks.replace(pairs=pairs, coupling=C - np.diag(np.diag(C)), form=f"dense: {why}")
+
+
+def _turned(drag: FloatArray, size: float) -> tuple[int, FloatArray]:
+    """Return how many rigid-body motions are dragged, and a basis with the others first."""
+    rank = int(np.linalg.matrix_rank(drag, tol=size))
+    if rank in (0, drag.shape[1]):
+        return rank, np.eye(drag.shape[1])
+    return rank, np.linalg.svd(drag)[2][::-1].T
 
 
 def _real(

@@ -85,6 +85,10 @@ class Feedthrough(Residual):
         push = realisation.inputs.reshape(n, b, 2)[:, fast]
         settled = -np.einsum("bij,nbj->nbi", np.linalg.inv(pairs), push).reshape(n, -1)
         kept = np.repeat(~fast, 2)
+        coupling = realisation.coupling
+        if coupling is not None:
+            # damping between a mode that stays and one that answers at once is left out with it
+            coupling = coupling[np.ix_(~fast, ~fast)]
         if realisation.static_outputs is not None and realisation.static_inputs is not None:
             see = np.hstack([realisation.static_outputs, see])
             settled = np.hstack([realisation.static_inputs, settled])
@@ -96,4 +100,5 @@ class Feedthrough(Residual):
             names=tuple(n for n, keep in zip(realisation.names, kept, strict=True) if keep),
             static_outputs=see,
             static_inputs=settled,
+            coupling=coupling,
         )

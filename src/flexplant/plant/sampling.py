@@ -233,6 +233,16 @@ def _noise(
     states = slice(layout.first, layout.first + g.n_states)
     parts = []
     for start, end in pairwise(edges):
+        if flow.coupled:
+            G = flow.noise(force, end - start)
+            column = np.zeros((layout.size, G.shape[1]))
+            column[states] = flow.at(h - end) @ G
+            for instant, seen in taken.items():
+                if end <= instant:
+                    rows = [layout.line(j)[-1] for j in seen]
+                    column[rows] = g.C[seen] @ flow.at(instant - end) @ G
+            parts.append(column)
+            continue
         count = 16 + int(np.ceil(0.7 * (end - start) * fastest))
         nodes, weights = np.polynomial.legendre.leggauss(count)
         for s, weight in zip(

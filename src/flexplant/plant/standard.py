@@ -14,6 +14,7 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import FloatArray, IntArray, Value, positive
+from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation
 
@@ -24,7 +25,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StandardPlant(Value):
+class StandardPlant(Partition, Value):
     """A plant with disturbances w, inputs u, performance z and measurements y.
 
     ::
@@ -106,6 +107,8 @@ class StandardPlant(Value):
         if self.ports is not None and self.ports.delays and not self.dt:
             late = ", ".join(f"{name} {delay:g} s" for name, delay in self.ports.delays.items())
             lines.append(f"  delays that act once it is sampled: {late}")
+        if self.form.startswith("dense"):
+            lines.append(f"  {self.form}")
         return "\n".join(lines)
 
     @classmethod
@@ -149,14 +152,17 @@ class StandardPlant(Value):
         return cls(ordered, tuple(w), tuple(u), tuple(z), tuple(y), dict(asd or {}))
 
     @property
-    def dt(self) -> float:
-        """Sampling time [s]; 0 when continuous."""
-        return self.system.dt
-
-    @property
     def n_rigid(self) -> int:
         """Number of rigid-body modes."""
         return self.realisation.n_rigid if self.realisation is not None else 0
+
+    @property
+    def form(self) -> str:
+        """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
+
+        Weights and filters of the ports add blocks of their own.
+        """
+        return self.realisation.form if self.realisation is not None else "as given"
 
     @property
     def model(self) -> Any:
@@ -193,43 +199,6 @@ class StandardPlant(Value):
                 "structure and sampled: use assemble_plant(model, ports).discretized(rate)."
             )
         return self.noise_factor @ self.noise_factor.T
-
-    @property
-    def sensor_noise(self) -> FloatArray:
-        """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor."""
-        if not self.dt:
-            raise ModelError("sensor noise per sample needs a sampled plant: discretized(rate).")
-        variance = [0.5 * self.asd.get(f"{name}:noise", 0.0) ** 2 / self.dt for name in self.y]
-        return np.diag(variance)
-
-    B1 = property(lambda self: self.Gzw.B, doc="w to dx/dt.")
-    B2 = property(lambda self: self.Gzu.B, doc="u to dx/dt.")
-    C1 = property(lambda self: self.Gzw.C, doc="x to z.")
-    C2 = property(lambda self: self.Gyw.C, doc="x to y.")
-    D11 = property(lambda self: self.Gzw.D, doc="w to z.")
-    D12 = property(lambda self: self.Gzu.D, doc="u to z.")
-    D21 = property(lambda self: self.Gyw.D, doc="w to y.")
-    D22 = property(lambda self: self.Gyu.D, doc="u to y.")
-
-    @property
-    def Gzw(self) -> StateSpace:
-        """The system w -> z."""
-        return self.system.select(self.z, self.w)
-
-    @property
-    def Gzu(self) -> StateSpace:
-        """The system u -> z."""
-        return self.system.select(self.z, self.u)
-
-    @property
-    def Gyw(self) -> StateSpace:
-        """The system w -> y."""
-        return self.system.select(self.y, self.w)
-
-    @property
-    def Gyu(self) -> StateSpace:
-        """The system u -> y."""
-        return self.system.select(self.y, self.u)
 
     def channel(self, name: str, side: str = "z") -> str:
         """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.

@@ -18,7 +18,7 @@ from ..updating.parameters import Parameter
 from ..values import ComplexArray, FloatArray, Value, positive
 from .assembly import assemble_plant
 from .neglected import NeglectedModes, neglected_modes, opened
-from .realisation import ModalRealisation, Structure
+from .realisation import MODAL, ModalRealisation, Structure
 from .standard import StandardPlant
 
 #: relative doubts below this open no channel
@@ -243,6 +243,12 @@ def _structure(plant: StandardPlant) -> ModalRealisation:
         raise ModelError(
             "uncertain modes need a plant assembled from a structure and not weighted: use "
             "assemble_plant(model, ports), or plant.unweighted."
+        )
+    if plant.form != MODAL:
+        raise ModelError(
+            f"the modes of this plant are coupled by damping ({plant.form}): frequency and "
+            "damping of one mode are not its own, so that no Delta belongs to it. Draw machines "
+            "from the fit itself (its parameters and covariance), or lower the damping."
         )
     return plant.realisation
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from ..lti.discretisation import block_diagonal
 from ..values import ComplexArray, FloatArray, Value
 from .ports import QUANTITIES
 from .standard import StandardPlant
@@ -20,6 +21,9 @@ _VERBS = {"w": "excites", "u": "reaches", "y": "sees", "z": "sees"}
 @dataclass(frozen=True, eq=False)
 class ModeVisibility(Value):
     """How well w excites, u reaches, y and z see an elastic mode.
+
+    Where damping couples the modes (`plant.form` is dense) it is an undamped mode, with its own
+    part of the damping.
 
     Parameters
     ----------
@@ -74,14 +78,19 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
         return ()
     g, n_rigid = plant.system, plant.n_rigid
     count = sum(name.startswith("mode") for name in plant.realisation.names) // 2
-    own = [np.linalg.eigvals(pair) for pair in plant.realisation.pairs[n_rigid:count]]
+    pairs = plant.realisation.pairs[n_rigid:count]
+    omega = np.sqrt(np.abs(np.linalg.det(pairs)))
+    zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
+    swinging = _swinging(pairs, omega)
+    own = [np.linalg.eigvals(pair) for pair in swinging]
     wanted = np.array([pole[np.argmax(pole.imag)] for pole in own], dtype=np.complex128)
     # the structure's states first: filters of sensors stand before them
     own_first = [*plant.modal_states, *np.setdiff1d(np.arange(g.n_states), plant.modal_states)]
     inner = g.A[np.ix_(own_first, own_first)]
+    elastic = slice(2 * n_rigid, 2 * count)
+    inner[elastic, elastic] = block_diagonal(swinging)
     g = g.replace(A=inner, B=g.B[own_first], C=g.C[:, own_first], states=(), blocks=None)
     left, right = _vectors(g.A, wanted, 2 * n_rigid)
-    omega = np.abs(wanted)
     sides: dict[str, tuple[Sequence[str], FloatArray]] = {}
     for side in "wu":
         names = [n for n in getattr(plant, side) if np.any(g.B[:, g.input_index([n])])]
@@ -92,11 +101,27 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
         power = np.array([1 - orders.get(name, 0) for name in names])
         gains = np.abs(g.C[g.output_index(names)] @ right).T * omega[:, None] ** power
         sides[side] = names, gains
-    return tuple(_entry(n_rigid + 1 + k, pole, k, sides) for k, pole in enumerate(wanted.tolist()))
+    return tuple(
+        _entry(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
+        for k in range(omega.size)
+    )
+
+
+def _swinging(pairs: FloatArray, omega: FloatArray) -> FloatArray:
+    """Return the pairs, those critically damped or more without damping: shapes are the same."""
+    half = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
+    slow = half**2 + pairs[:, 0, 1] * pairs[:, 1, 0] > -1e-6 * omega**2
+    swinging = pairs.copy()
+    swinging[slow, 0, 0] = swinging[slow, 1, 1] = 0.0
+    return swinging
 
 
 def _entry(
-    number: int, pole: complex, k: int, sides: dict[str, tuple[Sequence[str], FloatArray]]
+    number: int,
+    omega: float,
+    zeta: float,
+    k: int,
+    sides: dict[str, tuple[Sequence[str], FloatArray]],
 ) -> ModeVisibility:
     shares, channels = {}, {}
     for side, (names, gains) in sides.items():
@@ -105,8 +130,7 @@ def _entry(
         share = gains[k] / np.maximum(gains.max(axis=0), 1e-300)
         best = int(np.argmax(share))
         shares[side], channels[side] = float(share[best]), names[best]
-    size = abs(pole)
-    return ModeVisibility(number, size / (2 * np.pi), -pole.real / size, shares, channels)
+    return ModeVisibility(number, omega / (2 * np.pi), zeta, shares, channels)
 
 
 def _vectors(A: FloatArray, poles: ComplexArray, first: int) -> tuple[ComplexArray, ComplexArray]:

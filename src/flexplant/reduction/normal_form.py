@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -19,6 +20,8 @@ PROPORTIONAL = 1e-9
 _RIGID_DRAG = 1e-4
 #: eigenvalues closer than this (relative) have no eigenvectors of their own
 _CLUSTER = 1e-7
+#: what a plant makes of damping that modes cannot express
+_PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,26 +84,105 @@ def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> No
     Eigenvalues of (K, M) alone give rigid-body modes at rounding, some of them imaginary; here
     they are taken out of the problem first. Rigid-body modes are undamped by convention.
     """
-    M, K = dense(M), dense(K)
-    rigid = orthonormalised(M, real_array(rigid, "rigid", (M.shape[0], None)))
-    omega, phi = elastic_modes(M, K, rigid)
-    r = rigid.shape[1]
-    zero = np.zeros(r, dtype=np.complex128)
-    shapes = np.hstack([rigid, phi])
-    if D is None:
-        return NormalForm(np.concatenate([zero, 1j * omega]), shapes, r)
-    D = dense(D)
-    check_drag(rigid, D, omega)
-    C = phi.T @ D @ phi
-    rate = np.diag(C)
-    coupling = float(np.abs(C - np.diag(rate)).max(initial=0.0))
-    if coupling <= PROPORTIONAL * float(np.abs(rate).max(initial=0.0)):
+    real = real_form(M, D, K, rigid)
+    if D is not None:
+        check_drag(real.phi[:, : real.n_rigid], dense(D), real.omega[real.n_rigid :])
+    return modal(real)
+
+
+def modal(real: RealForm) -> NormalForm:
+    """Return the poles and shapes of a model given in its undamped modes; see `normal_form`."""
+    r, rate = real.n_rigid, np.diag(real.C)[real.n_rigid :]
+    zero, omega = np.zeros(r, dtype=np.complex128), real.omega[r:]
+    if real.is_proportional:
         root = omega**2 - 0.25 * rate**2
         _check_oscillating(root > 0, omega)
         poles = -0.5 * rate + 1j * np.sqrt(np.maximum(root, 0.0))
-        return NormalForm(np.concatenate([zero, poles]), shapes, r)
-    poles, mix = _complex_modes(omega, C)
-    return NormalForm(np.concatenate([zero, poles]), np.hstack([rigid, phi @ mix]), r)
+        return NormalForm(np.concatenate([zero, poles]), real.phi, r)
+    poles, mix = _complex_modes(omega, real.C[r:, r:])
+    shapes = np.hstack([real.phi[:, :r], real.phi[:, r:] @ mix])
+    return NormalForm(np.concatenate([zero, poles]), shapes, r)
+
+
+class RealForm(NamedTuple):
+    """A model in its undamped modes: ``p'' + C p' + Omega^2 p = phi' f, q = phi p``.
+
+    Attributes
+    ----------
+    omega : (k,) array [rad/s]
+        Undamped frequencies, the rigid-body ones first and exactly 0.
+    phi : (n, k) array
+        Undamped shapes, ``phi' M phi = I``.
+    C : (k, k) array [1/s]
+        ``phi' D phi``: any damping.
+    n_rigid : int
+        How many rigid-body motions there are.
+    """
+
+    omega: FloatArray
+    phi: FloatArray
+    C: FloatArray
+    n_rigid: int
+
+    @property
+    def is_proportional(self) -> bool:
+        """Whether D damps each elastic mode by itself; rigid-body motions are not looked at."""
+        C = self.C[self.n_rigid :, self.n_rigid :]
+        rate = np.diag(C)
+        coupling = float(np.abs(C - np.diag(rate)).max(initial=0.0))
+        return coupling <= PROPORTIONAL * float(np.abs(rate).max(initial=0.0))
+
+    @property
+    def drags(self) -> bool:
+        """Whether D damps rigid-body motion more than the convention lets pass."""
+        first = self.omega[self.n_rigid] if self.omega.size > self.n_rigid else 0.0
+        return bool(self.drag > _RIGID_DRAG * first)
+
+    @property
+    def drag(self) -> float:
+        """Largest damping rate of a rigid-body motion [1/s]."""
+        return float(np.abs(self.C[: self.n_rigid, : self.n_rigid]).max(initial=0.0))
+
+    def condition(self, form: NormalForm) -> float:
+        """Return the largest condition of a complex mode: how much rounding grows in its residue.
+
+        With states ``(Omega p, p')`` and ``v = (Omega x, lambda x)`` an eigenvector, the left one
+        is v with its first half negated, so that the condition is
+        ``|v|^2 / (2 |lambda| |Im lambda|)``: 1 for real modes, without bound where two modes
+        coalesce or one becomes critically damped.
+        """
+        r = self.n_rigid
+        mix = np.linalg.lstsq(self.phi[:, r:], form.phi[:, r:], rcond=None)[0]
+        poles = form.poles[r:]
+        size = np.linalg.norm(self.omega[r:, None] * mix, axis=0) ** 2
+        size += np.abs(poles) ** 2 * np.linalg.norm(mix, axis=0) ** 2
+        return float((size / (2.0 * np.abs(poles) * poles.imag)).max(initial=1.0))
+
+
+def real_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> RealForm:
+    """Return a second-order model in its undamped modes, whatever its damping.
+
+    Parameters
+    ----------
+    M, D, K, rigid
+        As in `normal_form`.
+
+    Returns
+    -------
+    RealForm
+
+    Raises
+    ------
+    ModelError
+        When M is not positive definite or an elastic mode has no stiffness.
+    """
+    M, K = dense(M), dense(K)
+    rigid = orthonormalised(M, real_array(rigid, "rigid", (M.shape[0], None)))
+    omega, phi = elastic_modes(M, K, rigid)
+    phi = np.hstack([rigid, phi])
+    omega = np.concatenate([np.zeros(rigid.shape[1]), omega])
+    C = np.zeros((omega.size, omega.size)) if D is None else phi.T @ dense(D) @ phi
+    return RealForm(omega, phi, 0.5 * (C + C.T), rigid.shape[1])
 
 
 def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
@@ -112,7 +194,7 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {_RIGID_DRAG:g} of the first "
             f"elastic frequency ({omega[0]:.4g} rad/s): with a damper to ground this large they "
-            "are no longer rigid-body modes at 0. Put the damper between two DOFs of the "
+            f"are no longer modes at 0. {_PLANT} Else put the damper between two DOFs of the "
             "structure, or leave it out of D and close it as a loop."
         )
 
@@ -122,7 +204,8 @@ def _check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) -
         i = int(np.argmin(oscillates))
         raise ModelError(
             f"the elastic mode at {omega[i] / (2 * np.pi):.4g} Hz is overdamped: it has two real "
-            "poles and no oscillation, which modes cannot express. Lower the damping."
+            f"poles and no oscillation, which modes cannot express. {_PLANT} Else lower the "
+            "damping."
         )
 
 
@@ -151,7 +234,7 @@ def _complex_modes(omega: FloatArray, C: FloatArray) -> tuple[ComplexArray, Comp
     if not worst < 1e-10:
         raise SolverError(
             f"complex modes leave a relative residual of {worst:.2g} (limit 1e-10): the damping is "
-            "close to critical for two modes at once. Change D slightly, or lower it."
+            f"close to critical for two modes at once. {_PLANT} Else change D, or lower it."
         )
     return poles, mix
 
