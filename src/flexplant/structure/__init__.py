@@ -3,6 +3,7 @@
 from .damping import Damping as Damping
 from .damping import ModalDamping as ModalDamping
 from .damping import Rayleigh as Rayleigh
+from .matrices import FEMatrices as FEMatrices
 from .model import FEModel as FEModel
 from .plate import PlateShape as PlateShape
 from .plate import kirchhoff_plate as kirchhoff_plate

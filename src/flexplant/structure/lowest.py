@@ -1,0 +1,154 @@
+"""The lowest eigenvalues of matrices that need not be a model yet, and what rounding did to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, cast
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from ..errors import SolverError
+from ..values import FloatArray
+from .factor import dense, diagonal, negative_pivots, symmetric_lu
+
+#: up to this many DOFs dense LAPACK finds every eigenvalue
+_DENSE = 300
+#: relative to the typical K_ii / M_ii: the first shift
+_FIRST_SHIFT = 1e-8
+#: eigenvalues that rounding of this many units in the last place could make are zero
+_ROUNDING = 30 * 2.0**-52
+#: more zero eigenvalues than this are not listed one by one
+_MOST = 64
+
+
+@dataclass(frozen=True)
+class Lowest:
+    """The lowest eigenvalues of ``K phi = lambda M phi``.
+
+    Attributes
+    ----------
+    values : (k,) array [1/s^2]
+        Ascending in size, the zero ones first.
+    shapes : (n, k) array
+        M-orthonormal.
+    spread : (k,) array [1/s^2]
+        ``|phi|^T |K| |phi|``: times the relative error of the entries of K, that of the eigenvalue.
+    n_zero : int
+        How many of them are zero, to the rounding of the entries.
+    below : int or None
+        Eigenvalues below the first that is not zero, counted by a factorisation (Sylvester); None
+        when it was not possible. Less `n_zero` it is the number of negative ones, or missed ones.
+    """
+
+    values: FloatArray
+    shapes: FloatArray
+    spread: FloatArray
+    n_zero: int
+    below: int | None
+
+
+def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest:
+    """Return the `count` lowest eigenvalues and more, until one of them is not zero.
+
+    By inverse iteration at a shift below zero, hence exact to rounding also where K is singular
+    and M has massless rows.
+
+    Parameters
+    ----------
+    K, M : (n, n) sparse matrix
+        Symmetric; M positive semi-definite and nonzero.
+    count : int
+        How many at least.
+    rounding : float
+        Relative error of the entries of K: of a text file, say.
+
+    Raises
+    ------
+    SolverError
+        When no shift makes K + s M regular, or the iteration does not converge.
+    """
+    K, M = sp.csc_array(K), sp.csc_array(M)
+    stiff, heavy = np.abs(diagonal(K)), diagonal(M)
+    ratios = stiff[heavy > 0] / heavy[heavy > 0]
+    typical = float(np.median(ratios[ratios > 0])) if np.any(ratios > 0) else 1.0
+    shift, asked, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
+    floor = max(rounding, _ROUNDING)
+    limit = min(int(np.count_nonzero(heavy > 0)), _MOST)
+    for _ in range(6):
+        asked = min(asked, limit)
+        shapes = _inverse_iteration(K, M, shift, asked)
+        values = np.einsum("ij,ij->j", shapes, np.asarray(K @ shapes))
+        spread = np.einsum("ij,ij->j", np.abs(shapes), np.asarray(size @ np.abs(shapes)))
+        zero = np.abs(values) <= floor * spread
+        order = np.lexsort((np.abs(values), ~zero))
+        values, shapes, spread = values[order], shapes[:, order], spread[order]
+        n_zero = int(np.count_nonzero(zero))
+        if n_zero == asked and asked < limit:
+            asked *= 3
+            continue
+        elastic = np.abs(values[n_zero:])
+        # close to the elastic modes, these separate well; as near to zero as rounding allows
+        if elastic.size and shift > 1e3 * elastic[0]:
+            shift = max(float(elastic[0]), 10 * floor * float(spread[:n_zero].max(initial=0.0)))
+            continue
+        break
+    below = _count_below(K, M, values, n_zero)
+    return Lowest(values, shapes, spread, n_zero, below)
+
+
+def _inverse_iteration(K: Any, M: Any, shift: float, count: int) -> FloatArray:
+    """Return the shapes (n, count) with the largest 1 / |lambda + shift|, M-orthonormal."""
+    n = K.shape[0]
+    if n <= _DENSE or count > n // 3:
+        stiff, heavy = dense(K + shift * M), dense(M)
+        try:
+            mu, shapes = la.eigh(heavy, stiff)
+        except la.LinAlgError:
+            # K is indefinite: M must then be definite, or there is nothing to work with
+            try:
+                found, shapes = la.eigh(stiff, heavy)
+            except la.LinAlgError as error:
+                raise SolverError(
+                    "both K and M are indefinite or singular in one motion: no eigenvalues follow. "
+                    "Look at the DOFs without mass or stiffness first."
+                ) from error
+            mu = 1 / np.where(found == 0, np.finfo(float).tiny, found)
+        best = np.argsort(-np.abs(mu))[:count]
+        shapes = shapes[:, best]
+    else:
+        lu = symmetric_lu(K + shift * M)
+        inverse: Any = spla.LinearOperator((n, n), matvec=lu.solve, dtype=np.float64)
+        # the same start every time: the same answer every time
+        start = lu.solve(M @ np.random.default_rng(0).standard_normal(n))
+        basis = min(n, 2 * count + 20)
+        try:
+            _, shapes = spla.eigsh(
+                K,
+                count,
+                M,
+                -shift,
+                v0=lu.solve(M @ start),
+                ncv=min(n, 2 * count + 20),
+                OPinv=inverse,
+            )
+        except (spla.ArpackError, spla.ArpackNoConvergence) as error:
+            raise SolverError(
+                f"the lowest eigenvalues of K and M did not converge ({error}). Look at the scales "
+                "of K and M: penalties and wrong units spread them."
+            ) from error
+    length = np.sqrt(np.abs(np.einsum("ij,ij->j", shapes, np.asarray(M @ shapes))))
+    return np.asarray(shapes / np.where(length > 0, length, 1.0), dtype=np.float64)
+
+
+def _count_below(K: Any, M: Any, values: FloatArray, n_zero: int) -> int | None:
+    """Return how many eigenvalues lie below the first positive one, by Sylvester's law."""
+    positive = np.sort(values[n_zero:][values[n_zero:] > 0])
+    if not positive.size:
+        return None
+    try:
+        return negative_pivots(symmetric_lu(K - 0.5 * positive[0] * M))
+    except SolverError:
+        return None

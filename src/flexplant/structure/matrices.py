@@ -1,0 +1,464 @@
+"""What a foreign file holds, before it is a model: matrices, and what their rows stand for."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError
+from ..labels import DIRECTIONS, DofSet
+from ..values import FloatArray, IntArray, Value, name_list, real_array, short, whole
+from .condense import condensed, no_mass
+from .factor import is_positive_definite
+from .model import FEModel
+from .precision import endangered
+from .units import units
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FEMatrices(Value):
+    """Matrices of ``M q'' + D q' + K q = f`` as a file holds them; `check` tells what is wrong.
+
+    An FEModel demands a positive definite M, known DOFs and coordinates; nothing of this is asked
+    here. `model` makes one when all is there, and says what is missing when not.
+
+    Parameters
+    ----------
+    K : (n, n) array or sparse matrix
+        Stiffness, both triangles.
+    M, D : (n, n) array or sparse matrix, optional
+        Mass and viscous damping; M may be singular.
+    dofs : DofSet, optional
+        What the rows stand for. None: not known yet, `with_dofs` gives it.
+    digits : int, optional
+        Significant decimal digits of a text file. None: binary, nothing was lost.
+    source : str, optional
+        Where it came from, for display.
+    constrained : sequence of str
+        Labels of DOFs that the file holds fixed, and that were dropped.
+    located : bool
+        Whether the coordinates in `dofs` are real ones. False: the file has none and they are zero.
+    notes : sequence of str
+        What the reader did: completed a triangle, dropped empty rows.
+
+    Raises
+    ------
+    ShapeError
+        When a matrix is not square or the sizes differ.
+    ModelError
+        When entries are no finite real numbers.
+
+    Examples
+    --------
+    >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]])
+    >>> found = FEMatrices([[5, -5], [-5, 5]], [[1, 0], [0, 2]], dofs=dofs)
+    >>> found
+    <FEMatrices: 2 DOFs, K (4 entries), M (2 entries)>
+    >>> found.model().mass
+    3.0
+    """
+
+    K: sp.csc_array
+    M: sp.csc_array | None = None
+    D: sp.csc_array | None = None
+    dofs: DofSet | None = field(default=None, kw_only=True)
+    digits: int | None = field(default=None, kw_only=True)
+    source: str | None = field(default=None, kw_only=True)
+    constrained: tuple[str, ...] = field(default=(), kw_only=True)
+    located: bool = field(default=True, kw_only=True)
+    notes: tuple[str, ...] = field(default=(), kw_only=True)
+
+    def __post_init__(self) -> None:
+        K = square(self.K, "K")
+        n = K.shape[0]
+        others: dict[str, Any] = {}
+        for name, given in (("M", self.M), ("D", self.D)):
+            others[name] = None if given is None else square(given, name)
+            if others[name] is not None and others[name].shape != (n, n):
+                raise ShapeError(
+                    f"{name} must have shape ({n}, {n}) like K, got {others[name].shape}. Were "
+                    "constraints applied to one matrix only?"
+                )
+        if self.dofs is not None and not isinstance(self.dofs, DofSet):
+            raise ModelError(
+                f"dofs must be a DofSet, got {type(self.dofs).__name__}. DofSet(nodes, directions, "
+                "xyz) makes one, DofSet.from_table(path) reads one."
+            )
+        if self.dofs is not None and len(self.dofs) != n:
+            raise ShapeError(
+                f"K has {n} rows, but the DofSet {len(self.dofs)} DOFs. Are constrained "
+                "DOFs in one of them only?"
+            )
+        if self.digits is not None:
+            object.__setattr__(self, "digits", whole(self.digits, "digits"))
+        self._set(
+            K=K,
+            **others,
+            constrained=name_list(self.constrained, "constrained DOFs"),
+            notes=name_list(self.notes, "notes"),
+        )
+
+    def __repr__(self) -> str:
+        stored = [
+            f"{name} ({matrix.nnz} entries)"
+            for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D))
+            if matrix is not None
+        ]
+        where = f" of {self.source!r}" if self.source else ""
+        parts = [f"{self.n_dof} DOFs", *stored]
+        if self.constrained:
+            parts.append(f"{len(self.constrained)} constrained DOFs dropped")
+        if self.digits is not None:
+            parts.append(f"{self.digits} digits")
+        if self.dofs is None:
+            parts.append("DOFs not named")
+        elif not self.located:
+            parts.append("no coordinates")
+        return f"<FEMatrices{where}: {', '.join(parts)}>"
+
+    @property
+    def n_dof(self) -> int:
+        """Number of rows n."""
+        return int(self.K.shape[0])
+
+    @property
+    def massless(self) -> tuple[str, ...]:
+        """The DOFs without any mass: labels, or rows (from 1) where there are no names."""
+        if self.M is None:
+            return ()
+        return self.names(np.flatnonzero(no_mass(self.M)))
+
+    def names(self, rows: IntArray) -> tuple[str, ...]:
+        """Return the labels of some rows (from 0), or 'row 1', 'row 2', ... without names."""
+        if self.dofs is None:
+            return tuple(f"row {row + 1}" for row in rows.tolist())
+        labels = self.dofs.labels
+        return tuple(labels[row] for row in rows.tolist())
+
+    def with_dofs(self, dofs: DofSet | str | Path) -> FEMatrices:
+        """Return the same matrices, their rows named by other DOFs.
+
+        Parameters
+        ----------
+        dofs : DofSet, or path of a CSV file
+            In the order of the rows, with coordinates.
+
+        Raises
+        ------
+        ShapeError
+            When their number is not that of the rows.
+        """
+        given = DofSet.from_table(dofs) if isinstance(dofs, str | Path) else dofs
+        return self.replace(dofs=given, located=True)
+
+    def located_at(self, nodes: Iterable[int], xyz: Any) -> FEMatrices:
+        """Return the same with the coordinates of the nodes, which the file did not hold.
+
+        Parameters
+        ----------
+        nodes : sequence of m int
+            Node numbers, in any order, all those of the DOFs among them.
+        xyz : (m, 3) array [m]
+            Where they are.
+
+        Raises
+        ------
+        LabelError
+            When the DOFs are not named, or a node has no coordinates.
+        """
+        if self.dofs is None:
+            raise LabelError("the rows have no names yet: with_dofs(dofs) gives these and places.")
+        numbers = np.asarray(list(nodes), dtype=np.int64)
+        places = real_array(xyz, "xyz", (numbers.size, 3))
+        missing = np.setdiff1d(self.dofs.nodes, numbers)
+        if missing.size:
+            raise LabelError(
+                f"no coordinates for nodes {missing[:6].tolist()} ({missing.size} in all): every "
+                "node that has a DOF needs them. Is this the table of the same model?"
+            )
+        order = np.argsort(numbers, kind="stable")
+        rows = order[np.searchsorted(numbers[order], self.dofs.nodes)]
+        return self.replace(dofs=self.dofs.replace(xyz=places[rows]), located=True)
+
+    def without(self, labels: Iterable[str]) -> FEMatrices:
+        """Return what is left when DOFs are held: their rows and columns dropped.
+
+        Parameters
+        ----------
+        labels : sequence of str
+            DOFs to hold, such as those a penalty holds already.
+
+        Raises
+        ------
+        LabelError
+            When the DOFs are not named, or one is not there.
+        """
+        if self.dofs is None:
+            raise LabelError("the rows have no names yet: with_dofs(dofs) gives them.")
+        held = name_list(labels, "DOFs to hold")
+        keep = np.ones(self.n_dof, dtype=bool)
+        keep[self.dofs.indices(held)] = False
+        return self._kept(np.flatnonzero(keep))
+
+    def _kept(self, rows: IntArray) -> FEMatrices:
+        dropped = np.setdiff1d(np.arange(self.n_dof), rows)
+        parts: dict[str, Any] = {
+            name: None if matrix is None else matrix[rows][:, rows]
+            for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D))
+        }
+        constrained = (*self.constrained, *self.names(dropped))
+        return self.replace(**parts, dofs=taken(self.dofs, rows), constrained=constrained)
+
+    def converted(
+        self, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
+    ) -> FEMatrices:
+        """Return the matrices and coordinates in SI, from those in other units.
+
+        Each entry by its kind: ``N/mm`` for displacements, ``N mm`` for rotations and so on, as
+        they follow from the units of length, mass and time.
+
+        Parameters
+        ----------
+        length, mass, time : str or float
+            The units they are in now: "mm", "t", "s"; or what one of these units is in SI.
+
+        Returns
+        -------
+        FEMatrices
+            In m, kg, s, N.
+
+        Raises
+        ------
+        ModelError
+            When a unit is unknown, or the DOFs are (rotations convert differently).
+
+        Examples
+        --------
+        >>> dofs = DofSet([1], ["z"], [[500.0, 0, 0]])
+        >>> si = FEMatrices([[12.0]], [[0.002]], dofs=dofs).converted("mm", "t").model()
+        >>> float(si.K[0, 0]), si.mass, float(si.dofs.xyz[0, 0])
+        (12000.0, 2.0, 0.5)
+        """
+        system = units(length, mass, time)
+        if self.dofs is None:
+            raise ModelError(
+                "the rows have no names, so that rotations, which convert differently, are not "
+                "known. with_dofs(dofs) first."
+            )
+        return self.replace(
+            K=system.stiffness_matrix(self.K, self.dofs),
+            M=None if self.M is None else system.mass_matrix(self.M, self.dofs),
+            D=None if self.D is None else system.damping_matrix(self.D, self.dofs),
+            dofs=system.placed(self.dofs),
+        )
+
+    def rotated(self, rotations: Any) -> FEMatrices:
+        """Return the matrices in global directions, from nodes with local coordinate systems.
+
+        With the direction cosines C of a node, ``q_local = C q_global``, and its three
+        displacements and three rotations turned alike: ``K_global = C^T K_local C``.
+
+        Parameters
+        ----------
+        rotations : mapping {node: (3, 3) array}
+            For nodes with a local system: row i holds the global components of local axis i.
+
+        Raises
+        ------
+        LabelError
+            When a node is not there.
+        ModelError
+            When cosines are not orthogonal, or a node has only some of its three directions: the
+            others, held in its local system, have no global ones.
+
+        Examples
+        --------
+        >>> dofs = DofSet([1, 1, 1], ["x", "y", "z"], np.zeros((3, 3)))
+        >>> turned = {1: [[0, 1, 0], [-1, 0, 0], [0, 0, 1]]}  # local x is global y
+        >>> FEMatrices(np.diag([4.0, 1, 1]), dofs=dofs).rotated(turned).K.diagonal().tolist()
+        [1.0, 4.0, 1.0]
+        """
+        if self.dofs is None:
+            raise LabelError("the rows have no names yet: with_dofs(dofs) gives them.")
+        C = _cosines(self.dofs, rotations)
+        turned: dict[str, Any] = {}
+        for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D)):
+            if matrix is not None:
+                full: Any = C.T @ matrix @ C
+                turned[name] = 0.5 * (full + full.T)
+        return self.replace(**turned)
+
+    def model(self, *, massless: str = "refuse", name: str | None = None) -> FEModel:
+        """Return the FEModel.
+
+        Parameters
+        ----------
+        massless : "refuse" or "condense"
+            What to do with DOFs without mass. "condense" removes them statically,
+            ``K = K_mm - K_ms K_ss^-1 K_sm``: exact, since they follow without inertia.
+        name : str, optional
+            For display.
+
+        Raises
+        ------
+        ModelError
+            When M is missing or singular, the DOFs are not known, coordinates are needed (the
+            structure is free) and not there, or massless DOFs are to be refused.
+
+        Warns
+        -----
+        FlexplantWarning
+            When the digits of a text file endanger the first elastic eigenvalue.
+        """
+        if massless not in ("refuse", "condense"):
+            raise ModelError(f"massless must be 'refuse' or 'condense', got {short(massless)}.")
+        if self.M is None:
+            raise ModelError("there is no M, hence no model. Read or export the mass matrix too.")
+        if self.dofs is None:
+            raise ModelError(
+                f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
+                "coordinates. with_dofs(DofSet(nodes, directions, xyz)) tells it."
+            )
+        without = no_mass(self.M)
+        if without.any():
+            return self._condensed(without, massless).model(name=name)
+        if not self.located and not is_positive_definite(self.K):
+            raise ModelError(
+                "the structure is free to move and its coordinates are not known, hence nor are "
+                "its rigid-body rotations. Give them: located_at(nodes, xyz), or to the reader."
+            )
+        model = FEModel(self.M, self.K, self.D, dofs=self.dofs, name=name or self.source)
+        if self.digits is not None:
+            said = endangered(self.K, self.M, self.digits)
+            if said:
+                warnings.warn(f"{self.source or 'text file'}: {said}", FlexplantWarning, 2)
+        return model
+
+    def _condensed(self, without: Any, massless: str) -> FEMatrices:
+        if massless == "refuse":
+            listed = ", ".join(repr(name) for name in self.massless[:6])
+            more = f" ({without.sum()} in all)" if without.sum() > 6 else ""
+            raise ModelError(
+                f"DOFs without mass: {listed}{more}. They have no motion of their own. Condense "
+                "them, which is exact: model(massless='condense'); or give them their mass."
+            )
+        K, M, D = condensed(self.K, cast(Any, self.M), self.D, without, self.names)
+        kept = np.flatnonzero(~without)
+        note = f"{int(without.sum())} massless DOFs condensed"
+        return self.replace(K=K, M=M, D=D, dofs=taken(self.dofs, kept), notes=(*self.notes, note))
+
+
+def taken(dofs: DofSet | None, rows: IntArray) -> DofSet | None:
+    """Return the DofSet of some rows (from 0), without interpolation; None of None."""
+    if dofs is None:
+        return None
+    names = np.array(DIRECTIONS, dtype=object)
+    return DofSet(dofs.nodes[rows], tuple(names[dofs.kinds[rows]]), dofs.xyz[rows])
+
+
+def square(given: Any, name: str) -> sp.csc_array:
+    """Return a square sparse matrix with finite real entries, without stored zeros.
+
+    Raises
+    ------
+    ShapeError
+        When it is not square.
+    ModelError
+        When entries are no finite real numbers.
+    """
+    stored: Any = given
+    if not sp.issparse(given):
+        array = real_array(given, name)
+        if array.ndim != 2 or array.shape[0] != array.shape[1]:
+            raise ShapeError(f"{name} must be square, got shape {array.shape}.")
+        return sp.csc_array(array)
+    listed: Any = stored.tocoo()
+    if listed.ndim != 2 or listed.shape[0] != listed.shape[1]:
+        raise ShapeError(f"{name} must be square, got shape {listed.shape}.")
+    data: FloatArray = real_array(listed.data, f"stored entries of {name}")
+    matrix: Any = sp.csc_array((data, (listed.row, listed.col)), shape=listed.shape)
+    matrix.sum_duplicates()
+    matrix.eliminate_zeros()
+    return cast("sp.csc_array", matrix)
+
+
+def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
+    """Return a symmetric matrix of which a file holds one triangle, and a note of what was done.
+
+    A matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
+    one that stores both is left as it is, for `check` to compare them.
+
+    Parameters
+    ----------
+    given : (n, n) array or sparse matrix
+        As stored.
+    name : str
+        What to call it.
+
+    Returns
+    -------
+    matrix : (n, n) csc_array
+    note : str or None
+
+    Raises
+    ------
+    ShapeError
+        When it is not square.
+    ModelError
+        When entries are no finite real numbers.
+
+    Examples
+    --------
+    >>> completed(np.array([[2.0, -1.0], [0.0, 1.0]]), "K")[1]
+    'K: upper triangle only, completed'
+    """
+    matrix = square(given, name)
+    lower: Any = sp.tril(matrix, -1, format="csc")
+    upper: Any = sp.triu(matrix, 1, format="csc")
+    if not lower.nnz and not upper.nnz:
+        return matrix, None
+    pattern = [abs(part).astype(bool).astype(np.int8) for part in (lower, upper.T)]
+    if pattern[0].multiply(pattern[1]).nnz:
+        return matrix, None
+    half: Any = lower + upper
+    which = "each pair once" if lower.nnz and upper.nnz else None
+    which = which or ("upper triangle only" if upper.nnz else "lower triangle only")
+    full: Any = sp.csc_array(half + half.T + sp.diags_array(matrix.diagonal()))
+    return full, f"{name}: {which}, completed"
+
+
+def _cosines(dofs: DofSet, rotations: Any) -> Any:
+    """Return C (n, n), sparse, ``q_local = C q_global``."""
+    rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
+    for node, given in dict(rotations).items():
+        cosines = real_array(given, f"rotations[{node}]", (3, 3))
+        if np.abs(cosines @ cosines.T - np.eye(3)).max() > 1e-6:
+            raise ModelError(
+                f"the direction cosines of node {node} are not orthogonal, got "
+                f"{cosines.round(6).tolist()}: row i holds the global components of local axis i."
+            )
+        found = np.flatnonzero(dofs.nodes == node)
+        if not found.size:
+            raise LabelError(f"rotations name node {node}, which has no DOF: {dofs!r}.")
+        for first in (0, 3):
+            kinds = dofs.kinds[found]
+            three = found[(kinds >= first) & (kinds < first + 3)]
+            if three.size not in (0, 3):
+                raise ModelError(
+                    f"node {node} has a local coordinate system, but only {three.size} of three "
+                    "directions: the held one would be oblique in global directions. Leave its "
+                    "DOFs local, place ports elsewhere, or export it unconstrained."
+                )
+            three = three[np.argsort(dofs.kinds[three])]
+            if three.size:
+                rows.append(np.repeat(three, 3))
+                columns.append(np.tile(three, 3))
+                values.append((cosines - np.eye(3)).ravel())
+    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csc_array(entries, shape=(len(dofs), len(dofs)))
