@@ -104,7 +104,7 @@ class Grid:
 
     @cached_property
     def _pattern(self) -> tuple[Any, Any]:
-        """The row numbers of all columns, and where each column begins (the matrix is symmetric)."""
+        """The row numbers of all columns, and where each begins; the matrix is symmetric."""
         f, d = self.per_node, self._ndim
         strides = np.cumprod([1, *(n + 1 for n in self.counts[:-1])])
         steps = np.array([s[::-1] for s in product((-1, 0, 1), repeat=d)]) @ strides

@@ -1,13 +1,16 @@
-"""Damping as a ratio per mode."""
+"""Damping laws: a ratio for each mode, and how well it stands for the law."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
+from scipy.optimize import nnls
 
 from ..errors import ModelError, ShapeError
-from ..values import FloatArray, Value, positive, real_array
+from ..values import FloatArray, Value, positive, real_array, short, whole
 
 
 class Damping(Value):
@@ -32,10 +35,17 @@ class Damping(Value):
 class ModalDamping(Damping):
     """A damping ratio for all modes, or one for each: Z in equation (5) of the paper.
 
+    Rigid-body modes are undamped unless asked: a structure in free flight has nothing to rub on.
+
     Parameters
     ----------
     ratio : float or (k,) array [-]
-        In [0, 1). An array counts rigid-body modes too, which stay undamped.
+        In [0, 1). An array counts rigid-body modes too; their entries are not used.
+    others : float [-], optional
+        For all modes beyond the array; without it there must be one entry for each mode.
+    rigid : float [1/s]
+        What slows rigid-body motions down in ``FEModel.with_damping``: their velocity decays with
+        this rate. Modes and plants, whose rigid-body modes are free, refuse a model with it.
 
     Raises
     ------
@@ -46,27 +56,94 @@ class ModalDamping(Damping):
     --------
     >>> ModalDamping(0.01).zeta([0.0, 1500.0])
     array([0.  , 0.01])
+    >>> ModalDamping([0.0, 0.02], others=0.01).zeta([0.0, 1500.0, 2000.0])
+    array([0.  , 0.02, 0.01])
     """
 
     ratio: float | FloatArray
+    others: float | None = field(default=None, kw_only=True)
+    rigid: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         ratio = real_array(self.ratio, "ratio")
         if ratio.ndim > 1:
-            raise ShapeError(f"ratio must be a number or one per mode, got shape {ratio.shape}.")
-        if np.any(ratio < 0) or np.any(ratio >= 1):
-            worst = ratio.min() if np.any(ratio < 0) else ratio.max()
-            raise ModelError(
-                f"damping ratios must be in [0, 1), got {worst:g}: 1 % is 0.01. Negative ones feed "
-                "energy in, and from 1 on there is no oscillation left."
+            raise ShapeError(
+                f"ratio must be a number or one per mode, got shape {ratio.shape}. Flatten it."
             )
-        self._set(ratio=float(ratio) if ratio.ndim == 0 else ratio)
+        others = None if self.others is None else _ratios(self.others, "others").item()
+        if others is not None and ratio.ndim == 0:
+            raise ModelError(
+                "others goes with one ratio for each of the first modes: a single ratio is that of "
+                "all modes already. Leave others out, or pass an array."
+            )
+        ratio = _ratios(ratio, "damping ratios")
+        self._set(
+            ratio=float(ratio) if ratio.ndim == 0 else ratio,
+            others=others,
+            rigid=positive(self.rigid, "rigid", zero=True),
+        )
+
+    @classmethod
+    def from_measured(
+        cls, poles: Any, *, modes: Sequence[int] | None = None, others: float
+    ) -> ModalDamping:
+        """Return the damping that measured poles show: ``zeta = -Re(p) / |p|``.
+
+        Parameters
+        ----------
+        poles : (k,) complex array [rad/s], or MeasuredModes
+            Measured poles, of either sign of the imaginary part.
+        modes : (k,) sequence of int
+            The number of each in the model, from 1, rigid-body modes included. MeasuredModes bring
+            their own.
+        others : float [-]
+            The ratio of every mode that was not measured.
+
+        Raises
+        ------
+        ModelError
+            When a pole is not stable and oscillating, or mode numbers are missing or doubled.
+
+        Examples
+        --------
+        >>> ModalDamping.from_measured([-3 + 300j], modes=[2], others=0.02).zeta([0, 300, 800])
+        array([0.       , 0.0099995, 0.02     ])
+        """
+        numbers = getattr(poles, "modes", None) if modes is None else modes
+        values = np.atleast_1d(np.asarray(getattr(poles, "poles", poles)))
+        if values.dtype.kind not in "iufc" or values.ndim != 1 or not np.all(np.isfinite(values)):
+            raise ModelError(
+                f"poles must be a list of complex numbers [rad/s], got {short(poles)}. "
+                "MeasuredModes or identify_modes(frf) hold them."
+            )
+        if numbers is None:
+            raise ModelError(
+                "the numbers of the measured modes are not known: a pole alone does not say which "
+                "mode of the model it damps. Pass modes=[...], counted from 1 with the rigid-body "
+                "modes."
+            )
+        listed = [whole(number, "a mode number") for number in numbers]
+        if len(listed) != values.size or len(set(listed)) != len(listed):
+            raise ModelError(
+                f"{values.size} poles need as many different mode numbers, got {short(listed)}. "
+                "Give one number for each pole."
+            )
+        wrong = (values.real > 0) | (values.imag == 0)
+        if wrong.any():
+            raise ModelError(
+                f"the pole {values[wrong][0]:.6g} rad/s does not oscillate and decay: it has no "
+                "damping ratio. Leave it out, or look for a sign or for Hz in place of rad/s."
+            )
+        ratio = np.full(max(listed, default=0), float(_ratios(others, "others")))
+        ratio[np.array(listed, dtype=np.int64) - 1] = -values.real / np.abs(values)
+        return cls(ratio, others=others)
 
     def __repr__(self) -> str:
         if isinstance(self.ratio, float):
             return f"<ModalDamping {self.ratio:g}>"
         low, high = np.min(self.ratio, initial=1.0), np.max(self.ratio, initial=0.0)
-        return f"<ModalDamping of {np.size(self.ratio)} modes, {low:g} to {high:g}>"
+        more = "" if self.others is None else f", others {self.others:g}"
+        return f"<ModalDamping of {np.size(self.ratio)} modes, {low:g} to {high:g}{more}>"
 
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes.
@@ -77,19 +154,26 @@ class ModalDamping(Damping):
             When there is one ratio per mode and their numbers differ.
         """
         omega = real_array(omega, "omega", (None,))
-        if not isinstance(self.ratio, float) and self.ratio.shape != omega.shape:
+        ratio: Any = self.ratio
+        if self.others is not None:
+            listed = np.full(omega.size, self.others)
+            listed[: np.size(ratio)] = ratio[: omega.size]
+            ratio = listed
+        elif not isinstance(ratio, float) and ratio.shape != omega.shape:
             raise ShapeError(
-                f"{self.ratio.size} damping ratios for {omega.size} modes (rigid-body modes and "
-                "vectors counted): give one ratio for all, or exactly one for each."
+                f"{ratio.size} damping ratios for {omega.size} modes (rigid-body modes and "
+                "vectors counted): give one ratio for all, exactly one for each, or others=, the "
+                "ratio of all modes beyond these."
             )
-        return np.where(omega > 0, self.ratio, 0.0)
+        return np.where(omega > 0, ratio, 0.0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rayleigh(Damping):
     """Damping ``D = alpha M + beta K``: ratio ``alpha / (2 omega) + beta omega / 2``.
 
-    Rigid-body modes are left undamped: a structure in free flight has nothing to rub on.
+    Rigid-body modes are left undamped unless asked: a structure in free flight has nothing to rub
+    on.
 
     Parameters
     ----------
@@ -97,6 +181,15 @@ class Rayleigh(Damping):
         Mass-proportional part.
     beta : float [s]
         Stiffness-proportional part.
+    rigid : bool
+        Let alpha slow rigid-body motions down too, in ``FEModel.with_damping``: D is then
+        ``alpha M + beta K`` as it stands. Modes and plants, whose rigid-body modes are free, refuse
+        such a model.
+
+    Raises
+    ------
+    ModelError
+        When alpha or beta is negative.
 
     Examples
     --------
@@ -106,12 +199,64 @@ class Rayleigh(Damping):
 
     alpha: float
     beta: float
+    rigid: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(
             alpha=positive(self.alpha, "alpha", zero=True),
             beta=positive(self.beta, "beta", zero=True),
         )
+
+    @classmethod
+    def fitted(cls, freq: Iterable[float], zeta: Iterable[float]) -> Rayleigh:
+        """Return the Rayleigh damping that is nearest to ratios at frequencies.
+
+        Through two of them exactly; through more by least squares of the ratios, alpha and beta not
+        negative.
+
+        Parameters
+        ----------
+        freq : (k,) array [Hz]
+            Frequencies, at least two different ones.
+        zeta : (k,) array [-]
+            The damping ratio at each.
+
+        Raises
+        ------
+        ModelError
+            When frequencies are not positive and different, or no Rayleigh damping goes through
+            the two ratios.
+
+        Examples
+        --------
+        >>> law = Rayleigh.fitted([100.0, 1000.0], [0.01, 0.02])
+        >>> law, law.zeta([200 * np.pi, 2000 * np.pi])
+        (<Rayleigh alpha 10.1546 1/s, beta 6.10898e-06 s>, array([0.01, 0.02]))
+        """
+        hertz = real_array(freq, "freq", (None,))
+        ratio = _ratios(real_array(zeta, "zeta", hertz.shape), "zeta")
+        if np.any(hertz <= 0) or np.unique(hertz).size < 2:
+            raise ModelError(
+                f"freq must hold at least two different positive frequencies, got {short(freq)}: "
+                "one ratio leaves alpha and beta open. Use ModalDamping for a constant ratio."
+            )
+        omega = 2 * np.pi * hertz
+        terms = 0.5 * np.column_stack([1 / omega, omega])
+        scale = np.linalg.norm(terms, axis=0)
+        if hertz.size == 2:
+            found = np.linalg.solve(terms / scale, ratio) / scale
+            found[np.abs(found * scale) < 1e-12 * np.abs(ratio).max()] = 0.0
+            if found.min() < 0:
+                bound = float(hertz.max() / hertz.min())
+                raise ModelError(
+                    f"no Rayleigh damping goes through {ratio.tolist()} at {hertz.tolist()} Hz: "
+                    f"{'alpha' if found[0] < 0 else 'beta'} would be negative and feed energy in. "
+                    f"The two ratios may differ by a factor of {bound:.3g} at most; use "
+                    "ModalDamping, with a ratio for each mode."
+                )
+        else:
+            found = nnls(terms / scale, ratio)[0] / scale
+        return cls(float(found[0]), float(found[1]))
 
     def __repr__(self) -> str:
         return f"<Rayleigh alpha {self.alpha:g} 1/s, beta {self.beta:g} s>"
@@ -122,3 +267,127 @@ class Rayleigh(Damping):
         safe = np.where(omega > 0, omega, 1.0)
         ratio = 0.5 * (self.alpha / safe + self.beta * safe)
         return np.asarray(np.where(omega > 0, ratio, 0.0), dtype=np.float64)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Hysteretic(Damping):
+    """Structural damping ``K (1 + i eta)``, as the viscous damping of equal loss at resonance.
+
+    A loss factor has no equation of motion (its free response is not causal), so that modes and
+    plants take ``zeta = eta / 2`` in its place. Of a mode's response
+    ``1 / (omega_i^2 (1 + i eta) - omega^2)`` the equivalent one is, relatively, off by
+
+        ``eta |1 - r| / sqrt((1 - r^2)^2 + eta^2 r^2)``,  ``r = omega / omega_i``:
+
+    nothing at resonance, eta / (1 + r) away from it, eta at most (statically, where the hysteretic
+    response alone has a loss). `error` gives it, `response_error` bounds a whole response.
+
+    Parameters
+    ----------
+    loss_factor : float [-]
+        eta, in [0, 2): the energy lost in a cycle over 2 pi times the largest energy stored.
+
+    Raises
+    ------
+    ModelError
+        When the loss factor is not in [0, 2).
+
+    References
+    ----------
+    D. J. Ewins, Modal Testing, 2nd ed., sections 2.4 and 2.7.
+
+    Examples
+    --------
+    >>> law = Hysteretic(0.02)
+    >>> law.zeta([0.0, 100.0]), law.error([0.0, 50.0, 100.0], [100.0])[:, 0].round(4)
+    (array([0.  , 0.01]), array([0.02  , 0.0133, 0.    ]))
+    """
+
+    loss_factor: float
+
+    def __post_init__(self) -> None:
+        eta = positive(self.loss_factor, "loss_factor", zero=True)
+        if eta >= 2:
+            raise ModelError(
+                f"loss_factor must be below 2, got {eta:g}: the equivalent damping ratio is half "
+                "of it, and from 1 on there is no oscillation left. 2 % is 0.02."
+            )
+        self._set(loss_factor=eta)
+
+    def __repr__(self) -> str:
+        return f"<Hysteretic, loss factor {self.loss_factor:g}>"
+
+    def zeta(self, omega: FloatArray) -> FloatArray:
+        """Return the damping ratios (k,) of modes at `omega` [rad/s]: eta / 2, 0 for rigid ones."""
+        omega = real_array(omega, "omega", (None,))
+        return np.where(omega > 0, 0.5 * self.loss_factor, 0.0)
+
+    def error(self, freq: FloatArray, natural: FloatArray) -> FloatArray:
+        """Return by how much, relatively, the viscous responses of modes differ (n_freq, k).
+
+        Parameters
+        ----------
+        freq : (n_freq,) array [Hz]
+            Where.
+        natural : (k,) array [Hz]
+            Natural frequencies; rigid-body modes (0) differ by nothing.
+
+        Raises
+        ------
+        ModelError
+            When a frequency is negative.
+        """
+        at, own = _frequencies(freq, "freq")[:, None], _frequencies(natural, "natural")
+        r = at / np.where(own > 0, own, 1.0)
+        eta = self.loss_factor
+        size = np.sqrt((1 - r**2) ** 2 + (eta * r) ** 2)
+        # without loss both are infinite at resonance, and the same
+        found = eta * np.abs(1 - r) / np.where(size > 0, size, 1.0)
+        return np.asarray(np.where(own > 0, found, 0.0), dtype=np.float64)
+
+    def response_error(
+        self, freq: FloatArray, natural: FloatArray, gains: FloatArray
+    ) -> FloatArray:
+        """Return a bound (n_freq,) of the difference between hysteretic and viscous responses.
+
+        The sum over the modes of ``|gain_i| |h_viscous - h_hysteretic|``: equality for one mode.
+
+        Parameters
+        ----------
+        freq : (n_freq,) array [Hz]
+            Where; above 0 when there are rigid-body modes.
+        natural : (k,) array [Hz]
+            Natural frequencies.
+        gains : (k,) array [1/kg]
+            ``phi_out phi_in`` of each mode, of mass-normalised shapes: receptance [m/N].
+
+        Raises
+        ------
+        ModelError, ShapeError
+            When a frequency is negative or the sizes differ.
+        """
+        own = _frequencies(natural, "natural")
+        weights = np.abs(real_array(gains, "gains", own.shape))
+        relative = self.error(freq, own)
+        at, omega = 2 * np.pi * real_array(freq, "freq")[:, None], 2 * np.pi * own
+        stiffness = np.abs(omega**2 * (1 + 1j * self.loss_factor) - at**2)
+        part = relative / np.where(stiffness > 0, stiffness, 1.0)
+        return np.asarray(part @ weights, dtype=np.float64)
+
+
+def _ratios(value: Any, name: str) -> FloatArray:
+    ratio = real_array(value, name)
+    if np.any(ratio < 0) or np.any(ratio >= 1):
+        worst = ratio.min() if np.any(ratio < 0) else ratio.max()
+        raise ModelError(
+            f"{name} must be in [0, 1), got {worst:g}: 1 % is 0.01. Negative ones feed energy in, "
+            "and from 1 on there is no oscillation left. Check the sign, and per cent."
+        )
+    return ratio
+
+
+def _frequencies(value: Any, name: str) -> FloatArray:
+    found = real_array(value, name, (None,))
+    if np.any(found < 0):
+        raise ModelError(f"{name} must not be negative, got {found.min():g} Hz. Take its size.")
+    return found

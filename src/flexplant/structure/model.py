@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, cast
@@ -11,10 +12,11 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet
-from ..values import FloatArray, Matrix, Value, real_array
-from .damping import Damping, Rayleigh
+from ..values import FloatArray, Matrix, Value, frozen, real_array
+from .damping import Damping, ModalDamping, Rayleigh
 from .eigen import elastic_modes
 from .factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
+from .parts import HeldShape, Part, added_matrices, sum_of
 from .rigid import rigid_body_basis
 
 #: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
@@ -78,13 +80,9 @@ class FEModel(Value):
                 f"M is not positive definite: {_lowest(M)}. Some motion would have no inertia, or "
                 "a negative one. Condense massless DOFs out, or look for a sign."
             )
-        for name, matrix in (("K", K), ("D", D)):
-            if matrix is not None and not _is_semidefinite(matrix):
-                raise ModelError(
-                    f"{name} is not positive semi-definite: {_lowest(matrix)}. The structure would "
-                    f"{'be unstable' if name == 'K' else 'feed energy in'}. Look for a sign or "
-                    "for swapped arguments (the order is M, K, D)."
-                )
+        _check_semidefinite(K, "K")
+        if D is not None:
+            _check_semidefinite(D, "D")
         self._set(M=M, K=K, D=D)
 
     def __repr__(self) -> str:
@@ -93,7 +91,8 @@ class FEModel(Value):
         r = self.rigid_body.shape[1]
         rigid = f"{r} rigid-body motion{'s' * (r != 1)}" if r else "no rigid-body motions"
         damping = "not given" if self.D is None else "given"
-        return f"<FEModel{named}: {self.n_dof} DOFs, {kind}, {rigid}, D {damping}>"
+        size = f"{self.n_dof} DOF{'s' * (self.n_dof != 1)}"
+        return f"<FEModel{named}: {size}, {kind}, {rigid}, D {damping}>"
 
     @property
     def n_dof(self) -> int:
@@ -124,51 +123,160 @@ class FEModel(Value):
             if direction in self.dofs.directions:
                 moved = np.array([d == direction for d in self.dofs.directions], dtype=np.float64)
                 return float(moved @ (self.M @ moved))
-        raise ModelError("the model has no translational DOF, so that its mass is not known.")
+        raise ModelError(
+            "the model has no translational DOF, so that its mass is not known. Ask for "
+            "rotation^T M rotation instead, an inertia."
+        )
 
-    def with_damping(self, damping: Damping) -> FEModel:
-        """Return the model with the matrix D of a damping law.
+    def with_damping(self, damping: Damping | Matrix) -> FEModel:
+        """Return the model with the matrix D of a damping law, or with a measured D.
 
-        Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix. Rayleigh
-        damping is ``alpha M + beta K``, less what alpha would do to rigid-body motions: these are
-        undamped in both.
+        Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix; so is the
+        viscous equivalent of a loss factor. Rayleigh damping is ``alpha M + beta K``. Rigid-body
+        motions are undamped in all of them unless the law asks for it (`rigid`).
 
         Parameters
         ----------
-        damping : ModalDamping or Rayleigh
-            The law.
+        damping : ModalDamping, Rayleigh, Hysteretic or (n, n) matrix [N s/m, ...]
+            The law, or D itself. It takes the place of the D that was there, and of its dampers.
 
         Raises
         ------
         ModelError
-            When a full D is needed and the model is too large for one.
+            When a full D is needed and the model is too large for one; when a given D is not
+            symmetric or not positive semi-definite.
         """
         if not isinstance(damping, Damping):
-            raise ModelError(
-                f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}."
-            )
+            if not (sp.issparse(damping) or isinstance(damping, np.ndarray | list)):
+                raise ModelError(
+                    f"damping must be a ModalDamping or Rayleigh (or Hysteretic, or a matrix D), "
+                    f"got {type(damping).__name__}. 1 % in all modes is ModalDamping(0.01)."
+                )
+            D = _symmetric(damping, "D", self.n_dof)
+            _check_semidefinite(D, "D")
+            return self._with(D=frozen(D))
         free = self.rigid_body.shape[1] > 0
-        if isinstance(damping, Rayleigh) and not (free and damping.alpha):
-            return self.replace(D=damping.alpha * self.M + damping.beta * self.K)
+        if isinstance(damping, Rayleigh) and not (free and damping.alpha and not damping.rigid):
+            return self._with(D=frozen(damping.alpha * self.M + damping.beta * self.K))
         if self.n_dof > _DENSE_DAMPING_LIMIT:
             raise ModelError(
                 f"this damping gives a full D, too large for {self.n_dof} DOFs (limit "
                 f"{_DENSE_DAMPING_LIMIT}). Pass it to solve_modes(model, damping=...) instead."
             )
-        return self.replace(D=_full_damping(self, damping))
+        return self._with(D=frozen(_full_damping(self, damping)))
+
+    def with_parts(self, parts: Iterable[Part] | Part) -> FEModel:
+        """Return the model with point masses, springs and dampers added.
+
+        Each adds ``weight row^T row`` to M, K or D, the row being the motion it feels, interpolated
+        where its place is between nodes.
+
+        Parameters
+        ----------
+        parts : PointMass, Spring, Damper, or a sequence of them
+            What is added.
+
+        Raises
+        ------
+        ModelError
+            When one of them is no part.
+        LabelError
+            When a place is unknown.
+
+        Examples
+        --------
+        >>> from flexplant.structure import Damper, PointMass, Spring, chain
+        >>> chain(masses=[1, 2], stiffnesses=[5]).with_parts([
+        ...     PointMass("1:x", 0.5), Spring("1:x", 100.0), Damper("1:x", 0.2, to="2:x")])
+        <FEModel 'chain': 2 DOFs, sparse, no rigid-body motions, D given>
+        """
+        added = added_matrices(self.dofs, parts)
+        # sums of definite matrices are definite: nothing to check again
+        return self._with(
+            **{name: frozen(sum_of(getattr(self, name), more)) for name, more in added.items()}
+        )
+
+    def fixed(self, labels: Iterable[str]) -> FEModel:
+        """Return the model with some DOFs held still: their rows and columns are taken out.
+
+        Places between nodes stay known where they were.
+
+        Parameters
+        ----------
+        labels : sequence of str, or DofSet
+            The DOFs that do not move; ``model.dofs.where(directions="z", box=...)`` finds those of
+            an edge.
+
+        Raises
+        ------
+        LabelError
+            When a DOF is unknown.
+        ModelError
+            When no DOF would be left.
+
+        Examples
+        --------
+        >>> from flexplant.structure import chain
+        >>> chain(masses=[1, 2], stiffnesses=[5]).fixed(["1:x"])
+        <FEModel 'chain': 1 DOF, sparse, no rigid-body motions, D not given>
+        """
+        held = np.zeros(self.n_dof, dtype=bool)
+        held[self.dofs.indices(labels)] = True
+        rows = np.flatnonzero(~held)
+        if not rows.size:
+            raise ModelError(
+                f"all {self.n_dof} DOFs would be fixed: nothing moves. Fix fewer of them."
+            )
+        shape = self.dofs.interpolation
+        if shape is not None:
+            shape = HeldShape(shape, rows)
+        return self._with(
+            **{
+                name: None if matrix is None else frozen(matrix[rows][:, rows])
+                for name, matrix in (("M", self.M), ("K", self.K), ("D", self.D))
+            },
+            dofs=self.dofs._taken(rows).replace(interpolation=shape),
+        )
+
+    @classmethod
+    def _proven(cls, **fields: Any) -> FEModel:
+        """Return a model whose matrices are known to be symmetric and definite, and read-only.
+
+        Not through the checks of the door: a factorisation that proves it again takes longer than
+        everything that leads here.
+        """
+        model = object.__new__(cls)
+        for name, value in fields.items():
+            object.__setattr__(model, name, value)
+        return model
+
+    def _with(self, **changes: Any) -> FEModel:
+        return FEModel._proven(**(self._fields() | changes))
 
 
 def _full_damping(model: FEModel, damping: Damping) -> FloatArray:
     M, K, rigid = dense(model.M), dense(model.K), model.rigid_body
     loaded = M @ rigid
     if isinstance(damping, Rayleigh):
-        return damping.alpha * (M - loaded @ loaded.T) + damping.beta * K
+        D = damping.alpha * (M - loaded @ loaded.T) + damping.beta * K
+        return np.asarray(0.5 * (D + D.T), dtype=np.float64)
     elastic, phi = elastic_modes(M, K, rigid)
     r = rigid.shape[1]
     zeta = damping.zeta(np.concatenate([np.zeros(r), elastic]))[r:]
     forces = M @ phi
     D = (forces * (2 * zeta * elastic)) @ forces.T
+    if isinstance(damping, ModalDamping) and damping.rigid:
+        D = D + damping.rigid * (loaded @ loaded.T)
     return np.asarray(0.5 * (D + D.T), dtype=np.float64)
+
+
+def _check_semidefinite(matrix: Matrix, name: str) -> None:
+    if not _is_semidefinite(matrix):
+        raise ModelError(
+            f"{name} is not positive semi-definite: {_lowest(matrix)}. The structure would "
+            f"{'be unstable' if name == 'K' else 'feed energy in'}. Look for a sign or "
+            "for swapped arguments (the order is M, K, D)."
+        )
 
 
 def _symmetric(given: Any, name: str, n: int) -> Matrix:
@@ -183,6 +291,8 @@ def _symmetric(given: Any, name: str, n: int) -> Matrix:
         )
     else:
         matrix = real_array(value, name, (n, n))
+    if sp.issparse(matrix) and _mirrored(matrix):
+        return cast(Matrix, matrix)
     scaled, _ = unit_diagonal(matrix)
     skew: Any = abs(scaled - scaled.T)
     worst = float(skew.max()) if n else 0.0
@@ -194,6 +304,16 @@ def _symmetric(given: Any, name: str, n: int) -> Matrix:
             f"0.5 * ({name} + {name}.T), when the difference is only rounding."
         )
     return cast(Matrix, matrix)
+
+
+def _mirrored(matrix: Any) -> bool:
+    """Return whether a sparse matrix equals its transpose to the bit, entry by entry."""
+    matrix.sum_duplicates()
+    other: Any = sp.csc_array(matrix.T)
+    return all(
+        np.array_equal(getattr(matrix, part), getattr(other, part))
+        for part in ("indptr", "indices", "data")
+    )
 
 
 def _is_semidefinite(matrix: Matrix) -> bool:

@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DofSet
 from ..values import FloatArray, Matrix
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
@@ -22,13 +22,15 @@ def rigid_motions(dofs: DofSet) -> FloatArray:
     hence a plate's rx = dz/dy and ry = -dz/dx.
     """
     n = len(dofs)
-    kind = np.array([DIRECTIONS.index(direction) for direction in dofs.directions], dtype=np.int64)
+    kind = dofs.kinds
     motions = np.zeros((n, 6))
     motions[np.arange(n), kind] = 1.0
     for axis in range(3):
-        turn = np.cross(np.eye(3)[axis], dofs.xyz)
-        moved = kind < 3
-        motions[moved, 3 + axis] = turn[moved, kind[moved]]
+        # a turn about axis moves the next one by minus the coordinate after it, and so on round
+        after, before = (axis + 1) % 3, (axis + 2) % 3
+        for moved, along, sign in ((after, before, -1.0), (before, after, 1.0)):
+            rows = kind == moved
+            motions[rows, 3 + axis] = sign * dofs.xyz[rows, along]
     return motions
 
 

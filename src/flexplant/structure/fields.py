@@ -1,0 +1,243 @@
+"""What varies over a grid of elements: materials, thicknesses, holes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import scipy.ndimage
+
+from ..errors import ModelError, ShapeError
+from ..labels import DofSet, Interpolation
+from ..values import FloatArray, Value, positive, real_array, short, whole
+from .assembly import Grid
+
+#: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre
+Field: TypeAlias = "float | Sequence[Any] | FloatArray | Callable[..., float]"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rectangle(Value):
+    """A rectangular hole: elements whose centre is inside are missing.
+
+    Parameters
+    ----------
+    lower, upper : (2,) array [m]
+        Its corners of smallest and largest x, y.
+
+    Raises
+    ------
+    ModelError
+        When upper is not above lower.
+    """
+
+    lower: Sequence[float]
+    upper: Sequence[float]
+
+    def __post_init__(self) -> None:
+        lower, upper = real_array(self.lower, "lower", (2,)), real_array(self.upper, "upper", (2,))
+        if np.any(upper <= lower):
+            raise ModelError(
+                f"a rectangle's upper corner must be above its lower one in x and y, got "
+                f"{lower.tolist()} and {upper.tolist()}. Swap them, or give it a width."
+            )
+        self._set(lower=tuple(lower.tolist()), upper=tuple(upper.tolist()))
+
+    def __repr__(self) -> str:
+        return f"<Rectangle {self.lower} to {self.upper} m>"
+
+    def holds(self, centres: FloatArray) -> Any:
+        """Return which of the points (p, 2) are inside."""
+        return np.all((centres > self.lower) & (centres < self.upper), axis=1)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Disc(Value):
+    """A round hole: elements whose centre is inside are missing.
+
+    Parameters
+    ----------
+    centre : (2,) array [m]
+        Its middle.
+    radius : float [m]
+        Above 0.
+
+    Raises
+    ------
+    ModelError
+        When the radius is not positive.
+    """
+
+    centre: Sequence[float]
+    radius: float
+
+    def __post_init__(self) -> None:
+        self._set(
+            centre=tuple(real_array(self.centre, "centre", (2,)).tolist()),
+            radius=positive(self.radius, "radius"),
+        )
+
+    def __repr__(self) -> str:
+        return f"<Disc of radius {self.radius:g} m about {self.centre} m>"
+
+    def holds(self, centres: FloatArray) -> Any:
+        """Return which of the points (p, 2) are inside."""
+        return np.linalg.norm(centres - np.array(self.centre), axis=1) < self.radius
+
+
+Hole = Rectangle | Disc
+
+
+def lengths_of(size: Any, count: int) -> tuple[float, ...]:
+    """Return `count` positive lengths."""
+    values = real_array(size, "size", (count,)).tolist()
+    return tuple(
+        positive(value, f"size in {axis}") for value, axis in zip(values, "xyz", strict=False)
+    )
+
+
+def counts_of(elements: Any, count: int) -> tuple[int, ...]:
+    """Return `count` numbers of elements."""
+    axes = "xyz"[:count]
+    listed = [elements] if count == 1 and np.ndim(elements) == 0 else elements
+    if not isinstance(listed, Sequence | np.ndarray) or len(listed) != count:
+        raise ShapeError(
+            f"elements must be {count} whole numbers (along {', '.join(axes)}), got "
+            f"{short(elements)}. Write ({', '.join(['8'] * count)}), say."
+        )
+    return tuple(
+        whole(value, f"elements along {axis}") for value, axis in zip(listed, axes, strict=True)
+    )
+
+
+def centres_of(lengths: Sequence[float], counts: Sequence[int]) -> FloatArray:
+    """Return the centres (elements, d) of all elements, x fastest."""
+    lines = [n * (np.arange(k) + 0.5) / k for n, k in zip(lengths, counts, strict=True)]
+    return np.column_stack([a.ravel() for a in np.meshgrid(*lines[::-1], indexing="ij")[::-1]])
+
+
+def field_of(
+    value: Any,
+    name: str,
+    lengths: Sequence[float],
+    counts: Sequence[int],
+    present: Any = None,
+) -> Any:
+    """Return one number, or an array (nz, ny, nx) of positive numbers where elements are present.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When a number is not positive or there is not one for each element.
+    """
+    if callable(value):
+        chosen = np.full(int(np.prod(counts)), True) if present is None else present.ravel()
+        found = np.ones(chosen.size)
+        centres = centres_of(lengths, counts)[chosen]
+        answers = [value(*centre) for centre in centres.tolist()]
+        found[chosen] = real_array(answers, f"{name} of the elements", (len(answers),))
+        values = found.reshape(tuple(counts[::-1]))
+    elif np.ndim(value) == 0:
+        return positive(value, name)
+    else:
+        values = real_array(value, name)
+        if values.shape != tuple(counts):
+            raise ShapeError(
+                f"{name} must be one number, one for each element in an array of shape "
+                f"{tuple(counts)}, or a function of an element's centre, got shape {values.shape}."
+            )
+        values = values.T
+    there = values if present is None else values[present]
+    if np.any(there <= 0):
+        raise ModelError(
+            f"{name} must be positive in every element, got {there.min():g}. Say where elements "
+            "are missing by holes=."
+        )
+    return values
+
+
+def poisson_of(value: Any, lengths: Sequence[float], counts: Sequence[int], present: Any) -> Any:
+    """Return Poisson's ratio: one number, or an array (nz, ny, nx)."""
+    if callable(value) or np.ndim(value):
+
+        def shifted(item: Any) -> Any:
+            return (lambda *at: 1.0 + item(*at)) if callable(item) else 1.0 + real_array(item, "nu")
+
+        found = field_of(shifted(value), "1 + poisson_ratio", lengths, counts, present) - 1.0
+        there = found if present is None else found[present]
+    else:
+        found = float(real_array(value, "poisson_ratio", ()))
+        there = np.array([found])
+    if np.any(there <= -1) or np.any(there >= 0.5):
+        worst = there.min() if np.any(there <= -1) else there.max()
+        raise ModelError(
+            f"poisson_ratio must be above -1 and below 0.5, got {worst:g}. Metals have 0.25 to "
+            "0.35; incompressible materials need other elements."
+        )
+    return found
+
+
+def present_of(
+    holes: Any, lengths: Sequence[float], counts: Sequence[int], *, corners: bool
+) -> Any:
+    """Return which elements exist (nz, ny, nx), None when all do.
+
+    Raises
+    ------
+    ModelError
+        When nothing is left, or it falls apart: `corners` tells whether a common corner holds.
+    """
+    if holes is None or (isinstance(holes, Sequence) and not len(holes)):
+        return None
+    missing = _missing(holes, lengths, counts)
+    present = ~missing.reshape(tuple(counts[::-1]))
+    if present.all():
+        return None
+    structure = np.ones((3,) * len(counts)) if corners else None
+    pieces = scipy.ndimage.label(present, structure=structure)[1]
+    if pieces != 1:
+        raise ModelError(
+            f"the holes leave {pieces} separate pieces of the structure"
+            + (", that is nothing at all" if not pieces else "")
+            + ": make them smaller, or model the pieces one by one."
+        )
+    return present
+
+
+def _missing(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
+    if not isinstance(holes, Hole) and not callable(holes):
+        given = np.asarray(holes) if not isinstance(holes, set) else np.array(None)
+        if given.dtype == bool:
+            if given.shape != tuple(counts):
+                raise ShapeError(
+                    f"holes must be a mask with one entry for each element, of shape "
+                    f"{tuple(counts)}, got {given.shape}. True is a missing element."
+                )
+            return given.T.ravel()
+    centres = centres_of(lengths, counts)
+    if callable(holes):
+        return np.array([bool(holes(*centre)) for centre in centres.tolist()])
+    listed = list(holes) if isinstance(holes, Iterable) else [holes]
+    if len(counts) != 2 or not all(isinstance(hole, Hole) for hole in listed):
+        raise ModelError(
+            f"holes must be Rectangle and Disc values, a mask of the elements or a function of an "
+            f"element's centre, got {short(holes)}. Rectangle((0.1, 0.1), (0.2, 0.2)), say."
+        )
+    return np.any([hole.holds(centres) for hole in listed], axis=0)
+
+
+def dofs_of(
+    grid: Grid, lengths: Sequence[float], directions: tuple[str, ...], shape: Interpolation
+) -> DofSet:
+    """Return the DOFs of a grid that begins at the origin; nodes keep their number beside holes."""
+    xyz = np.zeros((grid.nodes.size, 3))
+    xyz[:, : len(lengths)] = grid.coordinates(lengths)
+    times = len(directions)
+    return DofSet(
+        np.repeat(grid.nodes + 1, times),
+        directions * grid.nodes.size,
+        np.repeat(xyz, times, axis=0),
+        shape,
+    )

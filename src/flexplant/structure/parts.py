@@ -1,0 +1,270 @@
+"""What is screwed to a structure: point masses, springs, dampers; and structures held still."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, cast
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..labels import DIRECTIONS, DofSet, Interpolation, Place
+from ..values import FloatArray, IntArray, Matrix, Value, positive, real_array
+
+
+@dataclass(frozen=True, eq=False)
+class PointMass(Value):
+    """A rigid mass at a place of the structure.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        At a point, the mass rides on every translation that the model has there; at a DOF label
+        (or a mapping) on that motion alone.
+    mass : float [kg]
+        The mass; of a label that is a rotation, the inertia [kg m^2].
+    inertia : float or (3,) array [kg m^2]
+        About its own centre and the axes x, y, z: it rides on the rotations that the model has (or
+        that follow from its shapes) at a point.
+
+    Raises
+    ------
+    ModelError
+        When mass or inertia is negative.
+    """
+
+    at: Place
+    mass: float
+    inertia: float | Sequence[float] = field(default=0.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        inertia = real_array(self.inertia, "inertia")
+        about = np.broadcast_to(inertia, (3,)) if inertia.size == 1 else inertia
+        if about.shape != (3,) or np.any(about < 0):
+            raise ModelError(
+                f"inertia must be one number or three (about x, y, z), none negative, got "
+                f"{inertia.tolist()!r:.80}. Leave products of inertia out: turn the axes."
+            )
+        at = checked_place(self.at, "a point mass")
+        if about.any() and isinstance(at, str | Mapping):
+            raise ModelError(
+                f"a point mass with inertia needs a point (x, y, z), got {at!r:.80}: a label names "
+                "one motion only. Use dofs.xyz of the node as the point."
+            )
+        self._set(
+            at=at,
+            mass=positive(self.mass, "mass of a point mass", zero=True),
+            inertia=tuple(about.tolist()),
+        )
+
+    def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
+        """Return (matrix, row, weight): the weight times row^T row is added to M."""
+        if isinstance(self.at, str | Mapping):
+            return [("M", dofs.row(self.at), self.mass)]
+        moved = [d for d in ("x", "y", "z") if d in dofs.directions]
+        if not moved:
+            raise ModelError(
+                "the model has no translation for a point mass to ride on. Name a DOF by its label."
+            )
+        turned = zip(("rx", "ry", "rz"), np.asarray(self.inertia).tolist(), strict=True)
+        found = [("M", dofs.row(self.at, d), self.mass) for d in moved]
+        return found + [("M", dofs.row(self.at, d), j) for d, j in turned if j]
+
+
+@dataclass(frozen=True, eq=False)
+class Spring(Value):
+    """A linear spring between a place and the ground, or between two places.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        One end.
+    stiffness : float [N/m or N m/rad]
+        Not negative.
+    direction : str
+        The motion it feels at points: x, y, z, rx, ry, rz. A label carries its own.
+    to : place, optional
+        The other end; the ground when not given.
+
+    Raises
+    ------
+    ModelError
+        When the stiffness is negative.
+    """
+
+    at: Place
+    stiffness: float
+    direction: str = field(default="z", kw_only=True)
+    to: Place | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._set(
+            at=checked_place(self.at, "a spring"),
+            stiffness=positive(self.stiffness, "stiffness of a spring", zero=True),
+            direction=_checked_direction(self.direction),
+            to=None if self.to is None else checked_place(self.to, "a spring"),
+        )
+
+    def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
+        """Return (matrix, row, weight): the weight times row^T row is added to K."""
+        return [("K", _stretch(self, dofs), self.stiffness)]
+
+
+@dataclass(frozen=True, eq=False)
+class Damper(Value):
+    """A viscous damper between a place and the ground, or between two places.
+
+    Parameters
+    ----------
+    at : str, (3,) array [m] or mapping
+        One end.
+    rate : float [N s/m or N m s/rad]
+        Force per velocity, not negative.
+    direction : str
+        The motion it feels at points: x, y, z, rx, ry, rz. A label carries its own.
+    to : place, optional
+        The other end; the ground when not given. A grounded damper slows rigid-body motions down:
+        hold the structure by springs too, or modes and plants refuse it.
+
+    Raises
+    ------
+    ModelError
+        When the rate is negative.
+    """
+
+    at: Place
+    rate: float
+    direction: str = field(default="z", kw_only=True)
+    to: Place | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._set(
+            at=checked_place(self.at, "a damper"),
+            rate=positive(self.rate, "rate of a damper", zero=True),
+            direction=_checked_direction(self.direction),
+            to=None if self.to is None else checked_place(self.to, "a damper"),
+        )
+
+    def added(self, dofs: DofSet) -> list[tuple[str, FloatArray, float]]:
+        """Return (matrix, row, weight): the weight times row^T row is added to D."""
+        return [("D", _stretch(self, dofs), self.rate)]
+
+
+Part = PointMass | Spring | Damper
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class HeldShape(Interpolation):
+    """The shapes of a structure some of whose DOFs are held still.
+
+    Parameters
+    ----------
+    free : Interpolation
+        Of the structure with all its DOFs.
+    rows_left : (n,) array of int
+        Which of those are left, in order.
+    """
+
+    free: Interpolation
+    rows_left: IntArray
+
+    def __repr__(self) -> str:
+        return f"<HeldShape of {np.size(self.rows_left)} DOFs in {self.free!r}>"
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of the DOFs that are left in a motion at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is off the structure or the direction is unknown to it.
+        """
+        return np.asarray(self.free.row(xyz, direction)[self.rows_left])
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        return np.asarray(self.free.rows(points, direction)[:, self.rows_left])
+
+
+def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.csc_array]:
+    """Return what parts add to M, K and D, those that are touched only.
+
+    Raises
+    ------
+    ModelError
+        When one of them is no part.
+    """
+    listed = [parts] if isinstance(parts, Part) else list(_iterated(parts))
+    rows: dict[str, list[sp.csc_array]] = {}
+    for part in listed:
+        if not isinstance(part, Part):
+            raise ModelError(
+                f"a structure takes PointMass, Spring and Damper as parts, got "
+                f"{type(part).__name__}. Add matrices of your own by model.replace(K=...)."
+            )
+        for name, row, weight in part.added(dofs):
+            if weight:
+                scaled = np.sqrt(weight) * row
+                rows.setdefault(name, []).append(sp.csc_array(scaled[:, None]))
+    found = {}
+    for name, columns in rows.items():
+        spread = sp.hstack(columns, format="csc")
+        found[name] = sp.csc_array(spread @ spread.T)
+    return found
+
+
+def _iterated(parts: Any) -> Iterable[Any]:
+    if not isinstance(parts, Iterable):
+        raise ModelError(
+            f"parts must be a list of PointMass, Spring and Damper, got {type(parts).__name__}. "
+            "Pass them in [...]."
+        )
+    return parts
+
+
+def sum_of(matrix: Matrix | None, added: sp.csc_array | None) -> Matrix | None:
+    """Return the sum of two symmetric matrices, of which either may be None."""
+    if added is None or matrix is None:
+        return matrix if added is None else added
+    total: Any = matrix + added
+    return cast(Matrix, total if sp.issparse(total) else np.asarray(total, dtype=np.float64))
+
+
+def checked_place(at: Any, owner: str) -> Any:
+    """Return a label, a point as a tuple or a mapping as they are.
+
+    Raises
+    ------
+    LabelError
+        When it is none of these.
+    """
+    if isinstance(at, str | Mapping):
+        return at
+    try:
+        return tuple(real_array(at, "at", (3,)).tolist())
+    except ValueError:
+        raise LabelError(
+            f"{owner} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "
+            f"{{label: weight}}, got {at!r:.80}. dofs.nearest((x, y, z)) finds a label."
+        ) from None
+
+
+def _checked_direction(direction: Any) -> str:
+    if direction not in DIRECTIONS:
+        raise unknown_label("direction", direction, DIRECTIONS)
+    return str(direction)
+
+
+def _stretch(part: Spring | Damper, dofs: DofSet) -> FloatArray:
+    row = dofs.row(part.at, part.direction)
+    if part.to is None:
+        return row
+    row = row - dofs.row(part.to, part.direction)
+    if not row.any():
+        raise ModelError(
+            f"both ends of a {type(part).__name__.lower()} are at {part.at!r:.60}: it would do "
+            "nothing. Leave `to` out to fix its other end to the ground."
+        )
+    return row

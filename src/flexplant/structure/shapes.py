@@ -1,0 +1,264 @@
+"""Motions between the nodes of beams, plates and blocks, by their elements' shape functions."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError
+from ..labels import Interpolation
+from ..values import FloatArray, real_array
+from .assembly import Grid
+from .elements import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class GridShape(Interpolation):
+    """What the shape functions on regular grids have in common: where a point is."""
+
+    @cached_property
+    def _grid(self) -> Grid:
+        counts, present, per_node = self._layout()
+        there = np.ones(counts[::-1], dtype=bool) if present is None else np.asarray(present)
+        return Grid(counts, per_node, there)
+
+    def _layout(self) -> tuple[tuple[int, ...], Any, int]:
+        raise NotImplementedError
+
+    def _row(self, element: Sequence[int], weights: FloatArray) -> FloatArray:
+        """Return the row (n,) of an element's weights, its corners in the order of the grid."""
+        grid, f = self._grid, self._grid.per_node
+        strides = np.cumprod([1, *(n + 1 for n in grid.counts[:-1])])
+        nodes = grid.rank[(np.asarray(element) + grid.corners) @ strides]
+        row = np.zeros(grid.n_dof)
+        row[(f * nodes[:, None] + np.arange(f)).ravel()] = weights
+        return row
+
+    def _located(
+        self, point: FloatArray, lengths: Sequence[float], lost: Callable[[], LabelError]
+    ) -> tuple[tuple[int, ...], FloatArray, FloatArray]:
+        """Return the element of a point, its coordinates (d,) from 0 to 1 and the sizes (d,).
+
+        On an edge that is the element on the side of larger coordinates, unless it is missing.
+        """
+        grid = self._grid
+        choices: list[list[tuple[int, float]]] = []
+        for value, length, count in zip(point.tolist(), lengths, grid.counts, strict=False):
+            place = min(max(value / length, 0.0), 1.0) * count
+            nearest = round(place)
+            if abs(place - nearest) < 1e-9 * count:  # rounding must not decide on the side
+                place = float(nearest)
+            index = min(int(place), count - 1)
+            found = [(index, place - index)]
+            if place == index and index:
+                found.append((index - 1, 1.0))
+            choices.append(found)
+        sizes = np.array([n / k for n, k in zip(lengths, grid.counts, strict=True)])
+        order = np.ndindex(*(len(found) for found in choices))
+        for pick in sorted(order, key=sum):
+            chosen = [found[i] for found, i in zip(choices, pick, strict=True)]
+            element = tuple(index for index, _ in chosen)
+            if grid.present[element[::-1]]:
+                return element, np.array([s for _, s in chosen]), sizes
+        raise lost()
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlateShape(GridShape):
+    """The shape functions of a rectangular grid of plate elements.
+
+    Parameters
+    ----------
+    size : (float, float) [m]
+        Lengths in x and y.
+    thickness : float or (ny, nx) array [m]
+        Points between the two surfaces belong to the plate.
+    elements : (int, int)
+        Number of elements in x and y.
+    present : (ny, nx) array of bool, optional
+        Which elements exist; None: all.
+    """
+
+    size: tuple[float, float]
+    thickness: float | FloatArray
+    elements: tuple[int, int]
+    present: Any = None
+
+    def __post_init__(self) -> None:
+        self._set(thickness=self.thickness, present=self.present)
+
+    def __repr__(self) -> str:
+        (lx, ly), (nx, ny) = self.size, self.elements
+        holes = "" if self.present is None else f", {np.count_nonzero(~self.present)} missing"
+        return f"<PlateShape {lx:g} x {ly:g} m, {nx} x {ny} elements{holes}>"
+
+    def _layout(self) -> tuple[tuple[int, ...], Any, int]:
+        return self.elements, self.present, 3
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of all DOFs in the motion z, rx or ry at a point.
+
+        Between elements z is continuous; the slope across an edge is not (the element is
+        non-conforming), and the element on the side of larger coordinates is taken.
+
+        Raises
+        ------
+        LabelError
+            When the point is off the plate, or the direction is not z, rx or ry.
+        """
+        if direction not in ("z", "rx", "ry"):
+            raise LabelError(
+                f"a plate in bending has no motion {direction!r}: use one of z, rx, ry."
+            )
+        point = real_array(xyz, "xyz", (3,))
+        slack = 1e-9 * max(self.size)
+        if not _inside(point[:2], self.size, slack):
+            raise self._off(point, float(np.max(self.thickness)))
+        element, (s, t), (a, b) = self._located(point, self.size, lambda: self._in_hole(point))
+        thick: Any = self.thickness
+        depth = thick if np.ndim(thick) == 0 else float(thick[element[::-1]])
+        if abs(point[2]) > 0.5 * depth + slack:
+            raise self._off(point, depth)
+        terms = {
+            "z": plate_terms(s, t, 0, 0),
+            "rx": plate_terms(s, t, 0, 1) / b,
+            "ry": -plate_terms(s, t, 1, 0) / a,
+        }
+        return self._row(element, terms[direction] @ plate_coefficients(a, b))
+
+    def _off(self, point: FloatArray, depth: float) -> LabelError:
+        return LabelError(
+            f"the point {tuple(point.tolist())} is off the plate, which reaches from "
+            f"(0, 0) to ({self.size[0]:g}, {self.size[1]:g}) m at |z| <= "
+            f"{0.5 * depth:g} m: its motion is not known. Coordinates are in metres."
+        )
+
+    def _in_hole(self, point: FloatArray) -> LabelError:
+        nodes = self._grid.nodes
+        xy = self._grid.coordinates(self.size)
+        near = int(np.argmin(np.linalg.norm(xy - point[:2], axis=1)))
+        return LabelError(
+            f"the point {tuple(point.tolist())} is in a hole of the plate: nothing moves there. "
+            f"The nearest node is {nodes[near] + 1}, at {tuple(xy[near].tolist())} m."
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BeamShape(GridShape):
+    """The shape functions of a beam along x: cubic between its nodes.
+
+    Parameters
+    ----------
+    length : float [m]
+        Of the beam.
+    elements : int
+        Their number.
+    """
+
+    length: float
+    elements: int
+
+    def __repr__(self) -> str:
+        return f"<BeamShape {self.length:g} m, {self.elements} elements>"
+
+    def _layout(self) -> tuple[tuple[int, ...], Any, int]:
+        return (self.elements,), None, 2
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of all DOFs in the motion z or ry = -dz/dx at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is not on the axis of the beam, or the direction is not z or ry.
+        """
+        if direction not in ("z", "ry"):
+            raise LabelError(f"a beam in bending has no motion {direction!r}: use one of z, ry.")
+        point = real_array(xyz, "xyz", (3,))
+        slack = 1e-9 * self.length
+        if not _inside(point[:1], (self.length,), slack) or np.abs(point[1:]).max() > slack:
+            raise LabelError(
+                f"the point {tuple(point.tolist())} is off the beam, whose axis reaches from "
+                f"(0, 0, 0) to ({self.length:g}, 0, 0) m: its motion is not known. Coordinates are "
+                "in metres."
+            )
+        element, (s,), (h,) = self._located(point, (self.length,), lambda: LabelError("no element"))
+        weights = hermite(s, h, 0 if direction == "z" else 1) * [1, -1, 1, -1]
+        return self._row(element, weights if direction == "z" else -weights)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BlockShape(GridShape):
+    """The shape functions of a box of eight-node bricks: trilinear.
+
+    Parameters
+    ----------
+    size : (float, float, float) [m]
+        Lengths in x, y and z.
+    elements : (int, int, int)
+        Number of elements in x, y and z.
+    present : (nz, ny, nx) array of bool, optional
+        Which elements exist; None: all.
+    """
+
+    size: tuple[float, float, float]
+    elements: tuple[int, int, int]
+    present: Any = None
+
+    def __post_init__(self) -> None:
+        self._set(present=self.present)
+
+    def __repr__(self) -> str:
+        size, counts = (" x ".join(f"{n:g}" for n in part) for part in (self.size, self.elements))
+        return f"<BlockShape {size} m, {counts} elements>"
+
+    def _layout(self) -> tuple[tuple[int, ...], Any, int]:
+        return self.elements, self.present, 3
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of all DOFs in the motion of the material at a point.
+
+        Rotations rx, ry, rz are half the curl of the displacements; they step between elements, and
+        the element on the side of larger coordinates is taken.
+
+        Raises
+        ------
+        LabelError
+            When the point is outside the block, or the direction is unknown.
+        """
+        if direction not in _BLOCK_MOTIONS:
+            raise LabelError(
+                f"a solid has no motion {direction!r}: use one of {', '.join(_BLOCK_MOTIONS)}."
+            )
+        point = real_array(xyz, "xyz", (3,))
+
+        def off(what: str) -> LabelError:
+            return LabelError(
+                f"the point {tuple(point.tolist())} is {what} the block, which reaches from "
+                f"(0, 0, 0) to {self.size} m: its motion is not known. Coordinates are in metres."
+            )
+
+        if not _inside(point, self.size, 1e-9 * max(self.size)):
+            raise off("outside")
+        element, inside, sizes = self._located(point, self.size, lambda: off("in a hole of"))
+        kind = _BLOCK_MOTIONS.index(direction)
+        weights = np.zeros((8, 3))
+        if kind < 3:
+            weights[:, kind] = brick_shape(inside)
+        else:
+            slopes = brick_slopes(inside) / sizes
+            after, before = (kind - 2) % 3, (kind - 1) % 3
+            weights[:, before] = 0.5 * slopes[:, after]
+            weights[:, after] = -0.5 * slopes[:, before]
+        return self._row(element, weights.ravel())
+
+
+_BLOCK_MOTIONS = ("x", "y", "z", "rx", "ry", "rz")
+
+
+def _inside(point: FloatArray, lengths: Sequence[float], slack: float) -> bool:
+    return bool(np.all(point >= -slack) and np.all(point <= np.array(lengths) + slack))

@@ -1,0 +1,235 @@
+"""Ribs: beams along the edges of plate elements."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import ModelError
+from ..values import FloatArray, IntArray, Value, positive, real_array
+from .assembly import Grid
+from .elements import beam_mass, beam_rotary, beam_stiffness
+
+#: of an element: a rib's ends are this close to nodes
+_ON_NODE = 1e-6
+
+
+class Skin(NamedTuple):
+    """Thickness and material of a plate: numbers, or arrays (ny, nx)."""
+
+    thickness: Any
+    density: Any
+    youngs_modulus: Any
+    poisson_ratio: Any
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rib(Value):
+    """A straight beam on a plate, along edges of its elements: bending and St Venant torsion.
+
+    A rectangular rib (`width`, `height`) stands on the plate. Its stiffness and inertia are taken
+    about the plate's middle plane, ``I + A e^2`` with its centre at e = (height + thickness) / 2:
+    the plate of this model has no motion in its plane, with which the neutral plane would move up
+    towards the rib. The stiffness is thus an upper bound, good where the plate's section is large
+    against the rib's; a pair of ribs above and below (``eccentricity=0`` and the section of both)
+    is exact.
+
+    Parameters
+    ----------
+    start, end : (2,) array [m]
+        Both at nodes, one line along x or y.
+    width, height : float [m]
+        Of a rectangular section, or
+    area, inertia : float [m^2], [m^4]
+        of any section: its area, and the second moment of area for bending out of the plane, about
+        its own centre.
+    torsion, polar : float [m^4]
+        St Venant torsion constant (0 when not given) and polar second moment of area (`inertia`
+        when not given) of such a section.
+    eccentricity : float [m]
+        Distance of the section's centre from the middle plane; with width and height that of a rib
+        standing on the plate, otherwise 0 when not given.
+    density, youngs_modulus, poisson_ratio : float, optional
+        Of its material; that of the plate under it when not given.
+
+    Raises
+    ------
+    ModelError
+        When it is not along x or y, has no section or two, or a number is not positive.
+
+    References
+    ----------
+    Torsion of a rectangle: Timoshenko and Goodier, Theory of Elasticity, sec. 109 (a fit within
+    0.5 %): ``J = w^3 h (1/3 - 0.21 w/h (1 - (w/h)^4 / 12))`` for w <= h.
+    """
+
+    start: Sequence[float]
+    end: Sequence[float]
+    width: float | None = field(default=None, kw_only=True)
+    height: float | None = field(default=None, kw_only=True)
+    area: float | None = field(default=None, kw_only=True)
+    inertia: float | None = field(default=None, kw_only=True)
+    torsion: float | None = field(default=None, kw_only=True)
+    polar: float | None = field(default=None, kw_only=True)
+    eccentricity: float | None = field(default=None, kw_only=True)
+    density: float | None = field(default=None, kw_only=True)
+    youngs_modulus: float | None = field(default=None, kw_only=True)
+    poisson_ratio: float | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        start, end = real_array(self.start, "start", (2,)), real_array(self.end, "end", (2,))
+        if np.count_nonzero(start != end) != 1:
+            raise ModelError(
+                f"a rib runs along x or along y, got {start.tolist()} to {end.tolist()}. Make an "
+                "oblique one of steps, or of a mesh of your own."
+            )
+        box = (self.width, self.height)
+        free = (self.area, self.inertia, self.torsion, self.polar)
+        if (None in box or any(n is not None for n in free)) and (
+            None in free[:2] or any(n is not None for n in box)
+        ):
+            raise ModelError(
+                "a rib needs its section: width and height, or area and inertia (with torsion and "
+                f"polar), got {self._given()}. Give one of the two, complete."
+            )
+        for name, value in self._given().items():
+            if name != "poisson_ratio":
+                zero = name in ("torsion", "eccentricity", "polar", "inertia")
+                self._set(**{name: positive(value, f"{name} of a rib", zero=zero)})
+        nu = self.poisson_ratio
+        if nu is not None and not -1 < float(real_array(nu, "poisson_ratio", ())) < 0.5:
+            raise ModelError(
+                f"poisson_ratio must be above -1 and below 0.5, got {nu:g}. Metals have about 0.3."
+            )
+        self._set(start=tuple(start.tolist()), end=tuple(end.tolist()))
+
+    def _given(self) -> dict[str, Any]:
+        fields = self._fields()
+        return {n: v for n, v in fields.items() if v is not None and n not in ("start", "end")}
+
+    def __repr__(self) -> str:
+        if self.width is not None:
+            section = f"{self.width:g} x {self.height:g} m"
+        else:
+            section = f"area {self.area:g} m^2, inertia {self.inertia:g} m^4"
+        return f"<Rib {self.start} to {self.end} m, {section}>"
+
+    def section(self, thickness: FloatArray) -> tuple[float, FloatArray, float, FloatArray]:
+        """Return area, inertia, torsion and polar inertia about the plate's middle plane."""
+        if self.width is not None and self.height is not None:
+            w, h = self.width, self.height
+            thin, long = min(w, h), max(w, h)
+            q = thin / long
+            torsion = thin**3 * long * (1 / 3 - 0.21 * q * (1 - q**4 / 12))
+            area, inertia = w * h, w * h**3 / 12
+            polar, offset = inertia + h * w**3 / 12, 0.5 * (h + thickness)
+        else:
+            area, inertia = float(self.area or 0.0), float(self.inertia or 0.0)
+            torsion = float(self.torsion or 0.0)
+            polar = inertia if self.polar is None else self.polar
+            offset = np.zeros_like(thickness)
+        if self.eccentricity is not None:
+            offset = np.full_like(thickness, self.eccentricity)
+        return area, inertia + area * offset**2, torsion, polar + area * offset**2
+
+
+def rib_matrices(
+    grid: Grid, lengths: Sequence[float], skin: Skin, ribs: Sequence[Rib], M: Any, K: Any
+) -> tuple[sp.csc_array, sp.csc_array]:
+    """Return mass and stiffness of a plate with its ribs.
+
+    Raises
+    ------
+    ModelError
+        When a rib does not run along edges of elements that are there.
+    """
+    rows, columns, mass, stiffness = [], [], [], []
+    for rib in ribs:
+        axis, first, second, under = _edges(grid, lengths, rib)
+        h = lengths[axis] / grid.counts[axis]
+        thickness = _beside(skin.thickness, under)
+        own = {
+            name: _beside(getattr(skin, name), under)
+            if getattr(rib, name) is None
+            else np.full(first.size, float(getattr(rib, name)))
+            for name in ("density", "youngs_modulus", "poisson_ratio")
+        }
+        area, inertia, torsion, polar = rib.section(thickness)
+        rho, E = own["density"], own["youngs_modulus"]
+        G = E / (2 * (1 + own["poisson_ratio"]))
+        turn, line = np.array([[1.0, -1], [-1, 1]]) / h, np.array([[2.0, 1], [1, 2]]) * h / 6
+        bent_K, bent_M, bent_R = beam_stiffness(h), beam_mass(h), beam_rotary(h)
+        # z, the slope along the rib and its twist at both ends
+        K6, M6 = np.zeros((first.size, 6, 6)), np.zeros((first.size, 6, 6))
+        bend: Any = (slice(None), *np.ix_([0, 1, 3, 4], [0, 1, 3, 4]))
+        twist: Any = (slice(None), *np.ix_([2, 5], [2, 5]))
+        K6[bend] = (E * inertia)[:, None, None] * bent_K
+        K6[twist] = (G * torsion)[:, None, None] * turn
+        M6[bend] = (rho * area)[:, None, None] * bent_M
+        M6[bend] += (rho * inertia)[:, None, None] * bent_R
+        M6[twist] = (rho * polar)[:, None, None] * line
+        # along x the slope is -ry and the twist rx; along y the slope is rx and the twist ry
+        dof, sign = (([0, 2, 1], -1.0), ([0, 1, 2], 1.0))[axis]
+        signs = np.tile([1.0, sign, 1.0], 2)
+        index = 3 * grid.rank[np.column_stack([first, second])][:, :, None] + np.array(dof)
+        index = index.reshape(-1, 6)
+        rows.append(np.repeat(index, 6, axis=1).ravel())
+        columns.append(np.tile(index, (1, 6)).ravel())
+        mass.append((M6 * np.outer(signs, signs)).ravel())
+        stiffness.append((K6 * np.outer(signs, signs)).ravel())
+    place = (np.concatenate(rows), np.concatenate(columns))
+    found = []
+    for matrix, added in ((M, mass), (K, stiffness)):
+        more = sp.csc_array((np.concatenate(added), place), shape=matrix.shape)
+        total = sp.csc_array(matrix + 0.5 * (more + more.T))
+        for part in (total.data, total.indices, total.indptr):
+            part.flags.writeable = False
+        found.append(total)
+    return found[0], found[1]
+
+
+def _edges(
+    grid: Grid, lengths: Sequence[float], rib: Rib
+) -> tuple[int, IntArray, IntArray, list[IntArray]]:
+    """Return the axis, the nodes at both ends of each edge, and the elements on both sides."""
+    counts = np.array(grid.counts)
+    place = np.array([rib.start, rib.end]) / np.array(lengths) * counts
+    nodes = np.round(place).astype(int)
+    if np.abs(place - nodes).max() > _ON_NODE or np.any(nodes < 0) or np.any(nodes > counts):
+        steps = (np.array(lengths) / counts).tolist()
+        raise ModelError(
+            f"{rib!r} does not run from node to node: the nodes are at multiples of "
+            f"{steps[0]:.6g} and {steps[1]:.6g} m in x and y, up to {tuple(lengths)} m. Move its "
+            "ends, or choose elements= so that nodes are there."
+        )
+    axis = int(np.argmax(nodes[0] != nodes[1]))
+    low, high = np.sort(nodes[:, axis])
+    along, across = np.arange(low, high), int(nodes[0, 1 - axis])
+    stride = (1, int(counts[0]) + 1)
+    first = along * stride[axis] + across * stride[1 - axis]
+    sides = []
+    for side in (across - 1, across):
+        # -1: there is no element on this side
+        exists = np.full(along.size, 0 <= side < counts[1 - axis])
+        i, j = (along, np.full_like(along, side))[:: 1 if axis == 0 else -1]
+        exists &= grid.present[np.where(exists, j, 0), np.where(exists, i, 0)]
+        sides.append(np.where(exists, j * counts[0] + i, -1))
+    if np.any((sides[0] < 0) & (sides[1] < 0)):
+        raise ModelError(
+            f"{rib!r} crosses a hole: there is no plate to hold it. End it at the hole's edge."
+        )
+    return axis, first, first + stride[axis], sides
+
+
+def _beside(value: Any, sides: list[IntArray]) -> FloatArray:
+    """Return the mean of a property over the elements on both sides of each edge."""
+    if np.ndim(value) == 0:
+        return np.full(sides[0].size, float(value))
+    flat = np.asarray(value).ravel()
+    there = np.array([side >= 0 for side in sides])
+    found = np.array([flat[side] for side in sides])
+    return np.asarray(np.sum(found * there, axis=0) / there.sum(axis=0), dtype=np.float64)
