@@ -61,7 +61,7 @@ def inertia_load(
     if not np.any(motion):
         raise ModelError(
             f"a base acceleration along {direction!r} does not move this model: its DOFs are "
-            f"{', '.join(sorted(set(model.dofs.directions)))}."
+            f"{', '.join(sorted(set(getattr(model, 'full_dofs', model.dofs).directions)))}."
         )
     if isinstance(model, FEModel):
         return -np.asarray(model.M @ motion)
@@ -92,11 +92,12 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
     model = realisation.model
     origin = np.zeros(3)
     everywhere = _motions(model, origin)
+    directions = (model.full_dofs if isinstance(model, ReducedModel) else model.dofs).directions
     exists = [
         i
         for i, axis in enumerate(DIRECTIONS)
         if np.any(everywhere[:, i])
-        and (axis in model.dofs.directions or axis.startswith("r"))
+        and (axis in directions or axis.startswith("r"))
         and _missed(model, everywhere[:, i : i + 1], origin, axis) < _SPANNED
     ]
     exists = _independent(everywhere, exists)
@@ -110,6 +111,8 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
 
 
 def _motions(model: Structure, about: FloatArray) -> FloatArray:
+    if isinstance(model, ReducedModel):
+        return model.rigid_motions(about)
     dofs = model.dofs
     return rigid_motions(dofs.replace(xyz=dofs.xyz - about, interpolation=None))
 

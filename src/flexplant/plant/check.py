@@ -13,6 +13,7 @@ from ..errors import AssumptionError, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
+from ..reduction import ReducedModel
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, Value
 from .standard import StandardPlant
@@ -298,7 +299,10 @@ def _described(plant: StandardPlant, combinations: FloatArray) -> list[str]:
         return ["motion"]
     dofs = realisation.model.dofs
     shapes = realisation.outputs[:, 0 : 2 * plant.n_rigid : 2] @ combinations
-    motions = rigid_motions(dofs.replace(xyz=dofs.xyz - dofs.xyz.mean(axis=0)))
+    if isinstance(realisation.model, ReducedModel):
+        motions = realisation.model.rigid_motions(realisation.model.full_dofs.xyz.mean(axis=0))
+    else:
+        motions = rigid_motions(dofs.replace(xyz=dofs.xyz - dofs.xyz.mean(axis=0)))
     sizes = np.linalg.norm(motions, axis=0)
     parts = (np.linalg.lstsq(motions, shapes, rcond=None)[0] * sizes[:, None]).T
     # one axis for each motion that is missing, taken out of the others: none is said twice

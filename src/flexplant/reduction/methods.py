@@ -1,4 +1,4 @@
-"""Ways to reduce a structure; each is a small value given to `reduce`."""
+"""`reduce`, and the paper's way to reduce a structure; each way is a small value."""
 
 from __future__ import annotations
 
@@ -8,26 +8,32 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, ShapeError
-from ..values import Value
+from ..errors import FlexplantError, ModelError, ShapeError
+from ..labels import DofSet
+from ..structure import FEModel
+from ..values import FloatArray, Value
+from .criteria import PivotedQr
 from .modes import Modes
+from .projection import labels_given, shown
 from .reduced import ReducedModel
 
 #: beyond this, rounding in K* (eps cond^2) spoils the low modes
 _CONDITION_LIMIT = 1e6
+#: part of the largest pivot above which a row of phi tells a mode of its own
+_TELLS = 1e-3
 
 
 class ReductionMethod(Value):
-    """A way to go from modes to a reduced model."""
+    """A way to go from a structure to a reduced model."""
 
-    def reduced(self, modes: Modes) -> ReducedModel:
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model."""
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DesiredDofs(ReductionMethod):
-    """Modal reduction in desired physical DOFs (paper, eq. (6) to (8)).
+    """Modal reduction in desired physical DOFs (paper, eq. (6) to (8)); takes `Modes`.
 
     Parameters
     ----------
@@ -37,33 +43,35 @@ class DesiredDofs(ReductionMethod):
     Raises
     ------
     LabelError
-        When a label appears twice.
+        When a label appears twice, or none is given.
     """
 
     dofs: Iterable[str]
 
     def __post_init__(self) -> None:
-        labels = (self.dofs,) if isinstance(self.dofs, str) else tuple(str(d) for d in self.dofs)
-        doubled = sorted({label for label in labels if labels.count(label) > 1})
-        if doubled:
-            raise LabelError(f"desired DOFs {doubled} appear twice: phi_kk would be singular.")
-        self._set(dofs=labels)
+        self._set(dofs=labels_given(self.dofs, "desired DOFs"))
 
     def __repr__(self) -> str:
-        labels = list(self.dofs)
-        more = f", ... {labels[-1]}" if len(labels) > 3 else ""
-        return f"<DesiredDofs: {len(labels)} ({', '.join(labels[:3])}{more})>"
+        labels = tuple(self.dofs)
+        return f"<DesiredDofs: {len(labels)} ({shown(labels)})>"
 
-    def reduced(self, modes: Modes) -> ReducedModel:
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""
-        labels = list(self.dofs)
-        rows = modes.dofs.indices(labels)
+        modes = structure
+        if not isinstance(modes, Modes):
+            raise ModelError(
+                "DesiredDofs needs Modes and how many of them are kept, got "
+                f"{type(modes).__name__}: reduce(solve_modes(model, count={len(tuple(self.dofs))}),"
+                " DesiredDofs([...])). Serep(dofs) solves them itself."
+            )
+        labels = tuple(self.dofs)
+        modes.dofs.indices(labels)
         k = modes.n_modes + modes.n_vectors
         if np.iscomplexobj(modes.phi):
             raise ModelError(
                 "these modes are complex (the damping is not proportional), and equation (5) has "
                 "no diagonal form. Solve with damping=ModalDamping(...), reduce, and add the "
-                "dampers to the reduced model."
+                "dampers to the reduced model; or reduce(model, Serep(dofs)), which keeps D."
             )
         if len(labels) != k:
             raise ShapeError(
@@ -77,16 +85,9 @@ class DesiredDofs(ReductionMethod):
                 + f"; select_dofs(modes, {k}) finds a good set."
             )
         basis = np.asarray(modes.basis, dtype=np.float64)
-        partition = basis[rows]
-        singular = la.svdvals(partition)
-        condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
-        if not condition < _CONDITION_LIMIT:
-            raise ModelError(
-                f"phi_kk is near singular: condition {condition:.3g} (limit "
-                f"{_CONDITION_LIMIT:.0e}). The desired DOFs do not tell the {k} modes and vectors "
-                f"apart, and M*, K* would be rounding. Choose others: select_dofs(modes, {k}, "
-                "required=[those that must stay])."
-            )
+        what = f"{k} modes and vectors"
+        condition = refused_partition(modes.dofs, basis, labels, what, _CONDITION_LIMIT)
+        partition = basis[modes.dofs.indices(labels)]
         inverse = la.inv(partition)
         omega, zeta = modes.basis_omega, modes.basis_zeta
         return ReducedModel(
@@ -102,33 +103,97 @@ class DesiredDofs(ReductionMethod):
         )
 
 
-def reduce(modes: Modes, method: ReductionMethod) -> ReducedModel:
+def refused_partition(
+    dofs: DofSet, basis: FloatArray, labels: tuple[str, ...], what: str, limit: float
+) -> float:
+    """Return the condition of phi_kk.
+
+    Raises
+    ------
+    ModelError
+        When it is beyond the limit, with DOFs that can be inverted instead.
+    """
+    partition = basis[dofs.indices(labels)]
+    singular = la.svdvals(partition)
+    condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf
+    if condition < limit:
+        return condition
+    raise ModelError(
+        f"phi_kk is near singular: condition {condition:.3g} (limit {limit:.0e}). The DOFs do not "
+        f"tell the {what} apart, and M*, K* would be rounding. " + _proposal(dofs, basis, labels)
+    )
+
+
+def _proposal(dofs: DofSet, basis: FloatArray, labels: tuple[str, ...]) -> str:
+    """Return in words which DOFs to take in place of some of the given ones."""
+    k = basis.shape[1]
+    _, upper, order = la.qr(basis[dofs.indices(labels)].T, mode="economic", pivoting=True)
+    size = np.abs(np.diag(upper))
+    kept = [labels[i] for i in order[: int(np.count_nonzero(size > _TELLS * size[0]))]]
+    pool = [label for label in dofs.labels if label not in set(labels)]
+    straight = [label for label in pool if ":r" not in label]
+    for candidates in (straight, pool):
+        try:
+            taken = PivotedQr().chosen(basis[dofs.indices(kept)], _rows(dofs, basis, candidates),
+                                       k - len(kept))  # fmt: skip
+        except FlexplantError:
+            continue
+        fresh = [candidates[i] for i in taken]
+        values = la.svdvals(basis[dofs.indices([*kept, *fresh])])
+        if values[-1] > values[0] / _CONDITION_LIMIT:
+            left = [label for label in labels if label not in set(kept)]
+            return (
+                f"Take {', '.join(fresh)} in place of {', '.join(left)}: condition "
+                f"{values[0] / values[-1]:.3g}. Or select_dofs(modes, {k}, required=[those that "
+                "must stay])."
+            )
+    return f"Choose others: select_dofs(modes, {k}, required=[those that must stay])."
+
+
+def _rows(dofs: DofSet, basis: FloatArray, labels: list[str]) -> FloatArray:
+    return np.asarray(basis[dofs.indices(labels)])
+
+
+def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     """Return a reduced model of a structure.
 
     Parameters
     ----------
-    modes : Modes
-        Of `solve_modes`, with attachment vectors where the static compliance matters.
-    method : DesiredDofs
-        How to reduce.
+    model : FEModel or Modes
+        The structure: `DesiredDofs` takes the `Modes` of `solve_modes`, `ModalTruncation` and
+        `ModalBalanced` take either, all others work on the matrices of an `FEModel`.
+    method : ReductionMethod
+        How to reduce: `DesiredDofs` (the paper), `ModalTruncation`, `ModalBalanced`, `Guyan`,
+        `Irs`, `Serep`, `CraigBampton`, `Rubin`, `MacNeal` or `Krylov`.
 
     Returns
     -------
     ReducedModel
-        In physical DOFs; its modes are those given.
+        Its rigid-body motions are exact with every method. `.quality(...)` judges it.
 
     Raises
     ------
     ShapeError
-        When the number of desired DOFs is not that of modes plus attachment vectors.
+        When numbers of DOFs and modes do not belong together.
     ModelError
-        When phi_kk is near singular, or the modes are complex.
+        When the method needs another kind of structure, cannot invert what it must, or the modes
+        are complex.
     LabelError
         When a DOF is unknown.
+
+    Examples
+    --------
+    >>> from flexplant.structure import kirchhoff_plate
+    >>> from flexplant.reduction import Guyan
+    >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,
+    ...                         youngs_modulus=70e9, poisson_ratio=0.35)
+    >>> reduce(plate, Guyan(["1:z", "5:z", "13:z", "21:z", "25:z"]))
+    <ReducedModel: 5 of 75 DOFs by static condensation (Guyan), 3 rigid-body motions, cond(M*) 5.1>
     """
-    if not isinstance(modes, Modes) or not isinstance(method, ReductionMethod):
+    if not isinstance(model, FEModel | Modes) or not isinstance(method, ReductionMethod):
         raise ModelError(
-            f"reduce needs Modes and a method, got {type(modes).__name__} and "
-            f"{type(method).__name__}: reduce(solve_modes(model, count=24), DesiredDofs([...]))."
+            f"reduce needs an FEModel or Modes and a method, got {type(model).__name__} and "
+            f"{type(method).__name__}: reduce(solve_modes(model, count=24), DesiredDofs([...])), "
+            "reduce(model, Guyan([...]))."
         )
-    return method.reduced(modes)
+    return method.reduced(model)

@@ -1,15 +1,58 @@
-"""A structure in a few of its own physical degrees of freedom."""
+"""A structure in a few coordinates: some of its own degrees of freedom, modes, or both."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
+import scipy.linalg as la
 
+from ..errors import ModelError
 from ..labels import DofSet, Place
-from ..values import ComplexArray, FloatArray, Value, positive, real_array
+from ..structure.rigid import rigid_motions
+from ..values import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
 from .modes import Modes
 from .normal_form import normal_form
+
+if TYPE_CHECKING:
+    from ..structure import FEModel
+    from .quality import ReductionQuality
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ErrorBound(Value):
+    """What a reduction cannot miss by more, known before any response is computed.
+
+    Parameters
+    ----------
+    value : float [m/N]
+        At least the largest singular value, over all frequencies, of full minus reduced
+        displacement per force between the channels.
+    inputs, outputs : sequence of str
+        The channels it holds for.
+    rule : str
+        Where it comes from.
+    """
+
+    value: float
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    rule: str
+
+    def __post_init__(self) -> None:
+        self._set(
+            value=positive(self.value, "value", zero=True),
+            inputs=name_list(self.inputs, "inputs"),
+            outputs=name_list(self.outputs, "outputs"),
+        )
+
+    def __repr__(self) -> str:
+        return (
+            f"<ErrorBound {self.value:.4g} m/N, {len(self.inputs)} inputs to {len(self.outputs)} "
+            f"outputs: {self.rule}>"
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -19,20 +62,28 @@ class ReducedModel(Value):
     Parameters
     ----------
     M, D, K : (k, k) arrays
-        The paper's M*, D*, K* of equation (8), in the physical DOFs `dofs`.
+        The paper's M*, D*, K* of equation (8).
     T : (n, k) array
         Expansion to the full structure, equations (4) and (7).
     dofs : DofSet
-        The k desired DOFs.
+        The physical DOFs that are coordinates of the reduced model: all k of them (`DesiredDofs`,
+        `Guyan`), the first ones (`CraigBampton`) or none (`ModalTruncation`).
     full_dofs : DofSet
         The n DOFs of the full structure, with its shape functions.
     rigid_body : (k, r) array
-        Rigid-body motions in the desired DOFs: ``K rigid_body = 0``. Eigenvalues of (K*, M*)
+        Rigid-body motions in the k coordinates: ``K rigid_body = 0``. Eigenvalues of (K*, M*)
         alone would have them at rounding, some imaginary.
     method : str
         How it was made.
     condition : float
-        Condition number of phi_kk.
+        Condition number of what had to be inverted: phi_kk, or the scaled M*.
+    coordinates : sequence of k str
+        Names of all coordinates: the labels of `dofs` first, then generalised ones such as
+        "mode 7". Empty: the labels of `dofs`.
+    condition_of : str
+        Which matrix `condition` is of.
+    bound : ErrorBound, optional
+        On the error between channels, where the method has one.
 
     Raises
     ------
@@ -49,9 +100,18 @@ class ReducedModel(Value):
     rigid_body: FloatArray
     method: str = ""
     condition: float = 1.0
+    coordinates: Iterable[str] = ()
+    condition_of: str = "phi_kk"
+    bound: ErrorBound | None = None
 
     def __post_init__(self) -> None:
-        k, n = len(self.dofs), len(self.full_dofs)
+        names = tuple(str(name) for name in self.coordinates) or self.dofs.labels
+        if names[: len(self.dofs)] != self.dofs.labels or len(set(names)) != len(names):
+            raise ModelError(
+                f"the coordinates {list(names[:3])} ... must be unique and begin with the physical "
+                f"DOFs {list(self.dofs.labels[:3])} ...: rows of T are found by them."
+            )
+        k, n = len(names), len(self.full_dofs)
         self._set(
             M=real_array(self.M, "M", (k, k)),
             D=real_array(self.D, "D", (k, k)),
@@ -59,24 +119,88 @@ class ReducedModel(Value):
             T=real_array(self.T, "T", (n, k)),
             rigid_body=real_array(self.rigid_body, "rigid_body", (k, None)),
             condition=positive(self.condition, "condition"),
+            coordinates=names,
         )
 
     def __repr__(self) -> str:
+        held = len(self.dofs)
+        shown = f"{held} of {len(self.full_dofs)} DOFs"
+        if held < self.n_dof:
+            extra = f"{self.n_dof - held} generalised coordinates"
+            shown = f"{shown} and {extra}" if held else f"{extra} for {len(self.full_dofs)} DOFs"
         return (
-            f"<ReducedModel: {len(self.dofs)} of {len(self.full_dofs)} DOFs by {self.method}, "
-            f"{self.rigid_body.shape[1]} rigid-body motions, cond(phi_kk) {self.condition:.3g}>"
+            f"<ReducedModel: {shown} by {self.method}, {self.rigid_body.shape[1]} rigid-body "
+            f"motions, cond({self.condition_of}) {self.condition:.3g}>"
         )
 
     @property
     def n_dof(self) -> int:
-        """Number of DOFs k."""
-        return len(self.dofs)
+        """Number of coordinates k."""
+        return int(self.M.shape[0])
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether all coordinates are DOFs of the structure."""
+        return len(self.dofs) == self.n_dof
+
+    @property
+    def massless(self) -> IntArray:
+        """The positions (from 0) of coordinates without any mass; `MacNeal` makes such."""
+        return np.flatnonzero(~np.any(self.M, axis=1))
+
+    def condensed(self) -> tuple[ReducedModel, FloatArray, FloatArray]:
+        """Return the model without its massless coordinates, and the flexibility they leave.
+
+        Massless coordinates follow at once: ``q_k = S q_c + G T^T f``, exactly.
+
+        Returns
+        -------
+        ReducedModel
+            In the c coordinates that have mass; itself when all have.
+        (k, c) array
+            S.
+        (k, k) array [m/N]
+            G, the displacement at once per load on the coordinates; zero when all have mass.
+
+        Raises
+        ------
+        ModelError
+            When a massless coordinate is damped or has no stiffness.
+        """
+        light = self.massless
+        flexibility = np.zeros((self.n_dof, self.n_dof))
+        if not light.size:
+            return self, np.eye(self.n_dof), flexibility
+        heavy = np.setdiff1d(np.arange(self.n_dof), light)
+        if np.any(self.D[light]):
+            raise ModelError("a massless coordinate is damped: give it a mass, or no damper.")
+        try:
+            inverse = la.inv(self.K[np.ix_(light, light)])
+        except la.LinAlgError as error:
+            raise ModelError("a massless coordinate has no stiffness: nothing holds it.") from error
+        flexibility[np.ix_(light, light)] = 0.5 * (inverse + inverse.T)
+        follow = np.zeros((self.n_dof, heavy.size))
+        follow[heavy] = np.eye(follow.shape[1])
+        follow[light] = -inverse @ self.K[np.ix_(light, heavy)]
+        names = np.array(tuple(self.coordinates), dtype=object)[heavy].tolist()
+        kept = [label for label in names if label in self.dofs]
+        model = self.replace(
+            M=self.M[np.ix_(heavy, heavy)],
+            D=self.D[np.ix_(heavy, heavy)],
+            K=_symmetric(follow.T @ self.K @ follow),
+            T=self.T @ follow,
+            dofs=self.dofs.select(kept),
+            rigid_body=self.rigid_body[heavy],
+            coordinates=names,
+        )
+        return model, follow, flexibility
 
     def modes(self) -> Modes:
-        """Return all k modes, shapes in the desired DOFs; rigid-body ones exactly at 0.
+        """Return all modes; rigid-body ones exactly at 0.
 
-        Complex where D is not proportional (after a damper was added). `expand` gives the shapes
-        of the full structure.
+        Shapes are in the desired DOFs where all coordinates are DOFs, else those of the full
+        structure, ``T phi_k``. Complex where D is not proportional (after a damper was added).
+        Massless coordinates make no modes.
 
         Raises
         ------
@@ -84,14 +208,18 @@ class ReducedModel(Value):
             When M is no longer positive definite, D drags the rigid-body motions, or a mode is
             overdamped.
         """
-        form = normal_form(self.M, self.D, self.K, self.rigid_body)
+        model, _, _ = self.condensed()
+        form = normal_form(model.M, model.D, model.K, model.rigid_body)
         omega = np.abs(form.poles)
         r = form.n_rigid
         zeta = np.concatenate([np.zeros(r), -form.poles[r:].real / omega[r:]])
-        return Modes(omega, zeta, form.phi, self.dofs, n_rigid=r)
+        phi, dofs = form.phi, model.dofs
+        if not self.is_physical:
+            phi, dofs = model.expand(phi), model.full_dofs
+        return Modes(omega, zeta, phi, dofs, n_rigid=r)
 
     def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
-        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the desired ones.
+        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
 
         Shapes may be complex.
 
@@ -125,3 +253,70 @@ class ReducedModel(Value):
             When the place is unknown.
         """
         return np.asarray(self.full_dofs.row(at, direction) @ self.T)
+
+    def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
+
+        Parameters
+        ----------
+        about : (3,) array [m]
+            The point that rotations turn about.
+
+        Raises
+        ------
+        ShapeError
+            When `about` is no point.
+        """
+        centre = real_array(list(about), "about", (3,))
+        if self.is_physical:
+            dofs = self.dofs
+            return rigid_motions(dofs.replace(xyz=dofs.xyz - centre, interpolation=None))
+        dofs = self.full_dofs
+        wanted = rigid_motions(dofs.replace(xyz=dofs.xyz - centre, interpolation=None))
+        return np.asarray(la.lstsq(self.T, wanted)[0])
+
+    def quality(
+        self,
+        full: FEModel | Modes,
+        *,
+        band: tuple[float, float],
+        inputs: Place | Iterable[Place] = (),
+        outputs: Place | Iterable[Place] = (),
+        count: int | None = None,
+        freq: FloatArray | None = None,
+        loss: float | None = None,
+    ) -> ReductionQuality:
+        """Return how well this model stands for the full one, by a route of its own.
+
+        Parameters
+        ----------
+        full : FEModel or Modes
+            The full structure. Responses of an FEModel come from its matrices, frequency by
+            frequency, not from modes.
+        band : (float, float) [Hz]
+            Where modes and responses are compared.
+        inputs, outputs : places
+            DOF labels, points (z) or mappings; none: those of the bound, if there is one. No
+            outputs: the inputs.
+        count : int, optional
+            How many modes are compared; None: those up to the end of the band.
+        freq : (m,) array [Hz], optional
+            Check frequencies; None: the resonances in the band, and a grid over it.
+        loss : float, optional
+            Loss factor of both when the FEModel has no D: ``K (1 + i loss)``. None: twice the mean
+            damping ratio of the reduced model, 0.01 when it has none.
+
+        Raises
+        ------
+        ModelError
+            When `full` is of another kind or another size, or the band is none.
+        LabelError
+            When a place is unknown.
+        """
+        from .quality import quality_of
+
+        return quality_of(self, full, band, inputs, outputs, count, freq, loss)
+
+
+def _symmetric(matrix: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)

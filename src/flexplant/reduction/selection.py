@@ -3,30 +3,40 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, name_list, positive, real_array, whole
+from .criteria import PivotedQr, SelectionCriterion
 from .modes import Modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DofSelection(Value):
-    """Selected DOFs, to be given to `DesiredDofs`.
+    """Selected DOFs, to be given to `DesiredDofs`, `Guyan` or as a boundary.
 
     Parameters
     ----------
     labels : tuple of str
         The DOFs, required ones first.
     condition : float
-        Condition number of the rows of modes and vectors at these DOFs.
+        Condition number of the rows of modes and vectors at these DOFs (phi_kk).
+    values : (count,) array, optional
+        What the criterion says of each DOF, in the order of the labels.
+    criterion : SelectionCriterion
+        How they were chosen.
     """
 
     labels: tuple[str, ...]
     condition: float
+    values: FloatArray = field(default_factory=lambda: np.zeros(0))
+    criterion: SelectionCriterion = field(default_factory=PivotedQr)
+
+    def __post_init__(self) -> None:
+        self._set(values=real_array(self.values, "values", (None,)))
 
     def __repr__(self) -> str:
         more = f", ... {self.labels[-1]}" if len(self.labels) > 3 else ""
@@ -48,11 +58,10 @@ def select_dofs(
     *,
     candidates: Iterable[str] | None = None,
     required: Iterable[str] = (),
+    criterion: SelectionCriterion | None = None,
+    limit: float = 1e12,
 ) -> DofSelection:
     """Return DOFs at which modes and attachment vectors are well told apart.
-
-    By QR with column pivoting over the candidates: each next DOF is the one whose motion is least
-    explained by those chosen before.
 
     Parameters
     ----------
@@ -64,6 +73,10 @@ def select_dofs(
         Labels to choose from; None: all displacements (no rotations).
     required : iterable of str
         DOFs that are kept in any case.
+    criterion : PivotedQr, EffectiveIndependence or Greedy, optional
+        How to choose; None: `PivotedQr`.
+    limit : float
+        Largest condition of phi_kk that is let pass.
 
     Raises
     ------
@@ -72,47 +85,61 @@ def select_dofs(
     ShapeError
         When `count` does not fit.
     ModelError
-        When the modes are complex, or no candidates tell them apart.
+        When `count` is no whole number, the modes are complex, or no candidates tell them apart.
+
+    Examples
+    --------
+    >>> from flexplant.structure import kirchhoff_plate
+    >>> from flexplant.reduction import solve_modes
+    >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,
+    ...                         youngs_modulus=70e9, poisson_ratio=0.35)
+    >>> select_dofs(solve_modes(plate, count=3), 3, required="1:z")
+    <DofSelection: 3 DOFs (1:z, 25:z, 21:z), condition 2.45>
     """
+    if not isinstance(modes, Modes):
+        raise ModelError(
+            f"select_dofs tells modes apart, got {type(modes).__name__}: "
+            "select_dofs(solve_modes(model, count=24), 24)."
+        )
+    rule = PivotedQr() if criterion is None else criterion
+    if not isinstance(rule, SelectionCriterion):
+        raise ModelError(
+            f"criterion must be PivotedQr(), EffectiveIndependence() or Greedy(), got {rule!r:.60}."
+        )
     if np.iscomplexobj(modes.phi):
         raise ModelError("select_dofs needs real modes: solve with damping=ModalDamping(...).")
     basis = np.asarray(modes.basis, dtype=np.float64)
-    kept = [required] if isinstance(required, str) else list(required)
+    kept = list(name_list(required, "required DOFs"))
     if len(set(kept)) != len(kept):
         raise LabelError(f"required DOFs appear twice: {kept}.")
     if candidates is None:
         pool = [label for label in modes.dofs.labels if ":r" not in label]
     else:
-        pool = [candidates] if isinstance(candidates, str) else list(dict.fromkeys(candidates))
+        pool = list(dict.fromkeys(name_list(candidates, "candidates")))
     pool = [label for label in pool if label not in set(kept)]
     rows, open_rows = modes.dofs.indices(kept), modes.dofs.indices(pool)
     k = basis.shape[1]
-    if isinstance(count, bool) or int(count) != count or not max(1, len(kept)) <= count <= k:
+    number = whole(count, "count", minimum=-(10**9))
+    if not max(1, len(kept)) <= number <= k:
         raise ShapeError(
             f"count must be from {max(1, len(kept))} (the required DOFs) to {k} ({modes.n_modes} "
             f"modes plus {modes.n_vectors} attachment vectors), got {count!r}."
         )
-    missing = int(count) - len(kept)
+    missing = number - len(kept)
     if missing > len(pool):
         raise ShapeError(
             f"{missing} DOFs are to be chosen from {len(pool)} candidates: name more of them."
         )
-    chosen = kept + [pool[i] for i in _pivots(basis[rows], basis[open_rows], missing)]
-    singular = la.svdvals(basis[modes.dofs.indices(chosen)])
-    if not singular[-1] > 1e-12 * singular[0]:
+    taken = rule.chosen(basis[rows], basis[open_rows], missing) if missing else []
+    chosen = kept + [pool[i] for i in taken]
+    picked = basis[modes.dofs.indices(chosen)]
+    singular = la.svdvals(picked)
+    top = positive(limit, "limit")
+    if not singular[-1] * top > singular[0]:
         raise ModelError(
-            f"no {count} of these DOFs tell the modes apart (condition above 1e12): the required "
-            "ones depend on each other, or all candidates lie on node lines. Name other candidates."
+            f"no {number} of these DOFs tell the modes apart (condition above {top:.3g}): the "
+            "required ones depend on each other, or all candidates lie on node lines. Name other "
+            "candidates."
         )
-    return DofSelection(tuple(chosen), float(singular[0] / singular[-1]))
-
-
-def _pivots(required: FloatArray, pool: FloatArray, count: int) -> list[int]:
-    if not count:
-        return []
-    if required.shape[0]:
-        span = la.qr(required.T, mode="economic")[0]
-        for _ in range(2):
-            pool = pool - (pool @ span) @ span.T
-    pivots = la.qr(pool.T, mode="r", pivoting=True)[1]
-    return [int(i) for i in pivots[:count]]
+    condition = float(singular[0] / singular[-1])
+    return DofSelection(tuple(chosen), condition, rule.values(picked), rule)

@@ -118,6 +118,11 @@ class MatrixParameter(Parameter):
         low, high = build(middle - h), build(middle + h)
         if tuple(low.dofs) != tuple(high.dofs):
             raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
+        if not getattr(low, "is_physical", True):
+            raise ShapeError(
+                f"build of {name} gives generalised coordinates, which change with the parameter: "
+                "matrices in them cannot be compared. Build FEModels; they are projected."
+            )
         parts: dict[str, Any] = {}
         for label in "MDK":
             before, after = getattr(low, label), getattr(high, label)
@@ -142,7 +147,7 @@ class MatrixParameter(Parameter):
     def _projected(self, part: Matrix | None, model: Any) -> FloatArray | None:
         if part is None:
             return None
-        k, n = len(model.dofs), len(getattr(model, "full_dofs", model.dofs))
+        k, n = model.M.shape[0], len(getattr(model, "full_dofs", model.dofs))
         if part.shape[0] == k:
             return dense(part)
         if part.shape[0] != n:

@@ -231,4 +231,6 @@ class UpdateResult(Value):
         if not hasattr(self.model, "T"):
             return solve_modes(self.model)
         reduced: Modes = self.model.modes()
+        if not self.model.is_physical:
+            return reduced  # generalised coordinates: the shapes are expanded already
         return reduced.replace(phi=self.model.T @ reduced.phi, dofs=self.model.full_dofs)

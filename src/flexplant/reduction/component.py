@@ -1,0 +1,305 @@
+"""Component modes: static shapes of a boundary with fixed-interface or free modes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import KW_ONLY, dataclass
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError
+from ..structure import Damping, FEModel
+from ..structure.factor import dense, unit_diagonal
+from ..values import FloatArray, positive, whole
+from .condensation import Partition
+from .methods import ReductionMethod
+from .modes import Modes
+from .projection import (
+    block,
+    checked_damping,
+    fe_model,
+    inner,
+    labels_given,
+    projected,
+    shown,
+    undamped,
+)
+from .reduced import ReducedModel
+from .solve import solve_modes
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class CraigBampton(ReductionMethod):
+    """Static shapes of the boundary and modes of the interior with the boundary held.
+
+    ``T = [I 0; -Kii^-1 Kib  phi_i]``: coordinates are the boundary DOFs, then one per
+    fixed-interface mode ("fixed mode 1", ...). Every frequency is at or above the true one
+    (Rayleigh-Ritz) and none rises when modes are added; rigid-body motions are exact.
+
+    Parameters
+    ----------
+    boundary : sequence of str, DofSet or DofSelection
+        DOFs that stay, where loads and other structures attach; held, they stop all rigid-body
+        motion.
+    modes : int
+        Number of fixed-interface modes; 0 is static condensation.
+    below : float [Hz], optional
+        In place of `modes`: all fixed-interface modes up to this frequency.
+    damping : ModalDamping or Rayleigh, optional
+        Of the reduced model's own modes; None: ``T^T D T``.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For bad labels or numbers.
+
+    Notes
+    -----
+    R. R. Craig, M. C. C. Bampton, Coupling of substructures for dynamic analyses, AIAA Journal
+    6(7), 1968.
+    """
+
+    boundary: Iterable[str]
+    modes: int = 0
+    _: KW_ONLY
+    below: float | None = None
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        number = whole(self.modes, "modes", minimum=0)
+        if self.below is not None and number:
+            raise ModelError("give the number of fixed-interface modes or below=, not both.")
+        self._set(
+            boundary=labels_given(self.boundary, "boundary DOFs"),
+            modes=number,
+            below=None if self.below is None else positive(self.below, "below"),
+            damping=checked_damping(self.damping),
+        )
+
+    def __repr__(self) -> str:
+        labels = tuple(self.boundary)
+        more = f"{self.modes}" if self.below is None else f"all below {self.below:g} Hz"
+        return f"<CraigBampton: {len(labels)} DOFs ({shown(labels)}), fixed modes: {more}>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the reduced model; `reduce` is the public way."""
+        model, labels = fe_model(structure, self), tuple(self.boundary)
+        part = Partition(model, labels)
+        T, count = part.static, 0
+        if self.modes or self.below is not None:
+            fixed = self._fixed(model, part)
+            count = fixed.shape[1]
+            T = np.hstack([T, part.whole(np.zeros((len(labels), count)), fixed)])
+        names = [*labels, *(f"fixed mode {i}" for i in range(1, count + 1))]
+        return projected(
+            model,
+            T,
+            dofs=model.dofs.select(labels),
+            coordinates=names,
+            method=f"{count} fixed-interface modes (Craig-Bampton)",
+            damping=self.damping,
+        )
+
+    def _fixed(self, model: FEModel, part: Partition) -> FloatArray:
+        rows = part.others
+        if self.modes > rows.size:
+            raise ModelError(
+                f"{self.modes} fixed-interface modes of an interior of {rows.size} DOFs: ask for "
+                "fewer."
+            )
+        interior = FEModel(
+            block(model.M, rows, rows),
+            part.stiffness,
+            dofs=model.dofs.select([model.dofs.labels[i] for i in rows]),
+        )
+        found = solve_modes(interior, count=self.modes or None, below=self.below)
+        return np.real(found.phi)
+
+
+class _FreeInterface(ReductionMethod):
+    """Free modes of the whole structure and its residual flexibility at the boundary."""
+
+    def _parts(
+        self, structure: FEModel | Modes, boundary: Iterable[str], count: int
+    ) -> tuple[FEModel, Modes, FloatArray, FloatArray]:
+        """Return the model, its modes with vectors, T, and the map from (u_b, p) to (p, g)."""
+        model, labels = fe_model(structure, self), tuple(boundary)
+        b = len(labels)
+        modes = solve_modes(undamped(model), count=count, compliance_at=list(labels))
+        rows = model.dofs.indices(labels)
+        phi, vectors = np.real(modes.phi), modes.vectors
+        at = vectors[rows]
+        scaled, _ = unit_diagonal(at @ at.T)
+        values = la.eigvalsh(dense(scaled))
+        if not values[0] > 1e-13 * values[-1]:
+            raise ModelError(
+                "the residual flexibility of the boundary is singular (condition "
+                f"{values[-1] / max(float(values[0]), 1e-300):.3g}): some of its DOFs move "
+                "together. Leave one of them out, or keep fewer modes."
+            )
+        # u_b = phi_b p + V_b g
+        inverse = la.inv(at)
+        k = phi.shape[1]
+        back = np.block([[np.zeros((k, b)), np.eye(k)], [inverse, -inverse @ phi[rows]]])
+        T = np.hstack([phi, vectors]) @ back
+        T[rows] = np.eye(b, b + k)
+        return model, modes, T, back
+
+
+def _free_names(labels: Iterable[str], count: int) -> tuple[str, ...]:
+    return (*labels, *(f"mode {i}" for i in range(1, count + 1)))
+
+
+def _built(
+    model: FEModel,
+    modes: Modes,
+    T: FloatArray,
+    back: FloatArray,
+    labels: tuple[str, ...],
+    damping: Damping | None,
+    *,
+    massless: bool,
+    method: str,
+) -> ReducedModel:
+    k, r = modes.n_modes, modes.n_rigid
+    light = np.concatenate([np.ones(k), np.full(modes.n_vectors, 0.0 if massless else 1.0)])
+    M = (back.T * light) @ back
+    K = (back.T * modes.basis_omega**2) @ back
+    if damping is not None:
+        zeta = damping.zeta(modes.omega if massless else modes.basis_omega)
+        rate = np.zeros(light.size)
+        rate[: zeta.size] = 2 * zeta * modes.basis_omega[: zeta.size]
+        D = (back.T * rate) @ back
+    elif model.D is None:
+        D = np.zeros_like(M)
+    else:
+        D = inner(model.D, np.real(modes.basis)) * np.outer(light, light)
+        D = back.T @ D @ back
+    rigid = np.zeros((light.size, r))
+    b = len(labels)
+    rows = model.dofs.indices(labels)
+    rigid[:b], rigid[b : b + r] = np.real(modes.phi)[rows, :r], np.eye(r)
+    if massless:
+        # exactly: zeros say which coordinates have no mass
+        for matrix in (M, D):
+            matrix[:b], matrix[:, :b] = 0.0, 0.0
+    values = la.eigvalsh(dense(unit_diagonal(M[b:, b:] if massless else M)[0]))
+    return ReducedModel(
+        M=0.5 * (M + M.T),
+        D=0.5 * (D + D.T),
+        K=0.5 * (K + K.T),
+        T=T,
+        dofs=model.dofs.select(labels),
+        full_dofs=model.dofs,
+        rigid_body=rigid,
+        method=method,
+        condition=float(values[-1] / values[0]),
+        condition_of="M*",
+        coordinates=_free_names(labels, k),
+    )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Rubin(_FreeInterface):
+    """Free modes and the residual flexibility of the boundary, with its inertia.
+
+    The span is that of the modes and their residual attachment vectors; coordinates are the
+    boundary DOFs, then the modal ones ("mode 1", ...). The modes are exact, the response to loads
+    on the boundary is so up to order omega^2, and all other frequencies are above the true ones. A
+    free structure's flexibility is that of loads in balance with its inertia (inertia relief).
+
+    Parameters
+    ----------
+    boundary : sequence of str, DofSet or DofSelection
+        DOFs that stay, where loads and other structures attach.
+    modes : int
+        Number of free modes, rigid-body modes included.
+    damping : ModalDamping or Rayleigh, optional
+        Of modes and attachment vectors; None: ``T^T D T``.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For bad labels or numbers.
+
+    Notes
+    -----
+    S. Rubin, Improved component-mode representation for structural dynamic analysis, AIAA Journal
+    13(8), 1975.
+    """
+
+    boundary: Iterable[str]
+    modes: int
+    _: KW_ONLY
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            boundary=labels_given(self.boundary, "boundary DOFs"),
+            modes=whole(self.modes, "modes"),
+            damping=checked_damping(self.damping),
+        )
+
+    def __repr__(self) -> str:
+        labels = tuple(self.boundary)
+        return f"<Rubin: {len(labels)} DOFs ({shown(labels)}), {self.modes} free modes>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the reduced model; `reduce` is the public way."""
+        labels = tuple(self.boundary)
+        parts = self._parts(structure, labels, self.modes)
+        method = f"{self.modes} free modes and residual flexibility (Rubin)"
+        return _built(*parts, labels, self.damping, massless=False, method=method)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class MacNeal(_FreeInterface):
+    """Free modes and the residual flexibility of the boundary, without inertia.
+
+    As `Rubin`, but what lies beyond the modes answers at once: the boundary coordinates have no
+    mass (rows of M* are zero), and its poles are those of the modes alone. Exact at 0 Hz for loads
+    on the boundary. A plant takes it with a feedthrough; coupling and updating give the boundary
+    mass.
+
+    Parameters
+    ----------
+    boundary : sequence of str, DofSet or DofSelection
+        DOFs that stay, where loads and other structures attach.
+    modes : int
+        Number of free modes, rigid-body modes included.
+    damping : ModalDamping or Rayleigh, optional
+        Of the modes; None: their part of D.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For bad labels or numbers.
+
+    Notes
+    -----
+    R. H. MacNeal, A hybrid method of component mode synthesis, Computers & Structures 1(4), 1971.
+    """
+
+    boundary: Iterable[str]
+    modes: int
+    _: KW_ONLY
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            boundary=labels_given(self.boundary, "boundary DOFs"),
+            modes=whole(self.modes, "modes"),
+            damping=checked_damping(self.damping),
+        )
+
+    def __repr__(self) -> str:
+        labels = tuple(self.boundary)
+        return f"<MacNeal: {len(labels)} DOFs ({shown(labels)}), {self.modes} free modes>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the reduced model; `reduce` is the public way."""
+        labels = tuple(self.boundary)
+        parts = self._parts(structure, labels, self.modes)
+        method = f"{self.modes} free modes and static residual flexibility (MacNeal)"
+        return _built(*parts, labels, self.damping, massless=True, method=method)

@@ -1,0 +1,310 @@
+"""Reduction to physical degrees of freedom from the matrices: Guyan, IRS, SEREP."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError, ShapeError, SolverError
+from ..structure import Damping, FEModel
+from ..structure.factor import unit_diagonal
+from ..values import FloatArray, IntArray, positive, whole
+from .methods import ReductionMethod, refused_partition
+from .modes import Modes
+from .projection import (
+    Solver,
+    block,
+    checked_damping,
+    fe_model,
+    inner,
+    labels_given,
+    projected,
+    shown,
+    undamped,
+)
+from .reduced import ReducedModel
+from .solve import solve_modes
+
+_SINGULAR = (
+    "K of the condensed DOFs is singular: with the kept DOFs held, the structure can still move "
+    "(rigidly, or as a mechanism), so that it has no static shape. Keep DOFs that hold its "
+    "rigid-body motions: three z-DOFs that are not on a line for a plate."
+)
+
+
+class Partition:
+    """Kept rows, the others, and the static shapes ``-Kss^-1 Ksm`` between them."""
+
+    def __init__(self, model: FEModel, labels: tuple[str, ...]) -> None:
+        n = model.n_dof
+        self.kept: IntArray = model.dofs.indices(labels)
+        others = np.ones(n, dtype=bool)
+        others[self.kept] = False
+        self.others: IntArray = np.flatnonzero(others)
+        if not self.others.size:
+            raise ShapeError(f"all {n} DOFs are kept: nothing is left to condense.")
+        self.stiffness = block(model.K, self.others, self.others)
+        self.solver = Solver(self.stiffness, _SINGULAR)
+        coupling: Any = block(model.K, self.others, self.kept)
+        loads = coupling.toarray() if hasattr(coupling, "toarray") else np.asarray(coupling)
+        self.static = self.whole(np.eye(self.kept.size), -self.solver.solve(loads))
+
+    def whole(self, kept: FloatArray, others: FloatArray) -> FloatArray:
+        """Return all n rows from those of the two parts."""
+        rows = np.zeros((self.kept.size + self.others.size, kept.shape[1]))
+        rows[self.kept], rows[self.others] = kept, others
+        return rows
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Guyan(ReductionMethod):
+    """Static condensation to a few DOFs: ``T = [I; -Kss^-1 Ksm]``.
+
+    Exact at 0 Hz for loads on the kept DOFs and for rigid-body motions; every frequency is at or
+    above the true one (Rayleigh-Ritz), and none falls when DOFs are added.
+
+    Parameters
+    ----------
+    dofs : sequence of str, DofSet or DofSelection
+        The DOFs that are kept; held, they must stop all rigid-body motion.
+    damping : ModalDamping or Rayleigh, optional
+        Of the reduced model's own modes; None: ``T^T D T``.
+
+    Raises
+    ------
+    LabelError
+        When a label appears twice, or none is given.
+
+    Notes
+    -----
+    R. J. Guyan, Reduction of stiffness and mass matrices, AIAA Journal 3(2), 1965.
+    """
+
+    dofs: Iterable[str]
+    _: KW_ONLY
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        self._set(dofs=labels_given(self.dofs, "kept DOFs"), damping=checked_damping(self.damping))
+
+    def __repr__(self) -> str:
+        labels = tuple(self.dofs)
+        return f"<Guyan: {len(labels)} DOFs ({shown(labels)})>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the condensed model; `reduce` is the public way."""
+        model, labels = fe_model(structure, self), tuple(self.dofs)
+        part = Partition(model, labels)
+        return projected(
+            model,
+            part.static,
+            dofs=model.dofs.select(labels),
+            method="static condensation (Guyan)",
+            damping=self.damping,
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Irs(ReductionMethod):
+    """Improved reduced system: static condensation with the inertia of the condensed DOFs.
+
+    ``T_1 = T_s + S M T_s M_s^-1 K_s``, ``S = diag(0, Kss^-1)`` (one iteration is the IRS of
+    O'Callahan); iterated, T takes the place of T_s in the second term and tends to SEREP: the
+    lowest k modes exactly.
+
+    Parameters
+    ----------
+    dofs : sequence of str, DofSet or DofSelection
+        The DOFs that are kept.
+    iterations : int
+        At most so many.
+    tolerance : float
+        Stop when no omega^2 changes by more than this part of itself.
+    damping : ModalDamping or Rayleigh, optional
+        Of the reduced model's own modes; None: ``T^T D T``.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For bad labels, or options that are not positive.
+
+    Notes
+    -----
+    J. C. O'Callahan, A procedure for an improved reduced system (IRS) model, IMAC 7, 1989; M. I.
+    Friswell, S. D. Garvey, J. E. T. Penny, Model reduction using dynamic and iterated IRS
+    techniques, J. Sound and Vibration 186(2), 1995, and The convergence of the iterated IRS
+    method, 211(1), 1998. Each mode converges like the ratio of its omega^2 to the lowest one of
+    the structure with the kept DOFs held.
+    """
+
+    dofs: Iterable[str]
+    _: KW_ONLY
+    iterations: int = 1
+    tolerance: float = 1e-12
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            dofs=labels_given(self.dofs, "kept DOFs"),
+            iterations=whole(self.iterations, "iterations"),
+            tolerance=positive(self.tolerance, "tolerance", zero=True),
+            damping=checked_damping(self.damping),
+        )
+
+    def __repr__(self) -> str:
+        labels = tuple(self.dofs)
+        return f"<Irs: {len(labels)} DOFs ({shown(labels)}), at most {self.iterations} iterations>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the condensed model; `reduce` is the public way."""
+        model, labels = fe_model(structure, self), tuple(self.dofs)
+        part = Partition(model, labels)
+        rigid = model.rigid_body[part.kept]
+        T, before = part.static, np.zeros(0)
+        done = 0
+        while done < self.iterations:
+            done += 1
+            M, K = inner(model.M, T), inner(model.K, T)
+            rates, squares = _rates(M, K)
+            inertia = np.asarray(model.M @ T)[part.others] @ rates
+            # rigid-body motions have no rate: rounding in K is kept out of them
+            inertia = inertia - inertia @ rigid @ la.pinv(rigid) if rigid.shape[1] else inertia
+            T = part.static + part.whole(np.zeros_like(rates), part.solver.solve(inertia))
+            if before.size and _settled(squares, before, self.tolerance):
+                break
+            before = squares
+        return projected(
+            model,
+            T,
+            dofs=model.dofs.select(labels),
+            method=f"improved condensation (IRS, {done} iteration{'s' * (done != 1)})",
+            damping=self.damping,
+            singular="The iteration lost modes: take fewer iterations, or other DOFs.",
+        )
+
+
+def _rates(M: FloatArray, K: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return ``M^-1 K`` and its eigenvalues."""
+    scaled, scale = unit_diagonal(M)
+    stiffness = scale[:, None] * K * scale
+    try:
+        lower = la.cholesky(np.asarray(scaled), lower=True)
+    except la.LinAlgError as error:
+        raise SolverError(
+            "the reduced M is singular in the IRS iteration: it lost modes. Take fewer "
+            "iterations, or other DOFs."
+        ) from error
+    rates = scale[:, None] * la.cho_solve((lower, True), stiffness) / scale
+    half = la.solve_triangular(lower, stiffness, lower=True)
+    squares = la.eigvalsh(la.solve_triangular(lower, half.T, lower=True))
+    return np.asarray(rates), np.asarray(squares)
+
+
+def _settled(squares: FloatArray, before: FloatArray, tolerance: float) -> bool:
+    floor = 1e-12 * squares[-1]
+    return bool(np.all(np.abs(squares - before) <= tolerance * np.abs(squares) + floor))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Serep(ReductionMethod):
+    """System equivalent reduction (SEREP): the chosen modes, exactly, in as many DOFs.
+
+    ``T = phi phi_kk^-1`` like `DesiredDofs` (paper, eq. (6) to (8)), but the modes are solved here
+    and the matrices are ``T^T M T``, ``T^T K T`` and, for any D, ``T^T D T``.
+
+    Parameters
+    ----------
+    dofs : sequence of str, DofSet or DofSelection
+        The DOFs that are kept.
+    modes : sequence of int, optional
+        As many mode numbers (from 1, rigid-body modes included and all there); None: the lowest.
+    damping : ModalDamping or Rayleigh, optional
+        Of the reduced model's own modes; None: ``T^T D T``.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For bad labels or mode numbers.
+
+    Notes
+    -----
+    J. C. O'Callahan, P. Avitabile, R. Riemer, System equivalent reduction expansion process, IMAC
+    7, 1989. With fewer modes than DOFs its M* is singular, which no plant can take: refused.
+    """
+
+    dofs: Iterable[str]
+    modes: Iterable[int] | None = None
+    _: KW_ONLY
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        labels = labels_given(self.dofs, "kept DOFs")
+        numbers = None if self.modes is None else mode_numbers(self.modes)
+        if numbers is not None and len(numbers) != len(labels):
+            raise ShapeError(
+                f"{len(labels)} DOFs for {len(numbers)} modes: phi_kk must be square, or M* would "
+                "be singular. Name as many modes as DOFs."
+            )
+        self._set(dofs=labels, modes=numbers, damping=checked_damping(self.damping))
+
+    def __repr__(self) -> str:
+        labels = tuple(self.dofs)
+        which = "lowest" if self.modes is None else "chosen"
+        return f"<Serep: the {which} {len(labels)} modes in as many DOFs ({shown(labels)})>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the model in these DOFs; `reduce` is the public way."""
+        model, labels = fe_model(structure, self), tuple(self.dofs)
+        rows = model.dofs.indices(labels)
+        numbers = tuple(range(1, len(labels) + 1)) if self.modes is None else tuple(self.modes)
+        modes = solve_modes(undamped(model), count=max(numbers))
+        phi = np.real(modes.phi)[:, kept_columns(numbers, modes)]
+        condition = refused_partition(modes.dofs, phi, labels, f"{len(labels)} modes", 1e6)
+        return projected(
+            model,
+            la.solve(phi[rows].T, phi.T).T,
+            dofs=model.dofs.select(labels),
+            method=f"{len(labels)} modes (SEREP)",
+            damping=self.damping,
+            condition=condition,
+            condition_of="phi_kk",
+        )
+
+
+def mode_numbers(numbers: Any) -> tuple[int, ...]:
+    """Return mode numbers as a sorted tuple.
+
+    Raises
+    ------
+    ModelError
+        When they are not whole numbers from 1, or one is there twice.
+    """
+    if isinstance(numbers, str) or not isinstance(numbers, Iterable):
+        raise ModelError(f"modes are given by their numbers, got {numbers!r:.60}: [1, 2, 3, 7].")
+    listed = [whole(number, "a mode number") for number in numbers]
+    if not listed or len(set(listed)) != len(listed):
+        raise ModelError(f"mode numbers must be there once each, got {listed!r:.80}.")
+    return tuple(sorted(listed))
+
+
+def kept_columns(numbers: tuple[int, ...], modes: Modes) -> IntArray:
+    """Return the columns of mode numbers, all rigid-body modes among them.
+
+    Raises
+    ------
+    ModelError
+        When a number is beyond the modes, or a rigid-body mode is left out.
+    """
+    if numbers[-1] > modes.n_modes:
+        raise ModelError(f"mode {numbers[-1]} is asked for, but there are {modes.n_modes}.")
+    left = sorted(set(range(1, modes.n_rigid + 1)) - set(numbers))
+    if left:
+        raise ModelError(
+            f"rigid-body modes {left} are left out: the reduced structure could not move freely. "
+            f"Keep modes 1 to {modes.n_rigid}."
+        )
+    return np.array(numbers, dtype=np.int64) - 1

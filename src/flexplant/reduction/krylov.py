@@ -1,0 +1,231 @@
+"""Moment matching: the response and its derivatives at chosen frequencies, exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import KW_ONLY, dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ..errors import ModelError, SolverError
+from ..labels import Place
+from ..structure import Damping, FEModel
+from ..structure.factor import DENSE_LIMIT, dense
+from ..values import FloatArray, real_array, whole
+from .attachment import labels_of, places, static_response
+from .methods import ReductionMethod
+from .modes import Modes
+from .projection import checked_damping, fe_model, lu_of, projected
+from .reduced import ReducedModel
+
+#: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
+_DEPENDENT = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Krylov(ReductionMethod):
+    """Second-order rational Krylov reduction: moments of the response at given frequencies.
+
+    At each frequency f the response X = (s^2 M + s D + K)^-1 B, s = 2 pi i f, and its first
+    `moments` - 1 derivatives are put into the span, as real vectors, orthonormal in M, rigid-body
+    motions first; M* is the unit matrix, the coordinates are "krylov 1", ... From the inputs to any
+    place, `moments` Taylor coefficients at each s agree with the full model, and twice as many
+    between inputs (a Galerkin projection of symmetric matrices keeps both sides). Without D they
+    are coefficients in s^2. Frequencies are above the true ones (Rayleigh-Ritz).
+
+    Parameters
+    ----------
+    inputs : place or sequence of places
+        Where loads act: DOF labels, points (z) or mappings.
+    freq : float or sequence of float [Hz]
+        Expansion points, none a resonance of an undamped model; 0 is the static response (of a
+        free structure: of loads in balance with its inertia).
+    moments : int
+        At each frequency.
+    damping : ModalDamping or Rayleigh, optional
+        Of the reduced model's own modes, beside a basis of the undamped structure; None: the
+        model's D, in the basis too.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For bad places, frequencies or numbers.
+
+    Notes
+    -----
+    Z. Bai, Y. Su, Dimension reduction of large-scale second-order dynamical systems via a
+    second-order Arnoldi method, SIAM J. Scientific Computing 26(5), 2005; B. Salimbahrami, B.
+    Lohmann, Order reduction of large scale second-order systems using Krylov subspace methods,
+    Linear Algebra and its Applications 415, 2006.
+    """
+
+    inputs: Place | Iterable[Place]
+    freq: FloatArray | float
+    _: KW_ONLY
+    moments: int = 1
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        freq = np.atleast_1d(real_array(self.freq, "freq"))
+        if freq.ndim > 1 or not freq.size or np.any(freq < 0):
+            raise ModelError(
+                f"freq must be one or more frequencies [Hz] from 0 up, got {self.freq!r:.60}."
+            )
+        if np.unique(freq).size < freq.size:
+            raise ModelError("an expansion frequency is there twice: ask for more moments.")
+        self._set(
+            inputs=tuple(places(self.inputs)),
+            freq=freq,
+            moments=whole(self.moments, "moments"),
+            damping=checked_damping(self.damping),
+        )
+        if not self.inputs:
+            raise ModelError("Krylov needs at least one input: the place of a load.")
+
+    def __repr__(self) -> str:
+        listed: Any = self.inputs
+        at = ", ".join(f"{f:g}" for f in np.atleast_1d(self.freq)[:4])
+        more = ", ..." if np.size(self.freq) > 4 else ""
+        return f"<Krylov: {len(listed)} inputs, {self.moments} moments at {at}{more} Hz>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the reduced model; `reduce` is the public way."""
+        model = fe_model(structure, self)
+        listed: Any = self.inputs
+        labels_of(listed, model.dofs)
+        B = np.column_stack([model.dofs.row(place) for place in listed])
+        D = None if self.damping is not None else model.D
+        basis = np.array(model.rigid_body)
+        for f in np.atleast_1d(self.freq):
+            if D is None or f == 0:
+                found = _real_moments(model, B, 2 * np.pi * float(f), self.moments, D)
+            else:
+                found = _moments(model, D, B, 2j * np.pi * float(f), self.moments)
+            basis = extended(model, basis, found)
+        return projected(
+            model,
+            basis,
+            dofs=model.dofs.select(()),
+            coordinates=[f"krylov {i}" for i in range(1, basis.shape[1] + 1)],
+            method=f"moments at {np.size(self.freq)} frequencies (Krylov)",
+            damping=self.damping,
+        )
+
+
+def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: Any) -> FloatArray:
+    """Return a basis of the moments of an undamped model, or at 0 Hz."""
+    M: Any = model.M
+    K: Any = model.K
+    solve: Any = partial(static_response, M, K, model.rigid_body)
+    if omega > 0:
+        solve = _factorised(K - omega**2 * M, omega)
+    if D is not None:
+        return np.asarray(_second_order(solve, D, M, B, count))
+    block = _normed(model, solve(B))
+    found = [block]
+    for _ in range(count - 1):
+        # a new start in the same Krylov space: what is already there taken out first
+        block = _normed(
+            model, _without(model, np.hstack(found), solve(np.asarray(model.M @ block)))
+        )
+        found.append(block)
+    return np.hstack(found)
+
+
+def _moments(model: FEModel, D: Any, B: FloatArray, s: complex, count: int) -> FloatArray:
+    """Return a real basis of the moments of a damped model at s."""
+    M: Any = model.M
+    K: Any = model.K
+    solve = _factorised(s**2 * M + s * D + K, abs(s))
+    found = _second_order(solve, 2 * s * M + D, M, B, count)
+    return np.hstack([found.real, found.imag])
+
+
+def _second_order(
+    solve: Callable[[Any], Any], slope: Any, M: Any, B: FloatArray, count: int
+) -> Any:
+    """Return the tops of an orthonormal Krylov basis of the linearised problem (SOAR's space)."""
+    top = solve(B)
+    found, state = [top], np.vstack([top, np.zeros_like(top)])
+    basis = la.qr(state, mode="economic")[0]
+    m, n = B.shape[1], B.shape[0]
+    for _ in range(count - 1):
+        last = basis[:, -m:]
+        top = -solve(slope @ last[:n] + M @ last[n:])
+        state = np.vstack([top, last[:n]])
+        for _ in range(2):
+            state = state - basis @ (basis.conj().T @ state)
+        fresh = la.qr(state, mode="economic")[0]
+        basis = np.hstack([basis, fresh])
+        found.append(fresh[:n])
+    return np.hstack([basis[:n, :m], *found[1:]])
+
+
+def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
+    """Return a solver of an indefinite or complex symmetric matrix."""
+    at = f"{omega / (2 * np.pi):.6g} Hz"
+    kind, small = matrix.dtype, matrix.shape[0] <= DENSE_LIMIT
+    is_sparse = sp.issparse(matrix)
+    if small or not is_sparse:
+        full = matrix.toarray() if hasattr(matrix, "toarray") else np.asarray(matrix)
+        size = 1.0 / np.sqrt(np.abs(np.diag(full)).clip(1e-300))
+        factor = la.lu_factor(full * size[:, None] * size)
+        pivots = np.abs(np.diag(factor[0]))
+        if pivots.min() < 1e-13 * pivots.max():
+            raise ModelError(
+                f"the expansion frequency {at} is a resonance of the undamped model: its response "
+                "is infinite there. Move it a little."
+            )
+        return lambda loads: la.lu_solve(factor, loads * size[:, None]) * size[:, None]
+    lu = lu_of(matrix, 0.0)
+
+    def solve(loads: Any) -> Any:
+        loads = np.ascontiguousarray(np.asarray(loads, dtype=kind))
+        found = lu.solve(loads)
+        # pivots kept on the diagonal: one refinement brings the digits back
+        found = found + lu.solve(loads - matrix @ found)
+        left = np.linalg.norm(loads - matrix @ found, axis=0)
+        if not np.all(left <= 1e-6 * np.linalg.norm(loads, axis=0).clip(1e-300)):
+            raise SolverError(
+                f"the response at {at} leaves a residual of {left.max():.2g}: a resonance is too "
+                "near. Move the expansion frequency."
+            )
+        return found
+
+    return solve
+
+
+def _normed(model: FEModel, vectors: FloatArray) -> FloatArray:
+    square = np.sum(vectors * np.asarray(model.M @ vectors), axis=0)
+    return np.asarray(vectors / np.sqrt(square.clip(1e-300)))
+
+
+def _without(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return vectors M-orthogonal to the span of others."""
+    gram = basis.T @ np.asarray(model.M @ basis)
+    for _ in range(2):
+        share = la.lstsq(gram, basis.T @ np.asarray(model.M @ vectors))[0]
+        vectors = vectors - basis @ share
+    return np.asarray(vectors)
+
+
+def extended(model: FEModel, basis: FloatArray, vectors: FloatArray) -> FloatArray:
+    """Return an M-orthonormal basis with vectors added, those that add nothing left out."""
+    size = np.sqrt(np.sum(vectors * np.asarray(model.M @ vectors), axis=0))
+    vectors = vectors[:, size > 0] / size[size > 0]
+    for _ in range(2):
+        vectors = vectors - basis @ (basis.T @ np.asarray(model.M @ vectors))
+    values, mix = la.eigh(vectors.T @ np.asarray(model.M @ vectors))
+    kept = values > _DEPENDENT**2 * max(float(values[-1]) if values.size else 0.0, 1.0)
+    fresh = vectors @ (mix[:, kept] / np.sqrt(values[kept]))[:, ::-1]
+    for _ in range(2):
+        fresh = fresh - basis @ (basis.T @ np.asarray(model.M @ fresh))
+        gram = dense(fresh.T @ np.asarray(model.M @ fresh))
+        values, mix = la.eigh(gram)
+        good = values > 1e-6 * max(float(values[-1]) if values.size else 0.0, 1e-300)
+        fresh = fresh @ (mix[:, good] / np.sqrt(values[good]))
+    return np.hstack([basis, fresh])

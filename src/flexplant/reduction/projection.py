@@ -1,0 +1,234 @@
+"""What all reductions by projection share: their matrices, damping and rigid-body motions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+import scipy.sparse.linalg as spla
+
+from ..errors import LabelError, ModelError, SolverError
+from ..labels import DofSet
+from ..structure import Damping, FEModel
+from ..structure.eigen import elastic_modes
+from ..structure.factor import DENSE_LIMIT, dense, symmetric_lu, unit_diagonal
+from ..values import FloatArray, Matrix, name_list, rebuild
+from .modes import Modes
+from .reduced import ErrorBound, ReducedModel
+
+#: part of a rigid-body motion that a basis may miss
+_RIGID_TOLERANCE = 1e-7
+
+
+class Solver:
+    """A factorised positive definite matrix, dense or sparse."""
+
+    def __init__(self, matrix: Matrix, singular: str) -> None:
+        self._matrix: Any = matrix
+        self._sparse = bool(sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT)
+        if self._sparse:
+            try:
+                self._factor: Any = symmetric_lu(matrix)
+            except SolverError as error:
+                raise ModelError(singular) from error
+            # a mechanism leaves a pivot of rounding size
+            pivots = np.abs(self._factor.U.diagonal()) / np.abs(self._matrix.diagonal())
+            if pivots[pivots.argmin()] < 1e-13:
+                raise ModelError(singular)
+            return
+        scaled, self._scale = unit_diagonal(dense(matrix))
+        try:
+            self._factor = la.cho_factor(dense(scaled), lower=True)
+        except la.LinAlgError as error:
+            raise ModelError(singular) from error
+        if matrix.shape[0] and np.diag(self._factor[0]).min() < 1e-7:
+            raise ModelError(singular)
+
+    def solve(self, loads: FloatArray) -> FloatArray:
+        """Return the (n, m) solution, refined once."""
+        if not loads.size:
+            return np.zeros_like(loads)
+        found = self._once(loads)
+        return found + self._once(loads - np.asarray(self._matrix @ found))
+
+    def _once(self, loads: FloatArray) -> FloatArray:
+        if self._sparse:
+            return np.asarray(self._factor.solve(np.ascontiguousarray(loads)))
+        scale = self._scale[:, None]
+        return np.asarray(la.cho_solve(self._factor, loads * scale) * scale)
+
+
+def lu_of(matrix: Any, threshold: float) -> Any:
+    """Return the SuperLU factorisation of an indefinite or complex symmetric sparse matrix.
+
+    Raises
+    ------
+    SolverError
+        When it is singular.
+    """
+    splu: Any = spla.splu
+    try:
+        return splu(
+            sp.csc_matrix(matrix),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=threshold,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as error:
+        raise SolverError(
+            f"a dynamic stiffness is singular ({error}): the frequency is a resonance of the "
+            "undamped structure. Move it a little, or give the structure damping."
+        ) from error
+
+
+def labels_given(dofs: Iterable[str], what: str) -> tuple[str, ...]:
+    """Return labels as a tuple, none of them twice.
+
+    Raises
+    ------
+    LabelError
+        When there is none, or one is there twice.
+    """
+    labels = name_list(dofs, what)
+    if not labels:
+        raise LabelError(f"no {what} are given: name at least one DOF, such as '41:z'.")
+    seen = set(labels)
+    if len(seen) < len(labels):
+        doubled = sorted(label for label in seen if labels.count(label) > 1)
+        raise LabelError(f"{what} {doubled} appear twice: what must be inverted would be singular.")
+    return labels
+
+
+def shown(labels: Sequence[str]) -> str:
+    """Return a short text for labels."""
+    return ", ".join(labels[:3]) + (f", ... {labels[-1]}" if len(labels) > 3 else "")
+
+
+def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
+    """Return the structure when it has the matrices that a method needs.
+
+    Raises
+    ------
+    ModelError
+        When it is no FEModel.
+    """
+    if isinstance(structure, FEModel):
+        return structure
+    raise ModelError(
+        f"{type(method).__name__} works on the matrices M and K, which "
+        f"{type(structure).__name__} do not hold: reduce(model, {type(method).__name__}(...)) "
+        "with the FEModel."
+    )
+
+
+def undamped(model: FEModel) -> FEModel:
+    """Return the model without its D, its matrices not checked again."""
+    if model.D is None:
+        return model
+    bare = rebuild(FEModel, {**model._fields(), "D": None})
+    assert isinstance(bare, FEModel)  # noqa: S101  # rebuild keeps the class
+    return bare
+
+
+def block(matrix: Matrix, rows: Any, columns: Any) -> Any:
+    """Return a block of a dense or sparse matrix."""
+    if sp.issparse(matrix):
+        sparse: Any = matrix
+        return sparse[rows][:, columns]
+    return np.asarray(matrix)[np.ix_(rows, columns)]
+
+
+def inner(matrix: Matrix, T: FloatArray) -> FloatArray:
+    """Return ``T^T A T``, exactly symmetric."""
+    product = T.T @ np.asarray(matrix @ T)
+    return np.asarray(0.5 * (product + product.T), dtype=np.float64)
+
+
+def modal_damping(M: FloatArray, K: FloatArray, rigid: FloatArray, damping: Damping) -> FloatArray:
+    """Return the D that gives the modes of a reduced model the ratios of a damping law."""
+    omega, phi = elastic_modes(M, K, rigid)
+    r = rigid.shape[1]
+    zeta = damping.zeta(np.concatenate([np.zeros(r), omega]))[r:]
+    force = M @ phi
+    D = (force * (2 * zeta * omega)) @ force.T
+    return np.asarray(0.5 * (D + D.T), dtype=np.float64)
+
+
+def checked_damping(damping: object) -> Damping | None:
+    """Return a damping law or None.
+
+    Raises
+    ------
+    ModelError
+        When it is something else.
+    """
+    if damping is None or isinstance(damping, Damping):
+        return damping
+    raise ModelError(
+        f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}: "
+        "1 % in all modes is ModalDamping(0.01)."
+    )
+
+
+def projected(
+    model: FEModel,
+    T: FloatArray,
+    *,
+    dofs: DofSet,
+    method: str,
+    coordinates: Sequence[str] = (),
+    damping: Damping | None = None,
+    condition: float | None = None,
+    condition_of: str = "M*",
+    bound: ErrorBound | None = None,
+    singular: str = "",
+) -> ReducedModel:
+    """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``.
+
+    Raises
+    ------
+    ModelError
+        When T depends on itself or does not hold the rigid-body motions.
+    """
+    M, K = inner(model.M, T), inner(model.K, T)
+    scaled, scale = unit_diagonal(M)
+    values = la.eigvalsh(dense(scaled))
+    if not values[0] > 1e-13 * values[-1]:
+        raise ModelError(
+            f"the {T.shape[1]} coordinates of {method} depend on each other (condition of M* "
+            f"{values[-1] / max(float(values[0]), 1e-300):.3g}): M* would be singular. "
+            + (singular or "Take fewer.")
+        )
+    rigid = np.zeros((T.shape[1], 0))
+    full = model.rigid_body
+    if full.shape[1]:
+        load = scale[:, None] * (T.T @ np.asarray(model.M @ full))
+        rigid = scale[:, None] * la.solve(dense(scaled), load, assume_a="pos")
+        missed = float(np.abs(T @ rigid - full).max() / np.abs(full).max())
+        if not missed < _RIGID_TOLERANCE:
+            raise ModelError(
+                f"{method} does not hold the rigid-body motions of the structure (misses "
+                f"{missed:.2g} of them): its poles at 0 would be lost. "
+                + (singular or "Add coordinates that do.")
+            )
+    if damping is not None:
+        D = modal_damping(M, K, rigid, damping)
+    else:
+        D = np.zeros_like(M) if model.D is None else inner(model.D, T)
+    return ReducedModel(
+        M=M,
+        D=D,
+        K=K,
+        T=T,
+        dofs=dofs,
+        full_dofs=model.dofs,
+        rigid_body=rigid,
+        method=method,
+        condition=float(values[-1] / values[0]) if condition is None else condition,
+        condition_of=condition_of,
+        coordinates=coordinates,
+        bound=bound,
+    )

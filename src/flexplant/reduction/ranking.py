@@ -1,0 +1,203 @@
+"""Which modes matter to which channels: modal Hankel values, beside the exact ones."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError
+from ..labels import Place
+from ..lti.discretisation import block_diagonal
+from ..lti.hankel import hankel_values
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, IntArray, Value, name_list, real_array
+from .attachment import labels_of, places
+from .modes import Modes
+
+
+def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:
+    """Return the peaks of ``1 / |omega^2 - w^2 + 2 i zeta omega w|``; infinite without damping."""
+    low = zeta < np.sqrt(0.5)
+    damped = np.where(low, 2 * zeta * np.sqrt(np.maximum(1 - zeta**2, 0.0)), 1.0)
+    with np.errstate(divide="ignore"):
+        return np.asarray(1.0 / (damped * omega**2))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModeRanking(Value):
+    """Which elastic modes matter to which channels.
+
+    Parameters
+    ----------
+    modes : (m,) array of int
+        Mode numbers, from 1.
+    freq : (m,) array [Hz]
+        Their frequencies.
+    values : (m, p, q) array [m/N]
+        Modal Hankel values of each mode from each of q inputs to each of p outputs,
+        ``|c b| / (4 zeta omega^2)``.
+    total : (m,) array [m/N]
+        Those of all channels together, ``||c|| ||b|| / (4 zeta omega^2)``.
+    peak : (m,) array [m/N]
+        The largest singular value of each mode's own response, over all frequencies.
+    exact : (2 m,) array [m/N]
+        Hankel singular values of all elastic modes together, by Lyapunov equations, the largest
+        first; two for each mode, close to its `total` when damping is low and modes are apart.
+    inputs, outputs : sequence of str
+        The channels.
+    """
+
+    modes: IntArray
+    freq: FloatArray
+    values: FloatArray
+    total: FloatArray
+    peak: FloatArray
+    exact: FloatArray
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        inputs = name_list(self.inputs, "inputs")
+        outputs = name_list(self.outputs, "outputs")
+        m = np.size(self.modes)
+        self._set(
+            modes=np.asarray(self.modes, dtype=np.int64),
+            freq=real_array(self.freq, "freq", (m,)),
+            values=real_array(self.values, "values", (m, len(outputs), len(inputs))),
+            total=real_array(self.total, "total", (m,)),
+            peak=real_array(self.peak, "peak", (m,)),
+            exact=real_array(self.exact, "exact", (2 * m,)),
+            inputs=inputs,
+            outputs=outputs,
+        )
+
+    @property
+    def order(self) -> IntArray:
+        """The mode numbers, the most important first."""
+        return np.asarray(self.modes[np.argsort(-self.total, kind="stable")])
+
+    def __repr__(self) -> str:
+        first = ", ".join(str(i) for i in self.order[:6])
+        more = ", ..." if self.modes.size > 6 else ""
+        return (
+            f"<ModeRanking: {self.modes.size} elastic modes, {len(self.inputs)} inputs to "
+            f"{len(self.outputs)} outputs; by Hankel value: {first}{more}>"
+        )
+
+    def table(self, most: int = 12) -> str:
+        """Return the most important modes as text, with the channels each matters most to.
+
+        Parameters
+        ----------
+        most : int
+            How many modes.
+        """
+        lines = [f"mode{'f [Hz]':>11s}{'Hankel':>11s}{'peak':>11s}  share of the largest, channel"]
+        top = float(self.total.max(initial=0.0)) or 1.0
+        for i in np.argsort(-self.total, kind="stable")[:most]:
+            out, into = np.unravel_index(int(np.argmax(self.values[i])), self.values[i].shape)
+            lines.append(
+                f"{self.modes[i]:4d}{self.freq[i]:11.2f}{self.total[i]:11.3g}{self.peak[i]:11.3g}"
+                f"  {self.total[i] / top:7.2%}  {self.inputs[into]} -> {self.outputs[out]}"
+            )
+        return "\n".join(lines)
+
+
+def rank_modes(
+    modes: Modes,
+    *,
+    inputs: Place | Iterable[Place],
+    outputs: Place | Iterable[Place] = (),
+) -> ModeRanking:
+    """Return which elastic modes matter to which channels, by Hankel values.
+
+    The Hankel values of a lightly damped mode alone are both about ``||c|| ||b|| / (4 zeta
+    omega^2)``, b its forces and c its displacements at the channels; modes that are far apart
+    compared with their damping keep them side by side.
+
+    Parameters
+    ----------
+    modes : Modes
+        Real and damped; attachment vectors are left out.
+    inputs, outputs : place or sequence of places
+        Forces and displacements: DOF labels, points (z) or mappings; no outputs: the inputs.
+
+    Returns
+    -------
+    ModeRanking
+
+    Raises
+    ------
+    ModelError
+        When the modes are complex or an elastic one is undamped.
+    LabelError
+        When a place is unknown.
+
+    Notes
+    -----
+    C. Z. Gregory, Reduction of large flexible spacecraft models using internal balancing theory,
+    J. Guidance 7(6), 1984; W. Gawronski, Advanced Structural Dynamics and Active Control of
+    Structures, Springer, 2004, chapter 4.
+    """
+    into, out, B, C = channels(modes, inputs, outputs)
+    r = modes.n_rigid
+    omega, zeta = modes.omega[r:], modes.zeta[r:]
+    b, c = B[r:], C[:, r:]
+    if np.any(zeta <= 0):
+        i = int(np.argmin(zeta))
+        raise ModelError(
+            f"mode {r + 1 + i} is undamped: its Hankel values are infinite. Solve the modes with "
+            "damping=ModalDamping(...)."
+        )
+    half = 1.0 / (4 * zeta * omega**2)
+    force, seen = np.linalg.norm(b, axis=1), np.linalg.norm(c, axis=0)
+    return ModeRanking(
+        np.arange(r + 1, modes.n_modes + 1),
+        omega / (2 * np.pi),
+        np.abs(np.einsum("pm,mq,m->mpq", c, b, half)),
+        force * seen * half,
+        force * seen * peak_gains(omega, zeta),
+        _exact(omega, zeta, b, c),
+        into,
+        out,
+    )
+
+
+def channels(
+    modes: Modes, inputs: Place | Iterable[Place], outputs: Place | Iterable[Place]
+) -> tuple[tuple[str, ...], tuple[str, ...], FloatArray, FloatArray]:
+    """Return names of inputs and outputs, and modal forces (k, q) and motions (p, k) there.
+
+    Raises
+    ------
+    ModelError
+        When `modes` are none or complex, or no input is given.
+    """
+    if not isinstance(modes, Modes) or np.iscomplexobj(modes.phi):
+        kind = "complex modes" if isinstance(modes, Modes) else type(modes).__name__
+        raise ModelError(
+            f"channels are ranked by real Modes, got {kind}: solve_modes(model, count=..., "
+            "damping=ModalDamping(...))."
+        )
+    pushed = places(inputs)
+    watched = places(outputs) or pushed
+    if not pushed:
+        raise ModelError("no inputs are given: name at least one place, such as '41:z'.")
+    into, out = labels_of(pushed, modes.dofs), labels_of(watched, modes.dofs)
+    phi = np.real(modes.phi)
+    B = np.column_stack([modes.dofs.row(place) @ phi for place in pushed])
+    return into, out, B, np.array([modes.dofs.row(place) @ phi for place in watched])
+
+
+def _exact(omega: FloatArray, zeta: FloatArray, b: FloatArray, c: FloatArray) -> FloatArray:
+    m = omega.size
+    if not m:
+        return np.zeros(0)
+    pairs = np.zeros((m, 2, 2))
+    pairs[:, 0, 1], pairs[:, 1, 0], pairs[:, 1, 1] = omega, -omega, -2 * zeta * omega
+    B, C = np.zeros((2 * m, b.shape[1])), np.zeros((c.shape[0], 2 * m))
+    B[1::2], C[:, ::2] = b, c / omega
+    D = np.zeros((c.shape[0], b.shape[1]))
+    return hankel_values(StateSpace(block_diagonal(pairs), B, C, D, blocks=[2] * m))

@@ -1,0 +1,328 @@
+"""Modal truncation: the lowest modes, or those that matter to the channels, with a true bound."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import KW_ONLY, dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError
+from ..labels import Place
+from ..structure import Damping, FEModel, ModalDamping
+from ..values import FloatArray, whole
+from .attachment import labels_of, places, static_response
+from .condensation import kept_columns, mode_numbers
+from .methods import ReductionMethod
+from .modes import Modes
+from .projection import checked_damping, inner, undamped
+from .ranking import channels, peak_gains, rank_modes
+from .reduced import ErrorBound, ReducedModel
+from .solve import solve_modes
+
+_SUM = "sum of the peaks of the neglected modes"
+_RESIDUE = "residual flexibility over twice the damping (Cauchy-Schwarz)"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModalTruncation(ReductionMethod):
+    """The lowest (or chosen) modes alone (paper, eq. (5)), with or without static correction.
+
+    Coordinates are "mode 1", ..., then "static 1", ... With `static_at`, residual attachment
+    vectors keep the static compliance there of what was truncated.
+
+    Parameters
+    ----------
+    count : int, optional
+        How many modes, rigid-body modes included.
+    modes : sequence of int, optional
+        In place of `count`: mode numbers from 1, all rigid-body modes among them.
+    static_at : place or sequence of places
+        Where the static compliance is kept.
+    inputs, outputs : place or sequence of places
+        Channels of the a-priori bound; no outputs: the inputs.
+    damping : ModalDamping or Rayleigh, optional
+        With an FEModel: of modes and vectors, in place of its D.
+
+    Raises
+    ------
+    ModelError
+        When neither or both of `count` and `modes` are given.
+
+    Notes
+    -----
+    From `Modes`, what is truncated is what is left of them (their attachment vectors included),
+    and the bound is the sum over it of ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, each
+    mode's own peak. From an FEModel with one damping ratio for all, it covers all modes of the
+    structure unseen: by Cauchy-Schwarz the sum is at most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta
+    sqrt(1 - zeta^2))``, G the residual flexibility of one static solution. With `static_at`, the
+    peaks of the vectors are added.
+    """
+
+    count: int | None = None
+    _: KW_ONLY
+    modes: Iterable[int] | None = None
+    static_at: Place | Iterable[Place] = ()
+    inputs: Place | Iterable[Place] = ()
+    outputs: Place | Iterable[Place] = ()
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        if (self.count is None) == (self.modes is None):
+            raise ModelError("ModalTruncation needs count= (the lowest modes) or modes=, not both.")
+        self._set(
+            count=None if self.count is None else whole(self.count, "count"),
+            modes=None if self.modes is None else mode_numbers(self.modes),
+            static_at=tuple(places(self.static_at)),
+            inputs=tuple(places(self.inputs)),
+            outputs=tuple(places(self.outputs)),
+            damping=checked_damping(self.damping),
+        )
+
+    def __repr__(self) -> str:
+        listed: Any = self.static_at
+        extra = f", static at {len(listed)} places" if listed else ""
+        return f"<ModalTruncation: {len(self._numbers)} modes{extra}>"
+
+    @property
+    def _numbers(self) -> tuple[int, ...]:
+        if self.modes is not None:
+            return tuple(self.modes)
+        return tuple(range(1, int(self.count or 0) + 1))
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the truncated model; `reduce` is the public way."""
+        static: Any = self.static_at
+        if isinstance(structure, Modes):
+            if self.damping is not None:
+                raise ModelError(
+                    "these Modes have their damping: give damping= to solve_modes, or an FEModel."
+                )
+            bound_of = (self.inputs, self.outputs) if self.inputs else None
+            return truncated(structure, self._numbers, static, bound_of, "modal truncation")
+        return self._from_model(structure, static)
+
+    def _from_model(self, model: FEModel, static: Any) -> ReducedModel:
+        numbers = self._numbers
+        solved = solve_modes(undamped(model), count=max(numbers))
+        law = self.damping
+        if law is not None:
+            solved = solved.replace(zeta=law.zeta(solved.omega))
+        columns = kept_columns(numbers, solved)
+        kept = solved.replace(
+            omega=solved.omega[columns], zeta=solved.zeta[columns], phi=solved.phi[:, columns]
+        )
+        if static:
+            from .attachment import attachment_vectors
+
+            vectors, omega = attachment_vectors(model, kept.omega, np.real(kept.phi), static)
+            zeta = np.zeros(omega.size)
+            if law is not None:
+                zeta = law.zeta(omega)
+            kept = kept.replace(
+                vectors=vectors,
+                vector_omega=omega,
+                vector_zeta=zeta,
+                vector_dofs=labels_of(static, model.dofs),
+            )
+        bound = self._bound(model, kept) if self.inputs else None
+        names = [f"mode {i}" for i in numbers]
+        found = _diagonal(kept, names, "modal truncation", bound)
+        if law is None and model.D is not None:
+            found = found.replace(D=inner(model.D, found.T))
+        return found
+
+    def _bound(self, model: FEModel, kept: Modes) -> ErrorBound | None:
+        law = self.damping
+        into, out, force, seen = channels(kept, self.inputs, self.outputs)
+        if not isinstance(law, ModalDamping) or not isinstance(law.ratio, float) or not law.ratio:
+            return None
+        pushed = places(self.inputs)
+        watched = places(self.outputs) or pushed
+        B = np.column_stack([model.dofs.row(place) for place in pushed])
+        C = np.array([model.dofs.row(place) for place in watched])
+        flexible = static_response(model.M, model.K, model.rigid_body, np.hstack([B, C.T]))
+        r, q = kept.n_rigid, B.shape[1]
+        square = kept.omega[r:, None] ** 2
+        left = np.sum(B * flexible[:, :q]) - np.sum(force[r:] ** 2 / square)
+        right = np.sum(C.T * flexible[:, q:]) - np.sum(seen[:, r:].T ** 2 / square)
+        both = float(np.sqrt(max(float(left), 0.0) * max(float(right), 0.0)))
+        value = both * float(peak_gains(np.ones(1), np.array([law.ratio]))[0])
+        value += _vector_peaks(kept, B, C)
+        return ErrorBound(value, into, out, _RESIDUE)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ModalBalanced(ReductionMethod):
+    """The modes of largest modal Hankel value between the channels: balanced modal truncation.
+
+    Lightly damped modes that are apart are almost balanced one by one, with the Hankel values
+    ``||c|| ||b|| / (4 zeta omega^2)``; the smallest are left out, whatever their frequency.
+    Rigid-body modes stay. `rank_modes` shows the values.
+
+    Parameters
+    ----------
+    count : int
+        How many modes, rigid-body modes included.
+    inputs, outputs : place or sequence of places
+        Forces and displacements that matter; no outputs: the inputs.
+    among : int, optional
+        With an FEModel: how many of its lowest modes are looked at; None: all of a model that is
+        not large.
+    static_at : place or sequence of places
+        Where the static compliance of what was left out is kept.
+    damping : ModalDamping or Rayleigh, optional
+        With an FEModel: of its modes.
+
+    Raises
+    ------
+    ModelError
+        When numbers do not fit or no input is given.
+
+    Notes
+    -----
+    The bound is the sum of the neglected modes' own peaks, exact for one neglected mode. Twice the
+    sum of neglected Hankel values (K. Glover, 1984) bounds the truncation of the exactly balanced
+    model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
+    W. Gawronski, Advanced Structural Dynamics and Active Control of Structures, 2004, chapter 6.
+    """
+
+    count: int
+    inputs: Place | Iterable[Place]
+    _: KW_ONLY
+    outputs: Place | Iterable[Place] = ()
+    among: int | None = None
+    static_at: Place | Iterable[Place] = ()
+    damping: Damping | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            count=whole(self.count, "count"),
+            inputs=tuple(places(self.inputs)),
+            outputs=tuple(places(self.outputs)),
+            among=None if self.among is None else whole(self.among, "among", minimum=self.count),
+            static_at=tuple(places(self.static_at)),
+            damping=checked_damping(self.damping),
+        )
+        if not self.inputs:
+            raise ModelError("ModalBalanced needs inputs: the Hankel values are of channels.")
+
+    def __repr__(self) -> str:
+        into: Any = self.inputs
+        out: Any = self.outputs or self.inputs
+        return f"<ModalBalanced: {self.count} modes, {len(into)} inputs to {len(out)} outputs>"
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the truncated model; `reduce` is the public way."""
+        modes = structure
+        if not isinstance(modes, Modes):
+            modes = solve_modes(modes, count=self.among, damping=self.damping)
+        elif self.damping is not None or self.among is not None:
+            raise ModelError("among= and damping= are for an FEModel: these Modes are solved.")
+        if not modes.n_rigid <= self.count <= modes.n_modes:
+            raise ModelError(
+                f"count must be from {modes.n_rigid} (rigid-body modes stay) to {modes.n_modes} "
+                f"(all modes), got {self.count}."
+            )
+        ranking = rank_modes(modes, inputs=self.inputs, outputs=self.outputs)
+        best = ranking.order[: self.count - modes.n_rigid].tolist()
+        numbers = tuple(sorted([*range(1, modes.n_rigid + 1), *best]))
+        static: Any = self.static_at
+        bound_of = (self.inputs, self.outputs)
+        return truncated(modes, numbers, static, bound_of, "modal Hankel values")
+
+
+def truncated(
+    modes: Modes,
+    numbers: tuple[int, ...],
+    static: tuple[Place, ...],
+    bound_of: tuple[Any, Any] | None,
+    method: str,
+) -> ReducedModel:
+    """Return some of the modes, with the static compliance of the others in the same modes."""
+    if np.iscomplexobj(modes.phi):
+        raise ModelError(
+            "these modes are complex, and equation (5) has no diagonal form: solve with "
+            "damping=ModalDamping(...), or give the FEModel, whose D is projected."
+        )
+    columns = kept_columns(numbers, modes)
+    basis, omega, zeta = np.real(modes.basis), modes.basis_omega, modes.basis_zeta
+    others = np.setdiff1d(np.arange(omega.size), columns)
+    kept = Modes(
+        omega[columns], zeta[columns], basis[:, columns], modes.dofs, n_rigid=modes.n_rigid
+    )
+    if static:
+        kept = _corrected(kept, basis[:, others], omega[others], zeta[others], static)
+    bound = None
+    if bound_of is not None:
+        whole_set = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
+        into, out, force, seen = channels(whole_set, *bound_of)
+        with np.errstate(invalid="ignore"):
+            value = float(
+                np.linalg.norm(force, axis=1)
+                * np.linalg.norm(seen, axis=0)
+                @ peak_gains(omega[others], zeta[others])
+            )
+        pushed = places(bound_of[0])
+        watched = places(bound_of[1]) or pushed
+        B = np.column_stack([modes.dofs.row(place) for place in pushed])
+        value += _vector_peaks(kept, B, np.array([modes.dofs.row(place) for place in watched]))
+        bound = ErrorBound(value, into, out, _SUM) if np.isfinite(value) else None
+    return _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
+
+
+def _corrected(
+    kept: Modes, shapes: FloatArray, omega: FloatArray, zeta: FloatArray, static: Any
+) -> Modes:
+    """Return modes with attachment vectors made of the other modes of a known set."""
+    names = labels_of(static, kept.dofs)
+    rows = np.array([kept.dofs.row(place) for place in static])
+    moved = (rows @ shapes).T / omega[:, None] ** 2
+    vectors, values, _ = la.svd(moved, full_matrices=False)
+    if not values.size or values[-1] <= 1e-9 * values[0] or moved.shape[1] > moved.shape[0]:
+        raise ModelError(
+            f"the truncated modes cannot give {len(static)} independent static shapes at "
+            f"{', '.join(names)}: they are too few, or a place is there twice."
+        )
+    squares, mix = la.eigh((vectors.T * omega**2) @ vectors)
+    mix = vectors @ mix
+    return kept.replace(
+        vectors=shapes @ mix,
+        vector_omega=np.sqrt(squares),
+        vector_zeta=np.sum(mix**2 * (zeta * omega)[:, None], axis=0) / np.sqrt(squares),
+        vector_dofs=names,
+    )
+
+
+def _vector_peaks(kept: Modes, B: FloatArray, C: FloatArray) -> float:
+    """Return the sum of the peaks of attachment vectors between channels."""
+    if not kept.n_vectors:
+        return 0.0
+    force = np.linalg.norm(kept.vectors.T @ B, axis=1)
+    seen = np.linalg.norm(C @ kept.vectors, axis=0)
+    return float(force * seen @ peak_gains(kept.vector_omega, kept.vector_zeta))
+
+
+def _diagonal(
+    modes: Modes, names: list[str], method: str, bound: ErrorBound | None
+) -> ReducedModel:
+    """Return the reduced model whose coordinates are the modes themselves, equation (5)."""
+    omega, zeta = modes.basis_omega, modes.basis_zeta
+    k, r = omega.size, modes.n_rigid
+    static = [f"static {i}" for i in range(1, modes.n_vectors + 1)]
+    extra = f" and {modes.n_vectors} static vectors" if modes.n_vectors else ""
+    return ReducedModel(
+        M=np.eye(k),
+        D=np.diag(2 * zeta * omega),
+        K=np.diag(omega**2),
+        T=np.real(modes.basis),
+        dofs=modes.dofs.select(()),
+        full_dofs=modes.dofs,
+        rigid_body=np.eye(k, r),
+        method=f"{method}, {modes.n_modes} modes{extra}",
+        coordinates=[*names, *static],
+        condition_of="M*",
+        bound=bound if bound is None or np.isfinite(bound.value) else None,
+    )
