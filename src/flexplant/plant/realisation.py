@@ -152,10 +152,28 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
                 f"a plant of all {model.M.shape[0]} DOFs needs a dense eigenproblem of that size. "
                 "Pass solve_modes(model, count=...) or a reduced model instead."
             )
+        if isinstance(model, ReducedModel) and model.massless.size:
+            return _at_once(model)
         return _of_matrices(model, real_form(model.M, model.D, model.K, model.rigid_body))
     raise ModelError(
         f"a plant is assembled from an FEModel, Modes or ReducedModel, got {type(model).__name__}. "
         "A state-space model made elsewhere comes in through StandardPlant.from_statespace."
+    )
+
+
+def _at_once(model: ReducedModel) -> ModalRealisation:
+    """Return the realisation of a model with massless coordinates (MacNeal): they answer at once."""
+    heavy, follow, flexibility = model.condensed()
+    found = realised(heavy)
+    values, vectors = np.linalg.eigh(flexibility)
+    kept = values > 1e-15 * values[-1]
+    half = vectors[:, kept] * np.sqrt(values[kept])
+    return found.replace(
+        model=model,
+        inputs=follow @ found.inputs,
+        outputs=follow @ found.outputs,
+        static_outputs=half,
+        static_inputs=half,
     )
 
 
