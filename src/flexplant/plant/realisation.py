@@ -162,7 +162,7 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
 
 
 def _at_once(model: ReducedModel) -> ModalRealisation:
-    """Return the realisation of a model with massless coordinates (MacNeal): they answer at once."""
+    """Return the realisation of a model whose massless coordinates (MacNeal) answer at once."""
     heavy, follow, flexibility = model.condensed()
     found = realised(heavy)
     values, vectors = np.linalg.eigh(flexibility)
