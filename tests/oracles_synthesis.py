@@ -124,3 +124,63 @@ def rigid_sensor(point, die, axes):
     """
     dx, dy = point[0] - die[0], point[1] - die[1]
     return np.array([{"z": 1.0, "rx": dy, "ry": -dx}[axis] for axis in axes])
+
+
+# --- plants with a known smallest gamma, made here: for where no collection of plants is at hand
+
+
+def chain(masses=3, stiffness=4.0):
+    """A, B, C of equal masses on a line, free at both ends, undamped: force and motion at one end.
+
+    The non-collocated pair (force on the first, position of the last) when C is reversed.
+    """
+    L = 2.0 * np.eye(masses) - np.eye(masses, k=1) - np.eye(masses, k=-1)
+    L[0, 0] = L[-1, -1] = 1.0
+    A = np.block([[np.zeros((masses, masses)), np.eye(masses)], [-stiffness * L, np.zeros_like(L)]])
+    B = np.zeros((2 * masses, 1))
+    B[masses] = 1.0
+    C = np.zeros((1, 2 * masses))
+    C[0, masses - 1] = 1.0
+    return A, B, C
+
+
+def cart_pole(growth=2.0):
+    """A, B, C of an inverted pendulum on a cart: two integrators, a pole and its mirror."""
+    A = np.zeros((4, 4))
+    A[0, 1] = A[2, 3] = 1.0
+    A[1, 2], A[3, 2] = -1.0, growth**2
+    B = np.array([[0.0], [1.0], [0.0], [-1.0]])
+    C = np.array([[1.0, 0, 0, 0], [0, 0, 1.0, 0]])
+    return A, B, C
+
+
+def random_plant(seed, n=6, m=2, p=2):
+    """A, B, C of any poles."""
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(n, n)), rng.normal(size=(n, m)), rng.normal(size=(p, n))
+
+
+def sensitivity_problem(zero, pole, lag, *, peak=2.0, corner=0.5, low=0.01):
+    """The standard plant of ||W S||, and its infimum.
+
+    y = w + G u, z = W y, W = (s / peak + corner) / (s + corner low) and
+    ``G = (s - zero) / (s - pole)``, times ``1 / (s + 1)`` with lag. S is 1 at the zero and 0 at an
+    unstable pole, so that by the maximum modulus theorem (Zames; Khargonekar, Tannenbaum)
+    ``|W S| >= |W(zero)|``, times ``(zero + pole) / |zero - pole|`` when the pole is unstable.
+    """
+    # G: pole, then the lag; u -> g
+    A = np.array([[pole]])
+    B, C, D = np.array([[1.0]]), np.array([[pole - zero]]), np.array([[1.0]])
+    if lag:
+        A = np.array([[pole, 0.0], [pole - zero, -1.0]])
+        B, C, D = np.array([[1.0], [1.0]]), np.array([[0.0, 1.0]]), np.array([[0.0]])
+    n = A.shape[0]
+    a, d = -corner * low, 1.0 / peak
+    c = corner - corner * low / peak  # W = d + c / (s - a)
+    states = np.block([[A, np.zeros((n, 1))], [C, np.array([[a]])]])
+    inputs = np.block([[np.zeros((n, 1)), B], [np.ones((1, 1)), D]])
+    outputs = np.block([[d * C, np.array([[c]])], [C, np.zeros((1, 1))]])
+    through = np.block([[np.array([[d]]), d * D], [np.ones((1, 1)), D]])
+    weight = (zero / peak + corner) / (zero + corner * low)
+    least = weight * ((zero + pole) / abs(zero - pole) if pole > 0 else 1.0)
+    return (states, inputs, outputs, through), least

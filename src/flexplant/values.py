@@ -215,6 +215,19 @@ def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None
     return number
 
 
+def flag(value: Any, name: str) -> bool:
+    """Return `value` as a bool: True or False, nothing that merely counts as one.
+
+    Raises
+    ------
+    ModelError
+        When it is another thing.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise ModelError(f"{name} must be True or False, got {short(value)}. Pass one of them.")
+    return bool(value)
+
+
 def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
     """Return the SeedSequence that a seed, SeedSequence, Generator or None stands for.
 

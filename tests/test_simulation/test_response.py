@@ -121,3 +121,15 @@ def test_bad_input():
         Response([0.0], np.zeros((2, 1)), ["e", "e"])
     with pytest.raises(ModelError, match="NaN"):
         Response([0.0], [[np.nan]], ["e"])
+
+
+@pytest.mark.parametrize("size", [1e-300, 1e-170, 1.0, 1e160, 1e300, 1.7e308])
+def test_signals_whose_squares_leave_all_numbers(size):
+    """A run that grew, or one in units far too large: rms and moving figures scale with it."""
+    one = np.random.default_rng(0).uniform(-1.0, 1.0, (1, 40))
+    small, large = (Response(np.arange(40) * 0.1, k * one, ["e"]) for k in (1.0, size))
+    assert large.rms("e") / size == pytest.approx(small.rms("e"), rel=1e-12)
+    for name in ("moving_average", "moving_std"):
+        wanted, found = (getattr(run, name)("e", window=0.7) for run in (small, large))
+        np.testing.assert_allclose(found / size, wanted, rtol=1e-12, atol=1e-15)
+    assert Response([0.0, 0.1], np.zeros((1, 2)), ["e"]).rms("e") == 0.0

@@ -1,5 +1,6 @@
 """simulate against a dense recursion, scipy's dlsim and the Lyapunov equation."""
 
+import re
 import time
 
 import numpy as np
@@ -9,7 +10,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracles_loop as oracle
-from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
+from flexplant.errors import (
+    AssumptionError,
+    FlexplantWarning,
+    LabelError,
+    ModelError,
+    ShapeError,
+)
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
@@ -207,13 +214,36 @@ def test_big_machine_is_fast():
     )
 
 
-def test_unstable_loop_runs_until_it_leaves_all_numbers():
-    bad = close_loop(stage(), observer(), servo(hz=20.0))
-    run = simulate(bad, reference=1e-9, noise=False, duration=0.5)
+def test_an_unstable_loop_runs_with_a_warning_until_it_leaves_all_numbers():
+    bad = close_loop(stage(), observer(), servo(hz=20.0, sign=-1.0))
+    radius = np.abs(np.linalg.eigvals(bad.monitored.A)).max()
+    assert radius > 1.0
+    growth = re.escape(f"{radius**1000:.3g}")
+    words = rf"unstable \(spectral radius {radius:.6f}.* grows {growth} times"
+    with pytest.warns(FlexplantWarning, match=words):
+        run = simulate(bad, reference=1e-9, noise=False, duration=1000 / RATE)
     assert run.peak("die:z") > 1e-9
     worse = close_loop(stage(), observer(), servo(hz=8.0, sign=-1e6))
-    with pytest.raises(ModelError, match="diverged beyond all numbers"):
+    with (
+        pytest.warns(FlexplantWarning, match="grows beyond all numbers in these"),
+        pytest.raises(ModelError, match="diverged beyond all numbers"),
+    ):
         simulate(worse, reference=1.0, duration=3.0)
+
+
+def test_what_is_only_marginal_is_no_runaway():
+    """A free mass that rests: two poles at 1, which rounding may put a little outside."""
+    g = StateSpace(
+        [[1.0, 0.1], [0.0, 1.0]], [[0.0, 0.0], [0.1, 0.1]], [[1.0, 0.0]] * 2, np.zeros((2, 2)),
+        0.1, inputs=["w", "u"], outputs=["z", "y"],
+    )  # fmt: skip
+    turn = np.linalg.qr(np.random.default_rng(0).standard_normal((2, 2)))[0]
+    plant = StandardPlant.from_statespace(g.transformed(turn), u=["u"], y=["y"])
+    still = StateSpace([], [], [], [[0.0]], inputs=["y"], outputs=["u"])
+    loop = close_loop(plant, still)
+    assert loop.spectral_radius > 1.0  # 1e-8 of rounding
+    run = simulate(loop, disturbance={"w": 1.0}, duration=100.0)
+    assert run["z"][-1] == pytest.approx(0.5 * 99.9**2, rel=2e-2)
 
 
 def test_progress_bar_shows_when_asked(loop, capsys):
@@ -263,8 +293,15 @@ def test_assumptions_are_checked(loop):
         ({"reference": np.zeros(7)}, ShapeError, "reference 'die:ref' must have shape \\(20,\\)"),
         ({"reference": lambda t: t[:3]}, ShapeError, "shape"),
         ({"reference": np.nan}, ModelError, "NaN"),
-        ({"runs": 0}, ModelError, "runs must be at least 1"),
-        ({"runs": [-1]}, ModelError, "from 0"),
+        ({"runs": 0}, ModelError, "runs must be a whole number at least 1, got 0"),
+        ({"runs": 2.0}, ModelError, "runs must be a whole number"),
+        ({"runs": "two"}, ModelError, "runs must be a whole number"),
+        ({"runs": []}, ModelError, "runs must be at least 1"),
+        ({"runs": [-1]}, ModelError, "a run number must be a whole number at least 0"),
+        ({"rng": "a"}, ModelError, "rng must be a seed"),
+        ({"rng": 1.5}, ModelError, "rng must be a seed"),
+        ({"noise": "no"}, ModelError, "noise must be True or False"),
+        ({"disturbance": 3.0}, ModelError, "disturbance must be a mapping"),
         ({"start": np.zeros(3)}, ShapeError, "start"),
     ],
 )

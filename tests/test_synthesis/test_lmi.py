@@ -150,6 +150,54 @@ def test_bound_and_riccati_meet_with_feedthrough(seed):
     assert by_lmi.gamma <= 1.05 * 1.001 * by_riccati.gamma
 
 
+def random_system(n, seed, full):
+    """Two z, one y, one u; with the efforts and the noise left out, D12 = 0 and D21 = 0."""
+    rng = np.random.default_rng(seed)
+    A, B, C = (rng.standard_normal(size) for size in ((n, n), (n, 4), (3, n)))
+    D = np.zeros((3, 4))
+    D[1, 3] = D[2, 2] = float(full)
+    return A, B[:, :3], B[:, 3:], C[:2], C[2:], D[:2, :3], D[:2, 3:], D[2:, :3]
+
+
+# the solver's own settings stop at "InsufficientProgress" on each of these
+@pytest.mark.parametrize(
+    ("n", "seed", "full"),
+    [(3, 1, False), (3, 2, False), (3, 6, False), (5, 7, True), (5, 22, True), (5, 23, True)],
+)
+def test_a_solver_that_stops_early_is_not_the_end(n, seed, full):
+    parts = random_system(n, seed, full)
+    P, u, y = system(parts)
+    found = design_hinf(P, Lmi(back_off=1e-3), u=u, y=y)
+    K = found.system
+    loop = closed_loop(*parts, (K.A, K.B, K.C, K.D))
+    assert np.linalg.eigvals(loop[0]).real.max() < 0
+    assert swept_norm(*loop) <= found.gamma * (1 + 1e-6)
+    if full:  # another method, without semidefinite programs
+        gamma = design_hinf(P, Riccati(back_off=0.0, tolerance=1e-4), u=u, y=y).gamma
+        assert found.gamma <= 1.01 * gamma
+        assert found.lower == pytest.approx(gamma, rel=2e-3)
+
+
+@pytest.mark.slow
+def test_where_every_setting_stops_early_the_error_is_ours(monkeypatch):
+    """Gahinet's program, 10 states, rng 2: gamma is 2e6 times the plant's size."""
+    monkeypatch.setattr(lmi_programs, "ATTEMPTS", ({},))
+    P, u, y = system(random_system(10, 2, True))
+    with pytest.raises(SolverError, match=r"Loosen weights|loosen weights"):
+        design_hinf(P, Lmi(back_off=1e-3), u=u, y=y)
+
+
+def test_an_answer_that_cannot_be_read_is_named(monkeypatch):
+    import cvxpy as cp
+
+    def unread(*_):
+        raise cp.error.SolverError("Solver 'CLARABEL' failed.")
+
+    monkeypatch.setattr(cp.Problem, "unpack_results", unread)
+    with pytest.raises(SolverError, match=r"could not be read .*Solved after .*Loosen weights"):
+        Lmi().solve(problem(scalar(1.0, 1.0)))
+
+
 def test_sampled_plant_with_rigid_body_and_noise_free_sensor():
     h = 1e-3
     # 2 kg on no spring in SI units, sampled; y in m, z the position error in um and the effort
@@ -295,6 +343,8 @@ def reached(slack=1.2):
         {"tolerance": 0.0},
         {"time_limit": np.nan},
         {"max_states": -3},
+        {"max_states": 7.5},
+        {"tolerance": "small"},
     ],
 )
 def test_bad_options(options):

@@ -119,7 +119,9 @@ class Response(Value, Mapping[str, FloatArray]):
         ModelError
             When nothing is left after `start`.
         """
-        return _numbers(np.sqrt(np.mean(self._from(channel, start) ** 2, axis=-1)))
+        signal = self._from(channel, start)
+        unit = _unit(signal)
+        return _numbers(unit * np.sqrt(np.mean((signal / unit) ** 2, axis=-1)))
 
     def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the largest magnitude of a channel.
@@ -170,8 +172,7 @@ class Response(Value, Mapping[str, FloatArray]):
         ModelError
             When the window is shorter than one sample or longer than the record.
         """
-        signal = self[channel]
-        return moving_moments(signal, self._count(window))[0]
+        return self._moments(channel, window)[0]
 
     def moving_std(self, channel: str, *, window: float = 5e-3) -> FloatArray:
         """Return the standard deviation of a channel in a window centred at each time (MSD).
@@ -197,8 +198,7 @@ class Response(Value, Mapping[str, FloatArray]):
         ModelError
             When the window is shorter than one sample or longer than the record.
         """
-        signal = self[channel]
-        return moving_moments(signal, self._count(window))[1]
+        return self._moments(channel, window)[1]
 
     def to_sep005(self) -> list[dict[str, object]]:
         """Return the channels of a single run as SDyPy's time series (SEP 5).
@@ -228,6 +228,12 @@ class Response(Value, Mapping[str, FloatArray]):
                 f"start={first:g} s leaves nothing: the response ends at {self.time[-1]:g} s."
             )
         return signal[..., keep]
+
+    def _moments(self, channel: str, window: float) -> tuple[FloatArray, FloatArray]:
+        signal = self[channel]
+        unit = _unit(signal)
+        mean, deviation = moving_moments(signal / unit, self._count(window))
+        return unit * mean, unit * deviation
 
     def _count(self, window: float) -> int:
         length = positive(window, "window")
@@ -285,6 +291,11 @@ def moving_moments(signal: FloatArray, count: int) -> tuple[FloatArray, FloatArr
         means.append((tails[..., stretch, offset] + heads[..., stretch, offset]) / weight)
     centre = edges[..., 1:, 0][..., stretch] + means[0]
     return centre, np.sqrt(np.maximum(means[1] - means[0] ** 2, 0.0))
+
+
+def _unit(signal: FloatArray) -> float:
+    """Return the size of a signal as a power of two: its squares neither over- nor underflow."""
+    return float(2.0 ** (np.frexp(np.max(np.abs(signal), initial=0.0))[1] - 1))
 
 
 def _cumulative(parts: FloatArray) -> FloatArray:

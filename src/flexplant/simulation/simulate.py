@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -10,10 +11,20 @@ import numpy as np
 import numpy.typing as npt
 from threadpoolctl import threadpool_limits
 
-from ..errors import AssumptionError, LabelError, ModelError, unknown_label
+from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
+from ..lti.stability import obstacle
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, positive, real_array
+from ..values import (
+    FloatArray,
+    IntArray,
+    flag,
+    positive,
+    real_array,
+    seed_sequence,
+    short,
+    whole,
+)
 from .response import Response
 from .setpoint import SetPoint
 from .stepping import Buffers, Machine, machine, step_through
@@ -55,7 +66,8 @@ def simulate(
     Parameters
     ----------
     loop : ClosedLoop
-        Around a sampled plant, stable or not.
+        Around a sampled plant. An unstable one is run all the same, with a warning that names
+        its spectral radius and by how much it grows in the run.
     duration : float [s]
         Of the run; round(duration * rate) samples, the first at 0.
     reference : signal or mapping {name: signal}, optional
@@ -116,10 +128,11 @@ def simulate(
         )
     time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
     given = _given(plant, reference, disturbance, time)
-    white = _noise(plant, noise)
+    white = _noise(plant, flag(noise, "noise"))
     numbers = _run_numbers(runs)
     state = _start(loop, start)
     generators = _generators(rng, numbers)
+    _warn_unstable(loop, steps)
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
     data = np.zeros((len(numbers), len(shown), steps))
     parts = machine(loop)
@@ -215,6 +228,26 @@ def _check_sampled(loop: ClosedLoop) -> None:
         )
 
 
+def _warn_unstable(loop: ClosedLoop, steps: int) -> None:
+    """Warn of a loop that runs away; an integrator that is left alone is no such loop."""
+    radius = loop.spectral_radius
+    if radius <= 1:
+        return
+    found = obstacle(loop.monitored)
+    if found is None or not found.reason.startswith("unstable"):
+        return
+    with np.errstate(over="ignore"):
+        growth = float(np.float64(radius) ** steps)
+    by = f"{growth:.3g} times" if np.isfinite(growth) else "beyond all numbers"
+    warnings.warn(
+        f"the loop is unstable (spectral radius {radius:.9g}; {found.reason}): what grows fastest "
+        f"grows {by} in these {steps} samples, and no rms of it means anything. Lower the gain or "
+        "the delay of its controller; loop.modulus_margin tells how far a loop is from this.",
+        FlexplantWarning,
+        stacklevel=3,
+    )
+
+
 def _given(
     plant: StandardPlant,
     reference: Signal | Mapping[str, Signal] | None,
@@ -233,6 +266,11 @@ def _given(
                 "reference={name: signal}; Ports(references=[Reference(poi)]) adds one."
             )
         reference = {references[0]: reference}
+    if disturbance is not None and not isinstance(disturbance, Mapping):
+        raise ModelError(
+            f"disturbance must be a mapping, got {short(disturbance)}: say which channel of w is "
+            "meant, disturbance={name: signal}."
+        )
     given = np.zeros((time.size, len(plant.w)))
     for kind, known, signals in (
         ("reference", references, reference),
@@ -277,20 +315,17 @@ def _noise(plant: StandardPlant, wanted: bool) -> _Noise:
 def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:
     if runs is None:
         return [0]
-    numbers = range(runs) if isinstance(runs, int | np.integer) else runs
-    listed = [int(i) for i in numbers]
-    if not listed or min(listed) < 0:
-        raise ModelError(
-            f"runs must be at least 1, or a list of run numbers from 0, got {runs!r:.80}."
-        )
+    if not isinstance(runs, Iterable) or isinstance(runs, str):
+        return list(range(whole(runs, "runs")))
+    listed = [whole(number, "a run number", minimum=0) for number in runs]
+    if not listed:
+        raise ModelError("runs must be at least 1, or run numbers from 0, got none. Name one.")
     return listed
 
 
 def _generators(rng: Any, numbers: Iterable[int]) -> list[np.random.Generator]:
     """Return the generator of each run, from the child of the seed with the run's number."""
-    if isinstance(rng, np.random.Generator):
-        rng = np.random.SeedSequence(rng.integers(0, 2**32, size=4).tolist())
-    seed = rng if isinstance(rng, np.random.SeedSequence) else np.random.SeedSequence(rng)
+    seed = seed_sequence(rng)
     return [
         np.random.default_rng(
             np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number))

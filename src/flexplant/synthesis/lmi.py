@@ -14,7 +14,7 @@ from ..lti.interconnection import lft
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
 from ..lti.statespace import StateSpace
-from ..values import Value, positive
+from ..values import Value, positive, whole
 from .lmi_programs import (
     Matrices,
     Optimum,
@@ -34,6 +34,8 @@ _GAP = 5e-4
 _ROUNDS = 4
 #: gamma, relative to the plant's size, that is taken for zero
 _NOTHING = 1e-7
+#: multiples of the back-off that are tried in turn
+_LOOSER = np.array([1.0, 2.0, 4.0, 8.0])
 #: what a closed loop may exceed its target by
 _EXCESS = 1e-3
 
@@ -50,7 +52,7 @@ class Lmi(Value):
     ----------
     back_off : float
         Relative distance of the target from the smallest gamma, at which the controller's gains
-        may be infinite.
+        may be infinite. Doubled up to three times where no controller keeps the target.
     tolerance : float
         Of the solver: gap and residuals, relative.
     max_states : int
@@ -80,7 +82,7 @@ class Lmi(Value):
         self._set(
             back_off=positive(self.back_off, "back_off"),
             tolerance=positive(self.tolerance, "tolerance"),
-            max_states=int(positive(self.max_states, "max_states")),
+            max_states=whole(self.max_states, "max_states"),
             time_limit=positive(self.time_limit, "time_limit"),
         )
 
@@ -109,7 +111,7 @@ class Lmi(Value):
             )
         found = self._smallest(Plant.of(problem))
         failures = []
-        for back_off in (self.back_off, 2 * self.back_off):
+        for back_off in self.back_off * _LOOSER:
             try:
                 K = moderate_controller(found.plant, 1.0 + back_off, self._settings)
                 norm = _verified(problem, K, found.value * (1.0 + back_off))

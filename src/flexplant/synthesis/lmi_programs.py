@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from types import SimpleNamespace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -19,6 +20,12 @@ APART = 0.6
 MODERATION = 0.1
 #: largest violation of an LMI, relative to its largest eigenvalue
 VIOLATION = 1e-6
+#: settings of Clarabel, tried in turn: its own; without its scaling of the data; regularised more
+ATTEMPTS: tuple[dict[str, Any], ...] = (
+    {},
+    {"equilibrate_enable": False},
+    {"static_regularization_constant": 1e-7},
+)
 
 #: A, B, C, D of a controller
 Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
@@ -318,6 +325,9 @@ def _reconstructed(
 def _solve(problem: Any, settings: dict[str, float]) -> None:
     """Solve a semidefinite program; its LMIs are looked at by their eigenvalues afterwards.
 
+    Where Clarabel stops without an answer, the next of `ATTEMPTS` is made; the last resort is a
+    point at which progress became insufficient, which often is one that holds.
+
     Raises
     ------
     InfeasibleError
@@ -326,24 +336,30 @@ def _solve(problem: Any, settings: dict[str, float]) -> None:
         When it stopped without a solution, or the solution violates an LMI.
     """
     data, chain, inverse = problem.get_problem_data("CLARABEL", solver_opts={})
-    raw = chain.solve_via_data(problem, data, solver_opts=settings)
-    status = str(raw.status)
-    how = f"Clarabel: {status} after {raw.iterations} iterations"
-    if "PrimalInfeasible" in status:
-        raise InfeasibleError(
-            f"the LMIs have no solution ({how}). Does u reach and y see every unstable mode?"
-        )
-    if status not in ("Solved", "AlmostSolved", "InsufficientProgress"):
-        n = max(variable.shape[0] for variable in problem.variables() if variable.shape)
+    reached: Any = None
+    for attempt in ATTEMPTS:
+        raw = chain.solve_via_data(problem, data, solver_opts={**settings, **attempt})
+        status = str(raw.status)
+        how = f"Clarabel: {status} after {raw.iterations} iterations"
+        if "PrimalInfeasible" in status:
+            raise InfeasibleError(
+                f"the LMIs have no solution ({how}). Does u reach and y see every unstable mode?"
+            )
+        if status in ("Solved", "AlmostSolved"):
+            reached = raw
+            break
+        if status == "InsufficientProgress" and reached is None:
+            reached = raw
+        if "MaxTime" in status:
+            break
+    if reached is None:
         raise SolverError(
             f"the LMIs were not solved ({how}, residuals {raw.r_prim:.1e} and {raw.r_dual:.1e}, "
-            f"{n} states). Does u reach and y see every unstable mode? If so, loosen weights or "
-            "reduce the order of the plant."
+            f"{_order(problem)} states, {len(ATTEMPTS)} settings tried). Does u reach and y see "
+            "every unstable mode? If so, loosen weights or reduce the order of the plant."
         )
-    with warnings.catch_warnings():
-        # what is inaccurate is judged below
-        warnings.filterwarnings("ignore", message="Solution may be inaccurate")
-        problem.unpack_results(raw, chain, inverse)
+    _unpack(problem, reached, chain, inverse)
+    how = f"Clarabel: {reached.status} after {reached.iterations} iterations"
     for constraint in problem.constraints:
         M = constraint.args[0].value
         values = la.eigvalsh(half(M))
@@ -356,3 +372,28 @@ def _solve(problem: Any, settings: dict[str, float]) -> None:
                 f"an LMI is violated: smallest eigenvalue {values[0]:.1e}, largest "
                 f"{values[-1]:.1e} ({how}). Loosen weights or reduce the order of the plant."
             )
+
+
+def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
+    """Write a solver's point into the variables: what is inaccurate is judged by the LMIs."""
+    from cvxpy.error import SolverError as Unread
+
+    # cvxpy reads no point whose status is another
+    names = ("x", "z", "obj_val", "solve_time", "iterations")
+    point = SimpleNamespace(**{name: getattr(raw, name) for name in names}, status=raw.status)
+    if str(raw.status) not in ("Solved", "AlmostSolved"):
+        point.status = "AlmostSolved"
+    try:
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", message="Solution may be inaccurate")
+            problem.unpack_results(point, chain, inverse)
+    except (Unread, ValueError) as error:
+        raise SolverError(
+            f"the solver's answer could not be read (Clarabel: {raw.status} after "
+            f"{raw.iterations} iterations, {_order(problem)} states): {error} Loosen weights or "
+            "reduce the order of the plant."
+        ) from error
+
+
+def _order(problem: Any) -> int:
+    return max(variable.shape[0] for variable in problem.variables() if variable.shape)
