@@ -81,6 +81,7 @@ def made():
     yield from (fx.Rayleigh(1.0, 1e-6), fx.AddedStiffness(at), *unknowns, residual, poles, fit)
     yield eigenvalue_sensitivities(rom, unknowns, modes=[6])
     yield from of_updates(rom, unknowns, residual, fit)
+    yield from of_reductions(fe, modes, rom)
     yield from (plant, sampled, sampled.weighted(z={"die:z": 2.0}), uncertain, plant.check())
     yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
     yield from (static, fx.design_kalman(sampled), servo, loop, point, response)
@@ -96,6 +97,18 @@ def made():
     yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
     yield structure.interpolated(modes.dofs).interpolation
     yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
+
+
+def of_reductions(fe, modes, rom):
+    """One of each way to reduce, and what is said of the answer."""
+    at = rom.dofs.labels[:6:2]
+    truncation = fx.ModalTruncation(count=8, inputs=at)
+    yield from (truncation, fx.reduce(modes, truncation), fx.ModalBalanced(8, at))
+    yield from (fx.Guyan(at), fx.Irs(at, iterations=2), fx.Serep(at), fx.Krylov(at, [0.0, 500.0]))
+    yield from (fx.CraigBampton(at, 3), fx.Rubin(at, 5), fx.MacNeal(at, 5))
+    yield from (fx.PivotedQr(), fx.EffectiveIndependence(), fx.Greedy())
+    yield fx.rank_modes(modes, inputs=at)
+    yield fx.reduce(modes, truncation).quality(fe, band=(100.0, 400.0), freq=np.array([250.0]))
 
 
 def of_updates(rom, unknowns, residual, fit):
