@@ -21,8 +21,8 @@ Structure: TypeAlias = "FEModel | Modes | ReducedModel"
 
 #: a dense eigenproblem of more DOFs than this is refused: reduce first
 LARGEST_DENSE = 2500
-#: condition of a complex mode above which its block would cost too many digits
-ILL_CONDITIONED = 1e5
+#: condition c of a complex mode above which its block costs too many digits: rounding times c^2
+ILL_CONDITIONED = 30.0
 #: the form of a realisation whose modes do not see each other
 MODAL = "modal blocks"
 

@@ -81,9 +81,10 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
     pairs = plant.realisation.pairs[n_rigid:count]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
-    swinging = _swinging(pairs, omega)
-    own = [np.linalg.eigvals(pair) for pair in swinging]
-    wanted = np.array([pole[np.argmax(pole.imag)] for pole in own], dtype=np.complex128)
+    swinging = _swinging(pairs)
+    # filters of ports act at the pole; one that does not swing stands for its frequency
+    wanted = omega * (-zeta + 1j * np.sqrt(np.maximum(1.0 - zeta**2, 0.0)))
+    wanted = np.where(zeta < 1.0, wanted, 1j * omega)
     # the structure's states first: filters of sensors stand before them
     own_first = [*plant.modal_states, *np.setdiff1d(np.arange(g.n_states), plant.modal_states)]
     inner = g.A[np.ix_(own_first, own_first)]
@@ -107,12 +108,11 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
     )
 
 
-def _swinging(pairs: FloatArray, omega: FloatArray) -> FloatArray:
-    """Return the pairs, those critically damped or more without damping: shapes are the same."""
-    half = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
-    slow = half**2 + pairs[:, 0, 1] * pairs[:, 1, 0] > -1e-6 * omega**2
+def _swinging(pairs: FloatArray) -> FloatArray:
+    """Return the pairs, those of real modes without their damping: it is no part of the shape."""
+    real = pairs[:, 0, 0] == 0.0
     swinging = pairs.copy()
-    swinging[slow, 0, 0] = swinging[slow, 1, 1] = 0.0
+    swinging[real, 1, 1] = 0.0
     return swinging
 
 
