@@ -1,0 +1,275 @@
+"""Abaqus matrix output (*MATRIX GENERATE, *MATRIX OUTPUT): text files, one matrix each."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantError, LabelError, ModelError
+from ..labels import DIRECTIONS, DofSet
+from ..structure.matrices import FEMatrices
+from ..values import FloatArray, IntArray
+from .numbers import printed_digits, spaced_numbers
+
+#: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
+_HELD = 1e35
+_WORD = re.compile(rb"[^\s,]+")
+
+
+def read_abaqus(
+    stiffness: str | Path,
+    *,
+    mass: str | Path | None = None,
+    damping: str | Path | None = None,
+    inp: str | Path | None = None,
+    dofs: DofSet | None = None,
+) -> FEMatrices:
+    """Return the matrices that Abaqus wrote with `*MATRIX OUTPUT`.
+
+    FORMAT=MATRIX INPUT (the default; lines `node, dof, node, dof, value`, one triangle) or
+    FORMAT=COORDINATE (lines `row column value`, counted from 1). Degrees of freedom held by a
+    boundary condition, which Abaqus marks with 1e36 on the diagonal of K, are dropped.
+
+    Parameters
+    ----------
+    stiffness, mass, damping : str or Path
+        The files `job_STIF2.mtx`, `job_MASS2.mtx` and (viscous damping) `job_DMPV2.mtx`.
+    inp : str or Path, optional
+        The input file, for the coordinates in its `*NODE` blocks.
+    dofs : DofSet, optional
+        The rows, for FORMAT=COORDINATE, which does not name them.
+
+    Returns
+    -------
+    FEMatrices
+        Without `inp` not `located`; with the printed `digits`.
+
+    Raises
+    ------
+    FlexplantError
+        When a line has another form; it is named.
+    ModelError
+        When there are internal nodes (Lagrange multipliers of contact, couplings or hybrid
+        elements), degrees of freedom that are no displacement, or nodes in transformed systems.
+    LabelError
+        When a node has no coordinates in `inp`.
+    ShapeError
+        When `dofs` has another number of rows.
+    FileNotFoundError
+        When there is no such file.
+
+    Notes
+    -----
+    Format: Abaqus Analysis User's Guide, "Generating structural matrices"; Keywords Reference,
+    `*MATRIX INPUT` and `*MATRIX OUTPUT`. Units are those of the model: `.converted(...)`.
+    """
+    files = [stiffness, mass, damping]
+    parts = [None if file is None else _triplets(file) for file in files]
+    there = [part for part in parts if part is not None]
+    if len({part.named for part in there}) > 1:
+        raise ModelError(
+            "the files are of two formats, MATRIX INPUT and COORDINATE: their rows cannot be "
+            "matched. Write all with the same FORMAT."
+        )
+    order = np.unique(
+        np.concatenate([code for part in there for code in (part.rows, part.columns)])
+    )
+    if not there[0].named:
+        order = np.arange(16, 16 * (order[-1] >> 4) + 1, 16)
+    K, M, D = (None if part is None else part.matrix(order) for part in parts)
+    assert K is not None  # noqa: S101 - its file is no option
+    located = True
+    if there[0].named:
+        if dofs is not None:
+            raise ModelError("the files name their rows: dofs= is for FORMAT=COORDINATE only.")
+        dofs, located = _dofs(order, inp, str(stiffness)), inp is not None
+    found = FEMatrices(
+        K,
+        M,
+        D,
+        dofs=dofs,
+        digits=max(part.digits for part in there),
+        source=str(stiffness),
+        located=located,
+    )
+    held = found.K.diagonal() >= _HELD
+    if not held.any():
+        return found
+    if dofs is None:
+        raise ModelError(
+            f"rows {(np.flatnonzero(held)[:6] + 1).tolist()} of {str(stiffness)!r} are held by "
+            "boundary conditions (1e36 on the diagonal), and rows without names cannot be dropped. "
+            "Write FORMAT=MATRIX INPUT, or give dofs=."
+        )
+    return found.without([label for label, out in zip(dofs.labels, held, strict=True) if out])
+
+
+@dataclass
+class _Triplets:
+    """Entries of one matrix; a code is 16 node + degree of freedom, or 16 row."""
+
+    path: str
+    named: bool
+    rows: IntArray
+    columns: IntArray
+    values: FloatArray
+    digits: int
+
+    def matrix(self, order: IntArray) -> sp.csc_array:
+        i, j = np.searchsorted(order, self.rows), np.searchsorted(order, self.columns)
+        n = order.size
+        counts = np.unique(i * n + j, return_counts=True)[1]
+        if np.any(counts > 1):
+            raise FlexplantError(
+                f"{self.path!r} gives {int(np.count_nonzero(counts > 1))} entries twice: matrices "
+                "of several steps in one file, or a damaged one. Write it again."
+            )
+        return symmetric(sp.csc_array(sp.coo_array((self.values, (i, j)), shape=(n, n))))
+
+
+def symmetric(matrix: sp.csc_array) -> sp.csc_array:
+    """Return the full matrix of one that may hold one triangle only.
+
+    Parameters
+    ----------
+    matrix : (n, n) sparse matrix
+        A triangle, or the full matrix, which is returned as it is.
+    """
+    lower, upper = sp.tril(matrix, -1), sp.triu(matrix, 1)
+    if lower.count_nonzero() and upper.count_nonzero():
+        # unsorted labels put entries of a half on both sides: no entry then has its mirror image
+        both = abs(lower).multiply(abs(upper.T)).count_nonzero()
+        if both:
+            return matrix
+    return sp.csc_array(matrix + (lower + upper).T)
+
+
+def _triplets(path: str | Path) -> _Triplets:
+    lines = Path(path).read_bytes().splitlines()
+    scale = 1.0
+    data = [line for line in lines if line.strip() and line[:1] != b"*"]
+    for line in lines:
+        match = re.search(rb"SCALE\s*FACTOR\s*=\s*([^,\s]+)", line.upper())
+        if match and line[:1] == b"*" and line[:2] != b"**":
+            scale = float(match[1])
+    if not data:
+        raise FlexplantError(f"{str(path)!r} holds no matrix. Write it again.")
+    width = len(_WORD.findall(data[0]))
+    if width not in (3, 5):
+        raise _wrong(path, lines, data[0], 5)
+    numbers = spaced_numbers(b"\n".join(data).replace(b",", b" "), width * len(data))
+    if numbers is None:
+        raise next(_wrong(path, lines, line, width) for line in data if not _fits(line, width))
+    table = numbers.reshape(-1, width)
+    labels = table[:, :-1]
+    if not np.all(np.isfinite(table)) or np.any(labels != np.round(labels)):
+        bad = np.argmax(~np.isfinite(table).all(axis=1) | (labels != np.round(labels)).any(axis=1))
+        raise _wrong(path, lines, data[int(bad)], width)
+    whole: Any = labels.astype(np.int64)
+    inner = whole[:, :: 2 if width == 5 else 1]
+    if np.any(inner < 1):
+        raise ModelError(
+            f"{str(path)!r} has internal nodes {np.unique(inner[inner < 1])[:6].tolist()}: "
+            "Lagrange multipliers (of contact, couplings, hybrid elements) make the system "
+            "indefinite, which is no M, D, K of a structure. Use penalty or direct constraints."
+        )
+    if width == 3:
+        whole = np.column_stack([whole[:, 0], 0 * whole[:, 0], whole[:, 1], 0 * whole[:, 1]])
+    elif np.any((whole[:, 1::2] < 1) | (whole[:, 1::2] > 6)):
+        other = np.unique(whole[:, 1::2])
+        raise ModelError(
+            f"{str(path)!r} has degrees of freedom {other[(other < 1) | (other > 6)].tolist()}: "
+            "only displacements and rotations (1 to 6) are a structure's; 7 is warping, 8 "
+            "pressure, 11 temperature. Use other elements."
+        )
+    words = [_WORD.findall(line)[-1] for line in data[:: max(1, len(data) // 1000)]]
+    return _Triplets(
+        str(path),
+        width == 5,
+        16 * whole[:, 0] + whole[:, 1],
+        16 * whole[:, 2] + whole[:, 3],
+        scale * table[:, -1],
+        printed_digits(words),
+    )
+
+
+def _fits(line: bytes, width: int) -> bool:
+    numbers = spaced_numbers(line.replace(b",", b" "), width)
+    return numbers is not None
+
+
+def _wrong(path: str | Path, lines: list[bytes], line: bytes, width: int) -> FlexplantError:
+    form = "node, dof, node, dof, value" if width == 5 else "row column value"
+    return FlexplantError(
+        f"{str(path)!r}, line {lines.index(line) + 1}: {form!r} is due, got "
+        f"{line[:72].decode('latin-1')!r}. Write it with *MATRIX OUTPUT, FORMAT=MATRIX INPUT."
+    )
+
+
+def _dofs(order: IntArray, inp: str | Path | None, path: str) -> DofSet:
+    ids = order >> 4
+    directions = [DIRECTIONS[i - 1] for i in (order & 15).tolist()]
+    if inp is None:
+        return DofSet(ids, tuple(directions), np.zeros((ids.size, 3)))
+    places = _nodes(inp)
+    missing = sorted(set(ids.tolist()) - set(places))
+    if missing:
+        raise LabelError(
+            f"{len(missing)} nodes of {path!r} are in no *NODE block of {str(inp)!r}, the first "
+            f"{missing[:6]}. Are they generated or included? Write the flattened input file."
+        )
+    return DofSet(ids, tuple(directions), np.array([places[i] for i in ids.tolist()]))
+
+
+def _nodes(path: str | Path) -> dict[int, list[float]]:
+    """Return the coordinates of an input file's nodes."""
+    places: dict[int, list[float]] = {}
+    inside, instances, in_instance = False, 0, False
+    for number, raw in enumerate(Path(path).read_text(encoding="latin-1").splitlines(), 1):
+        line = raw.strip()
+        if not line or line.startswith("**"):
+            continue
+        if line.startswith("*"):
+            word, *options = [part.strip().upper() for part in line.split(",")]
+            where = f"{str(path)!r}, line {number}: {word}"
+            settings = dict(part.split("=", 1) for part in options if "=" in part)
+            if word in ("*TRANSFORM", "*SYSTEM") or settings.get("SYSTEM", "R") != "R":
+                raise ModelError(
+                    f"{where}: nodes in another coordinate system than the global one are not "
+                    "read. Remove it, or name rows and places yourself: .with_dofs(DofSet(...))."
+                )
+            if word in ("*INCLUDE", "*NGEN", "*NFILL", "*NCOPY", "*NMAP") or (
+                word == "*NODE" and "INPUT" in settings
+            ):
+                raise ModelError(
+                    f"{where}: nodes that are generated or in another file are not read. Write "
+                    "the flattened input file."
+                )
+            instances += word == "*INSTANCE"
+            in_instance = word == "*INSTANCE"
+            if instances > 1:
+                raise ModelError(
+                    f"{where}: with several instances, nodes are numbered anew in the matrices. "
+                    "Write a flat input file (no parts and assemblies)."
+                )
+            inside = word == "*NODE"
+        elif in_instance:
+            raise ModelError(
+                f"{str(path)!r}, line {number}: an instance that is moved is not read. Write a "
+                "flat input file (no parts and assemblies)."
+            )
+        elif inside:
+            try:
+                node, *xyz = [part.strip() for part in line.rstrip(",").split(",")]
+                places[int(node)] = ([float(part or 0) for part in xyz[:3]] + [0.0] * 3)[:3]
+            except ValueError:
+                raise FlexplantError(
+                    f"{str(path)!r}, line {number}: a node and its coordinates are due, got "
+                    f"{line[:72]!r}. Correct the line."
+                ) from None
+    return places

@@ -1,0 +1,367 @@
+"""Matrices that Nastran punches as DMIG cards, with nodes and components."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantError, LabelError, ModelError, unknown_label
+from ..labels import DIRECTIONS, DofSet
+from ..structure.matrices import FEMatrices
+from ..values import FloatArray, IntArray
+from .nastran import Nodes, nastran_float, read_nodes
+from .numbers import fixed_numbers, printed_digits
+
+_STIFFNESS = ("KAAX", "KAA", "KGG", "K2GG", "K2PP", "K")
+_MASS = ("MAAX", "MAA", "MGG", "M2GG", "M2PP", "M")
+_DAMPING = ("BAAX", "BAA", "BGG", "B2GG", "B2PP", "B")
+
+
+def read_dmig(
+    path: str | Path,
+    *,
+    bdf: str | Path | None = None,
+    stiffness: str | None = None,
+    mass: str | None = None,
+    damping: str | None = None,
+    scalar_direction: str | None = None,
+) -> FEMatrices:
+    """Return the matrices of a Nastran punch file (DMIG cards), their rows named by node.
+
+    Components 1..6 become x, y, z, rx, ry, rz. Rows are sorted by node and component; nodes that
+    only the vector VAX of the analysis set names are kept as empty rows.
+
+    Parameters
+    ----------
+    path : str or Path
+        A .pch file with DMIG cards in large, small or free fields.
+    bdf : str or Path, optional
+        The bulk data, for the coordinates of the nodes (GRID, CORD2R, CORD2C, CORD2S); nodes that
+        move in local directions (field CD) are turned into the basic system.
+    stiffness, mass, damping : str, optional
+        Names of the matrices; when not given, the one of the usual names (KAAX, KAA, KGG, K2GG;
+        MAAX, ...; BAAX, ...) that is there. Structural damping (K4AAX) is no viscous damping and
+        is not read.
+    scalar_direction : {"x", "y", "z", "rx", "ry", "rz"}, optional
+        What scalar points (component 0) move in; without it they are refused.
+
+    Returns
+    -------
+    FEMatrices
+        Without `bdf` not `located`; with the printed `digits` (ten in a usual punch file: soft
+        modes may be lost).
+
+    Raises
+    ------
+    FlexplantError
+        When a card cannot be read; the line is named.
+    LabelError
+        When there is no matrix of such a name, or a node has no coordinates in `bdf`.
+    ModelError
+        When a matrix is complex, not square, gives an entry twice, or scalar points are there.
+    FileNotFoundError
+        When there is no such file.
+
+    Notes
+    -----
+    Format: MSC Nastran Quick Reference Guide, DMIG. Lengths and masses are in the units of the
+    model: `.converted(...)` brings them to SI.
+    """
+    blocks = _blocks(Path(path).read_bytes().splitlines(), str(path))
+    if not blocks:
+        raise FlexplantError(
+            f"{str(path)!r} has no DMIG cards. Ask for them in the run: PARAM,EXTOUT,DMIGPCH or "
+            "EXTSEOUT(DMIGPCH)."
+        )
+    K, M, D = (
+        _chosen(given, usual, what, blocks, str(path))
+        for given, usual, what in (
+            (stiffness, _STIFFNESS, "stiffness"),
+            (mass, _MASS, "mass"),
+            (damping, _DAMPING, "damping"),
+        )
+    )
+    if K is None:
+        raise ModelError(
+            f"{str(path)!r} holds {sorted(blocks)}, none of which has a usual name of a stiffness "
+            f"matrix ({', '.join(_STIFFNESS)}). Say which it is: stiffness='...'."
+        )
+    given = [part for part in (K, M, D) if part is not None]
+    # a DOF as one number: 16 node + component
+    codes = [code for part in given for code in (part.rows, part.columns)]
+    if "VAX" in blocks:
+        codes.append(blocks["VAX"].rows)
+    order = np.unique(np.concatenate(codes))
+    nodes = None if bdf is None else read_nodes(bdf)
+    ids = set((order >> 4).tolist())
+    dofs = _dofs(order, nodes, scalar_direction, str(path))
+    found = FEMatrices(
+        K.matrix(order, str(path)),
+        None if M is None else M.matrix(order, str(path)),
+        None if D is None else D.matrix(order, str(path)),
+        dofs=dofs,
+        digits=max(part.digits for part in given),
+        source=str(path),
+        located=nodes is not None,
+        notes=_rows_missing(given, order.size),
+    )
+    local = {} if nodes is None else {n: axes.T for n, axes in nodes.axes.items() if n in ids}
+    turned = {n: C for n, C in local.items() if np.abs(C - np.eye(3)).max() > 1e-14}
+    if not turned:
+        return found
+    note = f"{len(turned)} nodes moved in local directions: turned into the basic ones"
+    return found.rotated(turned).replace(notes=(*found.notes, note))
+
+
+def _rows_missing(given: list[_Block], n: int) -> tuple[str, ...]:
+    """Return what to note when a header announces more rows than cards name."""
+    most = max((part.size for part in given if part.form == 6), default=0)
+    if most <= n:
+        return ()
+    return (
+        f"the header says {most} rows, {n} are named: the others are empty, or the file is cut",
+    )
+
+
+@dataclass
+class _Block:
+    """One matrix: codes 16 node + component of rows and columns, and values."""
+
+    name: str
+    form: int
+    kind: int
+    size: int  # columns that the header announces; 0 where it does not
+    rows: IntArray
+    columns: IntArray
+    values: FloatArray
+    digits: int
+
+    def matrix(self, order: IntArray, path: str) -> sp.csc_array:
+        where = f"matrix {self.name} of {path!r}"
+        if self.kind > 2:
+            raise ModelError(f"{where} is complex: a structure's M, D and K are real.")
+        if self.form not in (1, 6):
+            raise ModelError(
+                f"{where} has form {self.form}: a square (1) or symmetric (6) matrix is needed."
+            )
+        if not np.all(np.isfinite(self.values)):
+            raise FlexplantError(f"{where} has NaN or infinite entries. Write the file again.")
+        i, j = np.searchsorted(order, self.rows), np.searchsorted(order, self.columns)
+        n = order.size
+        low, high = (i, j) if self.form == 1 else (np.minimum(i, j), np.maximum(i, j))
+        keys, counts = np.unique(low * n + high, return_counts=True)
+        if np.any(counts > 1):
+            twice = int(keys[np.argmax(counts > 1)])
+            names = [
+                f"{code >> 4} component {code & 15}" for code in order[[twice // n, twice % n]]
+            ]
+            raise ModelError(
+                f"{where} gives the entry of node {' and '.join(names)} twice: a symmetric matrix "
+                "has one triangle only. Write the file again."
+            )
+        half = sp.coo_array((self.values, (i, j)), shape=(n, n))
+        if self.form == 1:
+            return sp.csc_array(half)
+        off = i != j
+        mirrored = sp.coo_array((self.values[off], (j[off], i[off])), shape=(n, n))
+        return sp.csc_array(half + mirrored)
+
+
+def _chosen(
+    given: str | None, usual: Sequence[str], what: str, blocks: dict[str, _Block], path: str
+) -> _Block | None:
+    if given is not None:
+        if given not in blocks:
+            raise unknown_label("matrix", given, blocks, repr(path))
+        return blocks[given]
+    there = [name for name in usual if name in blocks]
+    if len(there) > 1:
+        raise ModelError(
+            f"{path!r} holds {there}, any of which may be the {what}. Say which: "
+            f"{what}={there[0]!r}."
+        )
+    return blocks[there[0]] if there else None
+
+
+def _blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
+    """Return the matrices of a file by name."""
+    blocks: dict[str, _Block] = {}
+    heads = [i for i, line in enumerate(lines) if line[:4].upper() == b"DMIG" and _is_head(line)]
+    for at, head in enumerate(heads):
+        fields, first = _head(lines, head)
+        last = heads[at + 1] if at + 1 < len(heads) else len(lines)
+        try:
+            name, form, kind = fields[0].strip(), int(fields[2]), int(fields[3])
+        except (ValueError, IndexError):
+            raise _wrong(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN") from None
+        if not name or kind not in (1, 2, 3, 4):
+            raise _wrong(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN")
+        if name in blocks:
+            raise _wrong(path, head, lines[head], f"one matrix {name} only, here is a second")
+        size = fields[7].strip() if len(fields) > 7 else ""
+        announced = int(size) if size.isdigit() else 0
+        blocks[name] = _block(lines, first, last, (name, form, kind, announced), path)
+    return blocks
+
+
+def _is_head(line: bytes) -> bool:
+    fields = _split(line)
+    return len(fields) > 1 and fields[1].strip() == b"0"
+
+
+def _head(lines: list[bytes], at: int) -> tuple[list[str], int]:
+    fields = [field.decode("latin-1") for field in _split(lines[at])]
+    if b"*" in lines[at][:8] and at + 1 < len(lines):
+        return fields + [field.decode("latin-1") for field in _split(lines[at + 1])], at + 2
+    return fields, at + 1
+
+
+def _split(line: bytes) -> list[bytes]:
+    if b"," in line:
+        return line.split(b",")[1:]
+    width = 16 if b"*" in line[:8] else 8
+    return [line[i : i + width] for i in range(8, min(len(line), 72), width)]
+
+
+def _block(
+    lines: list[bytes], first: int, last: int, head: tuple[str, int, int, int], path: str
+) -> _Block:
+    stop = first
+    while stop < last and (lines[stop][:1] in b"*+ ,$" or lines[stop][:4].upper() == b"DMIG"):
+        stop += 1
+    part = lines[first:stop]
+    if all(line[:5] == b"DMIG*" or line[:1] == b"*" for line in part) and part:
+        columns, rows, values, words = _large(part, first, path)
+    else:
+        columns, rows, values, words = _any(part, first, head[0], path)
+    return _Block(*head, rows, columns, values, printed_digits(words))
+
+
+def _large(part: list[bytes], first: int, path: str) -> Any:
+    """Return columns, rows, values of cards in large fields, all at once."""
+    table = np.frombuffer(b"".join(line[:72].ljust(72) for line in part), np.uint8)
+    table = table.reshape(-1, 72)
+    heads = table[:, 0] == ord("D")
+    if not heads[0]:
+        raise _wrong(path, first, part[0], "DMIG*, NAME, GJ, CJ of the first column")
+
+    def whole(rows: Any, start: int) -> IntArray:
+        numbers = _field(table[rows, start : start + 16])
+        if numbers is None or np.any(numbers != np.round(numbers)) or np.any(numbers < 0):
+            raise _named(part, np.flatnonzero(rows), start, first, path, "a whole number")
+        return numbers.astype(np.int64)
+
+    columns = _codes(whole(heads, 24), whole(heads, 40), path)
+    rows = _codes(whole(~heads, 8), whole(~heads, 24), path)
+    values = _field(table[~heads, 40:56])
+    if values is None:
+        raise _named(part, np.flatnonzero(~heads), 40, first, path, "a number")
+    places = np.flatnonzero(~heads)
+    words = [part[i][40:56] for i in places[:: max(1, places.size // 1000)]]
+    return columns[np.cumsum(heads)[~heads] - 1], rows, values, words
+
+
+def _field(table: Any) -> FloatArray | None:
+    blank = (table == ord(" ")).all(axis=1)
+    if blank.any():
+        table = table.copy()
+        table[blank, -1] = ord("0")
+    return fixed_numbers(np.ascontiguousarray(table).tobytes(), 16)
+
+
+def _named(
+    part: list[bytes], places: IntArray, start: int, first: int, path: str, due: str
+) -> FlexplantError:
+    for i in places.tolist():
+        try:
+            number = nastran_float(part[i][start : start + 16].decode("latin-1"))
+            if due == "a number" or (number >= 0 and number == round(number)):
+                continue
+        except (ValueError, OverflowError):
+            pass
+        return _wrong(path, first + i, part[i], f"{due} in columns {start + 1} to {start + 16}")
+    return _wrong(path, first, part[0], "numbers in every field")
+
+
+def _any(part: list[bytes], first: int, name: str, path: str) -> Any:
+    """Return columns, rows, values of cards in small or free fields, line by line."""
+    columns, rows, values, words = list[int](), list[int](), list[float](), list[bytes]()
+    column, started = 0, False
+    for at, line in enumerate(part, first):
+        bare = line.split(b"$")[0].rstrip()
+        if not bare:
+            continue
+        fields = [field.strip() for field in _split(bare)]
+        try:
+            if bare[:4].upper() == b"DMIG":
+                if fields[0].decode("latin-1") != name:
+                    raise ValueError
+                column = _code(fields[1], fields[2] if len(fields) > 2 else b"")
+                started = True
+                fields = fields[4:]
+            if not started:
+                raise ValueError
+            for i in range(0, len(fields), 4):
+                entry = [*fields[i : i + 4], b"", b"", b""]
+                if entry[0]:
+                    rows.append(_code(entry[0], entry[1]))
+                    values.append(nastran_float(entry[2].decode("latin-1")))
+                    columns.append(column)
+                    words.append(entry[2])
+        except (ValueError, IndexError, OverflowError):
+            raise _wrong(path, at, line, f"DMIG, {name}, GJ, CJ, , G1, C1, A1") from None
+    return np.array(columns, np.int64), np.array(rows, np.int64), np.array(values), words[:1000]
+
+
+def _code(node: bytes, component: bytes) -> int:
+    number, kind = int(node), int(component or b"0")
+    if number < 1 or not 0 <= kind <= 6:
+        raise ValueError
+    return 16 * number + kind
+
+
+def _codes(nodes: IntArray, components: IntArray, path: str) -> IntArray:
+    if np.any(components > 6):
+        raise FlexplantError(
+            f"{path!r}: component {int(components.max())} of node "
+            f"{int(nodes[np.argmax(components)])}: components are 0 to 6. The file is damaged."
+        )
+    return np.asarray(16 * nodes + components, dtype=np.int64)
+
+
+def _dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path: str) -> DofSet:
+    ids, components = order >> 4, order & 15
+    if np.any(components == 0) and scalar is None:
+        raise ModelError(
+            f"{path!r} has scalar points {ids[components == 0][:6].tolist()}: they have no place "
+            "and no direction. Say what they move in, scalar_direction='z' (generalised "
+            "coordinates of a reduced model are no DOFs at a node: punch the g-set instead)."
+        )
+    if scalar is not None and scalar not in DIRECTIONS:
+        raise unknown_label("direction", scalar, DIRECTIONS)
+    directions = [scalar or "" if c == 0 else DIRECTIONS[c - 1] for c in components.tolist()]
+    if nodes is None:
+        return DofSet(ids, tuple(directions), np.zeros((ids.size, 3)))
+    held = set(ids[components > 0].tolist())
+    missing = sorted(held - set(nodes.xyz))
+    if missing:
+        raise LabelError(
+            f"{len(missing)} nodes of {path!r} have no GRID card in the bulk data, the first "
+            f"{missing[:6]}: it may be INCLUDEd from another file. Give the file that holds them."
+        )
+    origin = np.zeros(3)
+    return DofSet(
+        ids, tuple(directions), np.array([nodes.xyz.get(i, origin) for i in ids.tolist()])
+    )
+
+
+def _wrong(path: str, at: int, line: bytes, due: str) -> FlexplantError:
+    return FlexplantError(
+        f"{path!r}, line {at + 1}: {due} is due, got {line[:72].decode('latin-1')!r}. The file is "
+        "cut off or damaged: write it again."
+    )

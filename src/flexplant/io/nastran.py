@@ -1,0 +1,213 @@
+"""Nastran bulk data: where the nodes are, and in which directions they move."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import FlexplantError, LabelError, ModelError
+from ..values import FloatArray
+
+_BARE = re.compile(r"(?<=[\d.])([+-]\d)")
+_KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S", "SPOINT")
+
+
+@dataclass(frozen=True)
+class Nodes:
+    """Positions (n, 3) in the basic system, and the axes (3, 3) of each node's displacements."""
+
+    xyz: dict[int, FloatArray]
+    axes: dict[int, FloatArray]  # columns are the local axes; absent: the basic ones
+    scalar: frozenset[int]
+
+
+def read_nodes(path: str | Path) -> Nodes:
+    """Return the nodes of a Nastran bulk data file.
+
+    GRID, GRDSET, SPOINT and CORD2R, CORD2C, CORD2S in free, small or large fields; all other
+    cards are passed over.
+
+    Parameters
+    ----------
+    path : str or Path
+        A .bdf, .dat or .nas file.
+
+    Raises
+    ------
+    FlexplantError
+        When a card cannot be read; the line is named.
+    LabelError
+        When a coordinate system is not there.
+    FileNotFoundError
+        When there is no such file.
+    """
+    text = Path(path).read_text(encoding="latin-1")
+    grids: dict[int, list[str]] = {}
+    systems: dict[int, tuple[str, list[str]]] = {}
+    scalar: set[int] = set()
+    default = ["", ""]
+    for number, kind, fields in cards(text.splitlines(), _KINDS):
+        fields = fields + [""] * 12
+        try:
+            if kind == "GRID":
+                grids[int(fields[0])] = fields
+            elif kind == "GRDSET":
+                default = [fields[1], fields[5]]
+            elif kind == "SPOINT":
+                scalar.update(_listed(fields))
+            else:
+                systems[int(fields[0])] = (kind, fields)
+        except ValueError as error:
+            raise FlexplantError(
+                f"{str(path)!r}, line {number}: {kind} {fields[:8]}: {error}."
+            ) from None
+    known = _Systems(systems, str(path))
+    xyz, axes = {}, {}
+    for node, fields in grids.items():
+        try:
+            place = np.array([nastran_float(item) for item in fields[2:5]])
+            into, moves = int(fields[1] or default[0] or 0), int(fields[5] or default[1] or 0)
+        except ValueError as error:
+            raise FlexplantError(f"{str(path)!r}, GRID {node}: {error}.") from None
+        xyz[node] = known.position(into, place) if into else place
+        if moves > 0:
+            axes[node] = known.axes(moves, xyz[node])
+    return Nodes(xyz, axes, frozenset(scalar))
+
+
+def _listed(fields: list[str]) -> Iterator[int]:
+    words = [item for item in fields if item]
+    if len(words) == 3 and words[1].upper() == "THRU":
+        yield from range(int(words[0]), int(words[2]) + 1)
+    else:
+        yield from (int(word) for word in words)
+
+
+def nastran_float(text: str) -> float:
+    """Return a number as Nastran writes it: 1.5, 1.5E3, 1.5D3, 1.5+3; blank is 0.
+
+    Parameters
+    ----------
+    text : str
+        One field.
+
+    Examples
+    --------
+    >>> nastran_float("-2.5-3")
+    -0.0025
+    """
+    word = text.strip().upper().replace("D", "E")
+    return float(_BARE.sub(r"E\1", word) if "E" not in word else word) if word else 0.0
+
+
+def cards(lines: Iterable[str], kinds: tuple[str, ...]) -> Iterator[tuple[int, str, list[str]]]:
+    """Yield (line number, name, fields after the name) of the cards of some kinds.
+
+    Parameters
+    ----------
+    lines : iterable of str
+        Bulk data in free, small or large fields; a card goes on in lines that begin with `+`,
+        `*`, a comma or a blank.
+    kinds : tuple of str
+        Names of the cards to return.
+    """
+    number, kind, fields = 0, "", list[str]()
+    for at, raw in enumerate(lines, 1):
+        line = raw.split("$", 1)[0].rstrip().expandtabs(8)
+        if not line:
+            continue
+        if line[0] in "+* ,":
+            if kind:
+                fields += _fields(line)[1]
+            continue
+        if kind:
+            yield number, kind, fields
+        name, found = _fields(line)
+        number, kind, fields = at, name if name in kinds else "", found
+    if kind:
+        yield number, kind, fields
+
+
+def _fields(line: str) -> tuple[str, list[str]]:
+    if "," in line:
+        words = [word.strip() for word in line.split(",")]
+        wide = words[0].endswith("*") or words[0].startswith("*")
+        count = 4 if wide else 8
+        return words[0].rstrip("*").upper(), (words[1 : 1 + count] + [""] * count)[:count]
+    head = line[:8].strip().upper()
+    width = 16 if "*" in head else 8
+    body = line[8:72].ljust(64)
+    return head.rstrip("*"), [body[i : i + width].strip() for i in range(0, 64, width)]
+
+
+class _Systems:
+    """Coordinate systems, each defined in another one down to the basic one, 0."""
+
+    def __init__(self, given: dict[int, tuple[str, list[str]]], path: str) -> None:
+        self.given, self.path = given, path
+        self.known: dict[int, tuple[str, FloatArray, FloatArray]] = {
+            0: ("CORD2R", np.zeros(3), np.eye(3))
+        }
+
+    def system(self, name: int, above: tuple[int, ...] = ()) -> tuple[str, FloatArray, FloatArray]:
+        """Return the kind, the origin and the axes (columns) of a system."""
+        if name in self.known:
+            return self.known[name]
+        if name not in self.given:
+            raise LabelError(
+                f"{self.path!r} has no coordinate system {name} as CORD2R, CORD2C or CORD2S: nodes "
+                "refer to it. Add its card (CORD1R and the like: written out as CORD2R)."
+            )
+        if name in above:
+            raise ModelError(f"{self.path!r}: coordinate system {name} is defined by itself.")
+        kind, fields = self.given[name]
+        try:
+            numbers = [nastran_float(item) for item in fields[2:11]]
+            base = int(fields[1] or 0)
+        except ValueError as error:
+            raise FlexplantError(f"{self.path!r}, {kind} {name}: {error}.") from None
+        self.system(base, (*above, name))
+        origin, on_z, in_xz = (self.position(base, np.array(numbers[i : i + 3])) for i in (0, 3, 6))
+        z = on_z - origin
+        y = np.cross(z, in_xz - origin)
+        if not np.linalg.norm(z) or np.linalg.norm(y) < 1e-12 * np.linalg.norm(z):
+            raise ModelError(
+                f"{self.path!r}: the three points of {kind} {name} lie on a line, which gives no "
+                "axes. Correct the card."
+            )
+        z, y = z / np.linalg.norm(z), y / np.linalg.norm(y)
+        self.known[name] = (kind, origin, np.column_stack([np.cross(y, z), y, z]))
+        return self.known[name]
+
+    def position(self, name: int, place: FloatArray) -> FloatArray:
+        """Return the basic coordinates of a point of a system (angles in degrees)."""
+        kind, origin, axes = self.system(name)
+        first, second, third = place
+        turn = np.deg2rad(second)
+        if kind == "CORD2C":
+            place = np.array([first * np.cos(turn), first * np.sin(turn), third])
+        elif kind == "CORD2S":
+            around = np.deg2rad(third)
+            ring = first * np.sin(turn)
+            place = np.array([ring * np.cos(around), ring * np.sin(around), first * np.cos(turn)])
+        return np.asarray(origin + axes @ place)
+
+    def axes(self, name: int, xyz: FloatArray) -> FloatArray:
+        """Return the axes (columns) of displacements at a place, which turn with a polar system."""
+        kind, origin, axes = self.system(name)
+        if kind == "CORD2R":
+            return axes
+        x, y, z = axes.T @ (xyz - origin)
+        around = np.arctan2(y, x)
+        radial = np.array([np.cos(around), np.sin(around), 0.0])
+        tangent = np.array([-np.sin(around), np.cos(around), 0.0])
+        if kind == "CORD2C":
+            return np.asarray(axes @ np.column_stack([radial, tangent, [0, 0, 1]]))
+        down = np.arctan2(np.hypot(x, y), z)
+        outward = np.sin(down) * radial + np.cos(down) * np.array([0, 0, 1.0])
+        south = np.cos(down) * radial - np.sin(down) * np.array([0, 0, 1.0])
+        return np.asarray(axes @ np.column_stack([outward, south, tangent]))

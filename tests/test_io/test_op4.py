@@ -1,0 +1,234 @@
+"""OUTPUT4 files: every variant that pyYeti writes, real ones with a twin, and damaged ones."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+import scipy.sparse as sp
+
+from flexplant.errors import FlexplantError, LabelError, ModelError
+from flexplant.io.op4 import read_op4, read_op4_matrices
+
+SHARED = Path("/work/shared/data/fe/nastran")
+
+
+@pytest.fixture(scope="module")
+def op4():
+    return pytest.importorskip("pyyeti.nastran.op4")
+
+
+def matrices():
+    rng = np.random.default_rng(1)
+    mats = {
+        "A": rng.normal(size=(7, 5)),
+        "Z": np.zeros((4, 6)),
+        "C": rng.normal(size=(9, 9)) + 1j * rng.normal(size=(9, 9)),
+        "S": sp.random(300, 200, 0.02, rng=rng).toarray() * 1e-120,
+    }
+    mats["C"][2:4] = 0
+    return mats
+
+
+def dense(matrix):
+    return matrix.toarray() if sp.issparse(matrix) else matrix
+
+
+@pytest.mark.parametrize("endian", "<>")
+@pytest.mark.parametrize("sparse", ["dense", "bigmat", "nonbigmat"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_every_variant_of_pyyeti(op4, tmp_path, binary, sparse, endian):
+    given = matrices()
+    path = tmp_path / "x.op4"
+    op4.write(path, given, binary=binary, sparse=sparse, endian=endian, digits=16)
+    found = read_op4_matrices(path)
+    assert list(found) == list(given)
+    for name, matrix in given.items():
+        assert np.array_equal(dense(found[name]), matrix), name
+    if sparse != "dense":
+        assert sp.issparse(found["S"])
+    assert list(read_op4_matrices(path, names=["C", "A"])) == ["C", "A"]
+
+
+@pytest.mark.parametrize("integer", [4, 8])
+@pytest.mark.parametrize("marker", [4, 8])
+@pytest.mark.parametrize("order", "<>")
+def test_words_and_markers_of_any_length(tmp_path, order, marker, integer):
+    """A column of single precision (or, of 8 byte words, double), a gap, and the last record."""
+
+    def record(*parts):
+        body = b"".join(parts)
+        length = np.array(len(body), f"{order}i{marker}").tobytes()
+        return length + body + length
+
+    def whole(*numbers):
+        return np.array(numbers, f"{order}i{integer}").tobytes()
+
+    def real(*numbers):
+        return np.array(numbers, f"{order}f{integer}").tobytes()
+
+    name = b"KAA".ljust(2 * integer)
+    content = record(whole(3, 4, 2, 1), name)
+    content += record(whole(1, 2, 2), real(1.5, -2.5))
+    content += record(whole(3, 1, 1), real(0.25))
+    content += record(whole(4, 1, 1), real(1.0))
+    # 65536 (L + 1) + row, for strings of L words
+    content += record(whole(2, 4, 2, 1), b"MAA".ljust(2 * integer))
+    first, second = whole(2 * 65536 + 1) + real(7.0), whole(3 * 65536 + 3) + real(8.0, 9.0)
+    content += record(whole(2, 0, 5), first, second) + record(whole(3, 1, 1), real(1.0))
+    path = tmp_path / "x.op4"
+    path.write_bytes(content)
+    found = read_op4_matrices(path)
+    expected = np.zeros((4, 3))
+    expected[1:3, 0], expected[0, 2] = (1.5, -2.5), 0.25
+    assert np.array_equal(found["KAA"], expected)
+    assert found["MAA"].toarray().tolist() == [[0, 7], [0, 0], [0, 8], [0, 9]]
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+@pytest.mark.parametrize("name", ["nastran_op4_data_r_c_rc", "nastran_op4_data_double_bigmat_le"])
+def test_files_of_nastran_have_their_twins_content(name):
+    found = read_op4_matrices(SHARED / f"{name}.op4")
+    wanted = scipy.io.loadmat(SHARED / "nastran_op4_data_r_c_rc.mat")
+    assert len(found) == 3
+    for key, matrix in found.items():
+        twin = next(wanted[k] for k in wanted if k.upper() == key)
+        assert dense(matrix) == pytest.approx(dense(twin), rel=1e-14, abs=0), key
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+def test_superelements_of_nastran_have_their_twins_content():
+    path = SHARED / "nas2cam_extseout_nas2cam"
+    found = read_op4_matrices(path.with_suffix(".op4"))
+    twin = scipy.io.loadmat(path.with_suffix(".mat"))["nas"][0, 0]
+    compared = 0
+    for kind in ("kaa", "maa"):
+        for part in (twin[kind][0, 0][name] for name in twin[kind].dtype.names):
+            ours = [m for k, m in found.items() if k[:3] == kind.upper() and m.shape == part.shape]
+            assert len(ours) == 1
+            full = np.diag(part.ravel()) if 1 in part.shape else part
+            assert dense(ours[0]) == pytest.approx(full, rel=1e-14, abs=0)
+            compared += 1
+    assert compared == 6
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+def test_integers_of_64_bits(op4):
+    path = SHARED / "nastran_op4_data_binary_fabiola.op4"
+    names, wanted, _, _ = op4.read(path, into="list")
+    found = read_op4_matrices(path)
+    assert [name.lower() for name in found] == names
+    for ours, theirs in zip(found.values(), wanted, strict=True):
+        assert np.array_equal(dense(ours), dense(theirs))
+
+
+def test_text_of_other_formats(tmp_path):
+    """D exponents, no letter before long ones, touching fields, numbers with no scale factor."""
+    path = tmp_path / "x.op4"
+    path.write_text(
+        "       2       2       6       2KAA     2D12.4\n"
+        "       1       1       2\n  0.1000D+01 -0.2500D+01\n"
+        "       2       1       2\n -0.2500D+01  0.1234-101\n"
+        "       3       1       1\n  1.0000D+00\n"
+    )
+    found = read_op4(path)
+    assert found.K.toarray().tolist() == [[1.0, -2.5], [-2.5, 0.1234e-101]]
+    assert found.digits == 4
+    path.write_text(
+        "       2       2       2       2KAA     1P,2E10.3\n"
+        "       1       1       2\n-1.000E+00-2.500E+00\n"
+        "       2       2       1\n 3.000E+00\n"
+        "       3       1       1\n 1.000E+00\n"
+    )
+    assert read_op4_matrices(path)["KAA"].tolist() == [[-1.0, 0.0], [-2.5, 3.0]]
+
+
+def test_digits_and_names(op4, tmp_path):
+    K = np.array([[2.0, -1.0], [-1.0, 3.0]])
+    path = tmp_path / "x.op4"
+    op4.write(path, {"KAA": K, "MAA": np.eye(2), "UNUSED": np.ones((1, 3))}, binary=False, digits=9)
+    found = read_op4(path)
+    assert found.digits == 10  # 1P: one before the point
+    assert np.array_equal(found.K.toarray(), K)
+    assert np.array_equal(found.M.toarray(), np.eye(2))
+    assert found.dofs is None
+    assert found.D is None
+    op4.write(path, {"KAA": K, "KGG": K}, binary=True)
+    with pytest.raises(ModelError, match=r"holds \['KAA', 'KGG'\].*stiffness='KAA'"):
+        read_op4(path)
+    assert read_op4(path, stiffness="KGG").digits is None
+    with pytest.raises(LabelError, match="no matrix 'KGF'"):
+        read_op4(path, stiffness="KGF")
+    with pytest.raises(LabelError, match="no matrix 'X'"):
+        read_op4_matrices(path, names="X")
+    op4.write(path, {"A": K})
+    with pytest.raises(ModelError, match="none of which has a usual name"):
+        read_op4(path)
+    op4.write(path, {"KAA": K * (1 + 0.1j)})
+    with pytest.raises(ModelError, match="complex"):
+        read_op4(path)
+
+
+def test_a_triangle_of_a_symmetric_matrix_is_completed(op4, tmp_path):
+    path = tmp_path / "x.op4"
+    K = np.array([[2.0, -1.0, 0], [-1.0, 3.0, 1.0], [0, 1.0, 1.0]])
+    for form, wanted in ((6, K), (1, np.tril(K))):
+        op4.write(path, ["KAA"], [np.tril(K)], forms=[form])
+        assert np.array_equal(read_op4(path).K.toarray(), wanted)
+
+
+def test_doubled_names_are_kept_apart(op4, tmp_path):
+    path = tmp_path / "x.op4"
+    op4.write(path, ["K", "K", "K"], [np.eye(1), 2 * np.eye(1), 3 * np.eye(1)])
+    assert {k: float(m[0, 0]) for k, m in read_op4_matrices(path).items()} == {
+        "K": 1,
+        "K_2": 2,
+        "K_3": 3,
+    }
+
+
+@pytest.mark.parametrize("sparse", ["dense", "bigmat", "nonbigmat"])
+@pytest.mark.parametrize("binary", [True, False])
+def test_cut_or_damaged_files_are_named(op4, tmp_path, binary, sparse):
+    rng = np.random.default_rng(2)
+    path, part = tmp_path / "x.op4", tmp_path / "part.op4"
+    given = {"KAA": rng.normal(size=(11, 11)), "MAA": sp.random(40, 40, 0.1, rng=rng).toarray()}
+    op4.write(path, given, binary=binary, sparse=sparse, digits=16)
+    content = path.read_bytes()
+    whole = 0
+    for cut in np.linspace(0, len(content) - 3, 50).astype(int).tolist():
+        part.write_bytes(content[:cut])
+        try:
+            found = read_op4_matrices(part)
+        except FlexplantError as error:
+            assert "byte" in str(error) or "line" in str(error)
+        else:  # cut just between the two
+            whole += 1
+            assert list(found) == ["KAA"]
+    assert whole <= 1
+    for _ in range(100):
+        spoiled = bytearray(content)
+        spoiled[rng.integers(len(content))] = rng.integers(256)
+        part.write_bytes(spoiled)
+        try:
+            read_op4_matrices(part)
+        except FlexplantError:
+            pass
+
+
+def test_what_is_no_op4(op4, tmp_path):
+    path = tmp_path / "x.op4"
+    path.write_bytes(b"\x00\x01" * 40)
+    with pytest.raises(FlexplantError, match="byte 0.*copy it in binary mode"):
+        read_op4(path)
+    path.write_text("# quantity: unknown\nfrequency [Hz]\n1, 2, 3\n")
+    with pytest.raises(FlexplantError, match="line 1: 4 whole numbers are due"):
+        read_op4(path)
+    op4.write(path, {"KAA": np.array([[np.nan]])})
+    with pytest.raises(FlexplantError, match="KAA.*NaN"):
+        read_op4(path)
+    path.write_bytes(np.array([24, 2**30, 2**30, 2, 2], "<i4").tobytes() + b"KAA     ")
+    with pytest.raises(FlexplantError, match="byte 0"):
+        read_op4(path)
+    with pytest.raises(FileNotFoundError):
+        read_op4(tmp_path / "none.op4")
