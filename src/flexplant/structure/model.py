@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, cast
+from typing import Any, Self, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -18,6 +18,7 @@ from .eigen import elastic_modes
 from .factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
 from .parts import HeldShape, Part, added_matrices, sum_of
 from .rigid import rigid_body_basis
+from .units import units
 
 #: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
 _SYMMETRY_TOLERANCE = 1e-9
@@ -238,8 +239,42 @@ class FEModel(Value):
             dofs=self.dofs._taken(rows).replace(interpolation=shape),
         )
 
+    def converted(
+        self, *, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
+    ) -> FEModel:
+        """Return the model in SI units, its numbers being in the given ones now.
+
+        Coordinates are scaled as well; rotations are in radians before and after.
+
+        Parameters
+        ----------
+        length, mass, time : str or float
+            The units of the numbers, "mm", "t", "s" say, or their size in m, kg and s. Forces
+            follow: mm, t and s give N.
+
+        Raises
+        ------
+        ModelError
+            When a unit is unknown, or the DOFs carry an interpolation (convert first).
+
+        Examples
+        --------
+        >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [250, 0, 0]])
+        >>> model = FEModel([[0.001, 0], [0, 0.002]], [[5, -5], [-5, 5]], dofs=dofs)
+        >>> si = model.converted(length="mm", mass="t")
+        >>> si.M[0, 0], si.K[0, 0], si.dofs.xyz[1, 0]
+        (np.float64(1.0), np.float64(5000.0), np.float64(0.25))
+        """
+        unit = units(length, mass, time)
+        return self._with(
+            M=frozen(unit.mass_matrix(self.M, self.dofs)),
+            K=frozen(unit.stiffness_matrix(self.K, self.dofs)),
+            D=None if self.D is None else frozen(unit.damping_matrix(self.D, self.dofs)),
+            dofs=unit.placed(self.dofs),
+        )
+
     @classmethod
-    def _proven(cls, **fields: Any) -> FEModel:
+    def _proven(cls, **fields: Any) -> Self:
         """Return a model whose matrices are known to be symmetric and definite, and read-only.
 
         Not through the checks of the door: a factorisation that proves it again takes longer than
@@ -250,8 +285,8 @@ class FEModel(Value):
             object.__setattr__(model, name, value)
         return model
 
-    def _with(self, **changes: Any) -> FEModel:
-        return FEModel._proven(**(self._fields() | changes))
+    def _with(self, **changes: Any) -> Self:
+        return type(self)._proven(**(self._fields() | changes))
 
 
 def _full_damping(model: FEModel, damping: Damping) -> FloatArray:

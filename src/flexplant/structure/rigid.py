@@ -68,12 +68,14 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
         positive definite.
     """
     done = np.zeros((basis.shape[0], 0))
+    loaded = np.zeros((basis.shape[0], 0))  # M done: each vector meets M as few times as possible
     for i in range(basis.shape[1]):
         vector = basis[:, i]
-        length = _length(M, vector)
-        for _ in range(2):
-            vector = vector - done @ (done.T @ (M @ vector))
-        left = _length(M, vector)
+        length = _length(M, vector) if vector.any() else 0.0
+        if length:
+            for _ in range(2):
+                vector = vector - done @ (loaded.T @ vector)
+        left = _length(M, vector) if length else 0.0
         if left <= 1e-9 * length:
             if dependent == "drop":
                 continue
@@ -83,8 +85,11 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
             )
         vector = vector / left
         # once more, now that rounding of the normalisation shows
-        vector = vector - done @ (done.T @ (M @ vector))
-        done = np.column_stack([done, vector / _length(M, vector)])
+        vector = vector - done @ (loaded.T @ vector)
+        forces = np.asarray(M @ vector)
+        size = np.sqrt(vector @ forces)
+        done = np.column_stack([done, vector / size])
+        loaded = np.column_stack([loaded, forces / size])
     return done
 
 

@@ -63,11 +63,14 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     """
     dofs = item.dofs if isinstance(item, FEModel) else item
     if not isinstance(dofs, DofSet):
-        raise ModelError(f"interpolated needs an FEModel or a DofSet, got {type(item).__name__}.")
+        raise ModelError(
+            f"interpolated needs an FEModel or a DofSet, got {type(item).__name__}. "
+            "A reduced model interpolates with the shapes of the model it comes from."
+        )
     shape = ScatteredShape(dofs.xyz, dofs.directions, positive(margin, "margin", zero=True))
     between = dofs.replace(interpolation=shape)
     if isinstance(item, FEModel):
-        return item.replace(dofs=between)
+        return item._with(dofs=between)
     return between
 
 
@@ -121,7 +124,7 @@ class ScatteredShape(Interpolation):
         if not terms:
             raise LabelError(
                 f"this model has no motion {direction!r}, and no displacements whose slopes would "
-                f"give it: it has {', '.join(sorted(set(self.directions)))}."
+                f"give it: it has {', '.join(sorted(set(self.directions)))}. Ask for one of these."
             )
         return np.asarray(
             sum(sign * field.slopes(places, axis) for sign, field, axis in terms) / len(terms)
@@ -130,7 +133,7 @@ class ScatteredShape(Interpolation):
     def _field(self, direction: str) -> _Field:
         known: dict[str, _Field] = self.__dict__.setdefault("_known_fields", {})
         if direction not in known:
-            rows = np.array([i for i, d in enumerate(self.directions) if d == direction])
+            rows = np.flatnonzero(np.array(self.directions) == direction)
             known[direction] = _Field(self.xyz, rows, direction, self.margin)
         return known[direction]
 
@@ -148,7 +151,9 @@ class _Field:
         self.flat = (self.nodes - self.centre) @ self.axes.T
         self.tree = KDTree(self.nodes)
         if not self.extent:
-            raise LabelError(f"all DOFs {direction!r} are at one node: nothing to interpolate.")
+            raise LabelError(
+                f"all DOFs {direction!r} are at one node: nothing to interpolate. Use labels."
+            )
         self.step = 1e-3 * self.extent / max(rows.size ** (1 / self.axes.shape[0]), 2.0)
         self.all = self._interpolant(np.arange(rows.size)) if rows.size <= _GLOBAL else None
 
