@@ -3,6 +3,8 @@
 from .beam import beam as beam
 from .block import solid_block as solid_block
 from .chain import chain as chain
+from .check import ModelCheck as ModelCheck
+from .check import check as check
 from .damping import Damping as Damping
 from .damping import Hysteretic as Hysteretic
 from .damping import ModalDamping as ModalDamping

@@ -1,4 +1,4 @@
-"""The lowest eigenvalues of matrices that need not be a model yet, and what rounding did to them."""
+"""The lowest eigenvalues of matrices that need not be a model yet, and their rounding."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _DENSE = 300
 #: relative to the typical K_ii / M_ii: the first shift
 _FIRST_SHIFT = 1e-8
 #: eigenvalues that rounding of this many units in the last place could make are zero
-_ROUNDING = 30 * 2.0**-52
+ROUNDING = 30 * 2.0**-52
 #: more zero eigenvalues than this are not listed one by one
 _MOST = 64
 
@@ -75,7 +75,7 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
     ratios = stiff[heavy > 0] / heavy[heavy > 0]
     typical = float(np.median(ratios[ratios > 0])) if np.any(ratios > 0) else 1.0
     shift, asked, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
-    floor = max(rounding, _ROUNDING)
+    floor = max(rounding, ROUNDING)
     limit = min(int(np.count_nonzero(heavy > 0)), _MOST)
     for _ in range(6):
         asked = min(asked, limit)
@@ -125,15 +125,7 @@ def _inverse_iteration(K: Any, M: Any, shift: float, count: int) -> FloatArray:
         start = lu.solve(M @ np.random.default_rng(0).standard_normal(n))
         basis = min(n, 2 * count + 20)
         try:
-            _, shapes = spla.eigsh(
-                K,
-                count,
-                M,
-                -shift,
-                v0=lu.solve(M @ start),
-                ncv=min(n, 2 * count + 20),
-                OPinv=inverse,
-            )
+            _, shapes = spla.eigsh(K, count, M, -shift, v0=start, ncv=basis, OPinv=inverse)
         except (spla.ArpackError, spla.ArpackNoConvergence) as error:
             raise SolverError(
                 f"the lowest eigenvalues of K and M did not converge ({error}). Look at the scales "

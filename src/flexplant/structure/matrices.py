@@ -18,7 +18,9 @@ from .condense import condensed, no_mass
 from .factor import is_positive_definite
 from .model import FEModel
 from .precision import endangered
+from .singular_mass import left_out, null_motions, projected
 from .units import units
+from .zero_energy import freed, nearly_free
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -325,20 +327,47 @@ class FEMatrices(Value):
                 f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
                 "coordinates. with_dofs(DofSet(nodes, directions, xyz)) tells it."
             )
+        ready = self
         without = no_mass(self.M)
         if without.any():
-            return self._condensed(without, massless).model(name=name)
-        if not self.located and not is_positive_definite(self.K):
+            ready = ready._condensed(without, massless)
+        motions = null_motions(ready.M, self.digits)
+        if motions.shape[1]:
+            ready = ready._projected(motions, massless)
+        # of a text, the last digit decides whether K is singular
+        rounding = 1e-14 if self.digits is None else 10.0**-self.digits
+        if not self.located and not is_positive_definite(ready.K, -rounding):
             raise ModelError(
                 "the structure is free to move and its coordinates are not known, hence nor are "
                 "its rigid-body rotations. Give them: located_at(nodes, xyz), or to the reader."
             )
-        model = FEModel(self.M, self.K, self.D, dofs=self.dofs, name=name or self.source)
+        parts: Any = ready
+        label = name or self.source
+        model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=label)
         if self.digits is not None:
-            said = endangered(self.K, self.M, self.digits)
-            if said:
-                warnings.warn(f"{self.source or 'text file'}: {said}", FlexplantWarning, 2)
+            for said in (endangered(ready.K, ready.M, self.digits), _stuck(ready, model)):
+                if said:
+                    warnings.warn(f"{self.source or 'text file'}: {said}", FlexplantWarning, 2)
         return model
+
+    def freed(self) -> FEMatrices:
+        """Return the same with rigid-body motions free that only lost digits of K hold.
+
+        ``K' = P^T K P`` with ``P = I - R R^T M``: elastic modes, M-orthogonal to the rigid-body
+        motions R, stay as they are. For text files; K becomes a full matrix.
+
+        Raises
+        ------
+        ModelError
+            When M or the coordinates are missing, no motion is nearly free, or n is too large.
+        """
+        if self.M is None or self.dofs is None or not self.located:
+            raise ModelError(
+                "freeing rigid-body motions needs M, and DOFs with coordinates: with_dofs(dofs) or "
+                "located_at(nodes, xyz) first."
+            )
+        K = freed(self.K, self.M, self.dofs, self.digits)
+        return self.replace(K=K, notes=(*self.notes, "K freed of rounding in rigid-body motions"))
 
     def _condensed(self, without: Any, massless: str) -> FEMatrices:
         if massless == "refuse":
@@ -352,6 +381,32 @@ class FEMatrices(Value):
         kept = np.flatnonzero(~without)
         note = f"{int(without.sum())} massless DOFs condensed"
         return self.replace(K=K, M=M, D=D, dofs=taken(self.dofs, kept), notes=(*self.notes, note))
+
+    def _projected(self, motions: FloatArray, massless: str) -> FEMatrices:
+        if massless == "refuse":
+            at = ", ".join(self.names(left_out(motions, self.M)[:6]))
+            raise ModelError(
+                f"{motions.shape[1]} motions have no inertia, turning {at} among others: offset "
+                "masses without rotary inertia, or rods that do not resist turning? Condense them, "
+                "which is exact: model(massless='condense'); or give them their inertia."
+            )
+        K, M, D, kept = projected(self.K, self.M, self.D, motions, self.names)
+        note = f"{motions.shape[1]} motions without inertia condensed"
+        dofs = taken(self.dofs, kept)
+        return self.replace(K=K, M=M, D=D, dofs=dofs, notes=(*self.notes, note))
+
+
+def _stuck(given: FEMatrices, model: FEModel) -> str | None:
+    """Return what to say when rounding alone holds rigid-body motions."""
+    if given.dofs is None or not given.located:
+        return None
+    nearly = nearly_free(given.K, given.dofs, given.digits)
+    if nearly.shape[1] <= model.rigid_body.shape[1]:
+        return None
+    return (
+        f"{nearly.shape[1] - model.rigid_body.shape[1]} of its rigid-body motions are held by "
+        "nothing but the rounding of the text. Export in binary, or free them: FEMatrices.freed()."
+    )
 
 
 def taken(dofs: DofSet | None, rows: IntArray) -> DofSet | None:

@@ -1,0 +1,215 @@
+"""The facts behind a report on a model, as numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import ModelError, SolverError
+from ..values import FloatArray, IntArray
+from .factor import diagonal, is_positive_definite, unit_diagonal
+from .lowest import ROUNDING, Lowest, lowest_modes
+from .masses import RigidMass, rigid_mass
+from .matrices import FEMatrices
+from .pieces import pieces
+from .precision import loss
+from .rigid import rigid_motions
+from .singular_mass import left_out, null_motions
+from .zero_energy import ZeroEnergy, zero_energy
+
+#: asked of the solver: six rigid-body motions and some elastic modes
+_MODES = 10
+#: a rigid-body motion whose relative force is below this is free; its residual measures rounding
+_FREE = 1e-10
+
+
+@dataclass(frozen=True)
+class Facts:
+    """Everything `check` speaks of."""
+
+    given: FEMatrices
+    skew: dict[str, tuple[float, int, int]]
+    massless: IntArray
+    stiffless: IntArray
+    empty: IntArray
+    mass_definite: bool | None
+    negative_mass: IntArray
+    without_inertia: IntArray
+    lowest: Lowest | None
+    scaled_by_mass: bool
+    failure: str
+    motions: ZeroEnergy | None
+    mechanisms: FloatArray
+    body: RigidMass
+    piece: IntArray
+    loss: float | None
+    damping: dict[str, Any]
+
+    def names(self, rows: IntArray) -> tuple[str, ...]:
+        """Return the labels of some rows (from 0)."""
+        return self.given.names(rows)
+
+    @property
+    def n_zero(self) -> int:
+        """Motions without energy in K, those of DOFs in no matrix not counted."""
+        return 0 if self.lowest is None else self.lowest.n_zero
+
+    @property
+    def n_negative(self) -> int:
+        """Negative eigenvalues of K among the lowest ones."""
+        if self.lowest is None:
+            return 0
+        first = self.lowest.n_zero
+        seen = int(np.count_nonzero(self.lowest.values[first:] < 0))
+        counted = 0 if self.lowest.below is None else self.lowest.below - first
+        return max(seen, counted)
+
+    @property
+    def first_freq(self) -> float:
+        """Frequency of the first elastic mode [Hz], NaN when it is not known."""
+        if self.lowest is None or not self.scaled_by_mass:
+            return float("nan")
+        elastic = self.lowest.values[self.lowest.n_zero :]
+        elastic = elastic[elastic > 0]
+        return float(np.sqrt(elastic[0]) / (2 * np.pi)) if elastic.size else float("nan")
+
+
+def facts(given: FEMatrices) -> Facts:
+    """Return the facts on some matrices, all that can be known of them."""
+    skew = {
+        name: _skew(matrix)
+        for name, matrix in (("K", given.K), ("M", given.M), ("D", given.D))
+        if matrix is not None
+    }
+    K, M, D = (_halved(matrix) for matrix in (given.K, given.M, given.D))
+    n = given.n_dof
+    no_stiffness = _empty(K)
+    no_mass = np.zeros(n, dtype=bool) if M is None else _empty(M)
+    absent = no_stiffness & (no_mass if M is not None else True)
+    there = np.flatnonzero(~absent)
+    mass_definite, negative, weak = _mass_state(given, M, no_mass)
+    rounding = _rounding(K, given)
+    lowest, scaled, failure = _lowest(K, M, there, bool(mass_definite), no_mass, rounding)
+    motions, mechanisms = None, np.zeros((n, 0))
+    if lowest is not None:
+        zero = lowest.shapes[:, : lowest.n_zero]
+        if given.dofs is not None:
+            motions = zero_energy(
+                K, given.dofs, zero, located=given.located, rounding=max(ROUNDING, rounding)
+            )
+            mechanisms = motions.mechanisms
+    nothing = RigidMass(np.full(3, np.nan), np.full(3, np.nan), np.full((3, 3), np.nan))
+    body = nothing if M is None or given.dofs is None else rigid_mass(M, given.dofs)
+    if not given.located:
+        body = RigidMass(body.mass, nothing.center, nothing.inertia)
+    return Facts(
+        given=given,
+        skew=skew,
+        massless=np.flatnonzero(no_mass & ~absent),
+        stiffless=np.flatnonzero(no_stiffness & ~absent),
+        empty=np.flatnonzero(absent),
+        mass_definite=mass_definite,
+        negative_mass=negative,
+        without_inertia=weak,
+        lowest=lowest,
+        scaled_by_mass=scaled,
+        failure=failure,
+        motions=motions,
+        mechanisms=mechanisms,
+        body=body,
+        piece=pieces(K, M, given.dofs),
+        loss=None if lowest is None or given.digits is None else loss(lowest, given.digits),
+        damping={} if D is None else _damping(D, M, motions),
+    )
+
+
+def _skew(matrix: Any) -> tuple[float, int, int]:
+    scaled: Any
+    scaled, _ = unit_diagonal(matrix)
+    difference: Any = abs(scaled - scaled.T)
+    if not difference.nnz:
+        return 0.0, 0, 0
+    i, j = (int(k) for k in np.unravel_index(difference.argmax(), difference.shape))
+    return float(difference[i, j]), min(i, j), max(i, j)
+
+
+def _halved(matrix: Any) -> Any:
+    return None if matrix is None else sp.csc_array(0.5 * (matrix + matrix.T))
+
+
+def _empty(matrix: Any) -> Any:
+    return np.asarray(abs(matrix).sum(axis=1)).ravel() == 0
+
+
+def _mass_state(given: FEMatrices, M: Any, no_mass: Any) -> tuple[bool | None, IntArray, IntArray]:
+    """Return whether M is semi-definite, DOFs of negative mass, and DOFs of singular motions."""
+    none = np.zeros(0, dtype=np.int64)
+    if M is None:
+        return None, none, none
+    kept = np.flatnonzero(~no_mass)
+    negative = kept[diagonal(M)[kept] <= 0]
+    if negative.size or not kept.size:
+        return False, negative, none
+    part = M[kept][:, kept]
+    try:
+        motions = null_motions(part, given.digits)
+    except ModelError:
+        return False, negative, none
+    return True, negative, kept[left_out(motions, part)] if motions.size else none
+
+
+def _rounding(K: Any, given: FEMatrices) -> float:
+    """Return the relative error of K's entries, as its digits or its free rigid motions tell."""
+    written = 0.0 if given.digits is None else 10.0**-given.digits
+    if given.dofs is None:
+        return written
+    motions = rigid_motions(given.dofs)[:, : 6 if given.located else 3]
+    size: Any = abs(K)
+    sizes = np.asarray(size @ np.abs(motions))
+    force = np.asarray(K @ motions)
+    scale = np.linalg.norm(sizes, axis=0)
+    relative = np.linalg.norm(force, axis=0) / np.where(scale > 0, scale, 1.0)
+    free = (scale > 0) & (relative < _FREE)
+    work = np.einsum("ij,ij->j", np.abs(motions), np.abs(force))
+    most = np.einsum("ij,ij->j", np.abs(motions), sizes)
+    return max(written, 10 * float(np.max(work[free] / most[free], initial=0.0)))
+
+
+def _lowest(
+    K: Any, M: Any, there: IntArray, mass_definite: bool, no_mass: Any, rounding: float
+) -> tuple[Lowest | None, bool, str]:
+    """Return the lowest modes, whether M made them, and why there are none."""
+    if not there.size or not K.nnz:
+        return None, False, "K is zero"
+    stiff = np.abs(diagonal(K))
+    # without a mass to weigh by, displacements and rotations compare by their own stiffness
+    weight = sp.diags_array(np.where(stiff > 0, stiff, float(stiff.max()) or 1.0))
+    scaled = M is not None and mass_definite
+    inner: Any = M if scaled else weight
+    kept_K, kept_M = K[there][:, there], sp.csc_array(inner)[there][:, there]
+    try:
+        found = lowest_modes(kept_K, kept_M, min(_MODES, there.size), rounding=rounding)
+    except (SolverError, ModelError) as error:
+        return None, scaled, str(error)
+    shapes = np.zeros((K.shape[0], found.shapes.shape[1]))
+    shapes[there] = found.shapes
+    return (
+        Lowest(found.values, shapes, found.spread, found.n_zero, found.below),
+        scaled,
+        "",
+    )
+
+
+def _damping(D: Any, M: Any, motions: ZeroEnergy | None) -> dict[str, Any]:
+    kept = np.flatnonzero(~_empty(D))
+    definite = not kept.size or is_positive_definite(D[kept][:, kept], 1e-9)
+    drag = 0.0
+    if motions is not None and motions.n_rigid and kept.size:
+        size: Any = abs(D)
+        scale = np.linalg.norm(np.asarray(size @ np.abs(motions.rigid)), axis=0)
+        force = np.linalg.norm(np.asarray(D @ motions.rigid), axis=0)
+        drag = float(np.max(force / np.where(scale > 0, scale, 1.0), initial=0.0))
+    return {"definite": definite, "drag": drag}

@@ -1,0 +1,119 @@
+"""Motions without inertia that are no single DOF: offset masses without rotary inertia, say."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
+
+from ..errors import ModelError
+from ..values import FloatArray, IntArray
+from .factor import dense, diagonal, is_positive_definite, unit_diagonal
+
+#: relative to a unit diagonal: an eigenvalue of M below this is none
+_SINGULAR = 1e-11
+#: blocks of M larger than this are not searched for a null space
+_LARGEST_BLOCK = 3000
+#: the result is a full matrix; beyond, it would not fit the memory comfortably
+_LARGEST = 6000
+#: the DOFs to leave out must follow from the others: no worse conditioned than this
+_CONDITION = 1e12
+
+
+def null_motions(M: Any, digits: int | None) -> FloatArray:
+    """Return the motions (n, q) without inertia, block by block of M; (n, 0) when M is definite.
+
+    M is scaled to a unit diagonal first; eigenvalues below 1e-11, or below what the digits of a
+    text leave, are none.
+
+    Raises
+    ------
+    ModelError
+        When M is indefinite, or too large and coupled to be searched.
+    """
+    n = M.shape[0]
+    tolerance = _SINGULAR if digits is None else max(_SINGULAR, 10.0 ** (1 - digits))
+    if is_positive_definite(M, -tolerance):
+        return np.zeros((n, 0))
+    scaled: Any
+    scaled, scale = unit_diagonal(M)
+    scaled = sp.csc_array(scaled)
+    count, label = csgraph.connected_components(scaled, directed=False)
+    order = np.argsort(label, kind="stable")
+    columns: list[FloatArray] = []
+    for block in np.split(order, np.cumsum(np.bincount(label, minlength=count))[:-1]):
+        if block.size > _LARGEST_BLOCK:
+            raise ModelError(
+                f"M is singular or indefinite, and {block.size} of its DOFs are coupled: too "
+                f"many to search (limit {_LARGEST_BLOCK}). Export a lumped M, or one with rotary "
+                "inertia."
+            )
+        values, vectors = la.eigh(dense(scaled[block][:, block]))
+        if values[0] < -tolerance:
+            raise ModelError(
+                f"M is indefinite: scaled to a unit diagonal, an eigenvalue is {values[0]:.3g}. "
+                "Some motion would have a negative inertia. Look for a sign, or a cut triangle."
+            )
+        for vector in vectors[:, values < tolerance].T:
+            column = np.zeros(n)
+            column[block] = scale[block] * vector
+            columns.append(column)
+    return np.column_stack(columns) if columns else np.zeros((n, 0))
+
+
+def left_out(motions: FloatArray, M: Any) -> IntArray:
+    """Return the DOFs (q,), ascending, that the motions (n, q) without inertia move most."""
+    size = np.sqrt(diagonal(M))[:, None] * motions
+    pivots = la.qr(size.T, mode="r", pivoting=True)[1]
+    return np.sort(np.asarray(pivots[: motions.shape[1]], dtype=np.int64))
+
+
+def projected(
+    K: Any, M: Any, D: Any, motions: FloatArray, names: Callable[[IntArray], tuple[str, ...]]
+) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray]:
+    """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which.
+
+    Where N has no inertia, ``N^T K q = 0`` at every frequency. It tells q of the DOFs, s, by the
+    others, ``q_s = -(N^T K)_s^-1 (N^T K)_m q_m``: exact, all finite eigenvalues stay, and the
+    DOFs that are kept keep their meaning.
+
+    Raises
+    ------
+    ModelError
+        When such a motion has no stiffness or is damped, or the model is too large.
+    """
+    n, q = motions.shape
+    if n > _LARGEST:
+        raise ModelError(
+            f"condensing {q} motions without inertia gives full matrices of {n - q} DOFs (limit "
+            f"{_LARGEST}). Give the offset masses a rotary inertia."
+        )
+    if D is not None and np.abs(D @ motions).max() > 0:
+        raise ModelError(
+            "damping acts on motions without inertia: they do not follow statically. Give them "
+            "inertia, or leave D out and give damping by mode."
+        )
+    s = left_out(motions, M)
+    m = np.setdiff1d(np.arange(n), s)
+    forces = np.asarray(K @ motions).T
+    weight = np.sqrt(np.abs(diagonal(K)))[s]
+    weight[weight == 0] = 1.0
+    pivot = forces[:, s] / weight
+    pivot_rows = np.linalg.norm(pivot, axis=1)
+    if not pivot_rows.all() or np.linalg.cond(pivot / pivot_rows[:, None]) > _CONDITION:
+        raise ModelError(
+            f"a motion without inertia has no stiffness either, at {', '.join(names(s[:6]))} among "
+            "others: it does not follow from the others. Hold it: without([...])."
+        )
+    T = np.zeros((n, m.size))
+    T[m, np.arange(m.size)] = 1.0
+    T[s] = -np.linalg.solve(pivot, forces[:, m]) / weight[:, None]
+    parts = [None if A is None else T.T @ np.asarray(A @ T) for A in (K, M, D)]
+    K_m, M_m, D_m = (None if A is None else 0.5 * (A + A.T) for A in parts)
+    if K_m is None or M_m is None:
+        raise ModelError("K and M are both needed to condense.")
+    return K_m, M_m, D_m, m

@@ -1,0 +1,320 @@
+"""The lines of a report on a model, in plain words."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from ..labels import DIRECTIONS
+from ..values import FloatArray
+from .factor import diagonal
+from .facts import Facts
+
+#: verdict, subject, finding, next step
+Line: TypeAlias = tuple[str, str, str, str]
+
+#: relative to the diagonal: entries differ by less from their mirror images
+_SYMMETRY = 1e-9
+#: a diagonal that exceeds all it couples to by this much is a penalty
+_PENALTY = 1e6
+#: DOFs of a mechanism that move at least this part of the most moving one
+_MOVES = 0.05
+#: a body larger than this [m] and lighter, per cube of its size, than that [kg/m^3] is odd
+_LARGE, _LIGHT = 20.0, 1e-5
+_HEAVY = 1e5
+
+
+def listed(names: Sequence[str], most: int = 6) -> str:
+    """Return some names in a row, and how many more there are."""
+    more = f", ... ({len(names)} in all)" if len(names) > most else ""
+    return ", ".join(names[:most]) + more
+
+
+def spread(found: Facts, motion: FloatArray) -> tuple[str, ...]:
+    """Return the DOFs that move most in a motion (n,), the first first."""
+    size = np.abs(motion)
+    order = np.argsort(-size, kind="stable")[:24]
+    return found.names(order[size[order] >= _MOVES * size[order[0]]])
+
+
+def matrices(found: Facts) -> list[Line]:
+    """Return the lines on symmetry and definiteness."""
+    lines: list[Line] = []
+    wrong = {name: skew for name, skew in found.skew.items() if skew[0] > _SYMMETRY}
+    for name, (size, i, j) in wrong.items():
+        matrix: Any = getattr(found.given, name)
+        lines.append(
+            (
+                "fail",
+                f"symmetry of {name}",
+                (
+                    f"entries ({i + 1}, {j + 1}) and ({j + 1}, {i + 1}) are {matrix[i, j]:.6g} and "
+                    f"{matrix[j, i]:.6g} ({size:.2g} of the diagonal)"
+                ),
+                "gyroscopic, follower or contact terms have no place here; a triangle read twice?",
+            )
+        )
+    if not wrong:
+        lines.append(("ok", "symmetry", f"{', '.join(found.skew)} symmetric", ""))
+    lines += [_mass_line(found), _stiffness_line(found)]
+    if found.damping:
+        lines.append(_damping_line(found))
+    return lines
+
+
+def _mass_line(found: Facts) -> Line:
+    if found.mass_definite is None:
+        return ("fail", "mass", "there is no M", "export the mass matrix too")
+    if found.mass_definite:
+        singular = found.massless.size or found.empty.size or found.without_inertia.size
+        kind = "positive semi-definite" if singular else "positive definite"
+        return ("ok", "definiteness of M", kind, "")
+    at = f": zero or negative at {listed(found.names(found.negative_mass))}"
+    return (
+        "fail",
+        "definiteness of M",
+        f"M is not positive definite{at if found.negative_mass.size else ''}",
+        "look for a negative or singular mass element; constraints eliminated in K only?",
+    )
+
+
+def _stiffness_line(found: Facts) -> Line:
+    if found.lowest is None:
+        return (
+            "fail",
+            "definiteness of K",
+            f"not found out: {found.failure}",
+            "mend what the other lines name first",
+        )
+    if found.n_negative:
+        worst = found.lowest.values[found.lowest.values < 0]
+        lowest = f", the lowest found {worst.min():.3g} 1/s^2" if worst.size else ""
+        lowest = lowest if found.scaled_by_mass else ""
+        return (
+            "fail",
+            "definiteness of K",
+            f"K has {found.n_negative} negative eigenvalues{lowest}: unstable",
+            "buckled or prestressed state, a sign, or lost digits? Export the unloaded stiffness",
+        )
+    kind = "positive semi-definite" if found.n_zero else "positive definite"
+    freq = found.first_freq
+    heard = f", first elastic mode at {freq:.5g} Hz" if np.isfinite(freq) else ""
+    return ("ok", "definiteness of K", f"{kind}{heard}", "")
+
+
+def _damping_line(found: Facts) -> Line:
+    if not found.damping["definite"]:
+        return (
+            "fail",
+            "definiteness of D",
+            "D is not positive semi-definite: it feeds energy in",
+            "look for a sign; gyroscopic terms are not symmetric and do not belong into D",
+        )
+    if found.damping["drag"] > 1e-9:
+        return (
+            "note",
+            "damping",
+            "D drags free rigid-body motions: a damper to ground, or alpha M",
+            "these are undamped here; FEModel.with_damping leaves them so",
+        )
+    return ("ok", "definiteness of D", "positive semi-definite", "")
+
+
+def zero_rows(found: Facts) -> list[Line]:
+    """Return the lines on DOFs without mass, without stiffness, without both."""
+    lines: list[Line] = []
+    if found.empty.size:
+        lines.append(
+            (
+                "fail",
+                "empty rows",
+                f"neither mass nor stiffness: {listed(found.names(found.empty))}",
+                "held DOFs that the export kept? Drop them: FEMatrices.without([...])",
+            )
+        )
+    if found.massless.size:
+        lines.append(
+            (
+                "fail",
+                "without mass",
+                listed(found.names(found.massless)),
+                "condense them, exactly: FEMatrices.model(massless='condense')",
+            )
+        )
+    if found.without_inertia.size:
+        lines.append(
+            (
+                "fail",
+                "without inertia",
+                (
+                    f"{found.without_inertia.size} motions that no mass resists, moving "
+                    f"{listed(found.names(found.without_inertia))}"
+                ),
+                "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
+            )
+        )
+    if found.stiffless.size:
+        lines.append(
+            (
+                "fail",
+                "without stiffness",
+                f"{listed(found.names(found.stiffless))}: free to drift away",
+                "join them to the structure, or drop them",
+            )
+        )
+    if not lines:
+        lines.append(("ok", "rows", "every DOF has mass and stiffness", ""))
+    return lines
+
+
+def rigid(found: Facts) -> list[Line]:
+    """Return the lines on rigid-body motions, expected and found, and on mechanisms."""
+    if found.lowest is None:
+        return []
+    if found.motions is None:
+        return [
+            (
+                "note",
+                "rigid body",
+                f"{found.n_zero} motions without energy; rigid-body ones are known with DOFs only",
+                "with_dofs(DofSet(nodes, directions, xyz))",
+            )
+        ]
+    motions = found.motions
+    lines: list[Line] = []
+    free = ", ".join(motions.free) or "none"
+    combined = motions.n_rigid - len(motions.free)
+    if combined > 0:
+        free += f" and {combined} combination{'s' * (combined != 1)}"
+    held = f"; grounded in {', '.join(motions.grounded)}" if motions.grounded else ""
+    absent = f"; no DOFs for {', '.join(motions.absent)}" if motions.absent else ""
+    text = f"free in {free}{held}{absent}"
+    extra = motions.mechanisms.shape[1]
+    expected = f"{motions.n_rigid} by the geometry, {found.n_zero} found in K"
+    odd = motions.length_factor
+    if odd is not None:
+        lines.append(
+            (
+                "fail",
+                "coordinates",
+                f"rotations cost energy, but would not with coordinates times {odd:.6g}",
+                "the coordinates are in another unit than the matrices: converted(...) one of them",
+            )
+        )
+    if not found.given.located:
+        lines.append(
+            (
+                "note",
+                "rigid body",
+                f"{text}; coordinates are not known, hence nor are rotations ({expected})",
+                "give them: located_at(nodes, xyz)",
+            )
+        )
+        return lines
+    lines.append(("ok", "rigid body", f"{text} ({expected})", ""))
+    if not extra:
+        lines.append(("ok", "mechanisms", "none", ""))
+    elif odd is None:
+        moved = listed(spread(found, motions.mechanisms[:, 0]), most=4)
+        lines.append(
+            (
+                "fail",
+                "mechanisms",
+                (
+                    f"{extra} zero-energy motion{'s' * (extra != 1)} beyond rigid body; the first "
+                    f"moves {moved}"
+                ),
+                "join or hold these; wrong coordinates or directions look alike (all DOFs move)",
+            )
+        )
+    return lines
+
+
+def masses(found: Facts) -> list[Line]:
+    """Return the lines on mass, centre of gravity and inertia."""
+    mass, center = found.body.mass, found.body.center
+    known = np.isfinite(mass)
+    if not known.any():
+        return []
+    shown = [f"{m:.6g} kg in {d}" for m, d, k in zip(mass, "xyz", known, strict=False) if k]
+    same = np.ptp(mass[known]) <= 1e-6 * np.abs(mass[known]).max()
+    lines: list[Line] = []
+    if same:
+        text = f"{mass[known][0]:.6g} kg in {', '.join(d for d, k in zip('xyz', known) if k)}"  # noqa: B905
+        lines.append(("ok", "total mass", text, ""))
+    else:
+        lines.append(
+            (
+                "note",
+                "total mass",
+                "; ".join(shown) + ": differs between directions",
+                "dropped (held) DOFs take their mass along; else look at directions and labels",
+            )
+        )
+    if np.isfinite(center).any():
+        at = ", ".join(f"{c:.6g}" if np.isfinite(c) else "?" for c in center)
+        lines.append(("ok", "centre of gravity", f"({at}) m", ""))
+    turns = np.diag(found.body.inertia)
+    if np.isfinite(turns).any():
+        of = [
+            f"{j:.6g} ({d})" for j, d in zip(turns, DIRECTIONS[3:], strict=True) if np.isfinite(j)
+        ]
+        lines.append(("ok", "inertia about it", f"{', '.join(of)} kg m^2", ""))
+    return lines
+
+
+def scales(found: Facts) -> list[Line]:
+    """Return the lines on penalties and odd units."""
+    K: Any = found.given.K
+    entries = np.abs(diagonal(K))
+    coupling = np.asarray(abs(K).sum(axis=1)).ravel() - entries
+    lines: list[Line] = []
+    alone = np.flatnonzero((coupling == 0) & (entries > 0))
+    if alone.size and alone.size < entries.size:
+        lines.append(
+            (
+                "note",
+                "uncoupled rows",
+                f"joined to nothing but ground: {listed(found.names(alone))}",
+                "rows that a solver put there for held DOFs? FEMatrices.without([...])",
+            )
+        )
+    coupled = coupling > 0
+    typical = float(np.median(entries[coupled])) if coupled.any() else 0.0
+    penalty = np.flatnonzero(coupled & (entries > _PENALTY * np.maximum(coupling, typical)))
+    if penalty.size:
+        lines.append(
+            (
+                "note",
+                "penalties",
+                f"held by a huge stiffness: {listed(found.names(penalty))}",
+                "their rounding drowns soft modes; hold them: FEMatrices.without([...])",
+            )
+        )
+    dofs = found.given.dofs
+    known = np.isfinite(found.body.mass)
+    if dofs is None or not found.given.located or not known.any():
+        return lines
+    size = float(np.linalg.norm(np.ptp(dofs.xyz, axis=0)))
+    mass = float(found.body.mass[known].max())
+    if size > _LARGE and mass < _LIGHT * size**3:
+        lines.append(
+            (
+                "note",
+                "units",
+                f"{size:.4g} m in size, but {mass:.4g} kg: the coordinates look like mm",
+                "converted(length='mm', mass='t') turns mm, t, s (N, MPa) into SI",
+            )
+        )
+    elif size > 0 and mass > _HEAVY * size**3:
+        lines.append(
+            (
+                "note",
+                "units",
+                f"{mass:.4g} kg within {size:.4g} m is denser than any metal",
+                "matrices and coordinates in different units? converted(...) before",
+            )
+        )
+    return lines
