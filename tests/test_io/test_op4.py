@@ -1,5 +1,6 @@
 """OUTPUT4 files: every variant that pyYeti writes, real ones with a twin, and damaged ones."""
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
@@ -210,22 +211,20 @@ def test_cut_or_damaged_files_are_named(op4, tmp_path, binary, sparse):
         spoiled = bytearray(content)
         spoiled[rng.integers(len(content))] = rng.integers(256)
         part.write_bytes(spoiled)
-        try:
+        with contextlib.suppress(FlexplantError):
             read_op4_matrices(part)
-        except FlexplantError:
-            pass
 
 
 def test_what_is_no_op4(op4, tmp_path):
     path = tmp_path / "x.op4"
     path.write_bytes(b"\x00\x01" * 40)
-    with pytest.raises(FlexplantError, match="byte 0.*copy it in binary mode"):
+    with pytest.raises(FlexplantError, match=r"byte 0.*copy it in binary mode"):
         read_op4(path)
     path.write_text("# quantity: unknown\nfrequency [Hz]\n1, 2, 3\n")
     with pytest.raises(FlexplantError, match="line 1: 4 whole numbers are due"):
         read_op4(path)
     op4.write(path, {"KAA": np.array([[np.nan]])})
-    with pytest.raises(FlexplantError, match="KAA.*NaN"):
+    with pytest.raises(FlexplantError, match=r"KAA.*NaN"):
         read_op4(path)
     path.write_bytes(np.array([24, 2**30, 2**30, 2, 2], "<i4").tobytes() + b"KAA     ")
     with pytest.raises(FlexplantError, match="byte 0"):

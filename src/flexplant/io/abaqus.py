@@ -150,7 +150,8 @@ def symmetric(matrix: sp.csc_array) -> sp.csc_array:
 
 
 def _triplets(path: str | Path) -> _Triplets:
-    lines = Path(path).read_bytes().splitlines()
+    content = Path(path).read_bytes()
+    lines = content.splitlines()
     scale = 1.0
     data = [line for line in lines if line.strip() and line[:1] != b"*"]
     for line in lines:
@@ -160,7 +161,7 @@ def _triplets(path: str | Path) -> _Triplets:
     if not data:
         raise FlexplantError(f"{str(path)!r} holds no matrix. Write it again.")
     width = len(_WORD.findall(data[0]))
-    if width not in (3, 5):
+    if width not in (3, 5) or (width == 3 and b"," in data[0]):
         raise _wrong(path, lines, data[0], 5)
     numbers = spaced_numbers(b"\n".join(data).replace(b",", b" "), width * len(data))
     if numbers is None:
@@ -188,6 +189,10 @@ def _triplets(path: str | Path) -> _Triplets:
             "pressure, 11 temperature. Use other elements."
         )
     words = [_WORD.findall(line)[-1] for line in data[:: max(1, len(data) // 1000)]]
+    last = _WORD.findall(data[-1])[-1].lstrip(b"+-")
+    if not content.endswith((b"\n", b"\r")) and len(last) < len(words[0].lstrip(b"+-")):
+        # a number without its last digits still is a number
+        raise _wrong(path, lines, data[-1], width)
     return _Triplets(
         str(path),
         width == 5,

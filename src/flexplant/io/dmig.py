@@ -72,7 +72,13 @@ def read_dmig(
     Format: MSC Nastran Quick Reference Guide, DMIG. Lengths and masses are in the units of the
     model: `.converted(...)` brings them to SI.
     """
-    blocks = _blocks(Path(path).read_bytes().splitlines(), str(path))
+    content = Path(path).read_bytes()
+    lines = content.splitlines()
+    blocks = _blocks(lines, str(path))
+    ends = content.endswith((b"\n", b"\r"))
+    if blocks and not ends and len(lines[-1].rstrip()) < len(lines[-2].rstrip()):
+        # a number without its last digits still is a number
+        raise _wrong(str(path), len(lines) - 1, lines[-1], "a whole line")
     if not blocks:
         raise FlexplantError(
             f"{str(path)!r} has no DMIG cards. Ask for them in the run: PARAM,EXTOUT,DMIGPCH or "

@@ -1,0 +1,292 @@
+"""Mode shapes in Exodus files, which are netCDF files with agreed names."""
+
+from __future__ import annotations
+
+import importlib
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self, cast
+
+import numpy as np
+import scipy.io
+
+from ..errors import FlexplantError, LabelError, ModelError, ShapeError
+from ..labels import DIRECTIONS, DofSet
+from ..reduction import Modes
+from ..values import FloatArray, Matrix, positive, real_array
+
+_NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
+
+
+def read_exodus_modes(
+    path: str | Path,
+    *,
+    times: str = "frequency",
+    zeta: float | FloatArray = 0.0,
+    rigid_below: float | None = None,
+    variables: Mapping[str, str] | None = None,
+    M: Matrix | None = None,
+) -> Modes:
+    """Return the modes of an Exodus file: one time step a mode.
+
+    Parameters
+    ----------
+    path : str or Path
+        A netCDF-3 file; netCDF-4 (HDF5) needs h5py: pip install 'flexplant[hdf5]'.
+    times : {"frequency", "omega", "eigenvalue"}
+        What stands in the place of time: Hz (Sierra/SD), rad/s or (rad/s)^2.
+    zeta : float or (k,) array
+        Damping ratios, which the file does not hold; rigid-body modes have none.
+    rigid_below : float [Hz], optional
+        Modes below this are rigid-body modes, and set to exactly 0.
+    variables : mapping {direction: name}, optional
+        Which nodal variables are the shapes, such as {"z": "DispZ", "rx": "RotX"}; when not given
+        those called DispX ... RotZ, in the usual spellings.
+    M : (n, n) array or sparse matrix [kg], optional
+        The mass matrix in the order of the DOFs (node by node), to check the shapes with.
+
+    Returns
+    -------
+    Modes
+        With the shapes as they are. Modes are mass-normalised, which solvers write by default but
+        the file does not say: only `M` makes it sure.
+
+    Raises
+    ------
+    FlexplantError
+        When it is no Exodus file, cut off, or without shapes; when h5py is needed and not there.
+    ModelError
+        When modes are near zero and `rigid_below` does not say what they are, or the shapes are
+        not mass-normalised with `M`.
+    LabelError
+        When `times` or `variables` name what is not known.
+    FileNotFoundError
+        When there is no such file.
+
+    Notes
+    -----
+    Format: Schoof and Yarberry, "EXODUS II: A Finite Element Data Model", SAND92-2137.
+    """
+    if times not in ("frequency", "omega", "eigenvalue"):
+        raise LabelError(
+            f"times must be 'frequency', 'omega' or 'eigenvalue', got {times!r}. Choose one."
+        )
+    with opened(path) as file:
+        xyz, ids = file.nodes()
+        chosen = _chosen(file.variables(), variables, str(path))
+        values = np.asarray(file.array("time_whole"), dtype=np.float64)
+        shapes = [np.asarray(file.shapes(at), dtype=np.float64) for at in chosen.values()]
+    n, k = ids.size, values.size
+    if not k:
+        raise FlexplantError(f"{str(path)!r} has no time steps, hence no modes. Write them.")
+    if any(shape.shape != (k, n) for shape in shapes):
+        raise FlexplantError(
+            f"{str(path)!r}: shapes of {[shape.shape for shape in shapes]} do not belong to {k} "
+            f"steps and {n} nodes: the file is damaged. Write it again."
+        )
+    names = list(chosen)
+    phi = np.stack(shapes).transpose(2, 0, 1).reshape(n * len(names), k)
+    dofs = DofSet(np.repeat(ids, len(names)), tuple(names) * n, np.repeat(xyz, len(names), axis=0))
+    omega, n_rigid, order = _frequencies(values, times, rigid_below, str(path))
+    damping = np.broadcast_to(np.asarray(zeta, dtype=np.float64), (k,)).copy()
+    damping[:n_rigid] = 0.0
+    phi = phi[:, order]
+    if M is not None:
+        _check_mass(phi, M, str(path))
+    return Modes(omega, damping, phi, dofs, n_rigid)
+
+
+def _frequencies(values: FloatArray, times: str, rigid_below: float | None, path: str) -> Any:
+    if not np.all(np.isfinite(values)):
+        raise FlexplantError(f"{path!r} has NaN in the place of time: write it again.")
+    if times == "eigenvalue":
+        omega = np.sign(values) * np.sqrt(np.abs(values))
+    else:
+        omega = values * (2 * np.pi if times == "frequency" else 1.0)
+    limit = None if rigid_below is None else 2 * np.pi * positive(rigid_below, "rigid_below")
+    rigid = np.abs(omega) < limit if limit is not None else omega == 0
+    order = np.argsort(np.where(rigid, -1.0, omega), kind="stable")
+    omega, rigid = omega[order], rigid[order]
+    elastic = omega[~rigid]
+    if elastic.size and (elastic[0] < 0 or (elastic[0] < 1e-3 * elastic[-1] and limit is None)):
+        raise ModelError(
+            f"{path!r} has modes at {np.array2string(elastic[:6] / 2 / np.pi, precision=3)} Hz: "
+            "some of them seem to be rigid-body modes that came out near zero. Say which: "
+            "rigid_below=... [Hz] sets those below to exactly 0 (a tiny one keeps them all)."
+        )
+    return np.where(rigid, 0.0, omega), int(np.count_nonzero(rigid)), order
+
+
+def _check_mass(phi: FloatArray, M: Matrix, path: str) -> None:
+    mass: Any = M
+    if mass.shape != (phi.shape[0], phi.shape[0]):
+        raise ShapeError(
+            f"M must have shape ({phi.shape[0]}, {phi.shape[0]}), node by node, got {mass.shape}."
+        )
+    gram = phi.T @ np.asarray(mass @ phi)
+    off = np.abs(gram - np.eye(gram.shape[0]))
+    if off.max() > 1e-4:  # shapes may be in single precision
+        mode = int(np.argmax(off.max(axis=0)))
+        raise ModelError(
+            f"the shapes of {path!r} are not mass-normalised with M: phi^T M phi of mode "
+            f"{mode + 1} is {gram[mode, mode]:.6g}, the largest entry off by {off.max():.3g}. "
+            "Write them mass-normalised, or check the units and the order of M."
+        )
+
+
+def _chosen(names: list[str], given: Mapping[str, str] | None, path: str) -> dict[str, int]:
+    """Return {direction: place of the variable} in the order of directions."""
+    if given is not None:
+        wrong = sorted(set(given) - set(DIRECTIONS))
+        missing = sorted(set(given.values()) - set(names))
+        if wrong or missing or not given:
+            raise LabelError(
+                f"variables={dict(given)!r:.80}: directions are {', '.join(DIRECTIONS)}, and nodal "
+                f"variables of {path!r} {names[:12]}."
+            )
+        return {d: names.index(given[d]) for d in DIRECTIONS if d in given}
+    found: dict[str, list[int]] = {}
+    for at, name in enumerate(names):
+        match = _NAME.fullmatch(name.strip())
+        if match:
+            found.setdefault(("r" if match[1] else "") + match[2].lower(), []).append(at)
+    doubled = {d: [names[i] for i in places] for d, places in found.items() if len(places) > 1}
+    if doubled or not found:
+        raise FlexplantError(
+            f"{path!r} has nodal variables {names[:12]}, among which the shapes are not clear. Say "
+            "which they are: variables={'x': 'DispX', ...}."
+        )
+    return {d: found[d][0] for d in DIRECTIONS if d in found}
+
+
+def opened(path: str | Path) -> ExodusFile:
+    """Return an Exodus file, netCDF-3 or netCDF-4, to be used in a `with` block.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+
+    Raises
+    ------
+    FlexplantError
+        When it is no netCDF file, or h5py is needed and not installed.
+    FileNotFoundError
+        When there is no such file.
+    """
+    with Path(path).open("rb") as file:
+        start = file.read(8)
+    if start == b"\x89HDF\r\n\x1a\n":
+        try:
+            h5py = importlib.import_module("h5py")
+        except ImportError:
+            raise FlexplantError(
+                f"{str(path)!r} is a netCDF-4 file, which needs h5py. Install it: "
+                "pip install 'flexplant[hdf5]'."
+            ) from None
+        kinds: tuple[type[Exception], ...] = (OSError, RuntimeError, ValueError)
+        return ExodusFile(str(path), lambda: h5py.File(path, "r"), kinds)
+    kinds = (TypeError, ValueError, OSError, KeyError, IndexError, AssertionError, EOFError)
+    return ExodusFile(
+        str(path),
+        lambda: scipy.io.netcdf_file(path, "r", mmap=False),
+        (*kinds, OverflowError, MemoryError, UnicodeDecodeError, AttributeError),
+    )
+
+
+class ExodusFile:
+    """Arrays of an Exodus file by name; whatever fails becomes an error that names the file.
+
+    Parameters
+    ----------
+    path : str
+        For messages.
+    opener : callable
+        Opens the netCDF file.
+    kinds : tuple of exception classes
+        What the opened file raises when it is damaged.
+    """
+
+    def __init__(self, path: str, opener: Any, kinds: tuple[type[Exception], ...]) -> None:
+        self.path, self.kinds = path, kinds
+        try:
+            with np.errstate(all="ignore"):  # sizes of a damaged file overflow
+                self.file = opener()
+        except kinds as error:
+            raise self._wrong(error) from None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.file.close()
+
+    def _wrong(self, what: object) -> FlexplantError:
+        return FlexplantError(
+            f"{self.path!r} cannot be read as an Exodus (netCDF) file: {what!s:.120}. It is cut "
+            "off, damaged or another format: write it again."
+        )
+
+    def _names(self) -> Any:
+        return getattr(self.file, "variables", self.file)
+
+    def array(self, name: str) -> Any:
+        """Return a variable as an array.
+
+        Raises
+        ------
+        FlexplantError
+            When there is none, or it cannot be read.
+        """
+        if name not in self._names():
+            raise self._wrong(f"it has no {name!r}")
+        try:
+            array = np.array(self._names()[name][()] if self._hdf() else self._names()[name][:])
+        except self.kinds as error:
+            raise self._wrong(error) from None
+        return array.astype(array.dtype.newbyteorder("="))
+
+    def _hdf(self) -> bool:
+        return not hasattr(self.file, "variables")
+
+    def nodes(self) -> tuple[FloatArray, Any]:
+        """Return coordinates (n, 3) and node numbers (n,)."""
+        if "coord" in self._names():
+            rows = list(self.array("coord"))
+        else:
+            rows = [self.array(f"coord{a}") for a in "xyz" if f"coord{a}" in self._names()]
+        if not rows:
+            raise self._wrong("it has no coordinates of nodes")
+        rows += [np.zeros_like(rows[0])] * (3 - len(rows))
+        xyz = real_array(np.stack(rows, axis=1), "coordinates", (None, 3))
+        ids = np.arange(1, xyz.shape[0] + 1)
+        for name in ("node_num_map", "node_map"):
+            if name in self._names():
+                ids = self.array(name).astype(np.int64)
+                break
+        if ids.size != xyz.shape[0]:
+            raise self._wrong(f"{ids.size} node numbers, {xyz.shape[0]} nodes")
+        return xyz, ids
+
+    def variables(self) -> list[str]:
+        """Return the names of the nodal variables."""
+        if "name_nod_var" not in self._names():
+            raise self._wrong("it has no nodal variables, hence no shapes")
+        table = self.array("name_nod_var")
+        return [
+            b"".join(np.atleast_1d(row).tolist()).split(b"\0")[0].decode("latin-1").strip()
+            for row in table
+        ]
+
+    def shapes(self, place: int) -> Any:
+        """Return a nodal variable (steps, nodes) by its place (from 0)."""
+        if "vals_nod_var" in self._names():
+            return cast(Any, self.array("vals_nod_var"))[:, place]
+        return self.array(f"vals_nod_var{place + 1}")

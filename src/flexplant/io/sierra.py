@@ -1,0 +1,163 @@
+"""Matrices that Sierra/SD (Salinas) writes as MATLAB text: Kssr.m, Mssr.m, FetiMap_a.m."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantError, ModelError, ShapeError
+from ..labels import DIRECTIONS, DofSet
+from ..structure.matrices import FEMatrices
+from ..values import FloatArray
+from .abaqus import symmetric
+from .exodus import opened
+from .numbers import printed_digits, spaced_numbers
+
+_WORD = re.compile(rb"[^\s,;]+")
+#: the map has so many entries a node: x, y, z, rx, ry, rz and two that are no motion
+_PER_NODE = 8
+
+
+def read_sierra(
+    stiffness: str | Path,
+    *,
+    mass: str | Path | None = None,
+    damping: str | Path | None = None,
+    dof_map: str | Path | None = None,
+    exodus: str | Path | None = None,
+    dofs: DofSet | None = None,
+) -> FEMatrices:
+    """Return the matrices that Sierra/SD (formerly Salinas) wrote as MATLAB text.
+
+    The first bracketed table of each file is read: lines `row column value` counted from 1, one
+    triangle or both.
+
+    Parameters
+    ----------
+    stiffness, mass, damping : str or Path
+        The files `Kssr.m`, `Mssr.m` and `Cssr.m` (output option `mfile`).
+    dof_map : str or Path, optional
+        `FetiMap_a.m`: eight entries a node (x, y, z, rx, ry, rz and two that are no motion), each
+        the row of the matrices, 0 or less where there is none.
+    exodus : str or Path, optional
+        The mesh, for numbers and coordinates of the nodes in the order of the map.
+    dofs : DofSet, optional
+        The rows, where there is no map.
+
+    Returns
+    -------
+    FEMatrices
+        With a map and without `exodus`, nodes are numbered from 1 and not `located`.
+
+    Raises
+    ------
+    FlexplantError
+        When a line has another form; it is named.
+    ShapeError
+        When the map, the mesh and the matrices do not belong together.
+    ModelError
+        When rows are no motion of a node, or a map and `dofs` are both given.
+    FileNotFoundError
+        When there is no such file.
+    """
+    if dof_map is not None and dofs is not None:
+        raise ModelError("the rows are named twice, by dof_map and by dofs: give one of them.")
+    files = [file for file in (stiffness, mass, damping) if file is not None]
+    tables = {str(file): _table(file, 3) for file in files}
+    n = max(int(table[:, :2].max()) for table, _ in tables.values())
+
+    def matrix(file: str | Path | None) -> sp.csc_array | None:
+        if file is None:
+            return None
+        table = tables[str(file)][0]
+        at = table[:, :2].astype(np.int64) - 1
+        counts = np.unique(at[:, 0] * n + at[:, 1], return_counts=True)[1]
+        if np.any(counts > 1):
+            raise FlexplantError(f"{str(file)!r} gives an entry twice. Write it again.")
+        entries = sp.coo_array((table[:, 2], (at[:, 0], at[:, 1])), shape=(n, n))
+        return symmetric(sp.csc_array(entries))
+
+    located = True
+    if dof_map is not None:
+        dofs, located = _named(dof_map, exodus, n), exodus is not None
+    K = matrix(stiffness)
+    assert K is not None  # noqa: S101 - its file is no option
+    return FEMatrices(
+        K,
+        matrix(mass),
+        matrix(damping),
+        dofs=dofs,
+        digits=max(digits for _, digits in tables.values()),
+        source=str(stiffness),
+        located=located,
+    )
+
+
+def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
+    """Return the numbers of the first bracketed table (m, width), and the digits printed."""
+    content = Path(path).read_bytes()
+    start, stop = content.find(b"["), content.find(b"]")
+    if start < 0:  # a bare table
+        start, stop = -1, len(content)
+    if stop < start:
+        raise FlexplantError(
+            f"{str(path)!r}: the table does not end with ']': the file is cut off."
+        )
+    first = content[: start + 1].count(b"\n") + 1
+    lines = [
+        line.split(b"%")[0].strip(b" \t\r;,") for line in content[start + 1 : stop].split(b"\n")
+    ]
+    lines = [line.replace(b"...", b" ") for line in lines]
+    words = [_WORD.findall(line) for line in lines]
+    kept = [line for line in lines if line]
+    numbers = spaced_numbers(re.sub(rb"[,;]", b" ", b"\n".join(kept)), width * len(kept))
+    if numbers is None or not kept or not np.all(np.isfinite(numbers)):
+        for at, row in enumerate(words):
+            values = spaced_numbers(b" ".join(row), width)
+            if row and (values is None or not np.all(np.isfinite(values))):
+                raise FlexplantError(
+                    f"{str(path)!r}, line {first + at}: {width} number{'s' * (width > 1)} are due, "
+                    f"got {lines[at][:72].decode('latin-1')!r}. Write it again with 'mfile'."
+                )
+        raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
+    table = numbers.reshape(-1, width)
+    whole = table[:, : width - 1] if width > 1 else table
+    wrong = (whole != np.round(whole)) | ((whole < 1) & (width > 1))
+    if np.any(wrong):
+        raise FlexplantError(
+            f"{str(path)!r}: {whole[wrong][0]:g} is no row or column, which are counted from 1. "
+            "Write it again with 'mfile'."
+        )
+    shown = [row[-1] for row in words if row][:: max(1, len(kept) // 1000)]
+    return table, printed_digits(shown)
+
+
+def _named(path: str | Path, exodus: str | Path | None, n: int) -> DofSet:
+    places = _table(path, 1)[0].ravel().astype(np.int64)
+    if places.size % _PER_NODE or sorted(places[places > 0].tolist()) != list(range(1, n + 1)):
+        raise ShapeError(
+            f"{str(path)!r} maps {int(np.count_nonzero(places > 0))} of {places.size} entries, but "
+            f"the matrices have {n} rows, and nodes {_PER_NODE} entries. Is it of the same run?"
+        )
+    nodes = places.size // _PER_NODE
+    xyz, ids = np.zeros((nodes, 3)), np.arange(1, nodes + 1)
+    if exodus is not None:
+        with opened(exodus) as file:
+            xyz, ids = file.nodes()
+        if ids.size != nodes:
+            raise ShapeError(
+                f"{str(exodus)!r} has {ids.size} nodes, the map {str(path)!r} {nodes}. Are they of "
+                "the same mesh?"
+            )
+    entry = np.flatnonzero(places > 0)[np.argsort(places[places > 0])]
+    kind = entry % _PER_NODE
+    if np.any(kind >= len(DIRECTIONS)):
+        raise ModelError(
+            f"{str(path)!r} maps rows that are no motion of a node (entry {int(kind.max()) + 1}): "
+            "temperature, potential or a Lagrange multiplier are no part of M, D, K."
+        )
+    at = entry // _PER_NODE
+    return DofSet(ids[at], tuple(DIRECTIONS[i] for i in kind.tolist()), xyz[at])
