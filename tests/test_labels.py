@@ -1,6 +1,7 @@
 """DofSet: labels, places, tables."""
 
 import pickle
+import time
 
 import numpy as np
 import pytest
@@ -142,6 +143,97 @@ def test_from_table(tmp_path):
         DofSet.from_table([{"node": 4, "x": 0, "y": 0, "z": 0}])
     with pytest.raises(LabelError, match="needs rows"):
         DofSet.from_table([])
+
+
+def test_where_in_a_box():
+    assert DOFS.where(box=[(0, 0, 0), (0.5, 5, 5)]).labels == ("7:z", "7:rx")
+    assert DOFS.where(directions="z", box=[(1, 2, 0), (1, 2, 0)]).labels == ("3:z",)
+    assert DOFS.where(box=[(-np.inf,) * 3, (np.inf,) * 3]).labels == DOFS.labels
+    with pytest.raises(LabelError, match="nodes reach from"):
+        DOFS.where(box=[(5, 5, 5), (6, 6, 6)])
+    for box in ([(1, 0, 0), (0, 0, 0)], [(0, 0, 0)], "all", [(0, 0, np.nan), (1, 1, 1)]):
+        with pytest.raises(ShapeError, match="lowest and its highest"):
+            DOFS.where(box=box)
+
+
+def test_only_the_canonical_label_is_one():
+    for label in (
+        "07:z",
+        "+7:z",
+        " 7:z",
+        "7 :z",
+        "7:Z",
+        "7",
+        ":z",
+        "7:z:z",
+        "7_0:z",
+        "7.0:z",
+        "",
+        None,
+    ):
+        assert label not in DOFS
+        with pytest.raises(LabelError):
+            DOFS.index(label)
+    many = DofSet([-3, 70], ["x", "rz"], np.zeros((2, 3)))
+    assert many.index("-3:x") == 0
+    assert "9" * 30 + ":z" not in many
+
+
+def test_kinds_are_numbers_of_directions():
+    dofs = DofSet([1] * 6, DIRECTIONS, np.zeros((6, 3)))
+    assert dofs.kinds.tolist() == list(range(6))
+    with pytest.raises(ValueError, match="read-only"):
+        dofs.kinds[0] = 1
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "says"),
+    [
+        (lambda: DofSet([1, 2, 1], ["z"] * 3, np.zeros((3, 3))), LabelError,
+         r"'1:z' appears twice, in rows 0 and 2.*Drop one"),
+        (lambda: DofSet([1.5], ["z"], np.zeros((1, 3))), LabelError, "whole numbers"),
+        (lambda: DofSet(["a"], ["z"], np.zeros((1, 3))), LabelError, "whole numbers"),
+        (lambda: DofSet([None], ["z"], np.zeros((1, 3))), LabelError, "whole numbers"),
+        (lambda: DofSet([2**60], ["z"], np.zeros((1, 3))), LabelError, "whole numbers"),
+        (lambda: DofSet([1], "z", np.zeros((1, 3))), LabelError, "one for each DOF"),
+        (lambda: DofSet([1], ["up"], np.zeros((1, 3))), LabelError, "Translate the names"),
+        (lambda: DofSet([1], [["z"]], np.zeros((1, 3))), LabelError, "unknown directions"),
+        (lambda: DofSet([1], ["z"], np.zeros((1, 3)), "cubic"), LabelError, "interpolated"),
+        (lambda: DofSet.from_table([{"node": "a", "direction": "z", "x": 0, "y": 0, "z": 0}]),
+         LabelError, "column 'node'.*row 0.*no number"),
+        (lambda: DofSet.from_table([{"node": 1, "direction": "z", "x": "1 m", "y": 0, "z": 0}]),
+         LabelError, "column 'x'.*'1 m'"),
+        (lambda: DofSet.from_table([{"node": 1, "direction": "z", "x": None, "y": 0, "z": 0}]),
+         LabelError, r"missing: \['x'\]"),
+        (lambda: DofSet.from_table([(1, "z", 0, 0, 0)]), LabelError, "a tuple as its first row"),
+        (lambda: DOFS.where(nodes=["seven"]), LabelError, "whole numbers"),
+    ],
+)  # fmt: skip
+def test_errors_say_what_to_do(make, error, says):
+    with pytest.raises(error, match=says):
+        make()
+
+
+def test_many_dofs_stay_quick(tmp_path):
+    """60 000 DOFs: no dictionary, no comparing of each label, a file in tenths of a second."""
+    n = 60_000
+    rng = np.random.default_rng(0)
+    nodes = np.repeat(rng.permutation(n // 2) + 1, 2)
+    start = time.process_time()
+    dofs = DofSet(nodes, ("z", "rx") * (n // 2), rng.random((n, 3)))
+    assert dofs.index(f"{nodes[777]}:rx") == 777
+    with pytest.raises(LabelError, match=r"no DOF '7:zz' \(60000 known\).*'7:z', '7:rx'"):
+        dofs.index("7:zz")
+    with pytest.raises(LabelError, match="no DOF"):
+        dofs.index(None)
+    assert dofs.where(nodes=7).labels == ("7:z", "7:rx")
+    assert dofs.nearest(dofs.xyz[500], "z") == f"{nodes[500]}:z"
+    dofs.save(tmp_path / "dofs.npz")
+    other = load(tmp_path / "dofs.npz")
+    assert other.directions == dofs.directions
+    assert other.index(f"{nodes[777]}:rx") == 777
+    assert "labels" not in vars(dofs)
+    assert time.process_time() - start < 2  # 0.3 s
 
 
 def test_travels_read_only(tmp_path):

@@ -97,6 +97,7 @@ def made():
     yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
     yield structure.interpolated(modes.dofs).interpolation
     yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
+    yield from of_structures()
 
 
 def of_reductions(fe, modes, rom):
@@ -109,6 +110,20 @@ def of_reductions(fe, modes, rom):
     yield from (fx.PivotedQr(), fx.EffectiveIndependence(), fx.Greedy())
     yield fx.rank_modes(modes, inputs=at)
     yield fx.reduce(modes, truncation).quality(fe, band=(100.0, 400.0), freq=np.array([250.0]))
+
+
+def of_structures():
+    """One of each value that a structure is made of."""
+    steel = {"density": 7850.0, "youngs_modulus": 210e9}
+    bar = fx.beam(length=1.0, elements=2, area=1e-4, inertia=1e-9, **steel)
+    yield bar.fixed(["1:z"]).dofs.interpolation
+    yield from (fx.PointMass((0.1, 0, 0), 0.5, inertia=0.1), fx.Damper("1:z", 2.0))
+    yield from (fx.Spring("1:z", 2.0, to="2:z"), fx.Hysteretic(0.02))
+    yield from (fx.Rectangle((0, 0), (1, 1)), fx.Disc((0, 0), 1.0))
+    yield fx.Rib((0, 0), (1, 0), width=0.01, height=0.02)
+    block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}
+    corner = fx.solid_block(**block, **steel, holes=np.array([[[True]], [[False]]]))
+    yield corner.dofs.interpolation
 
 
 def of_updates(rom, unknowns, residual, fit):

@@ -5,8 +5,12 @@ import pickle
 import numpy as np
 import pytest
 
+import oracles_grids as grids
+import oracles_structure as oracle
 from flexplant.errors import ModelError, ShapeError
-from flexplant.structure import ModalDamping, Rayleigh
+from flexplant.identification import MeasuredModes
+from flexplant.reduction import solve_modes
+from flexplant.structure import Hysteretic, ModalDamping, Rayleigh, chain
 
 
 def test_modal_damping():
@@ -41,3 +45,171 @@ def test_bad_shapes():
         Rayleigh(-1, 0)
     with pytest.raises(ModelError):
         Rayleigh(0, np.nan)
+
+
+def test_ratios_beyond_the_list():
+    law = ModalDamping([0.0, 0.02, 0.03], others=0.01)
+    np.testing.assert_array_equal(law.zeta([0, 1, 2, 3, 4]), [0, 0.02, 0.03, 0.01, 0.01])
+    np.testing.assert_array_equal(law.zeta([0, 1]), [0, 0.02])
+    assert repr(law) == "<ModalDamping of 3 modes, 0 to 0.03, others 0.01>"
+    with pytest.raises(ModelError, match="others goes with"):
+        ModalDamping(0.01, others=0.02)
+    with pytest.raises(ModelError, match="others"):
+        ModalDamping([0.01], others=1.5)
+
+
+def test_measured_poles():
+    omega, zeta = np.array([900.0, 1500.0]), np.array([0.013, 0.004])
+    poles = -zeta * omega + 1j * omega * np.sqrt(1 - zeta**2)
+    law = ModalDamping.from_measured(poles, modes=[4, 6], others=0.01)
+    expected = [0, 0, 0, 0.013, 0.01, 0.004, 0.01]
+    np.testing.assert_allclose(law.zeta([0, 0, 0, 1, 2, 3, 4]), expected, rtol=1e-12)
+    # either sign of the imaginary part; and whatever holds poles and mode numbers
+    other = ModalDamping.from_measured(MeasuredModes(poles.conj(), modes=[4, 6]), others=0.01)
+    np.testing.assert_allclose(other.ratio, law.ratio)
+
+
+@pytest.mark.parametrize(
+    ("poles", "modes", "says"),
+    [
+        ([-1 + 10j], None, "numbers of the measured modes"),
+        ([-1 + 10j], [1, 2], "different mode numbers"),
+        ([-1 + 10j, -1 + 11j], [2, 2], "different mode numbers"),
+        ([1 + 10j], [1], "does not oscillate and decay"),
+        ([-1.0], [1], "does not oscillate and decay"),
+        ([-1 + 10j], [0], "mode number"),
+        (["a"], [1], "complex numbers"),
+        ([np.nan + 1j], [1], "complex numbers"),
+    ],
+)
+def test_bad_measured_poles(poles, modes, says):
+    with pytest.raises(ModelError, match=says):
+        ModalDamping.from_measured(poles, modes=modes, others=0.01)
+
+
+def test_rayleigh_through_ratios():
+    law = Rayleigh.fitted([100, 700], [0.02, 0.01])
+    np.testing.assert_allclose(law.zeta(2 * np.pi * np.array([100.0, 700.0])), [0.02, 0.01])
+    # more than two: the normal equations, by hand
+    hertz, zeta = np.array([50.0, 200.0, 400.0, 900.0]), np.array([0.02, 0.011, 0.012, 0.02])
+    law = Rayleigh.fitted(hertz, zeta)
+    w = 2 * np.pi * hertz
+    A = np.column_stack([0.5 / w, 0.5 * w])
+    np.testing.assert_allclose([law.alpha, law.beta], np.linalg.pinv(A) @ zeta, rtol=1e-9)
+    # where least squares would feed energy in, that part is left out
+    falling = Rayleigh.fitted([100.0, 200.0, 300.0], [0.05, 0.01, 0.002])
+    assert falling.beta == 0
+    assert falling.alpha > 0
+
+
+@pytest.mark.parametrize(
+    ("freq", "zeta", "error", "says"),
+    [
+        ([100, 1000], [0.01, 0.2], ModelError, "alpha would be negative.*factor of 10"),
+        ([100, 1000], [0.2, 0.01], ModelError, "beta would be negative"),
+        ([100, 100], [0.01, 0.01], ModelError, "two different"),
+        ([100], [0.01], ModelError, "two different"),
+        ([0, 100], [0.01, 0.01], ModelError, "two different"),
+        ([10, 100], [0.01, -0.01], ModelError, "zeta must be in"),
+        ([10, 100], [0.01], ShapeError, "zeta"),
+    ],
+)
+def test_bad_fits(freq, zeta, error, says):
+    with pytest.raises(error, match=says):
+        Rayleigh.fitted(freq, zeta)
+
+
+def test_rigid_body_modes_are_damped_only_when_asked():
+    model = chain(masses=[1, 2, 3], stiffnesses=[5e3, 7e3])
+    M, R = model.M.toarray(), model.rigid_body
+    for quiet in (ModalDamping(0.02), Rayleigh(2.0, 1e-3), Hysteretic(0.04)):
+        D = model.with_damping(quiet).D
+        assert np.abs(D @ R).max() < 1e-12 * np.abs(D).max()
+    drag = model.with_damping(ModalDamping(0.02, rigid=3.0)).D
+    np.testing.assert_allclose(drag @ R, 3.0 * M @ R, atol=1e-12)
+    elastic = model.with_damping(ModalDamping(0.02)).D
+    np.testing.assert_allclose(drag - elastic, 3.0 * M @ R @ R.T @ M, atol=1e-12)
+    whole = model.with_damping(Rayleigh(2.0, 1e-3, rigid=True)).D
+    np.testing.assert_allclose(whole.toarray(), 2 * M + 1e-3 * model.K.toarray(), rtol=1e-14)
+
+
+def test_a_measured_matrix():
+    model = chain(masses=[1, 2], stiffnesses=[5])
+    D = np.array([[2.0, -1], [-1, 3]])
+    np.testing.assert_array_equal(model.with_damping(D).D, D)
+    with pytest.raises(ModelError, match="feed energy in"):
+        model.with_damping(-D)
+    with pytest.raises(ModelError, match="not symmetric"):
+        model.with_damping(np.array([[2.0, -1], [0, 3]]))
+
+
+def held_chain():
+    return chain(masses=[1, 2, 1.5], stiffnesses=[5e4, 7e4], ground=[3e4, 0, 1e4])
+
+
+def test_hysteretic_is_half_the_loss_factor():
+    law = Hysteretic(0.06)
+    np.testing.assert_array_equal(law.zeta([0.0, 3.0, 9.0]), [0, 0.03, 0.03])
+    assert repr(law) == "<Hysteretic, loss factor 0.06>"
+    model = held_chain()
+    M, K = model.M.toarray(), model.K.toarray()
+    expected = oracle.modal_damping_matrix(M, K, 0.03, n_rigid=0)
+    np.testing.assert_allclose(model.with_damping(law).D, expected, atol=1e-12 * expected.max())
+
+
+def test_the_error_of_the_equivalence_is_that_of_dense_responses():
+    """One mass: equality at every frequency. Three: a bound that is not idle."""
+    eta, freq = 0.08, np.linspace(1.0, 90.0, 200)
+    law = Hysteretic(eta)
+    k, m = 4e4, 1.7
+    natural = np.sqrt(k / m) / 2 / np.pi
+    w = 2 * np.pi * freq
+    true = 1 / (k * (1 + 1j * eta) - m * w**2)
+    ours = 1 / (k - m * w**2 + 1j * w * eta * np.sqrt(k * m))
+    np.testing.assert_allclose(
+        law.error(freq, [natural])[:, 0], np.abs(ours / true - 1), rtol=1e-9, atol=1e-12
+    )
+    np.testing.assert_allclose(
+        law.response_error(freq, [natural], [1 / m]), np.abs(ours - true), rtol=1e-9, atol=1e-15
+    )
+    assert law.error([0.0], [natural]) == pytest.approx(eta)
+    assert law.error([natural], [natural]) == pytest.approx(0, abs=1e-12)
+
+    model = held_chain()
+    M, K = model.M.toarray(), model.K.toarray()
+    out, force = np.eye(3)[0], np.eye(3)[2]
+    true = grids.receptance(M, 0 * M, K * (1 + 1j * eta), out, force, freq)
+    ours = grids.receptance(M, model.with_damping(law).D, K, out, force, freq)
+    omega, phi = oracle.undamped(M, K, 0)
+    bound = law.response_error(freq, omega / 2 / np.pi, phi[0] * phi[2])
+    error = np.abs(ours - true)
+    assert np.all(error <= bound * (1 + 1e-9))
+    assert np.median(error / bound) > 0.5
+
+
+def test_without_loss_there_is_no_error():
+    np.testing.assert_array_equal(Hysteretic(0.0).error([0, 5.0, 7.0], [5.0]), 0)
+
+
+def test_bad_loss_factors():
+    for eta in (-0.1, 2.0, np.nan, "a"):
+        with pytest.raises(ModelError):
+            Hysteretic(eta)
+    with pytest.raises(ModelError, match="negative"):
+        Hysteretic(0.1).error([-1.0], [1.0])
+    with pytest.raises(ShapeError, match="gains"):
+        Hysteretic(0.1).response_error([1.0], [1.0, 2.0], [1.0])
+
+
+def test_laws_in_solve_modes():
+    model = held_chain()
+    for law, zeta in (
+        (Hysteretic(0.04), [0.02] * 3),
+        (
+            ModalDamping.from_measured([-3 + 200j], modes=[2], others=0.01),
+            [0.01, 3 / 200.0225, 0.01],
+        ),
+    ):
+        np.testing.assert_allclose(solve_modes(model, damping=law).zeta, zeta, rtol=1e-6)
+        # the same through the matrix
+        np.testing.assert_allclose(solve_modes(model.with_damping(law)).zeta, zeta, rtol=1e-6)
