@@ -13,7 +13,9 @@ from ..errors import ModelError
 from ..labels import DofSet, Place
 from ..structure import FEModel
 from ..structure.eigen import signed
-from ..structure.factor import DENSE_LIMIT, dense, diagonal, symmetric_lu
+from ..structure.factor import DENSE_LIMIT, dense, diagonal
+from ..structure.multifrontal import MultifrontalCholesky
+from ..structure.shifted import stiffness_factor
 from ..values import FloatArray, Matrix
 
 #: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
@@ -57,7 +59,10 @@ def attachment_vectors(
     """
     M, K, rigid = model.M, model.K, model.rigid_body
     loads = np.column_stack([model.dofs.row(place) for place in at])
-    response = static_response(M, K, rigid, loads)
+    if sp.issparse(K) and sp.issparse(M) and model.n_dof > DENSE_LIMIT:
+        response = stiffness_factor(model).static(loads)
+    else:
+        response = static_response(M, K, rigid, loads)
     whole = np.sum(loads * response, axis=0)
     for _ in range(2):
         response = response - phi @ (phi.T @ np.asarray(M @ response))
@@ -108,7 +113,7 @@ def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) 
     if sp.issparse(K) and n > DENSE_LIMIT:
         sparse: Any = K
         part_of_K = sparse[free][:, free]
-        solve = symmetric_lu(part_of_K).solve
+        solve = MultifrontalCholesky(part_of_K).solve
         part = solve(balanced[free])
         part = part + solve(balanced[free] - part_of_K @ part)
     else:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -45,6 +45,12 @@ class Modes(Value):
         Residual attachment vectors.
     vector_dofs : sequence of m str
         The places they belong to (together: they are mixed to become diagonal).
+    residual : (k,) array
+        ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode (rigid-body ones: 0), as
+        `solve_modes` found it; empty where it is not known.
+    certificate : mapping
+        What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I) and, for a
+        large model, the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
 
     Raises
     ------
@@ -61,6 +67,8 @@ class Modes(Value):
     vector_omega: FloatArray = field(default_factory=_nothing)
     vector_zeta: FloatArray = field(default_factory=_nothing)
     vector_dofs: Sequence[str] = ()
+    residual: FloatArray = field(default_factory=_nothing)
+    certificate: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         omega = real_array(self.omega, "omega", (None,))
@@ -92,6 +100,11 @@ class Modes(Value):
             vector_omega=real_array(vector_omega, "vector_omega", (m,)),
             vector_zeta=real_array(vector_zeta, "vector_zeta", (m,)),
             vector_dofs=tuple(str(place) for place in places),
+            residual=real_array(self.residual, "residual", (k if np.size(self.residual) else 0,)),
+            certificate={
+                str(name): float(real_array(value, f"certificate {name}", ()))
+                for name, value in self.certificate.items()
+            },
         )
 
     def __repr__(self) -> str:
@@ -104,7 +117,14 @@ class Modes(Value):
         held = f" ({', '.join(parts)})" if parts else ""
         more = ", ..." if self.n_vectors > 4 else ""
         extra = f", vectors at {', '.join(self.vector_dofs[:4])}{more}" if self.n_vectors else ""
-        return f"<Modes: {self.n_modes}{kind} of {len(self.dofs)} DOFs{held}{extra}>"
+        checked = ""
+        if "counted" in self.certificate:
+            checked = (
+                f",\n  {self.certificate['counted']:.0f} counted below "
+                f"{self.certificate['shift']:.4g} Hz, none missing; "
+                f"residual {np.max(self.residual, initial=0.0):.1g}"
+            )
+        return f"<Modes: {self.n_modes}{kind} of {len(self.dofs)} DOFs{held}{extra}{checked}>"
 
     @property
     def n_modes(self) -> int:

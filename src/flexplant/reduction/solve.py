@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
-from ..structure.eigen import check_stiffness, elastic_modes, signed
-from ..structure.factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
+from ..structure.counted import counted_modes, residuals
+from ..structure.eigen import elastic_modes, signed
+from ..structure.factor import DENSE_LIMIT, dense, diagonal
+from ..structure.shifted import stiffness_factor
 from ..values import FloatArray, positive
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
@@ -23,10 +24,8 @@ from .normal_form import PROPORTIONAL, check_drag, normal_form
 _ORTHONORMAL = 1e-12
 #: residual ||K phi - omega^2 M phi||, of omega^2 and of the largest eigenvalue of the model
 _RESIDUAL = (1e-8, 1e-12)
-#: part of the largest omega^2 below which an elastic one is rounding
-_ROUNDING = 1e-14
-#: frequencies closer than this (relative, squared) belong together
-_GAP = 1e-6
+#: with a larger part of all modes wanted, a dense solution of a model of this size is faster
+_MANY, _DENSE_MANY = 10, 6000
 
 
 def solve_modes(
@@ -97,13 +96,16 @@ def solve_modes(
     kept, top = _asked(model, count, below)
     at = places(compliance_at)
     names = labels_of(at, model.dofs)
-    omega, phi = _undamped(model, kept, top)
-    _check(model, omega, phi)
+    # one factor for the modes and for the attachment vectors, while it is held here
+    held = stiffness_factor(model) if at and _is_large(model) else None
+    omega, phi, certificate = _undamped(model, kept, top)
+    certificate = _check(model, omega, phi) | certificate
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _complex_modes(model, kept, top, names)
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
     if at:
         vectors, vector_omega = attachment_vectors(model, omega, phi, at)
+    del held
     r = model.rigid_body.shape[1]
     if damping is None:
         zeta = np.concatenate([np.zeros(r), projected_zeta(model.D, phi[:, r:], omega[r:])])
@@ -119,6 +121,8 @@ def solve_modes(
         vector_omega=vector_omega,
         vector_zeta=_vector_zeta(model, vectors, vector_omega, damping, compliance_damping),
         vector_dofs=names,
+        residual=residuals(model, omega**2, phi)[0],
+        certificate=certificate,
     )
 
 
@@ -158,67 +162,25 @@ def _vector_zeta(
     return damping.zeta(omega)
 
 
-def _undamped(model: FEModel, count: int, top: float) -> tuple[FloatArray, FloatArray]:
+def _undamped(
+    model: FEModel, count: int, top: float
+) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     rigid = model.rigid_body
     n, r = rigid.shape
-    if n <= DENSE_LIMIT or not sp.issparse(model.K) or not sp.issparse(model.M):
+    certificate: dict[str, float] = {}
+    small = n <= DENSE_LIMIT or (n <= _DENSE_MANY and _MANY * count > n)
+    if small or not sp.issparse(model.K) or not sp.issparse(model.M):
         omega, phi = elastic_modes(dense(model.M), dense(model.K), rigid, count - r)
+    elif count > r:
+        squares, phi, certificate = counted_modes(model, count - r, top)
+        omega, phi = np.sqrt(squares), signed(phi) if squares.size else phi
     else:
-        omega, phi = _sparse_modes(model, count - r, top)
+        omega, phi = np.zeros(0), np.zeros((n, 0))
     keep = omega**2 <= top
-    return np.concatenate([np.zeros(r), omega[keep]]), np.hstack([rigid, phi[:, keep]])
-
-
-def _sparse_modes(model: FEModel, count: int, top: float) -> tuple[FloatArray, FloatArray]:
-    """Return the lowest elastic modes by shift-invert Lanczos, complete by a Sturm count."""
-    M, rigid = model.M, model.rigid_body
-    K: Any = model.K
-    n, r = rigid.shape
-    # far below the first elastic mode, yet K - shift M is well away from singular; what rounding
-    # leaves in the rigid-body directions is projected out
-    shift = -1e-12 * _largest(model)
-    lu = symmetric_lu(K - shift * M)
-    if negative_pivots(lu):
-        raise ModelError(
-            f"K has {negative_pivots(lu)} negative eigenvalues: the structure is unstable. Look "
-            "for a sign in K."
-        )
-    if np.isfinite(top):
-        count = min(count, negative_pivots(symmetric_lu(K - top * M)) - r)
-    if count <= 0:
-        return np.zeros(0), np.zeros((n, 0))
-    if count > n // 10:
-        return elastic_modes(dense(M), dense(K), rigid, count)
-    loaded = np.asarray(M @ rigid)
-
-    def solve(force: FloatArray) -> FloatArray:
-        moved = lu.solve(force - loaded @ (rigid.T @ force))
-        return np.asarray(moved - rigid @ (loaded.T @ moved))
-
-    inverse = spla.LinearOperator((n, n), matvec=solve, dtype=np.float64)
-    for attempt in range(3):
-        # repeated pairs may lose a partner: over-ask, count, and try again from elsewhere
-        asked = min(count + max(8, count // 4) * (attempt + 1), n - r - 1)
-        start: Any = np.random.default_rng(attempt).standard_normal(n)
-        start = start - rigid @ (loaded.T @ start)
-        try:
-            found: Any = spla.eigsh(K, asked, M, shift, v0=start, ncv=3 * asked + 20, OPinv=inverse)
-        except spla.ArpackNoConvergence as error:
-            raise SolverError(f"Lanczos did not converge for {asked} modes: {error}.") from error
-        order = np.argsort(found[0])
-        squares, phi = found[0][order], found[1][:, order]
-        check_stiffness(squares, _ROUNDING * _largest(model), r)
-        gaps = np.flatnonzero(np.diff(squares) > _GAP * squares[1:]) + 1
-        gaps = gaps[gaps >= count]
-        if not gaps.size:
-            continue
-        sure = int(gaps[0])
-        between = 0.5 * (squares[sure - 1] + squares[sure])
-        if negative_pivots(symmetric_lu(K - between * M)) - r == sure:
-            return np.sqrt(squares[:count]), signed(phi[:, :count])
-    raise SolverError(
-        f"Lanczos left out some of the {count} lowest elastic modes three times over (a Sturm "
-        "count tells): closely repeated frequencies. Ask for some more or fewer modes."
+    return (
+        np.concatenate([np.zeros(r), omega[keep]]),
+        np.hstack([rigid, phi[:, keep]]),
+        certificate,
     )
 
 
@@ -227,7 +189,11 @@ def _largest(model: FEModel) -> float:
     return float(np.max(diagonal(model.K) / diagonal(model.M)))
 
 
-def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> None:
+def _is_large(model: FEModel) -> bool:
+    return model.n_dof > DENSE_LIMIT and sp.issparse(model.K) and sp.issparse(model.M)
+
+
+def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> dict[str, float]:
     """Raise SolverError unless shapes are M-orthonormal and fulfil the eigenvalue problem."""
     mass = np.asarray(model.M @ phi)
     error = float(np.abs(phi.T @ mass - np.eye(omega.size)).max(initial=0.0))
@@ -245,6 +211,7 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> None:
             f"mode {i + 1} at {omega[i] / (2 * np.pi):.5g} Hz leaves a residual of {size[i]:.2g} "
             f"(limit {limit[i]:.2g}) in the eigenvalue problem: not a mode of this model."
         )
+    return {"orthonormality": error}
 
 
 def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:

@@ -1,0 +1,159 @@
+"""The lowest modes of a large sparse structure, counted: none is missing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import SolverError
+from ..values import FloatArray
+from .eigen import check_stiffness
+from .lanczos import FOUND, BlockLanczos
+from .model import FEModel
+from .shifted import StiffnessFactor, modes_below, stiffness_factor
+
+#: modes beyond the last wanted one among which a gap is looked for
+_EXTRA = 4
+#: frequencies closer than this (relative, squared) belong together
+_GAP = 1e-6
+#: part of the largest omega^2 below which an elastic one is rounding
+_ROUNDING = 1e-14
+#: searches with what is found locked, before giving up
+_SEARCHES = 8
+#: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
+_RESIDUAL = 1e-11
+#: residuals below this many roundings of K phi are not reduced by more steps
+_ROUNDINGS = 10.0
+
+
+def counted_modes(
+    model: FEModel, count: int, top: float = np.inf
+) -> tuple[FloatArray, FloatArray, dict[str, float]]:
+    """Return the lowest elastic modes with omega^2 up to `top`, and what was counted.
+
+    Block Lanczos finds them, a Sturm count in a gap above the last one says how many there are;
+    what is missing is looked for beside those found until the count agrees.
+
+    Parameters
+    ----------
+    model : FEModel
+        The structure, sparse.
+    count : int
+        How many elastic modes at most.
+    top : float [rad^2/s^2]
+        Largest omega^2.
+
+    Returns
+    -------
+    squares : (k,) array
+        omega^2 of the elastic modes.
+    phi : (n, k) array
+        M-orthonormal shapes.
+    certificate : dict
+        `shift` [Hz], modes `counted` and `found` below it.
+
+    Raises
+    ------
+    ModelError
+        When K is indefinite or an elastic mode has no stiffness.
+    SolverError
+        When the count does not agree, or is not sure.
+    """
+    n, r = model.rigid_body.shape
+    factor: StiffnessFactor | None = stiffness_factor(model)
+    largest = factor.largest if factor else 0.0
+    below = None
+    if np.isfinite(top):
+        below = modes_below(model, top) - r
+        if not below:
+            return np.zeros(0), np.zeros((n, 0)), _certificate(top, r, r)
+        count = min(count, below)
+    squares, phi = np.zeros(0), np.zeros((n, 0))
+    missing = min(count + _EXTRA, n - r)
+    for search in range(_SEARCHES):
+        factor = factor or stiffness_factor(model)
+        locked = np.hstack([model.rigid_body, phi])
+        more = _search(model, factor, locked, missing, search)
+        squares, phi = _rayleigh_ritz(model, np.hstack([phi, more]))
+        check_stiffness(squares, _ROUNDING * largest, r)
+        # the count needs the memory
+        factor, more = None, np.zeros((n, 0))
+        if below == count and _apart(squares, count, top):
+            counted, sure, shift = count, count, top
+        else:
+            sure, shift = _gap(squares, count)
+            if not sure and squares.size < n - r:
+                missing = min(2 * _EXTRA, n - r - squares.size)
+                continue
+            if not sure:
+                sure, shift = squares.size, 2 * float(squares[-1])
+            counted = modes_below(model, shift) - r
+        if counted == sure:
+            return squares[:count], phi[:, :count], _certificate(shift, counted + r, sure + r)
+        if counted < sure:
+            break
+        missing = min(counted - sure + _EXTRA, n - r - squares.size)
+    raise SolverError(
+        f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count tells {counted + r} modes, "
+        f"{sure + r} were found: closely repeated frequencies. Ask for some more or fewer modes."
+    )
+
+
+def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
+    return {
+        "shift": float(np.sqrt(shift) / (2 * np.pi)),
+        "counted": float(counted),
+        "found": float(found),
+    }
+
+
+def _search(
+    model: FEModel, factor: StiffnessFactor, locked: FloatArray, want: int, seed: int
+) -> FloatArray:
+    """Return shapes (n, want) beside the locked ones, residuals down to rounding."""
+    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed)
+    theta, phi = lanczos.lowest(want)
+    for tolerance in (1e-2 * FOUND, 1e-4 * FOUND):
+        left, rounding = residuals(model, factor.sigma + 1 / theta, phi)
+        if np.all(left <= np.maximum(_RESIDUAL, _ROUNDINGS * rounding)):
+            break
+        theta, phi = lanczos.lowest(want, tolerance)
+    return phi
+
+
+def residuals(
+    model: FEModel, squares: FloatArray, phi: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, and the rounding in it."""
+    K: Any = model.K
+    force = np.asarray(K @ phi)
+    size = np.linalg.norm(force, axis=0)
+    size[size == 0] = 1.0
+    left = np.linalg.norm(force - np.asarray(model.M @ phi) * squares, axis=0)
+    rounding = np.finfo(np.float64).eps * np.linalg.norm(abs(K) @ np.abs(phi), axis=0)
+    return left / size, rounding / size
+
+
+def _rayleigh_ritz(model: FEModel, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+    stiffness = phi.T @ np.asarray(model.K @ phi)
+    mass = phi.T @ np.asarray(model.M @ phi)
+    squares, mix = la.eigh(0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T))
+    return squares, phi @ mix
+
+
+def _apart(squares: FloatArray, count: int, top: float) -> bool:
+    """Return whether `top` is well between the last mode below it and the next."""
+    near = squares[count - 1 : count + 1]
+    return bool(np.all(np.abs(near - top) > _GAP * top) and near[0] < top < near[-1])
+
+
+def _gap(squares: FloatArray, count: int) -> tuple[int, float]:
+    """Return how many modes lie below the widest gap after the last wanted one, and its middle."""
+    above = squares[count - 1 :]
+    wide = np.diff(above) / above[1:]
+    if not wide.size or wide.max() <= _GAP:
+        return 0, 0.0
+    i = int(np.argmax(wide))
+    return count + i, 0.5 * float(above[i] + above[i + 1])

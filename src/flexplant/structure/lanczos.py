@@ -1,0 +1,166 @@
+"""Block shift-invert Lanczos: the lowest modes of a large structure, repeated ones included."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ..errors import SolverError
+from ..values import FloatArray, Matrix
+
+#: vectors that are solved for at a time
+BLOCK = 8
+#: residual of a Ritz pair of the inverse, relative to its value, at which it counts as found
+FOUND = 1e-11
+#: steps between two restarts
+_STEPS = 16
+_RESTARTS = 60
+
+
+class BlockLanczos:
+    """The largest eigenvalues ``theta = 1 / (omega^2 - sigma)`` of ``(K - sigma M)^-1 M``.
+
+    Every new block is made M-orthogonal to all before it, twice, so that no value appears twice
+    [Grimes, Lewis and Simon, SIAM J. Matrix Anal. 15, 228 (1994)].
+
+    Parameters
+    ----------
+    solve : callable
+        Forces (n, m) to ``(K - sigma M)^-1`` times them.
+    M : (n, n) matrix
+        Mass, positive definite.
+    locked : (n, r) array
+        M-orthonormal vectors, modes already known: deflated.
+    want : int
+        About how many modes will be asked for.
+    seed : int
+        Of the starting block: the same seed gives the same answer.
+    """
+
+    def __init__(
+        self,
+        solve: Callable[[FloatArray], FloatArray],
+        M: Matrix,
+        locked: FloatArray,
+        *,
+        want: int,
+        seed: int = 0,
+        block: int = BLOCK,
+    ) -> None:
+        self._solve = solve
+        self._M: Any = sp.csr_array(M.T) if sp.issparse(M) else M
+        n, self._r = locked.shape
+        self._block = min(block, n - self._r)
+        self._rng = np.random.default_rng(seed)
+        self._reserve(want)
+        # rows: locked vectors, then the basis; only touched rows take memory
+        self._V = np.empty((self._capacity, n))
+        self._V[: self._r] = locked.T
+        self._m = 0
+        self._T = np.zeros((0, 0))
+        self.steps = 0
+        self._next, self._loaded, _ = self._orthonormal(self._random(self._block))
+
+    def _reserve(self, want: int) -> None:
+        # after a restart want + block vectors are kept; as many again or _STEPS blocks follow
+        room = 2 * self._block + max(_STEPS * self._block, want + self._block)
+        self._capacity = self._r + want + self._block + room
+
+    def lowest(self, count: int, tolerance: float = FOUND) -> tuple[FloatArray, FloatArray]:
+        """Return the `count` largest theta found and their shapes (n, count).
+
+        Raises
+        ------
+        SolverError
+            When they do not converge.
+        """
+        n = self._V.shape[1]
+        count = min(count, n - self._r)
+        for _ in range(_RESTARTS * _STEPS):
+            if self._m + self._r >= n or not self._next.shape[1]:
+                return self._ritz(count)
+            theta, mix, error = self._step()
+            done = theta.size >= count and bool(np.all(error[:count] <= tolerance * theta[:count]))
+            if done:
+                return theta[:count], self._V[self._r : self._r + self._m].T @ mix[:, :count]
+            if self._r + self._m + 2 * self._next.shape[1] > self._capacity:
+                self._restart(theta, mix, min(count + self._block, theta.size))
+        raise SolverError(
+            f"Lanczos did not converge for {count} modes in {self.steps} steps: M and K are badly "
+            "conditioned. Look for DOFs with next to no mass, or ask for fewer modes."
+        )
+
+    def _random(self, columns: int) -> FloatArray:
+        return self._rng.standard_normal((self._V.shape[1], columns))
+
+    def _ritz(self, count: int) -> tuple[FloatArray, FloatArray]:
+        theta, mix = la.eigh(self._T)
+        theta, mix = theta[::-1][:count], mix[:, ::-1][:, :count]
+        return theta, self._V[self._r : self._r + self._m].T @ mix
+
+    def _step(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Extend the basis by the next block; return Ritz values, vectors and residuals."""
+        block, width = self._next, self._next.shape[1]
+        moved = self._solve(self._loaded)
+        at = self._r + self._m
+        if at + width > self._V.shape[0]:
+            grown = np.empty((at + 2 * width + _STEPS * width, self._V.shape[1]))
+            grown[:at] = self._V[:at]
+            self._V, self._capacity = grown, grown.shape[0]
+        self._V[at : at + width] = block.T
+        self._m += width
+        self._next, self._loaded, (along, over) = self._orthonormal(moved)
+        along = along[self._r :]
+        grown_T = np.zeros((self._m, self._m))
+        grown_T[:-width, :-width] = self._T
+        grown_T[:, -width:] = along
+        grown_T[-width:, :-width] = along[:-width].T
+        grown_T[-width:, -width:] = 0.5 * (along[-width:] + along[-width:].T)
+        self._T = grown_T
+        self.steps += 1
+        theta, mix = la.eigh(self._T)
+        theta, mix = theta[::-1], mix[:, ::-1]
+        return theta, mix, np.linalg.norm(over @ mix[-width:], axis=0)
+
+    def _restart(self, theta: FloatArray, mix: FloatArray, keep: int) -> None:
+        """Keep the best Ritz vectors only; the next block holds the residuals of all of them."""
+        basis = self._V[self._r : self._r + self._m]
+        n = basis.shape[1]
+        for begin in range(0, n, 65536):  # in place
+            columns = slice(begin, min(begin + 65536, n))
+            basis[:keep, columns] = mix[:, :keep].T @ basis[:, columns]
+        self._m, self._T = keep, np.diag(theta[:keep])
+
+    def _orthonormal(
+        self, W: FloatArray
+    ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
+        """Return the M-orthonormal part of W beyond the basis, M times it, and the coefficients."""
+        basis = self._V[: self._r + self._m]
+        along = np.zeros((basis.shape[0], W.shape[1]))
+        over = np.eye(W.shape[1])
+        W = np.ascontiguousarray(W)
+        for _ in range(3):
+            part = basis @ (self._M @ W)
+            W -= basis.T @ part
+            along += part @ over
+            loaded = self._M @ W
+            size, turn = la.eigh(W.T @ loaded)
+            keep = size > 1e-24 * max(size[-1], 0.0)
+            if size[-1] <= 0 or not np.any(keep):
+                empty = np.zeros((W.shape[0], 0))
+                return empty, empty, (along, np.zeros((0, over.shape[1])))
+            root = np.sqrt(size[keep])
+            # once orthonormal to rounding, M W turns along with W
+            W, loaded = (np.ascontiguousarray(X @ (turn[:, keep] / root)) for X in (W, loaded))
+            over = (turn[:, keep] * root).T @ over
+            exact = (
+                float(np.abs(part).max(initial=0.0)) < 1e-13
+                and float(np.abs(size - 1).max()) < 1e-12
+            )
+            if exact:
+                break
+        return W, loaded, (along, over)

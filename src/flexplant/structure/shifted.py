@@ -1,0 +1,160 @@
+"""The factor of K - sigma M of a model: one for modes, residual vectors and error estimates."""
+
+from __future__ import annotations
+
+import weakref
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import ModelError, SolverError
+from ..values import FloatArray
+from .factor import diagonal
+from .model import FEModel
+from .multifrontal import MultifrontalCholesky, multifrontal_inertia
+from .ordering import Dissection, dissect
+
+#: the shift, of the largest eigenvalue: far below the first elastic mode of nearly all models,
+#: yet K - sigma M is well away from singular
+_SHIFT = -1e-12
+#: static responses solve K u = f to this part of the load
+_STATIC = 1e-13
+_held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]]
+_dissected: weakref.WeakKeyDictionary[FEModel, Dissection]
+
+
+class StiffnessFactor:
+    """``K - sigma M = L L^T`` of a sparse model, with sigma just below zero.
+
+    Get it from `stiffness_factor`, which hands out the same one for as long as someone holds it.
+
+    Parameters
+    ----------
+    model : FEModel
+        The structure; K may be singular for its rigid-body motions.
+
+    Raises
+    ------
+    ModelError
+        When K is indefinite.
+    """
+
+    def __init__(self, model: FEModel) -> None:
+        self.M: Any = sp.csc_array(model.M)
+        self.K: Any = sp.csc_array(model.K)
+        self.rigid = model.rigid_body
+        self.largest = float(np.max(diagonal(self.K) / diagonal(self.M)))
+        self.sigma = _SHIFT * self.largest
+        shifted = sp.csc_array(self.K - self.sigma * self.M)
+        self.dissection = dissection_of(model)
+        try:
+            self._cholesky = MultifrontalCholesky(shifted, self.dissection)
+        except SolverError as error:
+            negative = multifrontal_inertia(shifted, self.dissection)
+            if not negative:
+                raise
+            raise ModelError(
+                f"K has {negative} negative eigenvalue{'s' * (negative != 1)}: the structure is "
+                "unstable. Look for a sign in K."
+            ) from error
+
+    def __repr__(self) -> str:
+        size = self._cholesky.n_entries * 8e-9
+        return f"<StiffnessFactor: {self.K.shape[0]} DOFs, {size:.2g} GB>"
+
+    def solve(self, force: FloatArray) -> FloatArray:
+        """Return ``(K - sigma M)^-1 force`` for (n,) or (n, m) forces."""
+        return self._cholesky.solve(force)
+
+    def static(self, loads: FloatArray) -> FloatArray:
+        """Return the elastic static response (n, m) to loads, M-orthogonal to rigid-body motions.
+
+        ``K u = f - M R R^T f`` (inertia relief) by conjugate gradients, preconditioned with the
+        factor: a few steps, since sigma is small.
+
+        Raises
+        ------
+        SolverError
+            When K is singular beyond the rigid-body motions.
+        """
+        R = self.rigid
+        inertia = np.asarray(self.M @ R)
+        residual = loads - inertia @ (R.T @ loads)
+        wanted = np.linalg.norm(residual, axis=0)
+        u = np.zeros_like(residual)
+        direction, old = np.zeros_like(residual), np.ones(residual.shape[1])
+        best = np.full(residual.shape[1], np.inf)
+        for _ in range(60):
+            moved = self.solve(residual)
+            moved -= R @ (inertia.T @ moved)
+            new = np.sum(residual * moved, axis=0)
+            direction = moved + direction * (new / old)
+            force = np.asarray(self.K @ direction)
+            stored = np.sum(direction * force, axis=0)
+            length = np.divide(new, stored, out=np.zeros_like(new), where=stored > 0)
+            step = direction * length
+            u += step
+            residual -= force * length
+            residual -= inertia @ (R.T @ residual)
+            # measured in energy: in forces, rounding of stiff directions would hide the rest
+            part = np.sqrt(new * length / np.maximum(np.sum(u * (self.K @ u), axis=0), 1e-300))
+            if np.all((part <= 1e-12) | (wanted == 0)) or np.all(part >= best):
+                break
+            best, old = part, np.where(new > 0, new, 1.0)
+        if not np.all((part <= 1e-7) | (wanted == 0)):
+            raise SolverError(
+                f"a static response is not found (the last step is {part.max():.1g} of it): K is "
+                f"singular beyond the {R.shape[1]} rigid-body motions of the geometry. Look for a "
+                "mechanism, a DOF without stiffness, or wrong coordinates."
+            )
+        return u - R @ (inertia.T @ u)
+
+
+def stiffness_factor(model: FEModel) -> StiffnessFactor:
+    """Return the factor of a sparse model, the same one for as long as someone holds it.
+
+    Parameters
+    ----------
+    model : FEModel
+        The structure.
+
+    Raises
+    ------
+    ModelError
+        When K is indefinite.
+    """
+    known = _held.get(model)
+    factor = known() if known is not None else None
+    if factor is None:
+        factor = StiffnessFactor(model)
+        _held[model] = weakref.ref(factor)
+    return factor
+
+
+def dissection_of(model: FEModel) -> Dissection:
+    """Return the elimination order of a model's matrices, found once."""
+    found = _dissected.get(model)
+    if found is None:
+        M, K = sp.csc_array(model.M), sp.csc_array(model.K)
+        # of both matrices: entries that cancel in one stay in the other
+        same = np.array_equal(M.indptr, K.indptr) and np.array_equal(M.indices, K.indices)
+        pattern = K if same else sp.csc_array(abs(K) + abs(M))
+        found = dissect(pattern, model.dofs.nodes, model.dofs.xyz)
+        _dissected[model] = found
+    return found
+
+
+def modes_below(model: FEModel, square: float) -> int:
+    """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm).
+
+    Raises
+    ------
+    SolverError
+        When `square` is so close to a mode that the count is not sure.
+    """
+    return multifrontal_inertia(sp.csc_array(model.K - square * model.M), dissection_of(model))
+
+
+_held = weakref.WeakKeyDictionary()
+_dissected = weakref.WeakKeyDictionary()
