@@ -20,6 +20,8 @@ PROPORTIONAL = 1e-9
 _RIGID_DRAG = 1e-4
 #: eigenvalues closer than this (relative) have no eigenvectors of their own
 _CLUSTER = 1e-7
+#: mixing of shapes by rounding that one Newton step takes out
+_MIXED = 1e-2
 #: what a plant makes of damping that modes cannot express
 _PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form."
 
@@ -229,6 +231,7 @@ def _complex_modes(omega: FloatArray, C: FloatArray) -> tuple[ComplexArray, Comp
             cluster = slice(start, i)
             mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C)
             start = i
+    mix = _polished(poles, mix, C)
     residual = mix * poles**2 + (C @ mix) * poles + omega[:, None] ** 2 * mix
     worst = float(
         (np.linalg.norm(residual, axis=0) / np.linalg.norm(mix, axis=0) / np.abs(poles)).max()
@@ -249,6 +252,26 @@ def _normalised(poles: ComplexArray, mix: ComplexArray, C: FloatArray) -> Comple
     if poles.size == 1:
         mix = mix * np.sqrt(2j * mean.imag / gram[0, 0])
     else:
-        mix = mix @ la.inv(la.sqrtm(gram / (2j * mean.imag)))
+        try:
+            mix = mix @ la.inv(la.sqrtm(gram / (2j * mean.imag)))
+        except la.LinAlgError:
+            raise SolverError(
+                f"the repeated pole {mean:.6g} rad/s has no complete set of shapes: two modes "
+                f"coalesce. {_PLANT} Else change D, or lower it."
+            ) from None
     top = np.argmax(np.abs(mix), axis=0)
     return mix * np.where(mix[top, np.arange(poles.size)].real < 0, -1.0, 1.0)
+
+
+def _polished(poles: ComplexArray, mix: ComplexArray, C: FloatArray) -> ComplexArray:
+    """Return shapes with ``x_i^T (lambda_i + lambda_j + C) x_j = 0``, by one Newton step.
+
+    Rounding mixes the shapes of slow modes that are close by far more than their own size: by that
+    of the fastest mode over their distance.
+    """
+    unit = mix / np.sqrt(2j * poles.imag)
+    gram = (unit.T @ unit) * np.add.outer(poles, poles) + unit.T @ (C @ unit)
+    off = gram - np.eye(poles.size)
+    if not np.abs(off).max() < _MIXED:
+        return mix
+    return np.asarray((unit - 0.5 * unit @ off) * np.sqrt(2j * poles.imag))
