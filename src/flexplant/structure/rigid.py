@@ -50,8 +50,10 @@ def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
     if np.all(free):
         return motions
-    right, values = la.svd(force)[2], np.zeros(scale.size)
-    values[: min(force.shape)] = la.svdvals(force)
+    # of the small triangle: the left factor of all DOFs would be a full square matrix
+    _, found, right = la.svd(la.qr(force, mode="economic")[1])
+    values = np.zeros(scale.size)
+    values[: found.size] = found
     null = right[values < _ENERGY_TOLERANCE].T
     if null.shape[1] > np.count_nonzero(free):
         return orthonormalised(M, motions @ (null / np.where(scale > 0, scale, 1.0)[:, None]))
