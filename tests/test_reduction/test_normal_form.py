@@ -139,14 +139,11 @@ def test_it_is_a_value():
 
 def test_slow_close_modes_beside_fast_ones_stay_apart():
     # rounding of the fastest mode over the gap of the slow ones: 1e-16 * 5e5 / 1e-6
-    omega = np.array([10.0, 10.0 * (1 + 2e-7), 4e3, 9e4, 5e5])
-    mixed = np.random.default_rng(1).standard_normal((5, 5))
-    D = np.diag(0.01 * omega) + 1e-3 * mixed @ mixed.T * np.sqrt(np.outer(omega, omega))
-    K = np.diag(omega**2)
-    form = normal_form(np.eye(5), D, K, np.zeros((5, 0)))
+    n = 60
+    omega = np.concatenate([[10.0, 10.0 * (1 + 1.2e-7)], np.geomspace(4e3, 5e5, n - 2)])
+    mixed = np.random.default_rng(1).standard_normal((n, n))
+    D = np.diag(0.01 * omega) + 1e-5 * mixed @ mixed.T * np.sqrt(np.outer(omega, omega))
+    form = normal_form(np.eye(n), D, np.diag(omega**2), np.zeros((n, 0)))
     X, poles = form.phi, form.poles
     whole = 2 * np.real((X * poles / (2j * poles.imag)) @ X.T)  # M^-1
-    np.testing.assert_allclose(whole, np.eye(5), atol=1e-9)
-    for s in (300j, 5e3j):
-        exact = np.linalg.inv(s**2 * np.eye(5) + s * D + K)
-        np.testing.assert_allclose(receptance(form, s), exact, atol=1e-8 * np.abs(exact).max())
+    np.testing.assert_allclose(whole, np.eye(n), atol=1e-10)
