@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg as la
@@ -62,9 +62,8 @@ class CraigBampton(ReductionMethod):
 
     boundary: Iterable[str]
     modes: int = 0
-    _: KW_ONLY
-    below: float | None = None
-    damping: Damping | None = None
+    below: float | None = field(default=None, kw_only=True)
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         number = whole(self.modes, "modes", minimum=0)
@@ -231,8 +230,7 @@ class Rubin(_FreeInterface):
 
     boundary: Iterable[str]
     modes: int
-    _: KW_ONLY
-    damping: Damping | None = None
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(
@@ -283,8 +281,7 @@ class MacNeal(_FreeInterface):
 
     boundary: Iterable[str]
     modes: int
-    _: KW_ONLY
-    damping: Damping | None = None
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,12 @@ class Partition:
         self.others: IntArray = np.flatnonzero(others)
         if not self.others.size:
             raise ShapeError(f"all {n} DOFs are kept: nothing is left to condense.")
+        rigid = model.rigid_body
+        if rigid.shape[1]:
+            # held at the kept DOFs, no rigid-body motion may be left
+            size = la.svdvals(rigid[self.kept] / np.linalg.norm(rigid, axis=0))
+            if size.size < rigid.shape[1] or size[-1] < 1e-9 * size[0]:
+                raise ModelError(_SINGULAR)
         self.stiffness = block(model.K, self.others, self.others)
         self.solver = Solver(self.stiffness, _SINGULAR)
         coupling: Any = block(model.K, self.others, self.kept)
@@ -85,8 +91,7 @@ class Guyan(ReductionMethod):
     """
 
     dofs: Iterable[str]
-    _: KW_ONLY
-    damping: Damping | None = None
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(dofs=labels_given(self.dofs, "kept DOFs"), damping=checked_damping(self.damping))
@@ -142,10 +147,9 @@ class Irs(ReductionMethod):
     """
 
     dofs: Iterable[str]
-    _: KW_ONLY
-    iterations: int = 1
-    tolerance: float = 1e-12
-    damping: Damping | None = None
+    iterations: int = field(default=1, kw_only=True)
+    tolerance: float = field(default=1e-12, kw_only=True)
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(
@@ -238,8 +242,7 @@ class Serep(ReductionMethod):
 
     dofs: Iterable[str]
     modes: Iterable[int] | None = None
-    _: KW_ONLY
-    damping: Damping | None = None
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         labels = labels_given(self.dofs, "kept DOFs")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -15,6 +15,7 @@ from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..structure import Damping, FEModel
 from ..structure.factor import DENSE_LIMIT, dense
+from ..structure.shifted import stiffness_factor
 from ..values import FloatArray, real_array, whole
 from .attachment import labels_of, places, static_response
 from .methods import ReductionMethod
@@ -65,9 +66,8 @@ class Krylov(ReductionMethod):
 
     inputs: Place | Iterable[Place]
     freq: FloatArray | float
-    _: KW_ONLY
-    moments: int = 1
-    damping: Damping | None = None
+    moments: int = field(default=1, kw_only=True)
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         freq = np.atleast_1d(real_array(self.freq, "freq"))
@@ -120,9 +120,12 @@ def _real_moments(model: FEModel, B: FloatArray, omega: float, count: int, D: An
     """Return a basis of the moments of an undamped model, or at 0 Hz."""
     M: Any = model.M
     K: Any = model.K
-    solve: Any = partial(static_response, M, K, model.rigid_body)
     if omega > 0:
-        solve = _factorised(K - omega**2 * M, omega)
+        solve: Any = _factorised(K - omega**2 * M, omega)
+    elif sp.issparse(K) and sp.issparse(M) and model.n_dof > DENSE_LIMIT:
+        solve = stiffness_factor(model).static
+    else:
+        solve = partial(static_response, M, K, model.rigid_body)
     if D is not None:
         return np.asarray(_second_order(solve, D, M, B, count))
     block = _normed(model, solve(B))
@@ -181,7 +184,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
                 "is infinite there. Move it a little."
             )
         return lambda loads: la.lu_solve(factor, loads * size[:, None]) * size[:, None]
-    lu = lu_of(matrix, 0.0)
+    lu = lu_of(matrix)
 
     def solve(loads: Any) -> Any:
         loads = np.ascontiguousarray(np.asarray(loads, dtype=kind))

@@ -14,13 +14,16 @@ from ..errors import LabelError, ModelError, SolverError
 from ..labels import DofSet
 from ..structure import Damping, FEModel
 from ..structure.eigen import elastic_modes
-from ..structure.factor import DENSE_LIMIT, dense, symmetric_lu, unit_diagonal
+from ..structure.factor import DENSE_LIMIT, dense, unit_diagonal
+from ..structure.multifrontal import MultifrontalCholesky
 from ..values import FloatArray, Matrix, name_list, rebuild
 from .modes import Modes
 from .reduced import ErrorBound, ReducedModel
 
 #: part of a rigid-body motion that a basis may miss
 _RIGID_TOLERANCE = 1e-7
+#: part of the loads that a solution may leave
+_LEFT = 1e-7
 
 
 class Solver:
@@ -29,15 +32,12 @@ class Solver:
     def __init__(self, matrix: Matrix, singular: str) -> None:
         self._matrix: Any = matrix
         self._sparse = bool(sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT)
+        self._singular = singular
         if self._sparse:
             try:
-                self._factor: Any = symmetric_lu(matrix)
+                self._factor: Any = MultifrontalCholesky(matrix)
             except SolverError as error:
                 raise ModelError(singular) from error
-            # a mechanism leaves a pivot of rounding size
-            pivots = np.abs(self._factor.U.diagonal()) / np.abs(self._matrix.diagonal())
-            if pivots[pivots.argmin()] < 1e-13:
-                raise ModelError(singular)
             return
         scaled, self._scale = unit_diagonal(dense(matrix))
         try:
@@ -52,7 +52,12 @@ class Solver:
         if not loads.size:
             return np.zeros_like(loads)
         found = self._once(loads)
-        return found + self._once(loads - np.asarray(self._matrix @ found))
+        found = found + self._once(loads - np.asarray(self._matrix @ found))
+        left = np.linalg.norm(loads - np.asarray(self._matrix @ found))
+        # a mechanism that rounding let through the factorisation takes no load
+        if not left <= _LEFT * np.linalg.norm(loads):
+            raise ModelError(self._singular)
+        return found
 
     def _once(self, loads: FloatArray) -> FloatArray:
         if self._sparse:
@@ -61,7 +66,7 @@ class Solver:
         return np.asarray(la.cho_solve(self._factor, loads * scale) * scale)
 
 
-def lu_of(matrix: Any, threshold: float) -> Any:
+def lu_of(matrix: Any) -> Any:
     """Return the SuperLU factorisation of an indefinite or complex symmetric sparse matrix.
 
     Raises
@@ -74,7 +79,7 @@ def lu_of(matrix: Any, threshold: float) -> Any:
         return splu(
             sp.csc_matrix(matrix),
             permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=threshold,
+            diag_pivot_thresh=0.0,
             options={"SymmetricMode": True},
         )
     except RuntimeError as error:

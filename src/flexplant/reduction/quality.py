@@ -395,7 +395,7 @@ def _as_like(D: Matrix, K: Matrix) -> Any:
 def _solved(matrix: Any, B: FloatArray, many: bool) -> ComplexArray:
     is_sparse = sp.issparse(matrix)
     if many and is_sparse:
-        lu = lu_of(matrix, 0.01)
+        lu = lu_of(matrix)
         loads = B.astype(np.complex128)
         solved = lu.solve(loads)
         return np.asarray(solved + lu.solve(loads - matrix @ solved))

@@ -93,8 +93,9 @@ def select_dofs(
     >>> from flexplant.reduction import solve_modes
     >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,
     ...                         youngs_modulus=70e9, poisson_ratio=0.35)
-    >>> select_dofs(solve_modes(plate, count=3), 3, required="1:z")
-    <DofSelection: 3 DOFs (1:z, 25:z, 21:z), condition 2.45>
+    >>> near = ["7:z", "12:z", "23:z"]
+    >>> select_dofs(solve_modes(plate, count=3), 3, required=["1:z", "5:z"], candidates=near)
+    <DofSelection: 3 DOFs (1:z, 5:z, 23:z), condition 1.93>
     """
     if not isinstance(modes, Modes):
         raise ModelError(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ..errors import ModelError
 from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
 from ..values import FloatArray, whole
-from .attachment import labels_of, places, static_response
+from .attachment import attachment_vectors, labels_of, places, static_response
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod
 from .modes import Modes
@@ -62,12 +62,11 @@ class ModalTruncation(ReductionMethod):
     """
 
     count: int | None = None
-    _: KW_ONLY
-    modes: Iterable[int] | None = None
-    static_at: Place | Iterable[Place] = ()
-    inputs: Place | Iterable[Place] = ()
-    outputs: Place | Iterable[Place] = ()
-    damping: Damping | None = None
+    modes: Iterable[int] | None = field(default=None, kw_only=True)
+    static_at: Place | Iterable[Place] = field(default=(), kw_only=True)
+    inputs: Place | Iterable[Place] = field(default=(), kw_only=True)
+    outputs: Place | Iterable[Place] = field(default=(), kw_only=True)
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if (self.count is None) == (self.modes is None):
@@ -111,12 +110,14 @@ class ModalTruncation(ReductionMethod):
         if law is not None:
             solved = solved.replace(zeta=law.zeta(solved.omega))
         columns = kept_columns(numbers, solved)
-        kept = solved.replace(
-            omega=solved.omega[columns], zeta=solved.zeta[columns], phi=solved.phi[:, columns]
+        kept = Modes(
+            solved.omega[columns],
+            solved.zeta[columns],
+            solved.phi[:, columns],
+            model.dofs,
+            n_rigid=solved.n_rigid,
         )
         if static:
-            from .attachment import attachment_vectors
-
             vectors, omega = attachment_vectors(model, kept.omega, np.real(kept.phi), static)
             zeta = np.zeros(omega.size)
             if law is not None:
@@ -191,11 +192,10 @@ class ModalBalanced(ReductionMethod):
 
     count: int
     inputs: Place | Iterable[Place]
-    _: KW_ONLY
-    outputs: Place | Iterable[Place] = ()
-    among: int | None = None
-    static_at: Place | Iterable[Place] = ()
-    damping: Damping | None = None
+    outputs: Place | Iterable[Place] = field(default=(), kw_only=True)
+    among: int | None = field(default=None, kw_only=True)
+    static_at: Place | Iterable[Place] = field(default=(), kw_only=True)
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(
