@@ -1,0 +1,197 @@
+"""Frequency response functions from plain arrays in a file: NumPy's .npz and MATLAB's .mat."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+
+from ..errors import FlexplantError, ModelError, ShapeError, unknown_label
+from ..lti.frequency import Frf
+
+_OPTIONAL = ("inputs", "outputs", "quantity", "coherence", "variance")
+
+
+def read_frf_npz(
+    path: str | Path,
+    *,
+    freq: str = "freq",
+    data: str = "data",
+    quantity: str | None = None,
+    frequency_axis: int | None = None,
+) -> Frf:
+    """Return the frequency response functions that `numpy.savez` wrote as plain arrays.
+
+    Parameters
+    ----------
+    path : str or Path
+        A .npz file with frequencies [Hz] and responses; `inputs`, `outputs`, `quantity`,
+        `coherence` and `variance` are taken where they are there. What `Frf.save` wrote is read by
+        `flexplant.load`.
+    freq, data : str
+        Names of the arrays (n_freq,) and (n_out, n_in, n_freq); (n_freq,) for a single pair.
+    quantity : {"displacement", "velocity", "acceleration"}, optional
+        What the outputs are, where the file does not say.
+    frequency_axis : int, optional
+        Which axis of the responses is frequency, such as 0 for (n_freq, n_out, n_in); when not
+        given, the only one of that length.
+
+    Returns
+    -------
+    Frf
+
+    Raises
+    ------
+    FlexplantError
+        When it is no .npz file, or the arrays are not there.
+    ShapeError
+        When sizes do not match, or which axis is frequency is not clear.
+    ModelError
+        When frequencies do not increase, or entries are not finite.
+    LabelError
+        When an array or the quantity is unknown.
+    FileNotFoundError
+        When there is no such file.
+
+    Examples
+    --------
+    >>> import os, tempfile
+    >>> path = os.path.join(tempfile.mkdtemp(), "frf.npz")
+    >>> np.savez(path, freq=[1.0, 2.0], data=[0.5, 0.25j], quantity="velocity")
+    >>> read_frf_npz(path).quantity
+    'velocity'
+    """
+    with Path(path).open("rb") as file:
+        try:
+            archive = np.load(file, allow_pickle=False)
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise ValueError("one array only")
+            content = {name: archive[name] for name in archive.files}
+        except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile) as error:
+            raise FlexplantError(
+                f"{str(path)!r} cannot be read as a .npz file of plain arrays ({error!s:.80}). "
+                "Write it with numpy.savez(path, freq=..., data=...)."
+            ) from None
+    if "__flexplant__" in content:
+        raise FlexplantError(
+            f"{str(path)!r} was saved by flexplant: flexplant.load(path) reads it."
+        )
+    return _frf(content, path, freq, data, quantity, frequency_axis)
+
+
+def read_frf_mat(
+    path: str | Path,
+    *,
+    freq: str = "freq",
+    data: str = "data",
+    quantity: str | None = None,
+    frequency_axis: int | None = None,
+) -> Frf:
+    """Return the frequency response functions in a MATLAB file, as arrays.
+
+    Parameters
+    ----------
+    path : str or Path
+        A .mat file (up to version 7; save with '-v7') with the variables of `read_frf_npz`;
+        `inputs` and `outputs` are cell arrays of names.
+    freq, data, quantity, frequency_axis : optional
+        As in `read_frf_npz`.
+
+    Returns
+    -------
+    Frf
+
+    Raises
+    ------
+    FlexplantError
+        When it is no MATLAB file, or the variables are not there.
+    ShapeError
+        When sizes do not match, or which axis is frequency is not clear.
+    ModelError
+        When frequencies do not increase, or entries are not finite.
+    LabelError
+        When a variable or the quantity is unknown.
+    FileNotFoundError
+        When there is no such file.
+    """
+    file: Any  # the stubs know names of files only
+    with Path(path).open("rb") as file:
+        try:
+            content = scipy.io.loadmat(file, chars_as_strings=True)
+        except Exception as error:
+            raise FlexplantError(
+                f"{str(path)!r} cannot be read as a MATLAB file ({error!s:.80}). Version 7.3 is "
+                "another format: save it with '-v7'."
+            ) from None
+    plain = {name: value for name, value in content.items() if not name.startswith("__")}
+    for side in ("inputs", "outputs"):
+        if side in plain:
+            plain[side] = [str(np.squeeze(cell)).strip() for cell in np.ravel(plain[side])]
+    return _frf(plain, path, freq, data, quantity, frequency_axis)
+
+
+def _frf(
+    content: Mapping[str, Any],
+    path: str | Path,
+    freq: str,
+    data: str,
+    quantity: str | None,
+    axis: int | None,
+) -> Frf:
+    for name in (freq, data):
+        if name not in content:
+            raise unknown_label("array", name, content, repr(str(path)))
+    grid, responses = np.ravel(content[freq]), np.asarray(content[data])
+    for name, array in ((freq, grid), (data, responses)):
+        if array.dtype.kind not in "iufc":
+            raise FlexplantError(
+                f"{name!r} of {str(path)!r} holds no numbers ({array.dtype}). Name the array: "
+                "freq='...', data='...'."
+            )
+    responses = _ordered(responses, grid.size, axis, data, path)
+    others = {name: content[name] for name in _OPTIONAL if name in content}
+    said = "".join(str(part) for part in np.ravel(others.pop("quantity", "")))
+    if quantity is not None and said and said != quantity:
+        raise ModelError(
+            f"{str(path)!r} says it holds {said}, not {quantity}. Read it as it is, and convert: "
+            f".converted({quantity!r})."
+        )
+    kind = quantity or said or None
+    if kind not in (None, "displacement", "velocity", "acceleration"):
+        raise unknown_label("quantity", kind, ["displacement", "velocity", "acceleration"])
+    for name in ("coherence", "variance"):
+        if name in others:
+            others[name] = _ordered(np.asarray(others[name]), grid.size, axis, name, path).real
+    if np.iscomplexobj(grid):
+        raise ModelError(f"{freq!r} of {str(path)!r} is complex: give frequencies in Hz.")
+    inputs, outputs = ([str(name) for name in np.ravel(others.pop(s, []))] for s in _OPTIONAL[:2])
+    return Frf(grid, responses, inputs=inputs, outputs=outputs, quantity=kind, **others)
+
+
+def _ordered(array: Any, n: int, axis: int | None, name: str, path: str | Path) -> Any:
+    """Return responses as (n_out, n_in, n)."""
+    squeezed = array.reshape(-1) if array.size == n and axis is None else array
+    if squeezed.ndim == 1 and squeezed.size == n:
+        return squeezed.reshape(1, 1, n)
+    if array.ndim != 3:
+        raise ShapeError(
+            f"{name!r} of {str(path)!r} must have shape (n_out, n_in, {n}), or ({n},) for a single "
+            f"pair, got {array.shape}. Add the axes that are missing before saving."
+        )
+    fits = [i for i, size in enumerate(array.shape) if size == n]
+    if axis is None and len(fits) > 1:
+        raise ShapeError(
+            f"{name!r} of {str(path)!r} has shape {array.shape}, of which axes {fits} have the "
+            f"length {n} of freq. Say which is frequency: frequency_axis=2."
+        )
+    chosen = fits[0] if axis is None and fits else axis
+    if chosen is None or not -3 <= chosen < 3 or array.shape[chosen] != n:
+        raise ShapeError(
+            f"{name!r} of {str(path)!r} has shape {array.shape}, in which axis {chosen} is not the "
+            f"{n} frequencies. Save all frequencies of all pairs."
+        )
+    return np.moveaxis(array, chosen, 2)
