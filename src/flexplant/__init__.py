@@ -32,6 +32,8 @@ from .identification import identify_modes as identify_modes
 from .identification import multisine as multisine
 from .identification import numbered as numbered
 from .identification import stabilisation_diagram as stabilisation_diagram
+from .io import read_matrices as read_matrices
+from .io import read_model as read_model
 from .labels import DofSet as DofSet
 from .loop import ClosedLoop as ClosedLoop
 from .loop import bandwidth as bandwidth

@@ -208,6 +208,28 @@ class FEMatrices(Value):
         keep[self.dofs.indices(held)] = False
         return self._kept(np.flatnonzero(keep))
 
+    def trimmed(self) -> FEMatrices:
+        """Return the same without rows that a solver left for held DOFs; their names are kept.
+
+        These are empty in every matrix, or hold no mass and nothing but a diagonal of K: such a
+        DOF stays at rest, so that dropping it changes nothing.
+        """
+        sizes = [
+            np.asarray(abs(A).sum(axis=1)).ravel()
+            for A in (self.K, self.M, self.D)
+            if A is not None
+        ]
+        lonely = sizes[0] <= np.abs(self.K.diagonal())
+        for size in sizes[1:]:
+            lonely &= size == 0
+        if self.M is None:
+            lonely = sizes[0] == 0
+        if not lonely.any() or lonely.all():
+            return self
+        note = f"{int(lonely.sum())} rows of held DOFs dropped"
+        left = self._kept(np.flatnonzero(~lonely))
+        return left.replace(notes=(*left.notes, note))
+
     def _kept(self, rows: IntArray) -> FEMatrices:
         dropped = np.setdiff1d(np.arange(self.n_dof), rows)
         parts: dict[str, Any] = {

@@ -1,0 +1,173 @@
+"""ANSYS Mechanical: matrices of .full files, coordinates of .rst and .cdb files."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError, ModelError
+from ..labels import DIRECTIONS, DofSet
+from ..structure import FEMatrices
+from ..values import FloatArray, IntArray
+from .assembled import assembled, missing_extra, quiet
+from .tables import at_nodes, read_nodes_table
+
+#: a local coordinate system turned less than this [deg] is none
+_STRAIGHT = 1e-9
+
+
+def read_ansys(
+    path: str | Path,
+    *,
+    nodes: str | Path | Mapping[int, Any] | None = None,
+    rotations: Mapping[int, Any] | None = None,
+) -> FEMatrices:
+    """Return the matrices of an ANSYS .full file, their rows named by node and direction.
+
+    The file holds the upper triangle, which is completed, and constrained DOFs as empty rows, which
+    are dropped and named in `constrained`. It does not hold coordinates, nor which nodes have a
+    local coordinate system (NROTAT): both are in the .rst or .cdb file of the same model.
+
+    Parameters
+    ----------
+    path : str or Path
+        The .full file. Needs ansys-mapdl-reader: ``pip install 'flexplant[ansys]'``.
+    nodes : path, or mapping {node: (x, y, z)}, optional
+        A .rst or .cdb file, whose local coordinate systems are turned to global directions; or a
+        text table `node, x, y, z`. Without it the result is not `located`, enough for held models.
+    rotations : mapping {node: (3, 3) array}, optional
+        Direction cosines of local coordinate systems, where `nodes` does not tell: row i holds the
+        global components of local axis i.
+
+    Returns
+    -------
+    FEMatrices
+        In the units of the model: `.converted("mm", "t")` turns them to SI.
+
+    Raises
+    ------
+    FlexplantError
+        When the package is missing, or the file is no .full file.
+    ModelError
+        When a matrix is missing or lumped, DOFs are no displacements, or a partly held node has a
+        local coordinate system.
+    LabelError
+        When a node has no coordinates.
+    FileNotFoundError
+        When there is no such file.
+    """
+    path = Path(path)
+    full = _opened(path)
+    header = getattr(full, "_header", {})
+    with quiet():
+        table, K, M = full.load_km(sort=False)
+    if K is None or M is None:
+        raise ModelError(
+            f"{path.name!r} holds no {'stiffness' if K is None else 'mass'} matrix. Write the file "
+            "with a modal analysis: ANTYPE,MODAL; MODOPT,LANB; WRFULL."
+        )
+    kinds = np.asarray(table[:, 1], dtype=np.int64)
+    strange = sorted(set(kinds.tolist()) - set(range(6)))
+    if strange:
+        raise ModelError(
+            f"{path.name!r} has DOFs that are no displacement or rotation (ANSYS numbers {strange} "
+            "from 0: temperature, pressure, voltage, warping). Export the structural part alone."
+        )
+    notes = []
+    if header.get("ptrDMP"):
+        notes.append("the damping matrix in the file is not read: give damping by mode")
+    numbers = np.asarray(table[:, 0], dtype=np.int64)
+    order = np.lexsort((kinds, numbers))
+    numbers, kinds = numbers[order], kinds[order]
+    xyz, angles = np.zeros((numbers.size, 3)), dict(rotations or {})
+    if nodes is not None:
+        xyz, found = _placed(nodes, numbers)
+        angles = found | angles
+    dofs = DofSet(numbers, tuple(DIRECTIONS[kind] for kind in kinds.tolist()), xyz)
+    result = assembled(
+        {"K": K[order][:, order], "M": M[order][:, order]},
+        dofs=dofs,
+        source=path.name,
+        located=nodes is not None,
+        notes=notes,
+    )
+    left = set() if result.dofs is None else set(result.dofs.nodes.tolist())
+    turned = {node: cosines for node, cosines in angles.items() if node in left}
+    if turned:
+        note = f"{len(turned)} local coordinate systems turned to global directions"
+        result = result.rotated(turned).replace(notes=(*result.notes, note))
+    return result
+
+
+def cosines_of(angles: Any) -> FloatArray:
+    """Return the direction cosines (3, 3) of ANSYS nodal angles THXY, THYZ, THZX [deg].
+
+    The axes are turned about z, then about the new x, then about the new y; row i holds the global
+    components of local axis i.
+    """
+    (sz, sx, sy), (cz, cx, cy) = np.sin(np.deg2rad(angles)), np.cos(np.deg2rad(angles))
+    about_z = np.array([[cz, sz, 0], [-sz, cz, 0], [0, 0, 1]])
+    about_x = np.array([[1, 0, 0], [0, cx, sx], [0, -sx, cx]])
+    about_y = np.array([[cy, 0, -sy], [0, 1, 0], [sy, 0, cy]])
+    return np.asarray(about_y @ about_x @ about_z, dtype=np.float64)
+
+
+def _opened(path: Path) -> Any:
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {str(path)!r}")
+    try:
+        with quiet():
+            from ansys.mapdl import reader
+    except ImportError:
+        raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}") from None
+    try:
+        with quiet():
+            full = reader.read_binary(str(path))
+    except NotImplementedError as error:
+        raise ModelError(
+            f"{path.name!r}: {error}. Write a consistent, symmetric pair: LUMPM,OFF; no contact "
+            "with friction, no rotating frame."
+        ) from None
+    except Exception as error:
+        raise FlexplantError(
+            f"{path.name!r} cannot be read as an ANSYS binary file ({type(error).__name__}: "
+            f"{error}). A .full file was expected."
+        ) from None
+    if not hasattr(full, "load_km"):
+        raise FlexplantError(
+            f"{path.name!r} is an ANSYS {type(full).__name__}, not a .full file: it holds no "
+            "matrices of the whole structure. It may serve as nodes=..."
+        )
+    return full
+
+
+def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatArray]]:
+    """Return coordinates (n, 3) of the wanted nodes, and cosines of those with local systems."""
+    if isinstance(nodes, Mapping):
+        known = np.array(list(nodes), dtype=np.int64)
+        xyz = np.array([np.asarray(place, dtype=np.float64) for place in nodes.values()])
+        return at_nodes(wanted, known, xyz.reshape(-1, 3), "nodes"), {}
+    path = Path(nodes)
+    if path.suffix.lower() not in (".rst", ".cdb"):
+        known, xyz = read_nodes_table(path)
+        return at_nodes(wanted, known, xyz, str(path)), {}
+    if not path.is_file():
+        raise FileNotFoundError(f"no such file: {str(path)!r}")
+    from ansys.mapdl import reader
+
+    with quiet():
+        if path.suffix.lower() == ".rst":
+            mesh = reader.read_binary(str(path)).mesh
+        else:
+            mesh = reader.Archive(str(path), parse_vtk=False)
+    known = np.asarray(mesh.nnum, dtype=np.int64)
+    places = np.asarray(mesh.nodes, dtype=np.float64)[:, :3]
+    angles = np.asarray(mesh.node_angles, dtype=np.float64)
+    turned: dict[int, FloatArray] = {}
+    if angles.ndim == 2 and angles.shape[1] == 3:
+        for row in np.flatnonzero(np.abs(angles).max(axis=1) > _STRAIGHT).tolist():
+            turned[int(known[row])] = cosines_of(angles[row])
+    return at_nodes(wanted, known, places, str(path)), turned

@@ -1,0 +1,127 @@
+"""From the matrices of a file to FEMatrices: triangles completed, held rows dropped, digits."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import FlexplantError, ModelError
+from ..labels import DofSet
+from ..structure import FEMatrices
+from ..structure.matrices import completed
+from .numbers import printed_digits
+from .tables import read_dofs
+
+#: the names under which K, M and D are looked for, in any case
+USUAL: Mapping[str, tuple[str, ...]] = {
+    "K": ("k", "k0", "kaa", "kgg", "kaax", "kmat", "stiffness", "stiff", "kff", "kred"),
+    "M": ("m", "m0", "maa", "mgg", "maax", "mmat", "mass", "mff", "mred"),
+    "D": ("d", "c", "d0", "c0", "baa", "bgg", "b", "baax", "cmat", "damping", "damp"),
+}
+#: numbers shorter than this may be exact, 5 or 2.5; longer ones were rounded to so many digits
+_ROUNDED = 6
+
+
+def assembled(
+    parts: Mapping[str, Any],
+    *,
+    dofs: DofSet | str | Path | None,
+    source: str,
+    digits: int | None = None,
+    located: bool = True,
+    notes: Iterable[str] = (),
+) -> FEMatrices:
+    """Return the FEMatrices of what a file holds under "K", "M", "D" (None: absent).
+
+    Raises
+    ------
+    ModelError
+        When there is no K, or entries are no finite real numbers.
+    ShapeError
+        When sizes differ.
+    """
+    if parts.get("K") is None:
+        raise ModelError(f"{source!r} holds no stiffness matrix. Name the variable: stiffness=...")
+    done: dict[str, Any] = {"M": None, "D": None}
+    said = list(notes)
+    for name, given in parts.items():
+        if given is not None:
+            done[name], note = completed(given, name)
+            said += [note] if note else []
+    named = read_dofs(dofs) if isinstance(dofs, str | Path) else dofs
+    whole = FEMatrices(
+        done["K"],
+        done["M"],
+        done["D"],
+        dofs=named,
+        digits=digits,
+        source=source,
+        located=located,
+        notes=tuple(said),
+    )
+    return whole.trimmed()
+
+
+def chosen(
+    names: Iterable[str], wanted: Mapping[str, str | None], source: str
+) -> dict[str, str | None]:
+    """Return which of the names of a file are K, M and D; those asked for must be there.
+
+    Raises
+    ------
+    ModelError
+        When one asked for is missing, or no or several names look like K.
+    """
+    there = list(names)
+    found: dict[str, str | None] = {}
+    for part, asked in wanted.items():
+        if asked is not None:
+            if asked not in there:
+                raise ModelError(
+                    f"{source!r} has no variable {asked!r}: it holds {there[:10]}. Names are "
+                    "case-sensitive; fields of a structure are written 'structure.field'."
+                )
+            found[part] = asked
+            continue
+        # the shortest path first: K before model.K
+        usual = [
+            name
+            for usual_name in USUAL[part]
+            for name in sorted(there, key=lambda text: (text.count("."), text))
+            if name.rsplit(".", 1)[-1].lower() == usual_name
+        ]
+        found[part] = usual[0] if usual else None
+    if found["K"] is None:
+        raise ModelError(
+            f"{source!r} holds {there[:10]}, none of which looks like a stiffness matrix. Say "
+            "which it is: stiffness='...', mass='...'."
+        )
+    return found
+
+
+def text_digits(words: Iterable[bytes]) -> int | None:
+    """Return the significant digits a text was written with; None when its numbers are short.
+
+    Numbers such as 5 or 2.5 throughout were not rounded.
+
+    Examples
+    --------
+    >>> text_digits([b"3.245226567D+06", b"1.5"]), text_digits([b"5", b"-2.5"])
+    (10, None)
+    """
+    digits = printed_digits(list(words))
+    return digits if digits >= _ROUNDED else None
+
+
+def missing_extra(package: str, extra: str, what: str) -> FlexplantError:
+    """Return the error for an extra that is not installed, with the line to type."""
+    return FlexplantError(
+        f"{what} needs {package}, which is not installed. Type: pip install 'flexplant[{extra}]'"
+    )
+
+
+def quiet() -> warnings.catch_warnings[None]:
+    """Return a context in which what a foreign reader warns of is not passed on."""
+    return warnings.catch_warnings(action="ignore")

@@ -1,0 +1,202 @@
+"""MATLAB and SciPy files of matrices."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse as sp
+
+from ..errors import FlexplantError
+from ..labels import DofSet
+from ..structure import FEMatrices
+from .assembled import assembled, chosen, missing_extra
+
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+
+def read_matlab(
+    path: str | Path,
+    *,
+    stiffness: str | None = None,
+    mass: str | None = None,
+    damping: str | None = None,
+    dofs: DofSet | str | Path | None = None,
+) -> FEMatrices:
+    """Return the matrices of a MATLAB file, version 4 to 7.3.
+
+    Parameters
+    ----------
+    path : str or Path
+        The .mat file; version 7.3 (HDF5) needs h5py: ``pip install 'flexplant[hdf5]'``.
+    stiffness, mass, damping : str, optional
+        Names of the variables, fields of structures as "model.K0". Where not given, the usual names
+        are looked for: K, M and C or D.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for: the file does not say.
+
+    Returns
+    -------
+    FEMatrices
+
+    Raises
+    ------
+    FlexplantError
+        When it is no MATLAB file, or h5py is missing.
+    ModelError
+        When a variable is missing, or entries are no finite real numbers.
+    ShapeError
+        When sizes differ.
+    FileNotFoundError
+        When there is no such file.
+    """
+    path = Path(path)
+    with path.open("rb") as file:
+        head = file.read(512 + len(_HDF5))
+    wanted = {"K": stiffness, "M": mass, "D": damping}
+    if _HDF5 in (head[: len(_HDF5)], head[512:]):
+        parts = _version73(path, wanted)
+    else:
+        parts = _version5(path, wanted)
+    return assembled(parts, dofs=dofs, source=path.name)
+
+
+def read_npz(
+    stiffness: str | Path,
+    mass: str | Path | None = None,
+    *,
+    damping: str | Path | None = None,
+    dofs: DofSet | str | Path | None = None,
+) -> FEMatrices:
+    """Return the matrices of NumPy files.
+
+    Parameters
+    ----------
+    stiffness, mass, damping : str or Path
+        One file each, as `scipy.sparse.save_npz` or `numpy.save` writes it; or as `stiffness` alone
+        an .npz of `numpy.savez(path, K=K, M=M, D=D)`.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for: the files do not say.
+
+    Returns
+    -------
+    FEMatrices
+
+    Raises
+    ------
+    FlexplantError
+        When a file is neither.
+    ModelError
+        When there is no K, or entries are no finite real numbers.
+    ShapeError
+        When sizes differ.
+    FileNotFoundError
+        When there is no such file.
+    """
+    parts: dict[str, Any] = {}
+    for name, path in (("K", stiffness), ("M", mass), ("D", damping)):
+        if path is not None:
+            found = _numpy(Path(path), name)
+            parts |= found if name == "K" else {name: found[name]}
+    return assembled(parts, dofs=dofs, source=Path(stiffness).name)
+
+
+def _numpy(path: Path, name: str) -> dict[str, Any]:
+    with path.open("rb") as file:
+        try:
+            content: Any = np.load(file, allow_pickle=False)
+        except (ValueError, EOFError, zipfile.BadZipFile) as error:
+            raise FlexplantError(
+                f"{str(path)!r} is no NumPy file of numbers ({error}). Write it with "
+                "scipy.sparse.save_npz(path, K)."
+            ) from None
+        if isinstance(content, np.ndarray):
+            return {name: content}
+        if "__flexplant__" in content.files:
+            raise FlexplantError(f"{str(path)!r} is flexplant's own: flexplant.load(path).")
+        arrays = {key: content[key] for key in content.files}
+    if "format" in arrays and "shape" in arrays:
+        return {name: sp.load_npz(path)}
+    if name != "K":
+        if len(arrays) != 1:
+            raise FlexplantError(f"{str(path)!r} holds {list(arrays)}: one array was expected.")
+        return {name: next(iter(arrays.values()))}
+    names = chosen(arrays, {"K": None, "M": None, "D": None}, path.name)
+    return {part: arrays[key] for part, key in names.items() if key is not None}
+
+
+def _version5(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
+    file: Any  # the stubs know names of files only
+    with path.open("rb") as file:
+        try:
+            content = scipy.io.loadmat(file, struct_as_record=False, squeeze_me=False)
+        except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
+            raise FlexplantError(
+                f"{str(path)!r} cannot be read as a MATLAB file ({error}). Write it in MATLAB with "
+                "save(path, 'K', 'M', '-v7')."
+            ) from None
+    variables: dict[str, Any] = {}
+    for name, value in content.items():
+        if not name.startswith("__"):
+            _flatten(name, value, variables)
+    names = chosen(variables, wanted, path.name)
+    return {part: variables[key] for part, key in names.items() if key is not None}
+
+
+def _flatten(name: str, value: Any, found: dict[str, Any]) -> None:
+    """List square matrices, and those in structures as 'structure.field'."""
+    if isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
+        value = value.ravel()[0]
+    fields = getattr(value, "_fieldnames", None)
+    if fields:
+        for field in fields:
+            _flatten(f"{name}.{field}", getattr(value, field), found)
+    elif sp.issparse(value) or (isinstance(value, np.ndarray) and value.dtype.kind in "fiubc"):
+        matrix: Any = value
+        if matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]:
+            found[name] = matrix
+
+
+def _version73(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
+    try:
+        import h5py
+    except ImportError:
+        raise missing_extra(
+            "h5py", "hdf5", f"{path.name!r} is a MATLAB file of version 7.3 (HDF5), and reading it"
+        ) from None
+    with h5py.File(path, "r") as file:
+        variables: dict[str, Any] = {}
+
+        def visit(prefix: str, group: Any) -> None:
+            for key, item in group.items():
+                if key.startswith("#"):
+                    continue
+                name = f"{prefix}{key}"
+                if isinstance(item, h5py.Group) and "MATLAB_sparse" not in item.attrs:
+                    visit(f"{name}.", item)
+                elif isinstance(item, h5py.Group) or (
+                    item.ndim == 2 and item.shape[0] == item.shape[1] and item.dtype.kind in "fiu"
+                ):
+                    variables[name] = item
+
+        visit("", file)
+        names = chosen(variables, wanted, path.name)
+        return {part: _hdf5(variables[key]) for part, key in names.items() if key is not None}
+
+
+def _hdf5(item: Any) -> Any:
+    """Return a dense (MATLAB stores columns first) or sparse (data, ir, jc) matrix."""
+    if "MATLAB_sparse" not in item.attrs:
+        return np.asarray(item[()]).T
+    columns = np.asarray(item["jc"][()], dtype=np.int64)
+    shape = (int(item.attrs["MATLAB_sparse"]), columns.size - 1)
+    if "data" not in item:
+        return sp.csc_array(shape)
+    return sp.csc_array(
+        (np.asarray(item["data"][()]), np.asarray(item["ir"][()], dtype=np.int64), columns),
+        shape=shape,
+    )

@@ -1,0 +1,208 @@
+"""Matrices as text: Matrix Market and Harwell-Boeing."""
+
+from __future__ import annotations
+
+import gzip
+import re
+from collections.abc import Callable, Mapping
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.io
+import scipy.sparse as sp
+
+from ..errors import FlexplantError, ModelError
+from ..labels import DofSet
+from ..structure import FEMatrices
+from .assembled import assembled, text_digits
+from .numbers import fixed_numbers
+
+#: entries whose digits are counted
+_SAMPLE = 4000
+_FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)
+
+
+def read_matrix_market(
+    stiffness: str | Path,
+    mass: str | Path | None = None,
+    *,
+    damping: str | Path | None = None,
+    dofs: DofSet | str | Path | None = None,
+) -> FEMatrices:
+    """Return the matrices of Matrix Market files.
+
+    A triangle is completed, rows of held DOFs are dropped, printed digits are counted; `notes` say
+    so. Numbering in the file is from 1.
+
+    Parameters
+    ----------
+    stiffness, mass, damping : str or Path
+        Files (.mtx, also .mtx.gz) of K, M and D.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for: the files do not say.
+
+    Returns
+    -------
+    FEMatrices
+
+    Raises
+    ------
+    FlexplantError
+        When a file is no Matrix Market file.
+    ModelError
+        When a matrix is complex, skew-symmetric or a pattern without numbers.
+    ShapeError
+        When sizes differ.
+    FileNotFoundError
+        When there is no such file.
+    """
+    return _read({"K": stiffness, "M": mass, "D": damping}, _matrix_market, dofs)
+
+
+def read_harwell_boeing(
+    stiffness: str | Path,
+    mass: str | Path | None = None,
+    *,
+    damping: str | Path | None = None,
+    dofs: DofSet | str | Path | None = None,
+) -> FEMatrices:
+    """Return the matrices of Harwell-Boeing (or Rutherford-Boeing) files.
+
+    Assembled real or integer matrices, symmetric (RSA, of which the file holds the lower triangle)
+    or not (RUA). The rest is as in `read_matrix_market`.
+
+    Parameters
+    ----------
+    stiffness, mass, damping : str or Path
+        Files (.rsa, .rua, .hb, .rb) of K, M and D.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for: the files do not say.
+
+    Returns
+    -------
+    FEMatrices
+
+    Raises
+    ------
+    FlexplantError
+        When a file is no Harwell-Boeing file, or cut short.
+    ModelError
+        When a matrix is complex, skew-symmetric, a pattern, or not assembled.
+    ShapeError
+        When sizes differ.
+    FileNotFoundError
+        When there is no such file.
+
+    Notes
+    -----
+    Format: I. S. Duff, R. G. Grimes, J. G. Lewis, "Users' Guide for the Harwell-Boeing Sparse
+    Matrix Collection", 1992, section 2.
+    """
+    return _read({"K": stiffness, "M": mass, "D": damping}, _harwell_boeing, dofs)
+
+
+def _read(
+    paths: Mapping[str, str | Path | None],
+    reader: Callable[[Path], tuple[Any, int | None]],
+    dofs: DofSet | str | Path | None,
+) -> FEMatrices:
+    parts: dict[str, Any] = {}
+    digits: list[int] = []
+    for name, path in paths.items():
+        if path is None:
+            continue
+        parts[name], printed = reader(Path(path))
+        if printed is not None and name == "K":
+            digits.append(printed)
+    source = Path(str(paths["K"])).name
+    return assembled(parts, dofs=dofs, source=source, digits=min(digits, default=None))
+
+
+def _matrix_market(path: Path) -> tuple[Any, int | None]:
+    file: Any
+    with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as file:
+        lines: list[bytes] = list(islice(file, _SAMPLE + 200))
+    head = lines[0].decode("latin-1").lower().split() if lines else []
+    if len(head) < 5 or head[0] != "%%matrixmarket":
+        raise FlexplantError(
+            f"{str(path)!r} is no Matrix Market file: it begins with "
+            f"{lines[0][:40] if lines else b''!r}. Abaqus writes .mtx files of another kind: "
+            "read_abaqus."
+        )
+    kind, symmetry = head[3], head[4]
+    if kind in ("complex", "pattern") or symmetry in ("skew-symmetric", "hermitian"):
+        raise ModelError(
+            f"{str(path)!r} is {kind} {symmetry}: a stiffness, mass or damping matrix is real and "
+            "symmetric. Gyroscopic and structural (complex) terms have no place here."
+        )
+    try:
+        matrix = scipy.io.mmread(str(path))
+    except (ValueError, TypeError, OverflowError, EOFError) as error:
+        raise FlexplantError(
+            f"{str(path)!r} cannot be read as Matrix Market ({error}). Is it cut short?"
+        ) from None
+    if kind == "integer":
+        return matrix, None
+    rows = [line.split() for line in lines if not line.startswith(b"%") and line.strip()][1:]
+    return matrix, text_digits(row[-1] for row in rows)
+
+
+def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
+    lines = path.read_bytes().splitlines()
+    try:
+        counts = [int(lines[1][i : i + 14] or 0) for i in range(0, 56, 14)]
+        kind = lines[2][:3].decode("ascii").upper()
+        n_rows, n_columns, n_entries = (int(lines[2][i : i + 14]) for i in (14, 28, 42))
+        formats = lines[3].decode("ascii")
+        forms = [_form(formats[a:b]) for a, b in ((0, 16), (16, 32), (32, 52))]
+    except (IndexError, ValueError, UnicodeDecodeError) as error:
+        raise FlexplantError(
+            f"{str(path)!r} is no Harwell-Boeing file: its header cannot be read ({error})."
+        ) from None
+    if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
+        raise ModelError(
+            f"{str(path)!r} is of kind {kind!r}: only real or integer (R, I), symmetric or "
+            "unsymmetric (S, U), assembled (A) matrices are a stiffness or mass. A skew-symmetric "
+            "one is gyroscopic, an elemental one must be assembled first."
+        )
+    right_hand = 1 if len(lines[1]) >= 70 and lines[1][56:70].strip() not in (b"", b"0") else 0
+    first = 4 + right_hand
+    blocks = []
+    needed = (n_columns + 1, n_entries, n_entries)
+    for count, (per_line, width), size in zip(counts[1:4], forms, needed, strict=True):
+        blocks.append(_block(lines[first : first + count], per_line, width, size, path))
+        first += count
+    pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
+    matrix: Any = sp.csc_array((blocks[2], index, pointer), shape=(n_rows, n_columns))
+    matrix.sum_duplicates()
+    if kind[1] == "S":
+        matrix = sp.csc_array(matrix + sp.tril(matrix, -1).T + sp.triu(matrix, 1).T)
+    if kind[0] == "I":
+        return matrix, None
+    per_line, width = forms[2]
+    start = 4 + right_hand + counts[1] + counts[2]
+    sample = lines[start : start + _SAMPLE // max(per_line, 1) + 1]
+    words = [line[i : i + width] for line in sample for i in range(0, len(line.rstrip()), width)]
+    return matrix, text_digits(words)
+
+
+def _form(text: str) -> tuple[int, int]:
+    """Return numbers a line and the width of one from a Fortran format such as (1P,4E20.12)."""
+    match = _FORMAT.search(text)
+    if match is None:
+        raise ValueError(f"format {text.strip()!r}")
+    return int(match[1] or 1), int(match[3])
+
+
+def _block(lines: list[bytes], per_line: int, width: int, size: int, path: Path) -> Any:
+    full = per_line * width
+    text = b"".join(line[:full].ljust(full) for line in lines)
+    numbers = fixed_numbers(text[: size * width], width) if len(text) >= size * width else None
+    if numbers is None or numbers.size != size:
+        raise FlexplantError(
+            f"{str(path)!r} holds fewer than {size} numbers in fields of {width} characters, or "
+            "something else among them. Is it cut short, or were its blanks lost?"
+        )
+    return numbers

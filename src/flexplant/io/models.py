@@ -1,0 +1,242 @@
+"""One door for the files of all finite-element programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError, ModelError
+from ..labels import DofSet
+from ..structure import FEMatrices, FEModel
+from ..values import short
+from .abaqus import read_abaqus
+from .ansys import read_ansys
+from .dmig import read_dmig
+from .matlab import read_matlab, read_npz
+from .matrix_market import read_harwell_boeing, read_matrix_market
+from .op4 import read_op4
+from .sierra import read_sierra
+from .tables import at_nodes, read_dofs, read_nodes_table
+
+#: formats whose files hold one matrix each: mass= and damping= are files then
+_ONE_EACH = ("matrix market", "abaqus", "harwell-boeing", "numpy", "sierra")
+_BY_SUFFIX = {
+    ".rsa": "harwell-boeing",
+    ".rua": "harwell-boeing",
+    ".hb": "harwell-boeing",
+    ".rb": "harwell-boeing",
+    ".mat": "matlab",
+    ".npz": "numpy",
+    ".npy": "numpy",
+    ".full": "ansys",
+    ".op4": "op4",
+    ".pch": "dmig",
+    ".dmig": "dmig",
+    ".m": "sierra",
+}
+#: what holds results, not matrices, and who reads it
+_OTHERS = {
+    ".exo": "modes: flexplant.io.read_exodus_modes",
+    ".e": "modes: flexplant.io.read_exodus_modes",
+    ".g": "a mesh: give it to read_sierra(..., exodus=...)",
+    ".unv": "measured or computed data: flexplant.io has readers for UFF datasets",
+    ".uff": "measured or computed data: flexplant.io has readers for UFF datasets",
+    ".rst": "results: give it to read_ansys(..., nodes=...)",
+    ".cdb": "a mesh: give it to read_ansys(..., nodes=...)",
+    ".bdf": "a mesh: give it to read_dmig(..., bdf=...)",
+    ".inp": "a mesh: give it to read_abaqus(..., inp=...)",
+}
+
+
+def read_matrices(
+    path: str | Path,
+    *,
+    stiffness: str | None = None,
+    mass: str | Path | None = None,
+    damping: str | Path | None = None,
+    dofs: DofSet | str | Path | None = None,
+    nodes: str | Path | None = None,
+) -> FEMatrices:
+    """Return the matrices of a file, whichever program wrote it, for `check` to look at.
+
+    By suffix and content: Matrix Market or Abaqus .mtx; Harwell-Boeing .rsa, .rua; MATLAB .mat;
+    NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4 and .pch; Sierra .m.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; where each matrix has its own, that of K.
+    stiffness : str, optional
+        Name of the variable, in files that hold several (.mat, .op4, .pch).
+    mass, damping : str or Path, optional
+        Their files, or names of variables, likewise.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for, where the file does not say.
+    nodes : str or Path, optional
+        Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
+        .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
+
+    Returns
+    -------
+    FEMatrices
+
+    Raises
+    ------
+    FlexplantError
+        When the format is not known, holds no matrices, or the file is damaged.
+    ModelError, LabelError, ShapeError
+        What the reader of the format raises.
+    FileNotFoundError
+        When there is no such file.
+    """
+    path = Path(path)
+    form = _format(path)
+    if form in _ONE_EACH and stiffness is not None:
+        raise ModelError(
+            f"stiffness= names a variable; {path.name!r} holds one matrix. Leave it out."
+        )
+    named = read_dofs(dofs) if isinstance(dofs, str | Path) else dofs
+    names: dict[str, Any] = {"stiffness": stiffness, "mass": mass, "damping": damping}
+    files: dict[str, Any] = {"mass": mass, "damping": damping}
+    table, own = _split(nodes, form)
+    if form == "matrix market":
+        found = read_matrix_market(path, mass, damping=damping, dofs=named)
+    elif form == "harwell-boeing":
+        found = read_harwell_boeing(path, mass, damping=damping, dofs=named)
+    elif form == "numpy":
+        found = read_npz(path, mass, damping=damping, dofs=named)
+    elif form == "matlab":
+        found = read_matlab(path, **names, dofs=named)
+    elif form == "abaqus":
+        found = read_abaqus(path, **files, inp=own, dofs=named)
+    elif form == "sierra":
+        found = read_sierra(path, **files, dofs=named)
+    elif form == "op4":
+        found = read_op4(path, **names, dofs=named)
+    elif form == "dmig":
+        found = read_dmig(path, **names, bdf=own)
+    else:
+        found = read_ansys(path, nodes=own)
+    if form in ("dmig", "ansys") and named is not None:
+        found = found.with_dofs(named)
+    if table is not None:
+        if found.dofs is None:
+            raise ModelError(
+                f"{path.name!r} does not name its rows, so that coordinates of nodes are not "
+                "enough: give dofs=, a table node, direction, x, y, z in the order of the rows."
+            )
+        known, xyz = read_nodes_table(table)
+        wanted = np.unique(found.dofs.nodes)
+        found = found.located_at(wanted.tolist(), at_nodes(wanted, known, xyz, str(table)))
+    return found.trimmed()
+
+
+def read_model(
+    path: str | Path,
+    *,
+    stiffness: str | None = None,
+    mass: str | Path | None = None,
+    damping: str | Path | None = None,
+    dofs: DofSet | str | Path | None = None,
+    nodes: str | Path | None = None,
+    units: Sequence[str | float] = ("m", "kg", "s"),
+    massless: str = "refuse",
+    name: str | None = None,
+) -> FEModel:
+    """Return the model of a file, whichever program wrote it.
+
+    As `read_matrices(...).converted(*units).model(massless=...)`: what is wrong with a file is
+    refused with a reason, and `check(read_matrices(...))` tells it all at once.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file; where each matrix has its own, that of K.
+    stiffness : str, optional
+        Name of the variable, in files that hold several (.mat, .op4, .pch).
+    mass, damping : str or Path, optional
+        Their files, or names of variables, likewise.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for, where the file does not say. Its coordinates are in the unit of
+        length of the file, too.
+    nodes : str or Path, optional
+        Coordinates, where the file names its rows but has none.
+    units : (length, mass, time)
+        Of the file: ("mm", "t", "s") for instance; the model is in SI.
+    massless : "refuse" or "condense"
+        What to do with DOFs and motions without mass; condensing them is exact.
+    name : str, optional
+        For display; the name of the file when not given.
+
+    Returns
+    -------
+    FEModel
+
+    Raises
+    ------
+    FlexplantError
+        When the format is not known, holds no matrices, or the file is damaged.
+    ModelError, LabelError, ShapeError
+        What the reader of the format raises, or when the matrices make no model.
+    FileNotFoundError
+        When there is no such file.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the digits of a text file endanger the soft modes.
+    """
+    if isinstance(units, str) or len(tuple(units)) != 3:
+        raise ModelError(
+            f"units must be three, of length, mass and time, got {short(units)}: "
+            "('mm', 't', 's') for instance."
+        )
+    found = read_matrices(
+        path, stiffness=stiffness, mass=mass, damping=damping, dofs=dofs, nodes=nodes
+    )
+    if tuple(units) != ("m", "kg", "s"):
+        found = found.converted(*units)
+    return found.model(massless=massless, name=name or Path(path).name)
+
+
+def _split(nodes: str | Path | None, form: str) -> tuple[Any, Any]:
+    """Return the coordinates as a text table, or as a file that the reader knows itself."""
+    if nodes is None:
+        return None, None
+    suffix = Path(nodes).suffix.lower()
+    own = {
+        "ansys": (".rst", ".cdb"),
+        "dmig": (".bdf", ".dat", ".nas"),
+        "abaqus": (".inp",),
+    }
+    return (None, nodes) if suffix in own.get(form, ()) else (nodes, None)
+
+
+def _format(path: Path) -> str:
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    last = suffixes[-1] if suffixes else ""
+    if last == ".gz" and suffixes[-2:-1] == [".mtx"]:
+        return "matrix market"
+    with path.open("rb") as file:
+        head = file.read(80)
+    # what a file says of itself goes before its name
+    if head.lower().startswith(b"%%matrixmarket"):
+        return "matrix market"
+    if head.startswith(b"MATLAB "):
+        return "matlab"
+    if last == ".mtx":
+        return "abaqus"
+    if last in _BY_SUFFIX:
+        return _BY_SUFFIX[last]
+    if last in _OTHERS:
+        raise FlexplantError(f"{path.name!r} holds no matrices but {_OTHERS[last]}.")
+    if head.startswith((b"DMIG", b"$")) and b"DMIG" in path.read_bytes()[:20000]:
+        return "dmig"
+    raise FlexplantError(
+        f"the format of {path.name!r} is not known, neither by its suffix {last!r} nor by what it "
+        f"begins with. Known suffixes: .mtx, {', '.join(_BY_SUFFIX)}. Readers of one format are in "
+        "flexplant.io."
+    )

@@ -1,0 +1,219 @@
+"""Tables of degrees of freedom and of node coordinates, as text."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError, LabelError
+from ..labels import DIRECTIONS, DofSet
+from ..structure.units import units
+from ..values import FloatArray, IntArray
+
+#: what other programs call the six directions
+_DIRECTION = {
+    name: direction
+    for direction, names in {
+        "x": "x ux u1 t1 tx 1",
+        "y": "y uy u2 t2 ty 2",
+        "z": "z uz u3 t3 tz 3",
+        "rx": "rx rotx ur1 r1 4",
+        "ry": "ry roty ur2 r2 5",
+        "rz": "rz rotz ur3 r3 6",
+    }.items()
+    for name in names.split()
+}
+_COLUMN = {
+    "node": "node nodes nid id grid node_id nodeid gid",
+    "direction": "direction dir dof component comp dofs",
+    "x": "x xcoord coordx x1 x_coord",
+    "y": "y ycoord coordy x2 y_coord",
+    "z": "z zcoord coordz x3 z_coord",
+    "row": "row rows equation eq index",
+}
+_NAMES = {name: column for column, names in _COLUMN.items() for name in names.split()}
+
+
+def read_dofs(
+    path: str | Path,
+    *,
+    nodes: str | Path | None = None,
+    directions: Sequence[str] | None = None,
+    length: str | float = "m",
+) -> DofSet:
+    """Return the DofSet of a text table: what the rows of the matrices stand for.
+
+    Three forms: one line a DOF with columns `node, direction, x, y, z`; one line a DOF with `node,
+    direction`, and the coordinates in a second table of `nodes`; or a table of nodes (`node, x, y,
+    z`) all of which have the same `directions`. A column `row` (from 1) gives the order, else that
+    of the lines holds.
+
+    Parameters
+    ----------
+    path : str or Path
+        The table: commas, semicolons, tabs or spaces; a first line with the names of the columns.
+        Directions may be x to rz, UX to ROTZ, T1 to R3 or 1 to 6.
+    nodes : str or Path, optional
+        A table `node, x, y, z`, with or without a first line of names.
+    directions : sequence of str, optional
+        Of every node, in the order of the rows: ("x", "y", "z").
+    length : str or float
+        The unit of the coordinates, "mm" for instance, or its size in metres.
+
+    Returns
+    -------
+    DofSet
+
+    Raises
+    ------
+    FlexplantError
+        When a line has another number of columns, or holds no number where one is needed.
+    LabelError
+        When a column is missing, a direction is unknown, or a node has no coordinates.
+    FileNotFoundError
+        When there is no such file.
+    """
+    columns = _table(path)
+    scale = units(length).length
+    if directions is not None:
+        numbers, xyz = _nodes(columns, path)
+        each = [_direction(name, path) for name in directions]
+        return DofSet(
+            np.repeat(numbers, len(each)),
+            tuple(each) * numbers.size,
+            scale * np.repeat(xyz, len(each), axis=0),
+        )
+    needed = ("node", "direction") if nodes is not None else ("node", "direction", "x", "y", "z")
+    missing = [name for name in needed if name not in columns]
+    if missing:
+        raise LabelError(
+            f"{str(path)!r} has no column {missing}, got {list(columns)}. One line a DOF: node, "
+            "direction, x, y, z; or give nodes=table of coordinates, or directions=(...)."
+        )
+    numbers = _whole(columns["node"], "node", path)
+    kinds = [_direction(name, path) for name in columns["direction"]]
+    if nodes is None:
+        xyz = np.column_stack([_numbers(columns[c], c, path) for c in "xyz"])
+    else:
+        known, places = read_nodes_table(nodes)
+        xyz = at_nodes(numbers, known, places, str(nodes))
+    order = np.arange(numbers.size)
+    if "row" in columns:
+        rows = _whole(columns["row"], "row", path)
+        if not np.array_equal(np.sort(rows), np.arange(1, rows.size + 1)):
+            raise LabelError(
+                f"column 'row' of {str(path)!r} must count the {rows.size} rows of the matrices "
+                f"from 1, each once, got {rows.min()} to {rows.max()}. Add 1 if it counts from 0."
+            )
+        order = np.argsort(rows)
+    return DofSet(numbers[order], tuple(kinds[i] for i in order), scale * xyz[order])
+
+
+def read_nodes_table(path: str | Path) -> tuple[IntArray, FloatArray]:
+    """Return the node numbers (m,) and coordinates (m, 3) of a text table `node, x, y, z`.
+
+    Parameters
+    ----------
+    path : str or Path
+        Commas, semicolons, tabs or spaces; with or without a first line of names.
+
+    Raises
+    ------
+    FlexplantError
+        When it has another form.
+    """
+    return _nodes(_table(path, plain=("node", "x", "y", "z")), path)
+
+
+def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:
+    """Return the coordinates (n, 3) of some nodes out of a table of all.
+
+    Raises
+    ------
+    LabelError
+        When one is not there.
+    """
+    missing = np.setdiff1d(wanted, known)
+    if missing.size:
+        raise LabelError(
+            f"{source!r} has no coordinates for nodes {missing[:6].tolist()} ({missing.size} in "
+            "all). Is it the table of the same model?"
+        )
+    order = np.argsort(known, kind="stable")
+    return np.asarray(xyz[order[np.searchsorted(known[order], wanted)]], dtype=np.float64)
+
+
+def _nodes(columns: Mapping[str, list[str]], path: str | Path) -> tuple[IntArray, FloatArray]:
+    missing = [name for name in ("node", "x", "y", "z") if name not in columns]
+    if missing:
+        raise LabelError(
+            f"{str(path)!r} has no column {missing}, got {list(columns)}: a table of nodes has "
+            "node, x, y, z."
+        )
+    xyz = np.column_stack([_numbers(columns[c], c, path) for c in "xyz"])
+    return _whole(columns["node"], "node", path), xyz
+
+
+def _table(path: str | Path, plain: Sequence[str] = ()) -> dict[str, list[str]]:
+    text = Path(path).read_text(encoding="utf-8-sig")
+    lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] not in "#%!$"]
+    if not lines:
+        raise FlexplantError(f"{str(path)!r} is empty: a table was expected.")
+    mark = next((m for m in ";\t," if m in lines[0]), None)
+    rows = [
+        [cell.strip() for cell in cells]
+        for cells in (
+            csv.reader(lines, delimiter=mark)
+            if mark
+            else (re.split(r"\s+", line.strip()) for line in lines)
+        )
+    ]
+    first = [_NAMES.get(cell.lower().split("[")[0].strip(), cell) for cell in rows[0]]
+    if "node" in first:
+        names, rows, start = first, rows[1:], 2
+    elif plain and len(rows[0]) == len(plain):
+        names, start = list(plain), 1
+    else:
+        raise LabelError(
+            f"{str(path)!r} does not begin with the names of its columns, got {rows[0][:6]}. Write "
+            "node, direction, x, y, z in its first line."
+        )
+    wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
+    if wrong is not None:
+        raise FlexplantError(
+            f"{str(path)!r}, line {wrong + start} (comments not counted): {len(rows[wrong])} "
+            f"columns, {len(names)} names. Complete it."
+        )
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def _numbers(cells: list[str], column: str, path: str | Path) -> FloatArray:
+    try:
+        return np.array(cells, dtype=np.float64)
+    except ValueError as error:
+        raise FlexplantError(
+            f"{str(path)!r}: column {column!r} holds something that is no number ({error})."
+        ) from None
+
+
+def _whole(cells: list[str], column: str, path: str | Path) -> IntArray:
+    numbers: Any = _numbers(cells, column, path)
+    if not np.all(np.isfinite(numbers)) or np.any(numbers != np.round(numbers)):
+        raise FlexplantError(f"{str(path)!r}: column {column!r} must hold whole numbers.")
+    return np.asarray(numbers, dtype=np.int64)
+
+
+def _direction(name: str, path: str | Path) -> str:
+    direction = _DIRECTION.get(str(name).strip().lower())
+    if direction is None:
+        raise LabelError(
+            f"{str(path)!r}: {name!r} is no direction of motion. Known are "
+            f"{', '.join(DIRECTIONS)}, UX to ROTZ, T1 to R3 and 1 to 6; other DOFs (temperature, "
+            "pressure) have no place here."
+        )
+    return direction
