@@ -1,5 +1,7 @@
 """check(): rigid-body modes that a plant does not reach or see, in physical words."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -153,3 +155,43 @@ def test_plants_from_elsewhere_by_hautus(dt):
     found = StandardPlant.from_statespace(blind, u=["u"], y=["y"]).check()
     assert not found["detectable"].holds
     assert "y does not see the pole" in found["detectable"].finding
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_units_of_states_do_not_change_the_report_of_a_plant_from_elsewhere(seed):
+    rng = np.random.default_rng(seed)
+    g = assemble_plant(some_modes(), ports()).system
+    # one sensor sees z alone, so that something is missing and named
+    g = g.select([*g.outputs[:3], "u1:effort", "y1"], g.inputs)
+    asd = {name: 1e-3 for name in g.inputs if name.startswith("amp")}
+    size = 10.0 ** rng.uniform(-6, 6, g.n_states)
+    moved = g.replace(
+        A=g.A * size / size[:, None], B=g.B / size[:, None], C=g.C * size, blocks=None
+    )
+    texts = []
+    for system in (g.replace(blocks=None), moved):
+        plant = StandardPlant.from_statespace(system, u=["u1"], y=["y1"], asd=asd)
+        texts.append(repr(plant.check()))
+    assert texts[0] == texts[1]
+    assert "NO " in texts[0]
+
+
+def test_many_findings_are_three_and_a_number():
+    plant = assemble_plant(some_modes(0.0), ports(u=[Actuator("u1", at=(0.3, 0.3, 0.0))]))
+    found = plant.check()["stabilisable"]
+    assert not found.holds
+    assert re.search(r"; and \d+ more \(channels: u1\)", found.finding)
+    assert len(found.finding) < 500
+    with pytest.raises(AssumptionError) as caught:
+        plant.check().require(("stabilisable", "detectable"), "this")
+    assert len(str(caught.value)) < 2500
+
+
+def test_missing_motions_are_told_apart():
+    # no actuator at all but one that pushes nothing of rx and ry: each axis is said once
+    plant = assemble_plant(some_modes(), ports(u=[Actuator("u1", at=(0.3, 0.3, 0.0))]))
+    text = plant.check()["stabilisable"].finding
+    assert "rotation rx and rotation ry" in text
+    none = assemble_plant(some_modes(), ports(u=[]))
+    text = none.check()["stabilisable"].finding
+    assert "translation z and rotation rx and rotation ry" in text

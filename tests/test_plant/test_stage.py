@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError, ModelError
+from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import frequency_response
 from flexplant.plant import (
     Disturbance,
@@ -116,3 +116,23 @@ def test_numbers_out_of_range_are_refused(wrong):
     options = {"bandwidth": 30.0} | wrong
     with pytest.raises(ModelError):
         stage_weights(sampled(some_modes()), options.pop("bandwidth"), **options)
+
+
+def test_several_references_must_be_named():
+    edge = Poi("edge", at=(0.1, 0.2, 0.0), axes=AXES)
+    both = [Poi("die", at=OFF_NODE, axes=AXES), edge]
+    plant = sampled(some_modes(), ports(z=both, references=[Reference("die"), Reference("edge")]))
+    with pytest.raises(LabelError, match=r"die, edge.*poi='die'"):
+        reference_errors(plant)
+    with pytest.raises(LabelError, match=r"die, edge.*poi='die'"):
+        stage_weights(plant, 30.0)
+    with pytest.raises(LabelError, match="no POI with a reference 'dye'"):
+        reference_errors(plant, poi="dye")
+    block = reference_errors(plant, poi="edge")
+    assert block.inputs[-1] == "edge:ref"
+    expected = [rigid_sensor(p, (0.1, 0.2, 0.0), AXES)[0] for p in CORNERS]
+    np.testing.assert_allclose(block.D[:, -1], expected, atol=1e-9)
+    weights = stage_weights(plant, 30.0, poi="edge")
+    assert {"die:error", "edge:error"} <= set(weights.z)
+    with pytest.raises(ModelError, match="need a StandardPlant, got str"):
+        stage_weights("plant", 30.0)

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.lti import StateSpace, frequency_response
 from flexplant.plant import Poi, Reference, Sensor, StandardPlant, assemble_plant
 from flexplant.store import load
@@ -122,7 +122,9 @@ def test_moving_one_of_several():
     assert not C[0].any()
     assert C[1].any()
     np.testing.assert_array_equal(C[2], -C[1])
-    with pytest.raises(LabelError, match=r"2 POIs: say which moves, at\(\{name: point\}\)"):
+    with pytest.raises(
+        LabelError, match=r"2 POIs \(die, edge\): say which moves, at\(\{name: point\}\)"
+    ):
         plant.at(Z8)
     with pytest.raises(LabelError, match="no POI 'dye'"):
         plant.at({"dye": Z8})
@@ -248,3 +250,25 @@ def test_a_static_force_accelerates_the_rigid_body_alike_at_any_rate(delay, rate
     # acceleration 4 / m from four units of force: the change of velocity over one sample
     speed = (g.C[0, rigid] @ (A - np.eye(6)) @ gains) * rate
     np.testing.assert_allclose(speed * rate, 4 / mass, rtol=1e-8)
+
+
+def test_other_kinds_are_refused_at_the_door(plant):
+    g = plant.system
+    one = StandardPlant.from_statespace(g.select(["die:z", "y1"], ["amp1", "u1"]), u="u1", y="y1")
+    assert one.w == ("amp1",)  # "u1" is one name and not the letters u and 1
+    doors = [
+        (lambda: StandardPlant.from_statespace(g, u=3, y=["y1"]), "u are chosen by name, got 3"),
+        (lambda: plant.discretized(None), "rate must"),
+        (lambda: plant.discretized("fast"), "rate must"),
+        (lambda: plant.discretized(1e4, delay=None), "delay must"),
+        (lambda: plant.discretized(1e4, delay=True), "delay must be one number"),
+        (lambda: plant.weighted(z="die:z"), r"mapping \{channel: weight\}, got 'die:z'"),
+        (lambda: plant.with_ports(["u1"]), r"ports must be a Ports value, got list.*Ports\(w="),
+        (lambda: plant.at(None), "place of 'die'"),
+        (lambda: plant.along("dye", [(0.1, 0.1, 0.0)]), "no POI 'dye'"),
+        (lambda: plant.along("die", None), "points must"),
+        (lambda: plant.uncertain("fit"), "UpdateResult or MeasuredModes, got str"),
+    ]
+    for call, words in doors:
+        with pytest.raises(FlexplantError, match=words):
+            call()

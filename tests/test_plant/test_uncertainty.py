@@ -338,7 +338,15 @@ def test_values_of_delta_are_checked():
     with pytest.raises(ModelError, match="leaves mode 6 with negative damping"):
         uncertain.lft({"mode6:damping": -1e4})
     with pytest.raises(ModelError, match="negative stiffness"):
+        uncertain.lft({"mode6:freq": -1e4})
+    with pytest.raises(ModelError, match="the value of 'mode6:freq' has a NaN"):
         uncertain.lft({"mode6:freq": float("nan")})
+    with pytest.raises(ModelError, match=r"mapping \{name: value\}, got list"):
+        uncertain.lft([0.1])
+    with pytest.raises(ModelError, match="n must be a whole number"):
+        uncertain.sample(0, 2.5)
+    with pytest.raises(ModelError, match="rng must be a seed"):
+        uncertain.sample("seed")
 
 
 def test_accelerations_of_complex_modes_are_refused():

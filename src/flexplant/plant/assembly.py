@@ -66,8 +66,7 @@ def assemble_plant(
     ----------
     The paper, equations (1)-(8) and Fig. 2.
     """
-    if not isinstance(ports, Ports):
-        raise ModelError(f"ports must be a Ports value, got {type(ports).__name__}.")
+    _check_ports(ports)
     way = FastStates() if residual is None else residual
     if not isinstance(way, Residual):
         raise ModelError(
@@ -83,6 +82,15 @@ def assemble_plant(
             stacklevel=2,
         )
     return _assembled(way.applied(realisation), ports)
+
+
+def _check_ports(ports: Ports) -> None:
+    given: object = ports
+    if not isinstance(given, Ports):
+        raise ModelError(
+            f"ports must be a Ports value, got {type(given).__name__}. "
+            "Put the channels in one: Ports(w=[...], u=[...], z=[...], y=[...])."
+        )
 
 
 def _assembled(realisation: ModalRealisation, ports: Ports) -> StandardPlant:
@@ -220,6 +228,7 @@ def _with_own_delays(
 
 def reassembled(plant: StandardPlant, ports: Ports) -> StandardPlant:
     """Return a plant with other ports, from the same modes, sampled like the old one."""
+    _check_ports(ports)
     if plant.realisation is None or plant.unweighted is not None:
         raise ModelError(
             "other ports need a plant assembled from a structure and not weighted: use "

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import AssumptionError, ModelError, unknown_label
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, name_list
 from .body import RigidBody, rigid_body_of
 from .dynamics import load_of
 from .forces import Actuator
@@ -105,7 +105,7 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
             "decoupling needs a plant assembled from a structure: assemble_plant(model, ports)."
         )
     body = rigid_body_of(plant.realisation)
-    wanted = body.axes if axes is None else tuple(axes)
+    wanted = body.axes if axes is None else name_list(axes, "axes")
     for axis in wanted:
         if axis not in body.axes:
             raise unknown_label("rigid-body axis", axis, body.axes)

@@ -60,7 +60,9 @@ def moved(ports: Ports | None, places: Any) -> Ports:
     if not isinstance(places, Mapping):
         if len(ports.z) != 1:
             raise LabelError(
-                f"the plant has {len(ports.z)} POIs: say which moves, at({{name: point}})."
+                f"the plant has {len(ports.z)} POIs "
+                f"({', '.join(port.name for port in ports.z) or 'none'}): say which moves, "
+                "at({name: point})."
             )
         places = {ports.z[0].name: places}
     for name in places:

@@ -8,18 +8,30 @@ from typing import Any
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
-from ..values import check_names, real_array
+from ..values import check_names, real_array, short
+
+#: endings of the channels that a plant makes itself: estimates, references, errors, efforts, noises
+DERIVED = ("hat", "ref", "error", "effort", "noise")
 
 
 def checked_name(name: Any) -> str:
     """Return the name of a port, or raise LabelError."""
-    check_names([str(name)], "ports")
-    return str(name)
+    if not isinstance(name, str):
+        raise LabelError(f"a port is named by a string, got {short(name)}. Name it, such as 'u1'.")
+    check_names([name], "ports")
+    ending = name.rpartition(":")[2]
+    if ":" in name and ending in DERIVED:
+        raise LabelError(
+            f"a port cannot be named {name!r}: names that end in ':{ending}' are those of channels "
+            "that a plant and its observer make themselves, and loops connect by name. Name it "
+            f"{name.replace(':', '_')!r}, say."
+        )
+    return name
 
 
 def checked_direction(name: str, direction: str) -> str:
     """Return one of the six directions, or raise LabelError."""
-    if direction not in DIRECTIONS:
+    if not isinstance(direction, str) or direction not in DIRECTIONS:
         raise unknown_label(f"direction of {name!r}", direction, DIRECTIONS)
     return direction
 
@@ -56,7 +68,10 @@ def checked_filter(name: str, what: str, given: Any) -> StateSpace | None:
         return None
     sys = as_statespace(given)
     if len(sys.inputs) != 1 or len(sys.outputs) != 1:
-        raise ModelError(f"the {what} of {name!r} needs one input and one output, got {sys!r}.")
+        raise ModelError(
+            f"the {what} of {name!r} needs one input and one output, got {sys!r}. "
+            "Select a channel of it: sys['output', 'input']."
+        )
     if sys.n_states and sys.dt:
         raise ModelError(
             f"the {what} of {name!r} is sampled (dt {sys.dt:g} s), but belongs to the machine: "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -10,7 +10,7 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
-from ..values import Value, check_names, positive
+from ..values import Value, check_names, positive, short
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration, OutputDisturbance
 from .forces import Disturbance as Disturbance
@@ -37,7 +37,9 @@ class Sensor(Value):
     direction : str
         At points: x, y, z or rx, ry, rz.
     quantity : {"displacement", "velocity", "acceleration"}
-        What is measured.
+        What is measured. An acceleration answers forces at once (D21, D22); a white disturbance
+        that reaches it would give its samples infinite variance, which Kalman filters and
+        simulation refuse: shape the disturbance, or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
         One-sided amplitude spectral density of its white noise; a sample has variance
         asd^2 rate / 2. It is added to the samples, after dynamics and delay; what passes through
@@ -101,6 +103,11 @@ class Poi(Value):
     axes: tuple[str, ...] = ("z",)
 
     def __post_init__(self) -> None:
+        if not isinstance(self.axes, Iterable):
+            raise LabelError(
+                f"axes of POI {self.name!r} are names such as ('z', 'rx'), got {short(self.axes)}."
+                " Name them."
+            )
         axes = (self.axes,) if isinstance(self.axes, str) else tuple(self.axes)
         for axis in axes:
             if axis not in DIRECTIONS:
@@ -147,6 +154,13 @@ class Reference(Value):
 
     poi: str
 
+    def __post_init__(self) -> None:
+        poi: object = self.poi
+        if not isinstance(poi, str):
+            raise LabelError(
+                f"a Reference names a POI, got {short(poi)}. Pass its name: Reference('die')."
+            )
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Ports(Value):
@@ -189,11 +203,17 @@ class Ports(Value):
         }
         for side, kind in kinds.items():
             given = getattr(self, side)
+            if isinstance(given, str) or not isinstance(given, Value | Iterable):
+                raise ModelError(
+                    f"Ports.{side} must be a sequence of {_called(kind)}s, got {short(given)}. "
+                    f"Put them in a list: {side}=[...]."
+                )
             ports = (given,) if isinstance(given, Value) else tuple(given)
             for port in ports:
                 if not isinstance(port, kind):
                     raise ModelError(
-                        f"Ports.{side} holds {_called(kind)}s, got {type(port).__name__}."
+                        f"Ports.{side} holds {_called(kind)}s, got {type(port).__name__}. "
+                        f"{_HOME.get(type(port).__name__, 'Make one of it, or leave it out.')}"
                     )
             self._set(**{side: ports})
         check_names([port.name for port in self.forces], "inputs w and u")
@@ -212,6 +232,7 @@ class Ports(Value):
             "u": [port.name for port in self.u],
             "z": [poi.name for poi in self.z],
             "y": [port.name for port in self.y],
+            "references": [reference.poi for reference in self.references],
         }
         sides = ", ".join(f"{side}: {' '.join(listed)}" for side, listed in names.items() if listed)
         return f"<Ports {sides}>"
@@ -287,6 +308,18 @@ def filter_of(port: Any) -> StateSpace | None:
     """Return the shape or the dynamics of a port, or None."""
     found = port.dynamics if isinstance(port, Actuator | Sensor) else port.shape
     return found if isinstance(found, StateSpace) else None
+
+
+#: where ports of the wrong side belong
+_HOME = {
+    "Disturbance": "It belongs in w.",
+    "BaseAcceleration": "It belongs in w.",
+    "OutputDisturbance": "It belongs in w.",
+    "Actuator": "It belongs in u.",
+    "Poi": "It belongs in z.",
+    "Sensor": "It belongs in y.",
+    "Reference": "It belongs in references.",
+}
 
 
 def _called(kind: Any) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError
+from ..errors import AssumptionError, LabelError, ModelError, unknown_label
 from ..lti.discretisation import tustin
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
@@ -49,7 +49,7 @@ def _rigid_parts(plant: StandardPlant) -> tuple[FloatArray, FloatArray]:
     return system.C[:, position] * system.A[position, velocity], system.B[velocity]
 
 
-def reference_errors(plant: StandardPlant) -> StateSpace:
+def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSpace:
     """Return the static block from sensors and references to errors at the sensors.
 
     ``y_i:error = y_i,ref - y_i``, where y_i,ref is where sensor i would be if the whole body were
@@ -60,6 +60,8 @@ def reference_errors(plant: StandardPlant) -> StateSpace:
     ----------
     plant : StandardPlant
         Assembled from a free structure, with a reference and displacement sensors.
+    poi : str, optional
+        The POI whose reference the errors follow; the one that has a reference when not given.
 
     Returns
     -------
@@ -71,19 +73,25 @@ def reference_errors(plant: StandardPlant) -> StateSpace:
     AssumptionError
         When the plant has no reference, no displacement sensors, or the POI's axes do not span
         the rigid-body modes.
+    LabelError
+        When several POIs have a reference and none is named, or the named one has none.
     """
     ports = _ports(plant)
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
-    poi = ports.poi(ports.references[0].poi)
+    followed = ports.poi(_chosen([r.poi for r in ports.references], poi, "POI with a reference"))
     sensors = [s.name for s in ports.y if s.quantity == "displacement"]
     system = plant.structural
     shape, _ = _rigid_parts(plant)
-    axes = shape[system.output_index([poi.channel(axis) for axis in poi.axes])]
-    if not sensors or len(poi.axes) < plant.n_rigid or np.linalg.matrix_rank(axes) < plant.n_rigid:
+    axes = shape[system.output_index([followed.channel(axis) for axis in followed.axes])]
+    if (
+        not sensors
+        or len(followed.axes) < plant.n_rigid
+        or np.linalg.matrix_rank(axes) < plant.n_rigid
+    ):
         raise AssumptionError(
-            f"POI {poi.name!r} with axes {poi.axes} and sensors {sensors} do not tell the "
-            f"{plant.n_rigid} rigid-body motions: give the POI all its axes."
+            f"POI {followed.name!r} with axes {followed.axes} and sensors {sensors} do not tell "
+            f"the {plant.n_rigid} rigid-body motions: give the POI all its axes."
         )
     moved = shape[system.output_index(sensors)] @ np.linalg.pinv(axes)[:, 0]
     return StateSpace(
@@ -92,10 +100,24 @@ def reference_errors(plant: StandardPlant) -> StateSpace:
         [],
         np.hstack([-np.eye(len(sensors)), moved[:, None]]),
         plant.dt,
-        inputs=[*sensors, poi.derived(poi.axes[0], "ref")],
+        inputs=[*sensors, followed.derived(followed.axes[0], "ref")],
         outputs=[f"{name}:error" for name in sensors],
         name="reference errors",
     )
+
+
+def _chosen(names: list[str], poi: str | None, kind: str) -> str:
+    """Return the POI that is meant: the one named, or the only one."""
+    if poi is None:
+        if len(names) > 1:
+            raise LabelError(
+                f"there are {len(names)} of the kind {kind}: {', '.join(names)}. Say which is "
+                f"meant: poi={names[0]!r}."
+            )
+        return names[0]
+    if poi not in names:
+        raise unknown_label(kind, poi, names)
+    return poi
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -125,6 +147,7 @@ def stage_weights(
     plant: StandardPlant,
     bandwidth: float,
     *,
+    poi: str | None = None,
     peak: float = 2.0,
     disturbance: float = 0.3,
     effort: float = 0.3,
@@ -143,6 +166,8 @@ def stage_weights(
         Assembled from a free structure, continuous or sampled.
     bandwidth : float [Hz]
         Below which |S| shall stay under 1.
+    poi : str, optional
+        The POI whose first axis carries the length scale; needed when there are several.
     peak : float
         Bound on |S| at high frequencies.
     disturbance, effort : float
@@ -158,13 +183,16 @@ def stage_weights(
     ------
     AssumptionError
         When the plant is not assembled from a free structure with POIs, actuators and sensors.
+    LabelError
+        When there are several POIs and none is named, or the name is unknown.
     ModelError
         When a number is out of range.
     """
     ports = _ports(plant)
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
-    first = ports.z[0].channel(ports.z[0].axes[0])
+    scale = ports.poi(_chosen([port.name for port in ports.z], poi, "POI"))
+    first = scale.channel(scale.axes[0])
     push = np.linalg.norm(rigid_gain(plant, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")
     if plant.dt and crossing * plant.dt > 0.2:
@@ -177,15 +205,15 @@ def stage_weights(
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
     rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=positive(effort, "effort") / force)
     z: dict[str, Any] = {}
-    for poi in ports.z:
-        for axis in poi.axes:
-            error = poi.derived(axis, "error")
+    for goal in ports.z:
+        for axis in goal.axes:
+            error = goal.derived(axis, "error")
             size = arm if axis.startswith("r") else 1.0
             weight = _sampled(series(sense, np.array([[size]])), plant)
             if error in plant.z:
-                z[poi.channel(axis)], z[error] = None, weight
+                z[goal.channel(axis)], z[error] = None, weight
             else:
-                z[poi.channel(axis)] = weight
+                z[goal.channel(axis)] = weight
     z |= {f"{port.name}:effort": _sampled(rolloff, plant) for port in ports.u}
     push_size = positive(disturbance, "disturbance")
     w: dict[str, Any] = {}
@@ -206,6 +234,10 @@ def stage_weights(
 
 
 def _ports(plant: StandardPlant) -> Ports:
+    if not isinstance(plant, StandardPlant):
+        raise ModelError(
+            f"need a StandardPlant, got {type(plant).__name__}: assemble_plant(model, ports)."
+        )
     if plant.ports is None or not plant.n_rigid:
         raise AssumptionError(
             "this is for a plant assembled from a free structure: assemble_plant(model, ports)."

@@ -13,7 +13,7 @@ import numpy.typing as npt
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, IntArray, Value, positive
+from ..values import FloatArray, IntArray, Value, name_list, positive
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation
@@ -146,8 +146,9 @@ class StandardPlant(Partition, Value):
             When a name is unknown or on two sides.
         """
         g = as_statespace(sys)
-        w = [n for n in g.inputs if n not in u] if w is None else list(w)
-        z = [n for n in g.outputs if n not in y] if z is None else list(z)
+        u, y = name_list(u, "u"), name_list(y, "y")
+        w = [n for n in g.inputs if n not in u] if w is None else list(name_list(w, "w"))
+        z = [n for n in g.outputs if n not in y] if z is None else list(name_list(z, "z"))
         ordered = g.select([*z, *y], [*w, *u])
         return cls(ordered, tuple(w), tuple(u), tuple(z), tuple(y), dict(asd or {}))
 
@@ -272,7 +273,7 @@ class StandardPlant(Partition, Value):
         """
         from .weighting import weighted
 
-        return weighted(self, dict(z or {}), dict(w or {}))
+        return weighted(self, z, w)
 
     def through(self, block: System) -> StandardPlant:
         """Return the plant whose measurements are the outputs of a block that reads y.

@@ -15,7 +15,7 @@ from ..lti.statespace import StateSpace
 from ..structure.rigid import orthonormalised
 from ..updating import UpdateResult, eigenvalue_sensitivities
 from ..updating.parameters import Parameter
-from ..values import ComplexArray, FloatArray, Value, positive
+from ..values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from .assembly import assemble_plant
 from .neglected import NeglectedModes, neglected_modes, opened
 from .realisation import MODAL, ModalRealisation, Structure
@@ -129,13 +129,19 @@ class UncertainPlant(Value):
         ModelError
             When a mode would lose its stiffness or its damping would be negative.
         """
+        if values is not None and not isinstance(values, Mapping):
+            raise ModelError(
+                f"values of Deltas are a mapping {{name: value}}, got {type(values).__name__}."
+                " Such as {'" + self.deltas[0].name + "': 0.5}."
+            )
         given = dict(values or {})
         known = {delta.name: delta for delta in self.deltas}
         changes = []
         for name, value in given.items():
             if name not in known:
                 raise unknown_label("Delta", name, known)
-            changes.append((known[name], known[name].scale * float(value)))
+            amount = float(real_array(value, f"the value of {name!r}", ()))
+            changes.append((known[name], known[name].scale * amount))
         return _with_changes(self.plant, changes)
 
     def sample(self, rng: Any, n: int = 1) -> list[StandardPlant]:
@@ -162,7 +168,7 @@ class UncertainPlant(Value):
             When a machine drawn is not physical: the doubt is too large for a normal distribution.
         """
         machines = []
-        for i, own in enumerate(np.random.default_rng(rng).spawn(int(n)), 1):
+        for i, own in enumerate(generator(rng).spawn(whole(n, "n")), 1):
             try:
                 machines.append(self._drawn(own))
             except ModelError as error:

@@ -10,11 +10,13 @@ import numpy as np
 from ..errors import ModelError, unknown_label
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
+from ..values import short
 from .standard import StandardPlant
 
 
-def weighted(plant: StandardPlant, z: Mapping[str, Any], w: Mapping[str, Any]) -> StandardPlant:
+def weighted(plant: StandardPlant, z: Any, w: Any) -> StandardPlant:
     """Return ``W_z P W_w``; a weight None drops its channel."""
+    z, w = _mapping(z, "z"), _mapping(w, "w")
     for side, weights in (("z", z), ("w", w)):
         for name in weights:
             if name not in getattr(plant, side):
@@ -43,6 +45,17 @@ def weighted(plant: StandardPlant, z: Mapping[str, Any], w: Mapping[str, Any]) -
         delay=plant.delay,
         unweighted=plant.unweighted or plant,
     )
+
+
+def _mapping(weights: Any, side: str) -> dict[str, Any]:
+    if weights is None:
+        return {}
+    if not isinstance(weights, Mapping):
+        raise ModelError(
+            f"weights of {side} are a mapping {{channel: weight}}, got {short(weights)}. "
+            f"Such as {side}={{'die:error': inverse_sensitivity(30.0)}}."
+        )
+    return dict(weights)
 
 
 def measured_through(plant: StandardPlant, block: System) -> StandardPlant:
