@@ -264,6 +264,6 @@ def test_refusals():
     with pytest.raises(LabelError, match="more than once"):
         assemble_plant(some_modes(), ports(y=[Sensor("die:z", at=Z8)]))
     with pytest.raises(
-        LabelError, match="cannot be named 'y1:noise'.*plant and its observer make themselves"
+        LabelError, match=r"cannot be named 'y1:noise'.*plant and its observer make themselves"
     ):
         assemble_plant(some_modes(), ports(w=[Disturbance("y1:noise", at=Z8, asd=1.0)]))
