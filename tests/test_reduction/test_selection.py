@@ -1,12 +1,23 @@
 """select_dofs: pivoted QR over candidates."""
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+import oracles_reduction as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.reduction import select_dofs, solve_modes
+from flexplant.reduction import (
+    DesiredDofs,
+    EffectiveIndependence,
+    Greedy,
+    PivotedQr,
+    reduce,
+    select_dofs,
+    solve_modes,
+)
 from plates import make_plate
 
 
@@ -87,3 +98,72 @@ def test_refusals(modes):
     imaginary = few.replace(phi=few.phi * 1j)
     with pytest.raises(ModelError, match="real modes"):
         select_dofs(imaginary, 4)
+    with pytest.raises(ModelError, match="whole number"):
+        select_dofs(few, "a")
+    with pytest.raises(ModelError, match=r"PivotedQr\(\), EffectiveIndependence"):
+        select_dofs(few, 3, criterion="qr")
+    with pytest.raises(ModelError, match="got str"):
+        select_dofs("modes", 3)
+    with pytest.raises(ModelError, match="condition above 2"):
+        select_dofs(modes, 25, limit=2.0)
+
+
+def random_rows(seed, p=40, k=6):
+    return np.random.default_rng(seed).standard_normal((p, k))
+
+
+@given(st.integers(0, 10**6), st.integers(6, 12))
+def test_effective_independence_is_the_deletion_one_by_one(seed, count):
+    rows = random_rows(seed)
+    found = EffectiveIndependence().chosen(np.zeros((0, 6)), rows, count)
+    assert found == oracle.effective_independence(rows, count)
+
+
+def test_effective_independence_over_many_deletions():
+    """More than are done between two new information matrices, and with units far apart."""
+    rows = random_rows(3, p=200) * np.array([1e-2, 1.0, 10.0, 1.0, 1.0, 1e2])
+    found = EffectiveIndependence().chosen(np.zeros((0, 6)), rows, 6)
+    assert found == oracle.effective_independence(rows, 6)
+
+
+@given(st.integers(0, 10**6))
+def test_greedy_takes_the_best_next(seed):
+    rows = random_rows(seed, p=20)
+    assert Greedy().chosen(np.zeros((0, 6)), rows, 6) == oracle.greedy(rows, 6)
+
+
+@pytest.mark.parametrize("criterion", [PivotedQr(), EffectiveIndependence(), Greedy()])
+def test_criteria_keep_what_is_required(modes, criterion):
+    chosen = select_dofs(modes, 25, required=["23:z", "1:z"], criterion=criterion)
+    assert chosen.labels[:2] == ("23:z", "1:z")
+    assert len(set(chosen)) == 25
+    assert chosen.condition == pytest.approx(condition(modes, chosen.labels), rel=1e-10)
+    assert chosen.condition < 12
+    assert chosen.criterion is criterion
+    assert chosen.values.shape == (25,)
+    rows = modes.basis[modes.dofs.indices(chosen.labels)]
+    if isinstance(criterion, Greedy):
+        assert chosen.values[-1] == pytest.approx(np.linalg.svd(rows, compute_uv=False)[-1])
+    elif isinstance(criterion, EffectiveIndependence):
+        np.testing.assert_allclose(chosen.values, 1.0, rtol=1e-9)
+    else:
+        assert np.prod(chosen.values) == pytest.approx(abs(np.linalg.det(rows)), rel=1e-9)
+    fewer = select_dofs(modes, 7, required="23:z", criterion=criterion)
+    assert len(fewer) == 7
+    assert fewer.labels[0] == "23:z"
+
+
+def test_what_cannot_be_inverted_is_refused_with_dofs_that_can(modes):
+    """The labels in the message, put in place of those it names, are taken."""
+    few = solve_modes(make_plate(), count=6)
+    wrong = [few.dofs.nearest((0.3, 0.075 * i, 0)) for i in range(6)]
+    with pytest.raises(ModelError) as raised:
+        reduce(few, DesiredDofs(wrong))
+    text = str(raised.value)
+    take, leave, stated = re.search(
+        r"Take (.*?) in place of (.*?): condition ([\d.]+)\. ", text
+    ).groups()
+    better = [label for label in wrong if label not in leave.split(", ")] + take.split(", ")
+    model = reduce(few, DesiredDofs(better))
+    assert model.condition == pytest.approx(float(stated), rel=0.01)
+    assert model.condition < 1e3

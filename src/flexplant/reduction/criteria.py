@@ -74,7 +74,10 @@ class EffectiveIndependence(SelectionCriterion):
             return []
         fixed, p = required.shape[0], pool.shape[0]
         # orthonormal columns, so that no unit of a mode matters
-        vectors, size, _ = la.svd(np.vstack([required, pool]), full_matrices=False)
+        both = np.vstack([required, pool])
+        length = np.linalg.norm(both, axis=0)
+        both = both / np.where(length > 0, length, 1.0)
+        vectors, size, _ = la.svd(both, full_matrices=False)
         rows = np.array(vectors[:, size > _UNSEEN * size[0]])
         wanted = max(count, min(rows.shape[1] - fixed, p))
         alive = np.arange(fixed + p)

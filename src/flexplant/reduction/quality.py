@@ -175,7 +175,7 @@ def quality_of(
         )
     low, high = _band(band)
     pushed, watched = _channels(reduced, inputs, outputs)
-    modes = _full_modes(full, count, high)
+    modes = _full_modes(reduced, full, count, high)
     compared = _compared(full, modes, reduced, count, high)
     elastic = modes.freq[modes.n_rigid :]
     resonances = elastic[(elastic >= low) & (elastic <= high)]
@@ -251,15 +251,21 @@ def _loss(reduced: ReducedModel, loss: float | None) -> float:
     return 2.0 * float(np.mean(modes.zeta[modes.n_rigid :]))
 
 
-def _full_modes(full: FEModel | Modes, count: int | None, high: float) -> Modes:
+def _full_modes(
+    reduced: ReducedModel, full: FEModel | Modes, count: int | None, high: float
+) -> Modes:
     if isinstance(full, Modes):
         return full
-    bare = undamped(full)
+    bare, asked = undamped(full), 0
     if count is not None:
-        most = solve_modes(bare, count=whole(count, "count", maximum=full.n_dof))
-        if most.freq[-1] >= high:
-            return most
-    return solve_modes(bare, below=high)
+        asked = whole(count, "count", maximum=full.n_dof)
+    # the reduced model has about as many in the band: a count is cheaper than "all below"
+    asked = max(asked, int(np.sum(_undamped_modes(reduced).freq <= high)) + 8)
+    while True:
+        found = solve_modes(bare, count=min(asked, full.n_dof))
+        if found.n_modes == full.n_dof or found.freq[-1] > high:
+            return found
+        asked *= 2
 
 
 def _compared(

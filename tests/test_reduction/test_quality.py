@@ -1,0 +1,129 @@
+"""The quality report: against dense responses and eigenvalues, by any route."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+import oracles_reduction as oracle
+import oracles_structure
+from flexplant.errors import ModelError
+from flexplant.reduction import (
+    CraigBampton,
+    Guyan,
+    ModalBalanced,
+    ModalTruncation,
+    reduce,
+    solve_modes,
+)
+from flexplant.structure import ModalDamping
+from plates import make_plate
+
+LOW = ModalDamping(0.01)
+KEPT = ["1:z", "5:z", "21:z", "25:z", "13:z", "7:z", "19:z"]
+BAND = (100.0, 700.0)
+
+
+@pytest.fixture(scope="module")
+def plate():
+    return make_plate(elements=(4, 4))
+
+
+def test_every_number_against_dense_matrices(plate):
+    M, K = oracles_structure.plate_matrices(4, 4)
+    kept = [f"{node}:z" for node in range(1, 26, 2)]
+    model = reduce(plate, Guyan(kept, damping=LOW))
+    freq = np.array([120.0, 246.0, 500.0])
+    found = model.quality(plate, band=BAND, inputs="1:z", outputs=["13:z", "25:z"], freq=freq)
+    true, phi = la.eigh(K, M)
+    true = np.sqrt(true[3:]) / (2 * np.pi)
+    count = 3 + int(np.sum(true < BAND[1]))
+    assert found.modes.tolist() == list(range(1, count + 1))
+    np.testing.assert_allclose(found.full_freq[3:], true[: count - 3], rtol=1e-9)
+    T = oracle.guyan(K, plate.dofs.indices(kept))
+    less, mix = la.eigh(T.T @ K @ T, T.T @ M @ T)
+    partner = np.sqrt(less[3:]) / (2 * np.pi)
+    np.testing.assert_allclose(found.freq_error[3:6], partner[:3] / true[:3] - 1, rtol=1e-5)
+    for i in (3, 4, 5):  # simple modes: M-orthonormal shapes
+        wanted = float(phi[:, i] @ M @ (T @ mix[:, i])) ** 2
+        assert found.mac[i] == pytest.approx(wanted, rel=1e-6)
+    rows = np.eye(75)
+    b, C = rows[:, plate.dofs.indices(["1:z"])], rows[plate.dofs.indices(["13:z", "25:z"])]
+    gap, size = np.zeros((3, 2)), np.zeros((3, 2))
+    for i, f in enumerate(freq):
+        s, none = 2j * np.pi * f, np.zeros((1, 1))
+        H = oracle.response(M, none, K * (1 + 0.02j), b, C, s)[:, 0]
+        less_M, less_K = T.T @ M @ T, T.T @ K @ T * (1 + 0.02j)
+        h = oracle.response(less_M, none, less_K, T.T @ b, C @ T, s)[:, 0]
+        gap[i], size[i] = np.abs(H - h), np.abs(H)
+    np.testing.assert_allclose(found.frf_error[:, 0], gap.max(axis=0) / size.max(axis=0), rtol=1e-4)
+    assert found.true_error == pytest.approx(np.linalg.norm(gap, axis=1).max(), rel=1e-4)
+    assert found.orthogonality < 1e-9
+    assert "dense solutions at 3 frequencies, loss factor 0.02" in found.route
+    assert len(found.table().splitlines()) == count + 1
+    assert repr(found).startswith(f"<ReductionQuality: {count} modes, worst frequency ")
+
+
+def test_repeated_modes_are_compared_as_a_subspace(plate):
+    model = reduce(plate, CraigBampton(KEPT[:4], 20))
+    found = model.quality(plate, band=(600.0, 680.0))
+    f = found.full_freq
+    pair = np.flatnonzero(np.diff(f) < 1e-6 * f[1:])
+    assert pair[pair >= 3].size  # the square plate has one there
+    assert found.mac.min() > 0.999
+
+
+def test_the_report_can_fail(plate):
+    model = reduce(plate, ModalTruncation(9, damping=LOW, inputs=KEPT))
+    good = model.quality(plate, band=BAND)
+    assert good.holds
+    assert good.inputs == tuple(KEPT)
+    assert np.abs(good.freq_error).max() < 1e-9
+    wrong = model.replace(K=model.K * 1.02).quality(plate, band=BAND)
+    assert np.abs(wrong.freq_error[3:]).min() > 0.009
+    assert wrong.true_error > 10 * good.true_error
+    shifted = model.replace(M=model.M * 2.0, K=model.K * 2.0).quality(plate, band=BAND)
+    assert shifted.true_error > 5 * good.true_error
+    assert not shifted.holds or shifted.bound.value > shifted.true_error
+
+
+def test_modes_without_a_partner_are_said(plate):
+    model = reduce(plate, ModalBalanced(8, "13:z", damping=LOW))  # torsion is not seen there
+    found = model.quality(plate, band=BAND)
+    assert np.isnan(found.freq[3])
+    assert "without a partner" in repr(found)
+
+
+def test_against_modes_and_own_damping(plate):
+    damped = plate.replace(D=2e-5 * plate.K)
+    full = solve_modes(damped, count=40)
+    model = reduce(damped, CraigBampton(KEPT, 12))
+    by_modes = model.quality(full, band=BAND, inputs=KEPT[:2])
+    direct = model.quality(damped, band=BAND, inputs=KEPT[:2])
+    np.testing.assert_allclose(by_modes.freq_error, direct.freq_error, atol=1e-8)
+    np.testing.assert_allclose(by_modes.frf_error, direct.frf_error, rtol=0.2)
+    assert "sum over" in by_modes.route
+    assert "its D" in direct.route
+
+
+@pytest.mark.slow
+def test_a_large_model_is_solved_sparsely():
+    plate = make_plate(elements=(26, 26))
+    kept = [plate.dofs.nearest((x, y, 0)) for x in (0, 0.3, 0.6) for y in (0, 0.3, 0.6)]
+    model = reduce(plate, CraigBampton(kept, 25, damping=LOW))
+    found = model.quality(plate, band=BAND, inputs=kept[:2])
+    assert "sparse solutions" in found.route
+    assert found.mac.min() > 0.9999
+    assert found.frf_error.max() < 0.05
+    assert np.all(found.freq_error >= -1e-9)
+
+
+def test_refusals(plate):
+    model = reduce(plate, Guyan(KEPT))
+    with pytest.raises(ModelError, match="made of"):
+        model.quality(make_plate(elements=(3, 3)), band=BAND)
+    with pytest.raises(ModelError, match="made of"):
+        model.quality("plate", band=BAND)
+    with pytest.raises(ModelError, match="rising"):
+        model.quality(plate, band=(5.0, 1.0))
+    with pytest.raises(ModelError, match="whole number"):
+        model.quality(plate, band=BAND, count="a")
