@@ -124,6 +124,8 @@ def of_structures():
     block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}
     corner = fx.solid_block(**block, **steel, holes=np.array([[[True]], [[False]]]))
     yield corner.dofs.interpolation
+    foreign = fx.FEMatrices(np.eye(2), np.diag([1.0, 0.0]), digits=9, constrained=["3:x"])
+    yield from (foreign, fx.check(foreign))
 
 
 def of_updates(rom, unknowns, residual, fit):

@@ -17,7 +17,7 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, text_digits
-from .numbers import fixed_numbers
+from .numbers import fixed_numbers, spaced_numbers
 
 #: entries whose digits are counted
 _SAMPLE = 4000
@@ -200,7 +200,10 @@ def _block(lines: list[bytes], per_line: int, width: int, size: int, path: Path)
     full = per_line * width
     text = b"".join(line[:full].ljust(full) for line in lines)
     numbers = fixed_numbers(text[: size * width], width) if len(text) >= size * width else None
-    if numbers is None or numbers.size != size:
+    if numbers is None:
+        # not in the fields that the header names, as some programs write; blanks still separate
+        numbers = spaced_numbers(b" ".join(lines), size)
+    if numbers is None:
         raise FlexplantError(
             f"{str(path)!r} holds fewer than {size} numbers in fields of {width} characters, or "
             "something else among them. Is it cut short, or were its blanks lost?"

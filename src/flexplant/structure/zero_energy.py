@@ -15,6 +15,8 @@ from .factor import dense
 from .lowest import ROUNDING
 from .rigid import orthonormalised, rigid_motions
 
+#: times the energy that rounding of the entries allows: free
+_MARGIN = 3.0
 #: a singular value below this part of the largest is none
 _RANK = 1e-8
 #: full matrices beyond this do not fit the memory comfortably
@@ -58,7 +60,7 @@ def zero_energy(
 ) -> ZeroEnergy:
     """Return the rigid-body motions of the geometry and the mechanisms among `zero_modes` (n, q).
 
-    Free are those whose energy is below ten times the relative `rounding` of the entries of K.
+    Free are those whose energy is below three times the relative `rounding` of the entries of K.
     Rotations are left out where coordinates are not known.
     """
     center = dofs.xyz.mean(axis=0) if len(dofs) else np.zeros(3)
@@ -70,13 +72,14 @@ def zero_energy(
     size: Any = abs(K)
     # by energy, not by force: the last digits of coordinates change it in second order only
     most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
-    scale = np.sqrt(np.where(most > 0, most, 1.0))
-    energy = (motions / scale).T @ np.asarray(K @ (motions / scale))
-    allowed = 10 * rounding
-    free = (np.abs(np.diag(energy)) < allowed) & present
-    values, vectors = la.eigh(energy[np.ix_(present, present)])
-    combined = (motions / scale)[:, present] @ vectors[:, values < allowed]
-    basis = _independent(motions[:, free] if free.sum() == combined.shape[1] else combined)
+    energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
+    free = (energy < _MARGIN * rounding * most) & present
+    basis = _independent(motions[:, free])
+    if not free[present].all():
+        combined = _free_combinations(
+            K, size, _independent(motions[:, present]), _MARGIN * rounding
+        )
+        basis = combined if combined.shape[1] > basis.shape[1] else basis
     return ZeroEnergy(
         free=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
         grounded=tuple(
@@ -90,6 +93,17 @@ def zero_energy(
         mechanisms=_beyond(zero_modes, basis),
         length_factor=_length_factor(K, dofs, motions, free),
     )
+
+
+def _free_combinations(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
+    """Return an orthonormal basis (n, r) of the combinations of orthonormal motions without energy.
+
+    A hinge leaves one rotation about itself, which is none of those about the middle.
+    """
+    most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
+    scaled = motions / np.sqrt(np.where(most > 0, most, 1.0))
+    values, vectors = la.eigh(scaled.T @ np.asarray(K @ scaled))
+    return _independent(scaled @ vectors[:, np.abs(values) < allowed])
 
 
 def _independent(motions: FloatArray) -> FloatArray:
