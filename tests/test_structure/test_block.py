@@ -67,6 +67,28 @@ def test_bending_is_not_locked():
     np.testing.assert_allclose(np.sqrt(squares[6:8]), exact, rtol=0.005)
 
 
+@pytest.mark.slow
+def test_thin_block_beside_quadratic_bricks_of_scikit_fem():
+    skfem = pytest.importorskip("skfem")
+    from skfem.helpers import ddot, dot, eye, sym_grad, trace
+
+    lame, shear = 70e9 * 0.33 / 1.33 / 0.34, 70e9 / 2 / 1.33
+    stiffness = skfem.BilinearForm(
+        lambda u, v, _: ddot(
+            2 * shear * sym_grad(u) + lame * eye(trace(sym_grad(u)), 3), sym_grad(v)
+        )
+    )
+    mass = skfem.BilinearForm(lambda u, v, _: 2700.0 * dot(u, v))
+    mesh = skfem.MeshHex.init_tensor(
+        *(np.linspace(0, a, k + 1) for a, k in ((0.4, 6), (0.3, 4), (0.02, 1)))
+    )
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex2()), intorder=4)
+    exact = la.eigvalsh(stiffness.assemble(basis).toarray(), mass.assemble(basis).toarray())[6:10]
+    block = make_block(size=(0.4, 0.3, 0.02), elements=(12, 9, 1))
+    found = la.eigvalsh(block.K.toarray(), block.M.toarray(), subset_by_index=(6, 9))
+    np.testing.assert_allclose(np.sqrt(found), np.sqrt(exact), rtol=0.02)
+
+
 def test_six_rigid_body_motions():
     model = make_block()
     R = model.rigid_body
