@@ -135,3 +135,16 @@ def test_marginal_systems_are_refused():
 def test_bad_input(solve, A, Q, error):
     with pytest.raises(error):
         solve(A, Q)
+
+
+def test_a_nearly_triangular_matrix_of_any_sizes():
+    """Scales beyond 2^63: scipy's matrix_balance reads those as permutations, with a warning.
+
+    The reference has the triangle alone, which is solved by substitution without cancellation.
+    """
+    n = 4
+    A = np.diag(np.full(n - 1, 1e13), 1) - np.diag(np.arange(1.0, n + 1))
+    X = la.solve_continuous_lyapunov(A, -np.eye(n))
+    found = solve_lyapunov(A + np.tril(np.full((n, n), 1e-300), -1), np.eye(n))
+    size = np.sqrt(np.outer(X.diagonal(), X.diagonal()))
+    np.testing.assert_allclose(found / size, X / size, rtol=0, atol=1e-14)

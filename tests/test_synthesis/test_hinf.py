@@ -214,10 +214,26 @@ def test_rigid_motions_that_no_sensor_sees_are_named():
         design_hinf(sampled(updated(), blind))
 
 
-def test_a_plant_without_weights_is_told_so():
-    """Metres beside newtons: the cost of position is lost in rounding."""
+def test_a_plant_without_weights_is_solved_in_any_units():
+    """Metres beside newtons: the Riccati equations are in units of their own."""
+    plant = sampled(updated())
+    found = design_hinf(plant)
+    g, K = plant.system, found.system
+    parts = split(g.A, g.B, g.C, g.D, len(plant.u), len(plant.y))
+    loop = closed_loop(parts, K.A, K.B, K.C, K.D)
+    assert stability(loop[0], plant.dt) < 0
+    assert brute_norm(*loop, plant.dt) == pytest.approx(found.gamma, rel=1e-3)
+    assert found.lower <= found.gamma <= 1.06 * found.lower
+
+
+def test_a_plant_beyond_rounding_is_told_so():
+    """Sixteen lags in a row, each of gain 1000: 1e48 from the first state to the last."""
+    n = 16
+    A = np.diag(np.full(n - 1, 1e3), 1) - np.eye(n)
+    B, C = np.eye(n)[:, [0, -1]] @ np.ones((2, 2)), np.ones((2, n))
+    P = StateSpace(A, B, C, [[0.0, 1], [1, 0]], inputs=["w", "u"], outputs=["z", "y"])
     with pytest.raises((SolverError, AssumptionError), match="weight"):
-        design_hinf(sampled(updated()))
+        design_hinf(P, u="u", y="y")
 
 
 def small():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError, LabelError, ModelError, SolverError
+from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError, SolverError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
 from flexplant.plant import Actuator, Poi, Ports, assemble_plant
@@ -203,14 +203,30 @@ def test_bad_frequencies(name, bad):
         design_servo(sampled(some_modes()), **options)
 
 
+def test_a_fast_servo_keeps_its_rolloff_below_half_the_rate():
+    fast = design_servo(sampled(some_modes(), delay=0), bandwidth=0.08 * RATE)
+    given = design_servo(sampled(some_modes(), delay=0), bandwidth=0.08 * RATE, rolloff=0.4 * RATE)
+    np.testing.assert_array_equal(fast.system.A, given.system.A)
+
+
 def test_refusals():
     plant = sampled(some_modes())
     with pytest.raises(ModelError, match="bandwidth 5000 Hz is not well below the rate"):
         design_servo(plant, bandwidth=5000.0)
     with pytest.raises(SolverError, match=r"unstable \(spectral radius.*Lower the bandwidth"):
         design_servo(sampled(some_modes(), delay=3), bandwidth=1500.0)
-    with pytest.raises(ModelError, match="freq"):
+    with pytest.raises(ModelError, match="notch must be positive"):
         design_servo(plant, bandwidth=50.0, notches=[-1.0])
+    with pytest.raises(ShapeError, match=r"notches must have shape \(any,\), got the number 459"):
+        design_servo(plant, bandwidth=50.0, notches=459.0)
+    for name, options in (
+        ("notch", {"notches": [459.0, 0.5 * RATE]}),
+        ("notch", {"notches": [6000.0]}),
+        ("rolloff", {"rolloff": 0.7 * RATE}),
+        ("integrator", {"integrator": 0.5 * RATE}),
+    ):
+        with pytest.raises(ModelError, match=rf"{name} .* not below half the rate, 5000 Hz.*Leave"):
+            design_servo(plant, bandwidth=50.0, **options)
     with pytest.raises(AssumptionError, match=r"discretized\(rate"):
         design_servo(assemble_plant(some_modes(), ports()), bandwidth=50.0)
     with pytest.raises(AssumptionError, match=r"axes that span them.*z, rx, ry"):

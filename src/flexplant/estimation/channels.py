@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 from ..errors import AssumptionError, ModelError, unknown_label
 from ..plant import StandardPlant
+from ..values import short
 
 #: z channels that are not motions of a POI
 DERIVED = (":error", ":effort")
@@ -22,9 +23,7 @@ def checked_plant(plant: StandardPlant) -> StandardPlant:
         When it has no POI or no sensor.
     """
     if not isinstance(plant, StandardPlant):
-        raise ModelError(
-            f"need a StandardPlant, got {type(plant).__name__}: assemble_plant(model, ports)."
-        )
+        raise not_a_plant(plant)
     if plant.unweighted is not None:
         raise ModelError(
             "the plant is weighted: an estimator is of physical channels. Use plant.unweighted."
@@ -33,6 +32,20 @@ def checked_plant(plant: StandardPlant) -> StandardPlant:
         if not names:
             raise AssumptionError(f"the plant has no {side}: there is nothing to estimate with.")
     return plant
+
+
+def not_a_plant(given: object) -> ModelError:
+    """Return the error for something else where a StandardPlant is needed, with what to type."""
+    if hasattr(given, "A") and hasattr(given, "B"):
+        return ModelError(
+            f"need a StandardPlant, got a {type(given).__name__}, whose channels do not tell which "
+            "are disturbances and POIs. Type StandardPlant.from_statespace(sys, w=[...], u=[...], "
+            "z=[...], y=[...], asd={...}) and pass what it returns; for a Kalman filter with "
+            ".replace(noise_factor=G), G G' the covariance that w adds to x in one sample."
+        )
+    return ModelError(
+        f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports)."
+    )
 
 
 def sensors(plant: StandardPlant) -> tuple[str, ...]:

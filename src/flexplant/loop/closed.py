@@ -15,7 +15,7 @@ from ..lti.frequency import Frf, frequency_response
 from ..lti.interconnection import connect, lft
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import Value
+from ..values import Value, name_list, real_array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,7 +124,7 @@ class ClosedLoop(Value):
         ModelError
             When a frequency is not allowed, or the loop is singular at one.
         """
-        grid = np.asarray(freq, dtype=np.float64)
+        grid = real_array(freq, "freq", (None,))
         P = frequency_response(self.plant.system, grid)
         heard = list(self.controller.inputs)
         K = frequency_response(self.controller.select(outputs=self.driven), grid).data
@@ -238,7 +238,7 @@ def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> 
             "close_loop needs at least one block that drives an actuator: pass a StateSpace, "
             "a Controller, or an observer and a servo."
         )
-    resting = (idle,) if isinstance(idle, str) else tuple(idle)
+    resting = name_list(idle, "idle actuators")
     for name in resting:
         if name not in plant.u:
             raise unknown_label("actuator to leave idle", name, plant.u)

@@ -13,7 +13,7 @@ from ..lti.frequency import Frf, frequency_response
 from ..lti.interconnection import lft
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray, real_array
+from ..values import ComplexArray, FloatArray, real_array, short
 from .closed import ClosedLoop
 from .grid import resonance_grid
 
@@ -169,7 +169,8 @@ def taken_apart(loop: Loop) -> Pieces:
         return _modelled(plant, controller, loop.monitored.poles)
     if not isinstance(loop, tuple) or len(loop) != 2:
         raise ModelError(
-            f"need a ClosedLoop or a tuple (plant, controller), got {type(loop).__name__}."
+            f"need a ClosedLoop or a tuple (plant, controller), got {short(loop)}. Type "
+            "close_loop(plant, controller) or (plant, controller)."
         )
     plant, controller = loop[0], _controller(loop[1])
     if isinstance(plant, Frf):
@@ -196,7 +197,7 @@ def taken_apart(loop: Loop) -> Pieces:
 def open_gain(parts: Pieces, grid: FloatArray, at: str) -> ComplexArray:
     """Return K P or P K on a grid, frequency first."""
     if at not in ("u", "y"):
-        raise LabelError(f"a loop is broken at 'u' or 'y', got {at!r}.")
+        raise LabelError(f"a loop is broken at 'u' or 'y', got {short(at)}. Pass one of them.")
     K, P = parts.respond(grid)
     return K @ P if at == "u" else P @ K
 
@@ -293,7 +294,7 @@ def checked_grid(parts: Pieces, freq: npt.ArrayLike | None) -> FloatArray:
         return resonance_grid(parts.poles(), parts.dt)
     grid = real_array(freq, "freq")
     if grid.ndim != 1 or not grid.size:
-        raise ShapeError(f"freq must be a one-dimensional array [Hz], got shape {grid.shape}.")
+        raise ShapeError(f"freq must be a one-dimensional array [Hz], got {short(freq)}. Pass one.")
     if np.any(grid <= 0):
         raise ModelError("freq must be positive: integrators and free bodies are infinite at 0.")
     if parts.measured is not None and not np.all(np.isin(grid, parts.measured)):

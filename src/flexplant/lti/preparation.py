@@ -17,6 +17,7 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..values import FloatArray, Value
 from .discretisation import bilinear, tustin
+from .scaling import bordered_scale, state_scale
 from .statespace import StateSpace
 
 #: a direction of D12 or D21 below this, beside columns of unit size, counts as missing
@@ -229,7 +230,7 @@ def _balanced(
     n = A.shape[0]
     if not n:
         return A, B, C
-    scale = la.matrix_balance(A, permute=False, separate=True)[1][0]
+    scale = state_scale(A, B, C)  # never A alone: that shrinks one side of a nearly triangular A
     for _ in range(2):  # the border is weighed anew once the states have sizes alike
         A_, B_, C_ = A * scale / scale[:, None], B / scale[:, None], C * scale
         try:
@@ -237,10 +238,6 @@ def _balanced(
         except np.linalg.LinAlgError:  # a pole at s: any weight will do
             gain = 1.0
         weight = 1.0 / np.sqrt(gain) if 0.0 < gain < np.inf else 1.0
-        bordered = np.zeros((n + 1, n + 1))
-        bordered[:n, :n] = A_
-        bordered[:n, n] = weight * np.linalg.norm(B_, axis=1)
-        bordered[n, :n] = weight * np.linalg.norm(C_, axis=0)
-        found = la.matrix_balance(bordered, permute=False, separate=True)[1][0]
-        scale = scale * (found[:n] / found[n])
+        drive, sight = np.linalg.norm(B_, axis=1), np.linalg.norm(C_, axis=0)
+        scale = scale * bordered_scale(A_, weight * drive, weight * sight)
     return A * scale / scale[:, None], B / scale[:, None], C * scale

@@ -18,17 +18,29 @@ def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     alone shrinks whatever lies above its diagonal blocks without end (a Schur form of 84 states
     got units of 1e26 beside 1e-34), which costs B and C all their digits.
     """
-    n = A.shape[0]
     drive, sight = np.linalg.norm(B, axis=1), np.linalg.norm(C, axis=0)
     # borders whose size beside the balanced A is moderate, whatever the units of A, inputs, outputs
     size = BORDER * (float(np.linalg.norm(balanced_matrix(A))) or 1.0)
+    return bordered_scale(
+        A,
+        drive * (size / (float(np.linalg.norm(drive)) or 1.0)),
+        sight * (size / (float(np.linalg.norm(sight)) or 1.0)),
+    )
+
+
+def bordered_scale(A: FloatArray, drive: FloatArray, sight: FloatArray) -> FloatArray:
+    """Return d (n,), powers of two, that balance A bordered by a column and a row (Osborne)."""
+    n = A.shape[0]
     bordered = np.zeros((n + 1, n + 1))
-    bordered[:n, :n] = A
-    bordered[:n, n] = drive * (size / (np.linalg.norm(drive) or 1.0))
-    bordered[n, :n] = sight * (size / (np.linalg.norm(sight) or 1.0))
-    # gebal itself: scipy's matrix_balance reads scales above 2^63 as permutations, with a warning
-    found = la.lapack.dgebal(bordered, scale=1, permute=0)[3]
+    bordered[:n, :n], bordered[:n, n], bordered[n, :n] = A, drive, sight
+    found = even_scale(bordered)
     return np.asarray(found[:n] / found[n])
+
+
+def even_scale(A: FloatArray) -> FloatArray:
+    """Return d (n,), powers of two, for which ``A d / d[:, None]`` has even rows and columns."""
+    # gebal itself: scipy's matrix_balance reads scales above 2^63 as permutations, with a warning
+    return np.asarray(la.lapack.dgebal(A, scale=1, permute=0)[3])
 
 
 def balanced_matrix(A: FloatArray) -> FloatArray:

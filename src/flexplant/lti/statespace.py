@@ -274,12 +274,12 @@ class StateSpace(Value):
 
 
 def as_statespace(sys: System | FloatArray) -> StateSpace:
-    """Return `sys` as our StateSpace; arrays are static gains.
+    """Return `sys` as our StateSpace; arrays are static gains, a value with a `.system` is that.
 
     Raises
     ------
     ModelError
-        When it is neither a system nor a (p, m) array.
+        When it is neither a system nor a (p, m) array; for a StandardPlant, which holds four.
     """
     if isinstance(sys, StateSpace):
         return sys
@@ -288,6 +288,14 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
         return StateSpace(
             np.zeros((0, 0)), np.zeros((0, gain.shape[1])), np.zeros((gain.shape[0], 0)), gain
         )
+    inner = getattr(sys, "system", None)  # a controller, an observer, a closed loop w -> z
+    if isinstance(inner, StateSpace):
+        if all(hasattr(sys, side) for side in "wuzy"):
+            raise ModelError(
+                "this is a StandardPlant, whose [w; u] -> [z; y] are four systems: say which is "
+                "meant, plant.Gzw (or Gzu, Gyw, Gyu), or plant.system for all of it."
+            )
+        return inner
     return StateSpace.from_control(sys)
 
 

@@ -19,7 +19,7 @@ from ..errors import (
 from ..plant import Actuator, Sensor, StandardPlant, assemble_plant
 from ..plant.ports import QUANTITIES
 from ..plant.realisation import ModalRealisation
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, short
 from .criteria import PoiLqr, PoiVariance, plain
 from .quadratic import Quadratic
 
@@ -147,7 +147,7 @@ def scorer_of(
     if not callable(criterion):
         raise ModelError(
             "a criterion is PoiVariance(...), PoiLqr(...) or a callable from plant to float, got "
-            f"{type(criterion).__name__}."
+            f"{short(criterion)}. Pass such a value, or none."
         )
     wanted: type[PoiVariance] | type[PoiLqr] = PoiVariance if side == "y" else PoiLqr
     if isinstance(criterion, PoiVariance | PoiLqr) and not isinstance(criterion, wanted):
@@ -173,7 +173,8 @@ def checked_plant(plant: StandardPlant) -> None:
     """Raise ModelError unless the plant is sampled, not weighted, and made of a structure."""
     if not isinstance(plant, StandardPlant):
         raise ModelError(
-            f"need a StandardPlant, got {type(plant).__name__}: assemble_plant(model, ports)."
+            f"need a StandardPlant, got {short(plant)}. A state space has no rows for candidates: "
+            "make the plant from the structure, assemble_plant(model, ports).discretized(rate)."
         )
     if plant.realisation is None or plant.ports is None:
         raise ModelError(
@@ -206,6 +207,11 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
     ModelError
         When something is no Sensor (Actuator).
     """
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ModelError(
+            f"candidates are a list of {KIND[side].__name__}s or names, got {short(given)}. "
+            "Put them in a list."
+        )
     own: dict[str, Port] = {p.name: p for p in getattr(plant.ports, side)}
     found: dict[str, Port] = {}
     for item in given:
@@ -217,7 +223,7 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
         if not isinstance(port, KIND[side]):
             raise ModelError(
                 f"candidates are {KIND[side].__name__}s or names of the plant's, got "
-                f"{type(port).__name__}."
+                f"{short(port)}. Pass {KIND[side].__name__}(name, at=...)."
             )
         other = found.setdefault(port.name, port)
         if other is not port and other._fields() != port._fields():

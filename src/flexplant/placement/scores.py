@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import LabelError, ModelError
 from ..parallel import mapped
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, Value
+from ..values import FloatArray, IntArray, Value, short, whole
 from .candidates import (
     Criterion,
     Port,
@@ -80,7 +80,7 @@ class Scores(Value):
         count : int
             How many.
         """
-        return "\n".join(self._lines(count))
+        return "\n".join(self._lines(whole(count, "count")))
 
     def on(self, plant: StandardPlant, rank: int = 0) -> StandardPlant:
         """Return the plant with the layout of a rank (0 is the best) instead of its own.
@@ -92,6 +92,7 @@ class Scores(Value):
         rank : int
             Which layout.
         """
+        rank = whole(rank, "rank", minimum=0, maximum=len(self) - 1)
         known = {port.name: port for port in self.candidates}
         return with_side(plant, self.side, [known[name] for name in self.layouts[rank]])
 
@@ -210,6 +211,11 @@ def _scored(
     progress: bool | None,
 ) -> Scores:
     checked_plant(plant)
+    if isinstance(layouts, str) or not isinstance(layouts, Sequence):
+        raise ModelError(f"layouts are a list of lists of names, got {short(layouts)}. Pass such.")
+    wrong = [layout for layout in layouts if not isinstance(layout, Iterable)]
+    if wrong:
+        raise ModelError(f"a layout is a list of names, got {short(wrong[0])}. Pass such a list.")
     listed = [(layout,) if isinstance(layout, str) else tuple(layout) for layout in layouts]
     if not listed or not all(listed):
         raise ModelError("there is nothing to score: give at least one layout, none of them empty.")

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
 from ..parallel import mapped
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, name_list, seed_sequence, whole
 from .candidates import (
     WEAK,
     Criterion,
@@ -56,8 +56,7 @@ class Exchange(Value):
     starts: int = 10
 
     def __post_init__(self) -> None:
-        if int(self.starts) != self.starts or self.starts < 1:
-            raise ModelError(f"starts must be a whole number of at least 1, got {self.starts!r}.")
+        self._set(starts=whole(self.starts, "starts"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,9 +67,17 @@ class Exhaustive(Value):
     ----------
     limit : int
         More subsets than this are refused.
+
+    Raises
+    ------
+    ModelError
+        When limit is no whole number of at least 1.
     """
 
     limit: int = 200_000
+
+    def __post_init__(self) -> None:
+        self._set(limit=whole(self.limit, "limit"))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -269,13 +276,10 @@ def _placed(
 ) -> Placement:
     checked_plant(plant)
     ports = tuple(known_candidates(plant, side, candidates).values())
-    if len(ports) != len(list(candidates)):
+    if len(ports) != len(tuple(candidates)):
         raise LabelError("a candidate is listed twice: each may be chosen once.")
     kept = _required([port.name for port in ports], required)
-    if isinstance(count, bool) or int(count) != count or not 1 <= count <= len(ports):
-        raise ModelError(
-            f"count must be a whole number from 1 to the {len(ports)} candidates, got {count!r}."
-        )
+    count = whole(count, "count", maximum=max(len(ports), 1))
     if len(kept) > count:
         raise ModelError(f"{len(kept)} candidates are required, but only {count} are chosen.")
     scorer = scorer_of(plant, side, ports, criterion)
@@ -295,7 +299,7 @@ def _placed(
         found = _exchanged(scorer, int(count), kept, method, executor, progress, rng)
     else:
         raise ModelError(
-            f"method must be Exchange(...) or Exhaustive(), got {type(method).__name__}."
+            f"method must be Exchange(...) or Exhaustive(), got {type(method).__name__}. Pass one."
         )
     chosen, value, evaluations, history = found
     if not np.isfinite(value):
@@ -322,7 +326,7 @@ def _placed(
 
 
 def _required(names: Sequence[str], required: Sequence[str]) -> tuple[int, ...]:
-    listed = (required,) if isinstance(required, str) else tuple(required)
+    listed = name_list(required, "required candidates")
     for name in listed:
         if name not in names:
             raise unknown_label("required candidate", name, names)
@@ -372,7 +376,7 @@ def _exchanged(
     rng: int | np.random.SeedSequence | np.random.Generator | None,
 ) -> _Found:
     search = _Search(scorer, count, kept)
-    seed = np.random.SeedSequence() if rng is None else rng
+    seed = seed_sequence(rng)
     runs = mapped(
         search,
         range(method.starts),

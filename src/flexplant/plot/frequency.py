@@ -7,8 +7,9 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..errors import ModelError
 from ..lti.frequency import Frf
-from ..values import FloatArray
+from ..values import FloatArray, short
 from ._axes import CYCLE, axes, finish
 
 
@@ -39,7 +40,19 @@ def frf(
     Returns
     -------
     Axes
+
+    Raises
+    ------
+    ModelError
+        When there is no such mapping.
     """
+    if not isinstance(responses, Mapping) or isinstance(responses, Frf):
+        raise ModelError(
+            f"need a mapping of labels to Frfs, got {short(responses)}. Type {{'model': frf}}."
+        )
+    wrong = [found for found in responses.values() if not isinstance(found, Frf)]
+    if wrong:
+        raise ModelError(f"need Frfs to draw, got {short(wrong[0])}. Use frequency_response(sys).")
     ax = axes(ax, figsize=(8.0, 4.5))
     for i, (label, response) in enumerate(responses.items()):
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
@@ -72,7 +85,17 @@ def sensitivity(
     Returns
     -------
     Axes
+
+    Raises
+    ------
+    ModelError
+        When there is no such mapping.
     """
+    if not isinstance(curves, Mapping):
+        raise ModelError(
+            f"need a mapping of labels to (freq, size), got {short(curves)}. Type "
+            "{'model': (freq, size)}."
+        )
     ax = axes(ax, figsize=(8.0, 4.5))
     for i, (label, (freq, size)) in enumerate(curves.items()):
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])

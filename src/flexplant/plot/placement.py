@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..errors import ModelError
 from ..placement import SensorMap
 from ..plant import Ports
-from ..values import FloatArray
+from ..values import FloatArray, short
 from ._axes import MEASURED, UPDATED, axes, finish
 
 
@@ -28,7 +29,14 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     Axes
         Filled contours of the square root of the score's ratio: the error with the sensor over
         the error without it.
+
+    Raises
+    ------
+    ModelError
+        When `found` is no SensorMap.
     """
+    if not isinstance(found, SensorMap):
+        raise ModelError(f"need a SensorMap, got {short(found)}. Pass what sensor_map returned.")
     ax = axes(ax, figsize=(6.4, 5.4))
     ratio = np.sqrt(found.ratio)
     x, y = found.points[:, 0], found.points[:, 1]

@@ -7,8 +7,9 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..errors import unknown_label
+from ..errors import ModelError, unknown_label
 from ..simulation import Response
+from ..values import name_list, short
 from ._axes import CYCLE, axes, finish
 
 SCALES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
@@ -48,9 +49,14 @@ def response(
     ------
     LabelError
         When a channel is unknown.
+    ModelError
+        When `run` is no Response.
     """
+    if not isinstance(run, Response):
+        raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+    chosen = None if channels is None else name_list(channels, "channels")
     ax = axes(ax, figsize=(8.0, 4.0))
-    names = list(channels or [n for n in run if n.endswith(":error")] or list(run)[:1])
+    names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])
     signals = []
     for name in names:
         if name not in run:

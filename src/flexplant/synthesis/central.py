@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ..errors import AssumptionError
 from ..lti.preparation import Prepared
+from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
 from ..values import FloatArray
 
@@ -149,8 +150,15 @@ def stabilising(
         return np.zeros((0, 0)), np.asarray(-SR)
     drift, spread = A - B @ SR, B @ BR
     rest = Q - S @ SR
+    # units of the states from A, B and C together, and one of the adjoint states: still Hamiltonian
+    d = state_scale(A, B, np.sqrt(np.abs(Q.diagonal()))[None, :])
+    beside = [
+        float(np.linalg.norm(part)) for part in (rest * d * d[:, None], spread / d / d[:, None])
+    ]
+    unit = float(2.0 ** np.round(0.5 * np.log2(beside[0] / beside[1]))) if all(beside) else 1.0
+    scale = np.concatenate([d, unit / d])
     hamiltonian = np.block([[drift, -spread], [-rest, -drift.T]])
-    balanced, (scale, _) = la.matrix_balance(hamiltonian, permute=False, separate=True)
+    balanced = hamiltonian * scale / scale[:, None]
     triangle, vectors, count = la.schur(balanced, sort="lhp")
     values = la.eigvals(triangle)
     margin = _AXIS * (np.abs(values) + 1e-2 * np.linalg.norm(balanced))

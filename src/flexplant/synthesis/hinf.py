@@ -11,7 +11,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant
-from ..values import FloatArray
+from ..values import FloatArray, name_list, short
 from .certificate import certified_norm
 from .controller import Controller
 from .riccati import Riccati
@@ -87,13 +87,15 @@ def design_hinf(
                 f"design_hinf needs a StandardPlant, got {type(plant).__name__}. For a StateSpace "
                 "name the controller's channels: design_hinf(sys, u=(...), y=(...))."
             )
-        u, y = ((side,) if isinstance(side, str) else side for side in (u, y))
+        u, y = name_list(u, "u"), name_list(y, "y")
         plant = StandardPlant.from_statespace(plant, u=u, y=y)
     elif u is not None or y is not None:
         raise ModelError("a StandardPlant knows its u and y: leave them out.")
     method = Riccati() if method is None else method
     if not hasattr(method, "solve"):
-        raise ModelError(f"method must be Riccati(...) or Lmi(...), got {method!r:.60}.")
+        raise ModelError(
+            f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
+        )
     if not plant.w or not plant.z or not plant.u or not plant.y:
         raise AssumptionError(f"H-infinity synthesis needs channels w, z, u and y, got {plant!r}.")
     if plant.realisation is not None:  # it can name the rigid-body motion that is missed

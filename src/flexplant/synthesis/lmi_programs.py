@@ -396,4 +396,4 @@ def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
 
 
 def _order(problem: Any) -> int:
-    return max(variable.shape[0] for variable in problem.variables() if variable.shape)
+    return int(max(variable.shape[0] for variable in problem.variables() if variable.shape))

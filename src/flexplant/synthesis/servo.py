@@ -13,7 +13,7 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..plant import Poi, StandardPlant
 from ..plant.stage import rigid_gain
 from ..plant.weights import leadlag, lowpass, notch
-from ..values import FloatArray, positive
+from ..values import FloatArray, positive, real_array
 from .controller import Controller
 
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body
@@ -43,15 +43,17 @@ def design_servo(
     plant : StandardPlant
         Sampled, with a POI whose axes span its rigid-body modes.
     bandwidth : float [Hz]
-        Where the open loop of each axis crosses 1.
+        Where the open loop of each axis crosses 1; below a fifth of the rate.
     poi : str, optional
         Which POI, when the plant has several.
     rolloff : float [Hz], optional
-        Corner of the second-order low-pass; 8 bandwidths unless given.
+        Corner of the second-order low-pass, below half the rate; unless given 8 bandwidths, or 0.4
+        of the rate where that is less.
     integrator : float [Hz], optional
         Corner of the integral action; a tenth of the bandwidth unless given.
     notches : sequence of float [Hz]
-        Frequencies of resonances to notch.
+        Frequencies of resonances to notch, each below half the rate: a sampled controller has no
+        notch above that, where the map would fold it to another frequency.
 
     Returns
     -------
@@ -77,14 +79,22 @@ def design_servo(
             "a servo is designed at its sampling rate: pass plant.discretized(rate, delay=...)."
         )
     rate = 1.0 / plant.dt
-    if not 0.0 < positive(bandwidth, "bandwidth") < 0.2 * rate:
-        raise ModelError(f"bandwidth {bandwidth:g} Hz is not well below the rate, {rate:g} Hz.")
+    if positive(bandwidth, "bandwidth") >= 0.2 * rate:
+        raise ModelError(
+            f"bandwidth {bandwidth:g} Hz is not well below the rate, {rate:g} Hz: the lead needs "
+            f"room above it. Stay below {0.2 * rate:g} Hz, or raise the rate."
+        )
+    corner = min(8.0 * bandwidth, 0.4 * rate) if rolloff is None else rolloff
+    slow = 0.1 * bandwidth if integrator is None else integrator
+    depths = real_array(notches, "notches", (None,)).tolist()
+    for name, freq in (("rolloff", corner), ("integrator", slow), *(("notch", f) for f in depths)):
+        _below_nyquist(freq, name, rate)
     decoupling = _decoupling(plant, poi_port)
     axis = _axis_controller(
-        bandwidth,
-        8.0 * bandwidth if rolloff is None else rolloff,
-        0.1 * bandwidth if integrator is None else integrator,
-        notches,
+        float(bandwidth),
+        float(corner),
+        float(slow),
+        depths,
         rate,
     )
     certificate = _certified(axis, rate, plant.delay, bandwidth)
@@ -93,6 +103,14 @@ def design_servo(
         f"servo {bandwidth:g} Hz on {poi_port.name!r}",
         certificate=certificate,
     )
+
+
+def _below_nyquist(freq: float, name: str, rate: float) -> None:
+    if positive(freq, name) >= 0.5 * rate:
+        raise ModelError(
+            f"{name} {freq:g} Hz is not below half the rate, {0.5 * rate:g} Hz: sampled, it would "
+            "act at another frequency. Leave it out, lower it, or raise the rate."
+        )
 
 
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
@@ -134,7 +152,7 @@ def _axis_controller(
     bandwidth: float, rolloff: float, integrator: float, notches: Sequence[float], rate: float
 ) -> StateSpace:
     """Return error -> acceleration of one axis, sampled, of unit open-loop gain at bandwidth."""
-    omega_i = 2.0 * np.pi * positive(integrator, "integrator")
+    omega_i = 2.0 * np.pi * integrator
     parts = [
         StateSpace([[0.0]], [[omega_i]], [[1.0]], [[1.0]]),
         leadlag(bandwidth / _LEAD, _LEAD * bandwidth),

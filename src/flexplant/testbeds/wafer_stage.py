@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -19,7 +19,7 @@ from ..plant.realisation import ModalRealisation, realised
 from ..simulation import Response, simulate
 from ..structure import FEModel, ModalDamping, kirchhoff_plate
 from ..synthesis import design_servo
-from ..values import FloatArray, Value, positive
+from ..values import FloatArray, Value, generator, positive, short, whole
 
 SIZE = (0.6, 0.6)
 #: the plate of the paper's Table 1, as its drawing says
@@ -68,14 +68,19 @@ def wafer_stage(
     ModelError
         When a value is out of range.
     """
+    given = tuple(elements) if isinstance(elements, tuple | list) else ()
+    if len(given) != 2:
+        raise ModelError(
+            f"elements are two whole numbers (nx, ny), got {short(elements)}. Try (8, 8)."
+        )
+    elements = (whole(given[0], "elements along x"), whole(given[1], "elements along y"))
+    late = whole(delay, "delay", minimum=0)
     bare = kirchhoff_plate(elements=elements, name="wafer stage", **DRAWING)
     damped = bare.with_damping(ModalDamping(damping))
     row = damped.dofs.row((SIZE[0] / 2, SIZE[1] / 4, 0.0), "z")
     mass = positive(added_mass, "added_mass", zero=True) * np.outer(row, row)
     truth = FEModel(damped.M + mass, damped.K, damped.D, dofs=damped.dofs, name="wafer stage")
-    if int(delay) != delay or delay < 0:
-        raise ModelError(f"the machine's delay is a whole number of samples, got {delay!r}.")
-    return WaferStage(truth, positive(rate, "rate"), int(delay))
+    return WaferStage(truth, positive(rate, "rate"), late)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -85,7 +90,7 @@ class WaferStage(Value):
     Parameters
     ----------
     truth : FEModel
-        What it really is; no design may read it.
+        What it really is: for tests and for judging an answer; no design may read it.
     rate : float [Hz]
         Of its controller.
     delay : int [samples]
@@ -118,16 +123,28 @@ class WaferStage(Value):
         ------
         LabelError
             When a mode is not there, or is a rigid-body mode (a drift has no pole to measure).
+        ModelError
+            When a mode is no whole number, or lies above half the machine's rate, where no
+            sampled measurement shows it.
         """
         pairs = self._realisation.pairs
         known = range(self._realisation.n_rigid + 1, pairs.shape[0] + 1)
         found = []
-        for mode in modes:
+        listed = [modes] if not isinstance(modes, Iterable) or isinstance(modes, str) else modes
+        numbers = tuple(whole(mode, "mode") for mode in listed)
+        for mode in numbers:
             if mode not in known:
                 raise unknown_label("elastic mode", mode, map(str, known))
             values = np.linalg.eigvals(pairs[mode - 1])
-            found.append(values[np.argmax(values.imag)])
-        return MeasuredModes(poles=np.array(found, dtype=np.complex128), modes=tuple(modes))
+            pole = values[np.argmax(values.imag)]
+            if (freq := abs(pole) / (2.0 * np.pi)) >= 0.5 * self.rate:
+                raise ModelError(
+                    f"mode {mode} at {freq:.4g} Hz is not below half the rate, {0.5 * self.rate:g} "
+                    "Hz: no measurement of this machine shows it. Ask for lower modes, or raise "
+                    "the rate."
+                )
+            found.append(pole)
+        return MeasuredModes(poles=np.array(found, dtype=np.complex128), modes=numbers)
 
     def loop(self, ports: Ports, *blocks: Any) -> ClosedLoop:
         """Return the machine's own closed loop, for its margins.
@@ -212,7 +229,7 @@ class WaferStage(Value):
         """
         if not ports.u or not ports.y:
             raise ModelError(f"an FRF needs actuators and sensors, got {ports!r}.")
-        random = np.random.default_rng(rng)
+        random = generator(rng)
         count, samples = len(ports.u), round(positive(period, "period") * self.rate)
         _check_multisine(samples, periods, discard)
         shakers = [f"{port.name}:excitation" for port in ports.u]
@@ -273,8 +290,7 @@ def _check_multisine(samples: int, periods: int, discard: int) -> None:
             f"a period of {samples} samples has no frequencies to measure at. Lengthen period."
         )
     for name, number, least in (("periods", periods, 1), ("discard", discard, 0)):
-        if not isinstance(number, int | np.integer) or number < least:
-            raise ModelError(f"{name} must be a whole number, {least} or more, got {number!r}.")
+        whole(number, name, minimum=least)
 
 
 def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:

@@ -1,0 +1,183 @@
+"""Wrong kinds at the doors of the control rooms: our errors with a next step, never Python's."""
+
+import re
+from functools import cache
+
+import pytest
+
+import flexplant as fx
+from flexplant.errors import FlexplantError
+from flexplant.loop import close_loop
+from flexplant.testbeds import wafer_stage
+from stages import RATE, ports, sampled, some_modes
+
+#: nothing that is a number, a list of names, a plant or a system
+KINDS = {
+    "text": "a",
+    "none": None,
+    "nan": float("nan"),
+    "negative": -1.0,
+    "fraction": 2.5,
+    "bool": True,
+    "object": object(),
+    "dict": {"a": 1},
+    "list": [None],
+}
+
+
+@cache
+def plant():
+    return sampled(some_modes())
+
+
+@cache
+def loop():
+    servo = fx.design_servo(plant(), bandwidth=50.0)
+    return close_loop(plant(), fx.design_static(plant()), servo)
+
+
+@cache
+def run():
+    return fx.simulate(loop(), duration=0.01)
+
+
+@cache
+def stage():
+    return wafer_stage(elements=(4, 4))
+
+
+def placed(**options):
+    names = [sensor.name for sensor in plant().ports.y]
+    return fx.place_sensors(plant(), options.pop("candidates", names), **({"count": 4} | options))
+
+
+def servo(**options):
+    return fx.design_servo(plant(), **({"bandwidth": 50.0} | options))
+
+
+def simulated(**options):
+    return fx.simulate(loop(), **({"duration": 0.01} | options))
+
+
+def machine_frf(**options):
+    return stage().measure_frf(ports(), **({"period": 0.01} | options))
+
+
+#: (name, call of one argument, kinds that are allowed there)
+DOORS = [
+    ("design_kalman", lambda x: fx.design_kalman(x), ()),
+    ("design_static", lambda x: fx.design_static(x), ()),
+    ("design_servo", lambda x: fx.design_servo(x, bandwidth=50.0), ()),
+    ("design_servo bandwidth", lambda x: servo(bandwidth=x), ("fraction",)),
+    ("design_servo rolloff", lambda x: servo(rolloff=x), ("none", "fraction")),
+    ("design_servo integrator", lambda x: servo(integrator=x), ("none", "fraction")),
+    ("design_servo notches", lambda x: servo(notches=x), ()),
+    ("design_servo a notch", lambda x: servo(notches=[x]), ("fraction", "bool")),
+    ("design_servo poi", lambda x: servo(poi=x), ("none",)),
+    ("design_hinf", lambda x: fx.design_hinf(x), ()),
+    ("design_hinf method", lambda x: fx.design_hinf(plant(), x), ("none",)),
+    ("design_hinf u", lambda x: fx.design_hinf(plant().system, u=x, y=plant().y), ()),
+    ("Lmi back_off", lambda x: fx.Lmi(back_off=x), ("fraction",)),
+    ("Lmi max_states", lambda x: fx.Lmi(max_states=x), ()),
+    ("Lmi time_limit", lambda x: fx.Lmi(time_limit=x), ("fraction",)),
+    ("Riccati tolerance", lambda x: fx.Riccati(tolerance=x), ("fraction",)),
+    ("close_loop", lambda x: fx.close_loop(x, loop().controller), ()),
+    ("close_loop block", lambda x: fx.close_loop(plant(), x), ()),
+    ("close_loop idle", lambda x: fx.close_loop(plant(), *loop().blocks, idle=x), ()),
+    ("loop response", lambda x: loop().frequency_response(x), ()),
+    ("sensitivity", lambda x: fx.sensitivity(x), ()),
+    ("sensitivity freq", lambda x: fx.sensitivity(loop(), freq=x), ("none",)),
+    ("sensitivity at", lambda x: fx.sensitivity(loop(), at=x), ()),
+    ("modulus_margin", lambda x: fx.modulus_margin(x), ()),
+    ("simulate", lambda x: fx.simulate(x, duration=0.01), ()),
+    ("simulate duration", lambda x: simulated(duration=x), ("fraction",)),
+    ("simulate rng", lambda x: simulated(rng=x), ("none",)),
+    ("simulate runs", lambda x: simulated(runs=x), ("none",)),
+    ("simulate noise", lambda x: simulated(noise=x), ("bool",)),
+    ("simulate start", lambda x: simulated(start=x), ("none",)),
+    ("simulate disturbance", lambda x: simulated(disturbance=x), ("none",)),
+    ("simulate reference", lambda x: simulated(reference=x),
+        ("none", "negative", "fraction", "bool")),
+    ("setpoint", lambda x: fx.setpoint(x, velocity=1.0, acceleration=1.0, jerk=1.0),
+        ("negative", "fraction", "bool")),
+    ("setpoint velocity", lambda x: fx.setpoint(1.0, velocity=x, acceleration=1.0, jerk=1.0),
+        ("fraction",)),
+    ("setpoint snap", lambda x: fx.setpoint(1.0, velocity=1.0, acceleration=1.0, jerk=1.0, snap=x),
+        ("none", "fraction")),
+    ("rms", lambda x: run().rms(x), ()),
+    ("rms start", lambda x: run().rms("die:z", start=x), ("negative",)),
+    ("moving_average window", lambda x: run().moving_average("die:z", window=x), ()),
+    ("place_sensors", lambda x: fx.place_sensors(x, ["y1"], 1), ()),
+    ("place_sensors candidates", lambda x: placed(candidates=x), ()),
+    ("place_sensors count", lambda x: placed(count=x), ()),
+    ("place_sensors required", lambda x: placed(required=x), ()),
+    ("place_sensors method", lambda x: placed(method=x), ("none",)),
+    ("place_sensors rng", lambda x: placed(rng=x, method=fx.Exchange(starts=2)), ("none",)),
+    ("place_sensors criterion", lambda x: placed(criterion=x), ("none",)),
+    ("Exchange", lambda x: fx.Exchange(starts=x), ()),
+    ("Exhaustive", lambda x: fx.Exhaustive(limit=x), ()),
+    ("score_sensors", lambda x: fx.score_sensors(plant(), x), ()),
+    ("score_sensors layout", lambda x: fx.score_sensors(plant(), [x]), ()),
+    ("sensor_map points", lambda x: fx.sensor_map(plant(), x, asd=1e-12), ()),
+    ("sensor_map asd", lambda x: fx.sensor_map(plant(), [(0.3, 0.3, 0.0)], asd=x), ("fraction",)),
+    ("hinf_norm", lambda x: fx.hinf_norm(x), ("negative", "fraction", "bool")),
+    ("h2_norm", lambda x: fx.h2_norm(x), ("negative", "fraction", "bool")),
+    ("frequency_response", lambda x: fx.frequency_response(x), ("negative", "fraction", "bool")),
+    ("frequency_response freq", lambda x: fx.frequency_response(loop().controller, x), ("none",)),
+    ("StateSpace A", lambda x: fx.StateSpace(x, [[1.0]], [[1.0]], [[0.0]]), ()),
+    ("StateSpace dt", lambda x: fx.StateSpace([], [], [], [[1.0]], dt=x), ("fraction",)),
+    ("StateSpace inputs", lambda x: fx.StateSpace([], [], [], [[1.0]], inputs=x),
+        ("text", "none", "dict")),
+    ("lft", lambda x: fx.lft(plant().system, x), ()),
+    ("wafer_stage elements", lambda x: wafer_stage(elements=x), ()),
+    ("wafer_stage an element", lambda x: wafer_stage(elements=(x, 8)), ()),
+    ("wafer_stage delay", lambda x: wafer_stage(elements=(2, 2), delay=x), ()),
+    ("wafer_stage rate", lambda x: wafer_stage(elements=(2, 2), rate=x), ("fraction",)),
+    ("wafer_stage added_mass", lambda x: wafer_stage(elements=(2, 2), added_mass=x), ("fraction",)),
+    ("poles", lambda x: stage().poles(x), ()),
+    ("measure_frf periods", lambda x: machine_frf(periods=x), ()),
+    ("measure_frf rng", lambda x: machine_frf(rng=x), ("none",)),
+    ("plot.response", lambda x: fx.plot.response(x), ()),
+    ("plot.response channels", lambda x: fx.plot.response(run(), x), ("none",)),
+    ("plot.frf", lambda x: fx.plot.frf(x, "y1", "u1"), ()),
+    ("plot.sensitivity", lambda x: fx.plot.sensitivity(x), ("dict",)),
+    ("plot.sensor_map", lambda x: fx.plot.sensor_map(x), ()),
+]  # fmt: skip
+
+CASES = [
+    pytest.param(call, kind, id=f"{name} {kind}")
+    for name, call, allowed in DOORS
+    for kind in KINDS
+    if kind not in allowed
+]
+
+
+@pytest.mark.parametrize(("call", "kind"), CASES)
+def test_wrong_kinds(call, kind):
+    with pytest.raises(FlexplantError) as caught:
+        call(KINDS[kind])
+    text = str(caught.value)
+    assert len(text) < 600
+    # something to do, or what is there to choose from
+    assert re.search(r"[.:;?] ?[A-Z][a-z]|Type|Known are|Close matches|use |Pass|: \w+", text), text
+
+
+def test_the_rate_of_these_tests_is_the_stages():
+    assert plant().dt == 1 / RATE
+    with pytest.raises(FlexplantError, match=r"mode 70 at .* not below half the rate, 1000 Hz"):
+        wafer_stage(elements=(8, 8), rate=2000.0).poles([70])
+
+
+def test_a_plant_where_a_system_is_needed_is_told_which_systems_it_has():
+    for function in (fx.hinf_norm, fx.h2_norm, fx.frequency_response, fx.peak_gain):
+        with pytest.raises(FlexplantError, match=r"plant\.Gzw .*plant\.system for all of it"):
+            function(plant())
+    servo = fx.design_servo(plant(), bandwidth=50.0)
+    assert fx.peak_gain(servo) == fx.peak_gain(servo.system)
+
+
+def test_a_system_where_a_plant_is_needed_is_told_what_to_type():
+    for function in (fx.design_kalman, fx.design_static):
+        for sys in (plant().system, plant().system.to_control()):
+            with pytest.raises(FlexplantError, match=r"from_statespace\(sys, w=\[.*noise_factor"):
+                function(sys)
