@@ -96,3 +96,31 @@ def test_bad_input(changes, error):
     given = {"omega": [1.0, 2.0], "zeta": [0, 0], "phi": np.eye(2), "dofs": DOFS} | changes
     with pytest.raises(error):
         Modes(**given)
+
+
+def test_large_models_tell_what_was_counted():
+    modes = solve_modes(make_plate(elements=(24, 24)), count=24)
+    shown = modes.certificate
+    assert shown["counted"] == shown["found"] >= 24
+    assert shown["shift"] > modes.freq[-1]
+    assert shown["orthonormality"] < 1e-12
+    assert modes.residual.shape == (24,)
+    assert np.all(modes.residual[:3] == 0)
+    assert 0 < modes.residual.max() < 1e-7
+    assert "counted below" in repr(modes)
+    assert "none missing" in repr(modes)
+    small = solve_modes(make_plate(), count=24)
+    assert "counted" not in small.certificate
+    assert small.residual.max() < 1e-8
+    with pytest.raises(ShapeError):
+        modes.replace(residual=[1.0, 2.0])
+
+
+def test_residual_is_that_of_the_equation():
+    model = make_plate()
+    modes = solve_modes(model, count=8)
+    force = model.K @ modes.phi
+    left = np.linalg.norm(force - model.M @ modes.phi * modes.omega**2, axis=0)
+    np.testing.assert_allclose(
+        modes.residual[3:], (left / np.linalg.norm(force, axis=0))[3:], rtol=1e-3
+    )

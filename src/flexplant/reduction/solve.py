@@ -11,9 +11,9 @@ import scipy.sparse as sp
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
-from ..structure.counted import counted_modes, residuals
+from ..structure.counted import counted_modes
 from ..structure.eigen import elastic_modes, signed
-from ..structure.factor import DENSE_LIMIT, dense, diagonal
+from ..structure.factor import DENSE_LIMIT, by_rows, dense, diagonal
 from ..structure.shifted import stiffness_factor
 from ..values import FloatArray, positive
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
@@ -99,7 +99,8 @@ def solve_modes(
     # one factor for the modes and for the attachment vectors, while it is held here
     held = stiffness_factor(model) if at and _is_large(model) else None
     omega, phi, certificate = _undamped(model, kept, top)
-    certificate = _check(model, omega, phi) | certificate
+    orthonormality, residual = _check(model, omega, phi)
+    certificate["orthonormality"] = orthonormality
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _complex_modes(model, kept, top, names)
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
@@ -121,7 +122,7 @@ def solve_modes(
         vector_omega=vector_omega,
         vector_zeta=_vector_zeta(model, vectors, vector_omega, damping, compliance_damping),
         vector_dofs=names,
-        residual=residuals(model, omega**2, phi)[0],
+        residual=residual,
         certificate=certificate,
     )
 
@@ -193,16 +194,17 @@ def _is_large(model: FEModel) -> bool:
     return model.n_dof > DENSE_LIMIT and sp.issparse(model.K) and sp.issparse(model.M)
 
 
-def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> dict[str, float]:
+def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[float, FloatArray]:
     """Raise SolverError unless shapes are M-orthonormal and fulfil the eigenvalue problem."""
-    mass = np.asarray(model.M @ phi)
+    mass = by_rows(model.M) @ phi
     error = float(np.abs(phi.T @ mass - np.eye(omega.size)).max(initial=0.0))
     if not error <= _ORTHONORMAL:
         raise SolverError(
             f"modes are M-orthonormal only to {error:.2g} (limit {_ORTHONORMAL:g}): M is too badly "
             "conditioned. Look for DOFs with next to no mass."
         )
-    residual = np.asarray(model.K @ phi) - mass * omega**2
+    force = by_rows(model.K) @ phi
+    residual = force - mass * omega**2
     size = np.linalg.norm(residual / np.sqrt(diagonal(model.M))[:, None], axis=0)
     limit = _RESIDUAL[0] * omega**2 + _RESIDUAL[1] * _largest(model)
     if not np.all(size <= limit):
@@ -211,7 +213,9 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> dict[str, floa
             f"mode {i + 1} at {omega[i] / (2 * np.pi):.5g} Hz leaves a residual of {size[i]:.2g} "
             f"(limit {limit[i]:.2g}) in the eigenvalue problem: not a mode of this model."
         )
-    return {"orthonormality": error}
+    elastic = omega > 0
+    scale = np.where(elastic, np.linalg.norm(force, axis=0), 1.0)
+    return error, np.where(elastic, np.linalg.norm(residual, axis=0), 0.0) / scale
 
 
 def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:

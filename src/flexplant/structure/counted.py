@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import SolverError
 from ..values import FloatArray
 from .eigen import check_stiffness
+from .factor import by_rows
 from .lanczos import FOUND, BlockLanczos
 from .model import FEModel
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
+from .threads import one_thread
 
 #: modes beyond the last wanted one among which a gap is looked for
 _EXTRA = 4
@@ -61,6 +61,13 @@ def counted_modes(
     SolverError
         When the count does not agree, or is not sure.
     """
+    with one_thread():
+        return _counted(model, count, top)
+
+
+def _counted(
+    model: FEModel, count: int, top: float
+) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
     factor: StiffnessFactor | None = stiffness_factor(model)
     largest = factor.largest if factor else 0.0
@@ -116,31 +123,30 @@ def _search(
     lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed)
     theta, phi = lanczos.lowest(want)
     for tolerance in (1e-2 * FOUND, 1e-4 * FOUND):
-        left, rounding = residuals(model, factor.sigma + 1 / theta, phi)
+        left, rounding = _residuals(model, factor.sigma + 1 / theta, phi)
         if np.all(left <= np.maximum(_RESIDUAL, _ROUNDINGS * rounding)):
             break
         theta, phi = lanczos.lowest(want, tolerance)
     return phi
 
 
-def residuals(
+def _residuals(
     model: FEModel, squares: FloatArray, phi: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, and the rounding in it."""
-    K: Any = model.K
-    force = np.asarray(K @ phi)
+    K = by_rows(model.K)
+    force = K @ phi
     size = np.linalg.norm(force, axis=0)
-    size[size == 0] = 1.0
-    left = np.linalg.norm(force - np.asarray(model.M @ phi) * squares, axis=0)
+    left = np.linalg.norm(force - (by_rows(model.M) @ phi) * squares, axis=0)
     rounding = np.finfo(np.float64).eps * np.linalg.norm(abs(K) @ np.abs(phi), axis=0)
     return left / size, rounding / size
 
 
 def _rayleigh_ritz(model: FEModel, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    stiffness = phi.T @ np.asarray(model.K @ phi)
-    mass = phi.T @ np.asarray(model.M @ phi)
+    stiffness = phi.T @ (by_rows(model.K) @ phi)
+    mass = phi.T @ (by_rows(model.M) @ phi)
     squares, mix = la.eigh(0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T))
-    return squares, phi @ mix
+    return squares, np.asarray(phi @ mix)
 
 
 def _apart(squares: FloatArray, count: int, top: float) -> bool:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import scipy.linalg as la
-import scipy.sparse as sp
 
 from ..errors import SolverError
 from ..values import FloatArray, Matrix
+from .factor import by_rows
 
 #: vectors that are solved for at a time
 BLOCK = 8
@@ -52,7 +51,7 @@ class BlockLanczos:
         block: int = BLOCK,
     ) -> None:
         self._solve = solve
-        self._M: Any = sp.csr_array(M.T) if sp.issparse(M) else M
+        self._M = by_rows(M)
         n, self._r = locked.shape
         self._block = min(block, n - self._r)
         self._rng = np.random.default_rng(seed)

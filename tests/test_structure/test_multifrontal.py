@@ -1,0 +1,146 @@
+"""The multifrontal factor and its order: solutions, definiteness and counts beside dense LAPACK."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+import scipy.sparse as sp
+from hypothesis import given
+from hypothesis import strategies as st
+
+import meshes
+from flexplant.errors import SolverError
+from flexplant.structure.factor import is_positive_definite, lowest_eigenvalue_bound
+from flexplant.structure.multifrontal import MultifrontalCholesky, multifrontal_inertia
+from flexplant.structure.ordering import dissect
+
+
+def random_sparse(seed, n, links):
+    """A symmetric positive definite matrix of a random graph, possibly in several pieces."""
+    rng = np.random.default_rng(seed)
+    i, j = rng.integers(0, n, (2, links))
+    off = sp.coo_array((rng.standard_normal(links), (i, j)), shape=(n, n))
+    A = sp.csc_array(off + off.T)
+    return sp.csc_array(A + sp.diags_array(np.asarray(abs(A).sum(axis=1)) + rng.random(n) + 0.1))
+
+
+def check_order(A, dissection):
+    """Every DOF once; each front's rows hold all later entries of its columns and children."""
+    n = A.shape[0]
+    assert np.array_equal(np.sort(dissection.order), np.arange(n))
+    position = np.argsort(dissection.order)
+    seen = 0
+    for front in dissection.fronts:
+        assert front.first == seen
+        seen = front.last
+        columns = A[:, dissection.order[front.first : front.last]]
+        later = position[np.unique(columns.nonzero()[0])]
+        assert set(later[later >= front.last]) <= set(front.rows)
+        for child in front.children:
+            rest = dissection.fronts[child].rows
+            assert set(rest[rest >= front.last]) <= set(front.rows)
+    assert seen == n
+
+
+@given(
+    seed=st.integers(0, 10**6),
+    n=st.integers(1, 90),
+    density=st.floats(0.0, 4.0),
+    leaf=st.integers(1, 30),
+)
+def test_random_graphs(seed, n, density, leaf):
+    A = random_sparse(seed, n, int(density * n))
+    rng = np.random.default_rng(seed)
+    for xyz in (None, rng.random((n, 3)), np.zeros((n, 3))):
+        dissection = dissect(A, None, xyz, leaf=leaf)
+        check_order(A, dissection)
+        b = rng.standard_normal((n, 3))
+        x = MultifrontalCholesky(A, dissection).solve(b)
+        np.testing.assert_allclose(
+            x, la.solve(A.toarray(), b, assume_a="pos"), rtol=1e-8, atol=1e-10
+        )
+        shift = rng.uniform(0, A.diagonal().max())
+        indefinite = sp.csc_array(A - shift * sp.eye_array(n))
+        expected = np.count_nonzero(la.eigvalsh(indefinite.toarray()) < 0)
+        assert multifrontal_inertia(indefinite, dissection) == expected
+
+
+@pytest.mark.parametrize("mesh", [meshes.plate(14), meshes.solid(6, 5, 4)], ids=["plate", "solid"])
+@pytest.mark.parametrize("known", [True, False])
+def test_meshes(mesh, known):
+    M, K, nodes, xyz, _ = mesh
+    dissection = dissect(K, nodes, xyz if known else None, leaf=40)
+    check_order(sp.csc_array(abs(K) + abs(M)), dissection)
+    squares = la.eigh(K.toarray(), M.toarray(), eigvals_only=True)
+    n_rigid = 6 if mesh[4][0] == "x" else 3
+    for k in (n_rigid, n_rigid + 4, 60, len(squares) // 2, len(squares) - 3):
+        k += int(np.argmax(np.diff(squares[k : k + 4])))  # between repeated ones there is no gap
+        shift = 0.5 * (squares[k] + squares[k + 1])
+        assert multifrontal_inertia(sp.csc_array(K - shift * M), dissection) == k + 1
+    b = np.random.default_rng(1).standard_normal(len(nodes))
+    A = sp.csc_array(K + squares[n_rigid] * M)
+    x = MultifrontalCholesky(A, dissection).solve(b)
+    assert la.norm(A @ x - b) < 1e-10 * la.norm(b)
+    # DOFs of a node stay together
+    assert np.all(np.ptp(nodes[dissection.order].reshape(-1, 3), axis=1) == 0)
+
+
+def test_fill_is_that_of_nested_dissection():
+    _, K, nodes, xyz, _ = meshes.plate(60)
+    known = dissect(K, nodes, xyz)
+    assert known.n_factor < 31 * K.shape[0] * np.log2(61**2)
+    assert dissect(K, nodes).n_factor < 1.6 * known.n_factor
+    # coordinates that say nothing about the graph are not followed
+    wrong = np.random.default_rng(0).permutation(xyz)
+    assert dissect(K, nodes, wrong).n_factor < 1.6 * known.n_factor
+
+
+def test_a_hub_does_not_spoil_the_order():
+    _, K, nodes, xyz, _ = meshes.plate(40)
+    n = K.shape[0]
+    arms = sp.csc_array((np.full(n // 3, -1.0), (np.arange(0, n, 3), np.full(n // 3, 600))), (n, n))
+    spider = sp.csc_array(K + 1e9 * sp.eye_array(n) + arms + arms.T)
+    dissection = dissect(spider, nodes, xyz)
+    assert dissection.n_factor < 1.5 * dissect(K, nodes, xyz).n_factor
+    b = np.ones(n)
+    assert la.norm(spider @ MultifrontalCholesky(spider, dissection).solve(b) - b) < 1e-9
+
+
+def test_indefinite_and_singular_matrices_are_refused():
+    A = random_sparse(3, 60, 150)
+    with pytest.raises(SolverError, match="not positive"):
+        MultifrontalCholesky(sp.csc_array(A - 3 * sp.eye_array(60)))
+
+
+@pytest.mark.parametrize("tiny", [1e-17, 0.0])
+def test_a_count_with_unstable_pivots_raises(tiny):
+    # leaves of one DOF each, next to singular: nothing to pivot with
+    A = sp.csc_array([[tiny, 1.0, 0.0], [1.0, 1.0, 1.0], [0.0, 1.0, tiny]])
+    dissection = dissect(A, None, np.eye(3) * 0 + np.arange(3)[:, None], leaf=1)
+    assert len(dissection.fronts) == 3
+    with pytest.raises(SolverError, match="another frequency"):
+        multifrontal_inertia(A, dissection)
+
+
+def test_definiteness_of_large_mass_matrices():
+    mesh = meshes.plate(64)
+    M = mesh[0]
+    scaled = M / M.diagonal().max()
+    assert is_positive_definite(M)
+    assert is_positive_definite(M, nodes=mesh[2], xyz=mesh[3])
+    # one DOF out of 12 675 with a little too little mass
+    lowest = la.eigvalsh(meshes.plate(3)[0].toarray())[0]
+    assert lowest > 0
+    row = 6000
+    bad = M.tolil()
+    bad[row, row] = 0.2 * M[row, row]
+    assert not is_positive_definite(sp.csc_array(bad))
+    assert lowest_eigenvalue_bound(sp.csc_array(scaled)) < 1
+
+
+def test_the_bound_is_below_the_lowest_eigenvalue():
+    rng = np.random.default_rng(5)
+    for lowest in (0.3, 0.02, -0.02):
+        A = sp.csc_array(sp.diags_array(np.append(rng.uniform(0.4, 1, 3000), lowest)))
+        bound = lowest_eigenvalue_bound(A)
+        assert bound < lowest
+        assert (bound > 0) == (lowest > 0)
