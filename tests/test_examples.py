@@ -98,7 +98,7 @@ def test_what_the_update_buys(result):
         for (_, rms, half), pin in zip(
             result["cases"][zeta]["errors"][1e-3].values(), wanted, strict=True
         ):
-            assert 0 < half < 0.2 * rms
+            assert 0 < half < 0.25 * rms  # five seeds: wide where modes ring for seconds
             assert abs(1e9 * rms - pin) < 2e9 * half
     predicted = errors[1e-3]["updated"][0]
     assert predicted == pytest.approx(0.305e-9, rel=2e-2)  # notes.md
