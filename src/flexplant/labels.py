@@ -209,6 +209,7 @@ class DofSet(Value):
         """Return the rows of several DOFs, in the order given."""
         if isinstance(labels, str):
             labels = [labels]
+        labels = _listed(labels, "labels", "a list of DOF labels such as '41:z'")
         return np.array([self.index(label) for label in labels], dtype=np.int64)
 
     def select(self, labels: Iterable[str]) -> DofSet:
@@ -255,7 +256,8 @@ class DofSet(Value):
                 )
             keep &= np.isin(self.nodes, wanted)
         if directions is not None:
-            named = {directions} if isinstance(directions, str) else set(directions)
+            given = [directions] if isinstance(directions, str) else directions
+            named = set(_listed(given, "directions", "one or more of x, y, z, rx, ry, rz"))
             absent = sorted(str(d) for d in named - set(self.directions))
             if absent:
                 raise LabelError(
@@ -386,7 +388,7 @@ class DofSet(Value):
             with open(table, newline="", encoding="utf-8") as file:
                 rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
         else:
-            rows = list(table)
+            rows = _listed(table, "a DOF table", "a CSV file or a list of mappings")
         if not rows or not all(isinstance(row, Mapping) for row in rows):
             raise LabelError(
                 "a DOF table needs rows with columns node, direction, x, y, z, got "
@@ -416,6 +418,12 @@ def _number(row: Mapping[str, Any], column: str, line: int) -> float:
         ) from None
 
 
+def _listed(items: Any, name: str, form: str) -> list[Any]:
+    if not isinstance(items, Iterable):
+        raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
+    return list(items)
+
+
 def _node_numbers(nodes: Any) -> IntArray:
     try:
         numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
@@ -437,7 +445,7 @@ def _directions(directions: Any) -> tuple[str, ...]:
             f"[{directions!r}] * n."
         )
     # the million of a large model are strings already, and few different ones
-    given = directions if type(directions) is tuple else tuple(directions)
+    given = tuple(_listed(directions, "directions", "a list with one for each DOF"))
     try:
         if all(type(d) is str for d in set(given)):
             return given

@@ -122,6 +122,8 @@ class ModalDamping(Damping):
                 "mode of the model it damps. Pass modes=[...], counted from 1 with the rigid-body "
                 "modes."
             )
+        if not isinstance(numbers, Iterable):
+            numbers = [numbers]
         listed = [whole(number, "a mode number") for number in numbers]
         if len(listed) != values.size or len(set(listed)) != len(listed):
             raise ModelError(
