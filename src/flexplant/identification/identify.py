@@ -9,14 +9,19 @@ import numpy as np
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
-from ..values import positive, real_array
+from ..structure.threads import one_thread
+from ..values import positive, real_array, whole
 from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
 from .refine import Lines, refined
 from .support import freedom, supported
+from .unexplained import BROADEST, completed, lessened, unexplained, warned
 from .weights import Prepared, prepared
 from .windows import diagram_of, weighted_by_remainder, windows
+
+#: numbers of residual terms of modes above the band that are tried
+UPPER = (3, 5, 7, 9)
 
 
 def stabilisation_diagram(
@@ -75,7 +80,8 @@ def stabilisation_diagram(
     ready, listed = prepared(frf, band), _checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
-    return diagram_of(ready, _affordable(listed, ready), limits, top)
+    with one_thread():
+        return diagram_of(ready, _affordable(listed, ready), limits, top)
 
 
 def identify_modes(
@@ -85,7 +91,7 @@ def identify_modes(
     orders: Iterable[int] | None = None,
     start: PoleSelection | None = None,
     lower: int = 2,
-    upper: int = 3,
+    upper: int | None = None,
     hold: float | None = None,
     dofs: Mapping[str, str] | None = None,
     max_iterations: int = 150,
@@ -100,8 +106,9 @@ def identify_modes(
 
     with residues of rank one, so that close and repeated modes are told apart by several inputs
     and outputs. Rigid-body modes and modes below the band are in 1/s and 1/s^2, those above in
-    the powers of s. Chosen poles that the data do not support (Bayesian information criterion)
-    are left out, unless `start` is given.
+    the powers of s. Chosen poles that noise would feign once in a thousand times are left out;
+    where more than noise is left a pole is added. With `start` neither is done. What then is
+    still not explained is warned of, with its frequency.
 
     Parameters
     ----------
@@ -115,8 +122,11 @@ def identify_modes(
         Of the stabilisation diagram; 2 to 40 by default.
     start : PoleSelection, optional
         Poles chosen by hand, `stabilisation_diagram(frf).select(freq=[...])`.
-    lower, upper : int
-        Numbers of residual terms.
+    lower : int
+        Number of residual terms of rigid-body modes and modes below the band.
+    upper : int, optional
+        Number of those of modes above; when not given 3, and more where the data ask for them:
+        with too few the poles are biased by a standard deviation before the misfit shows it.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of
         a sampled plant.
@@ -131,6 +141,11 @@ def identify_modes(
     IdentifiedModes
         A `MeasuredModes`, sorted by frequency, without mode numbers (see `numbered`). Its
         covariance is enlarged by the misfit where that exceeds one.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the residual of a stretch of lines is more than noise: a missed or merged mode.
 
     Raises
     ------
@@ -147,15 +162,26 @@ def identify_modes(
     Pintelon, Guillaume, Schoukens, "Uncertainty calculation in (operational) modal analysis",
     Mechanical Systems and Signal Processing 21 (2007) 2359-2373.
     """
+    with one_thread():
+        return _identified(frf, band, orders, start, lower, upper, hold, dofs, max_iterations)
+
+
+def _identified(
+    frf: Frf,
+    band: tuple[float, float] | None,
+    orders: Iterable[int] | None,
+    start: PoleSelection | None,
+    lower: int,
+    upper: int | None,
+    hold: float | None,
+    dofs: Mapping[str, str] | None,
+    max_iterations: int,
+) -> IdentifiedModes:
     ready = prepared(frf, band)
     low, high = float(ready.freq[0]), float(ready.freq[-1])
-    for name, number, least in (
-        ("lower", lower, 0),
-        ("upper", upper, 0),
-        ("max_iterations", max_iterations, 1),
-    ):
-        if not isinstance(number, int | np.integer) or number < least:
-            raise ModelError(f"{name} must be a whole number, {least} or more, got {number!r}.")
+    lower = whole(lower, "lower", minimum=0)
+    tried = UPPER if upper is None else (whole(upper, "upper", minimum=0),)
+    max_iterations = whole(max_iterations, "max_iterations")
     rate = None if hold is None else positive(hold, "hold")
     if rate is not None and high > rate / 2 * (1 + 1e-12):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
@@ -178,18 +204,26 @@ def identify_modes(
         chosen = start
     poles, part = chosen.poles, chosen.participation
     for _ in range(1 if ready.known else 2):
-        lines = Lines(ready.freq, ready.data, ready.weight, int(lower), int(upper), rate)
+        # with all residual terms, so that no pole is kept or moved to stand in for one
+        lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate)
         if start is None:
             poles, part = supported(lines, poles, part)
         fit = refined(lines, poles, part, steps=max_iterations)
         if start is None:
-            fewer, part = supported(lines, fit.poles, fit.participation)
+            light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
+            fewer, part = supported(lines, fit.poles[light], fit.participation[:, light])
             if fewer.size < fit.poles.size:
                 fit = refined(lines, fewer, part, steps=max_iterations)
+        lines, fit = lessened(lines, fit, tried[:-1], steps=max_iterations)
+        if start is None:
+            fit, left = completed(lines, fit, steps=max_iterations)
+        else:
+            left = unexplained(lines, fit)
         poles, part = fit.poles, fit.participation
         if not ready.known:
             share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)
+    warned(left)
     return answer(frf, ready, lines, fit, (low, high), labels, diagram)
 
 

@@ -220,3 +220,8 @@ def projected_normal(
 ) -> list[tuple[FloatArray, FloatArray, float]]:
     """Return per output the normal equations of shapes, free of residual terms, and the power."""
     return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).linear
+
+
+def projected_cost(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> float:
+    """Return the cost with the best shapes and residual terms."""
+    return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).cost

@@ -1,29 +1,43 @@
-"""Which poles the data support: by the Bayesian information criterion."""
+"""Which poles the data support: those that noise would feign once in a thousand times."""
 
 from __future__ import annotations
 
 import numpy as np
 import scipy.linalg as la
+from scipy.stats import chi2
 
 from ..values import ComplexArray
 from .refine import Lines, projected_normal
+
+#: probability that noise anywhere in the band passes for a pole
+CHANCE = 1e-3
 
 
 def supported(
     lines: Lines, poles: ComplexArray, part: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Leave out, one by one, poles without which the Bayesian information is higher."""
-    n_out, n_in, n_freq = lines.data.shape
-    price = 2 * (n_out + n_in) * np.log(2 * n_out * n_in * n_freq)
+    """Leave out, one by one, poles that noise may feign."""
+    least = price(lines)
     costs = _Costs(lines, poles, part)
     kept = list(range(poles.size))
     while len(kept) > 1:
         unit = max(1.0, costs.of(kept) / freedom(lines, len(kept)))
         losses = [costs.of([k for k in kept if k != out]) - costs.of(kept) for out in kept]
-        if min(losses) > price * unit:
+        if min(losses) > least * unit:
             break
         kept.pop(int(np.argmin(losses)))
     return poles[kept], part[:, kept]
+
+
+def price(lines: Lines) -> float:
+    """Return by how much a pole must lower the cost.
+
+    Its pole, shape and participation are 2 (n_out + n_in) numbers, so noise lowers the cost by a
+    chi-square of that many degrees; it has as many places to do so as there are lines. A pole kept
+    in vain costs little; one left out biases its neighbours by up to the root of this price.
+    """
+    n_out, n_in, n_freq = lines.data.shape
+    return float(chi2.isf(CHANCE / n_freq, 2 * (n_out + n_in)))
 
 
 class _Costs:

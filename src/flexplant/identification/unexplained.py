@@ -1,0 +1,169 @@
+"""What a fit leaves: lines where more than noise is left, and the pole that would explain it."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import scipy.linalg as la
+from scipy.stats import chi2
+
+from ..errors import FlexplantWarning, SolverError
+from ..values import ComplexArray
+from .refine import Fit, Lines, projected_cost, refined
+from .support import freedom, price
+
+#: lengths [lines] of the stretches that are looked at
+STRETCHES = (3, 9, 27, 81)
+#: standard deviations of a stretch's chi-square above which it is not explained
+LIMIT = 6.0
+#: damping ratios tried for a missed pole, beside the widths that its stretch suggests
+DAMPING = (0.0005, 0.002, 0.008, 0.03)
+#: data without noise leave rounding, which is no noise either
+ROUNDING = 1e-9
+#: poles that may be added, and the damping ratio above which one is no mode
+MOST, BROADEST = 6, 0.2
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A stretch of lines that is not explained: its middle [Hz], width [Hz] and height [sigma]."""
+
+    freq: float
+    width: float
+    height: float
+
+
+def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
+    r"""Return the stretches whose residual is more than noise, the highest first.
+
+    Over L lines of c channels the sum of :math:`2 |e|^2/\sigma^2` is chi-square with 2 c L degrees
+    of freedom. Its middle and spread are also taken from all stretches (median, median absolute
+    deviation): an estimated variance is off everywhere, a missed pole is off in one place.
+
+    Parameters
+    ----------
+    lines : Lines
+        What was fitted.
+    model : (n_out, n_in, n_freq) complex array
+        The fit.
+    used : float
+        Share of the data's freedom that the fit used up.
+    """
+    error = np.abs(lines.data - model) ** 2 * lines.weight**2
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    power = error.sum(axis=(0, 1))
+    found: list[Peak] = []
+    if la.norm(lines.data - model) < ROUNDING * la.norm(lines.data):
+        return found
+    for length in STRETCHES:
+        if 4 * length > power.size:
+            break
+        total = np.convolve(power, np.ones(length), mode="valid")
+        middle = float(np.median(total))
+        spread = 1.4826 * float(np.median(np.abs(total - middle)))
+        freedom = 2.0 * channels * length * (1.0 - used)
+        spread = max(spread, middle / freedom * np.sqrt(2.0 * freedom))
+        # chi-square leans to the right, its cube root does not (Wilson and Hilferty, 1931)
+        height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
+        best = int(np.argmax(height))
+        if height[best] > LIMIT:
+            seen = lines.freq[best : best + length]
+            weight = power[best : best + length]
+            step = float(lines.freq[1] - lines.freq[0])
+            middle_freq = float(seen @ weight / weight.sum())
+            found.append(Peak(middle_freq, step * length, float(height[best])))
+    return sorted(found, key=lambda peak: -peak.height)
+
+
+def candidate(
+    lines: Lines, model: ComplexArray, poles: ComplexArray, part: ComplexArray, peak: Peak
+) -> tuple[ComplexArray, ComplexArray, float]:
+    """Return poles and participation with the one added that explains a peak best, and the cost.
+
+    Frequencies across the peak and some damping ratios are tried; the participation is the
+    leading right singular vector of what the trial pole has in common with the residual.
+    """
+    error = (lines.data - model) * lines.weight**2
+    best: tuple[float, ComplexArray, ComplexArray] | None = None
+    own = np.clip(peak.width / (2 * peak.freq) * np.array([0.3, 1.0]), 1e-5, 0.15)
+    for zeta in np.unique([*DAMPING, *own.tolist()]):
+        for shift in (-0.5, -0.2, 0.0, 0.2, 0.5):
+            omega = 2 * np.pi * (peak.freq + shift * peak.width)
+            pole = omega * (-zeta + 1j * np.sqrt(1 - zeta**2))
+            term = 1.0 / (2j * np.pi * lines.freq - pole)
+            common = error @ term.conj()
+            gain = np.sum(lines.weight**2 * np.abs(term) ** 2, axis=2)
+            sizes, right = la.svd(common / np.sqrt(gain))[1:]
+            score = float(sizes[0])
+            if best is None or score > best[0]:
+                best = score, np.array([pole]), right[0][:, None]
+    assert best is not None  # noqa: S101 - trials were made
+    more = np.concatenate([poles, best[1]])
+    parts = np.concatenate([part, best[2].astype(np.complex128)], axis=1)
+    return more, parts, projected_cost(lines, more, parts)
+
+
+def lessened(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
+    """Return the fit with the fewest residual terms of modes above that the data let pass."""
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    for upper in fewer:
+        less = replace(lines, upper=upper)
+        lost = projected_cost(less, fit.poles, fit.participation) - fit.cost
+        # a term too many costs next to nothing; one too few a bias: so noise may pass 1 in 10
+        if lost < unit * chi2.isf(0.1, channels * (lines.upper - upper)):
+            return less, refined(less, fit.poles, fit.participation, steps=steps)
+    return lines, fit
+
+
+def completed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Fit, list[Peak]]:
+    """Return the fit with the poles added that its residual asks for, and the peaks still left."""
+    left = unexplained(lines, fit)
+    for _ in range(MOST):
+        better = next(filter(None, (_added(lines, fit, peak, steps) for peak in left[:2])), None)
+        if better is None:
+            break
+        fit = better
+        left = unexplained(lines, fit)
+    return fit, left
+
+
+def _added(lines: Lines, fit: Fit, peak: Peak, steps: int) -> Fit | None:
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    least = price(lines) * unit
+    poles, part, cost = candidate(lines, fit.model, fit.poles, fit.participation, peak)
+    if fit.cost - cost < least / 4:
+        return None
+    try:
+        more = refined(lines, poles, part, steps=steps)
+    except SolverError:
+        return None
+    zeta = -more.poles.real / np.abs(more.poles)
+    return more if fit.cost - more.cost > least and zeta.max() < BROADEST else None
+
+
+def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
+    """Return the peaks of what a fit leaves, each once, the highest first."""
+    used = 1.0 - freedom(lines, fit.poles.size) / (2 * fit.model.size)
+    kept: list[Peak] = []
+    for peak in peaks(lines, fit.model, used):
+        if all(abs(peak.freq - other.freq) > max(peak.width, other.width) for other in kept):
+            kept.append(peak)
+    return kept
+
+
+def warned(left: list[Peak]) -> None:
+    """Warn of stretches that no pole explains."""
+    if not left:
+        return
+    listed = ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])
+    warnings.warn(
+        f"more than noise is left near {listed}: a mode may be missed or merged there, and its "
+        "neighbours be off by more than they say. Look at plot.identified and "
+        "plot.stabilisation, choose poles by hand (start=), or narrow the band.",
+        FlexplantWarning,
+        4,
+    )
