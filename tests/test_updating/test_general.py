@@ -394,6 +394,34 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     assert "4 alike" in repr(found)
 
 
+def test_localisation_beside_a_wrong_stiffness(plate):
+    """Hidden 0.5 kg and 2 % of stiffness: alone z8 is not found, with the nuisance it is."""
+    rom = plate.reduced(0.01, True)
+    M, K = oracle.plate()
+    D = oracle.modal_damping(M, K, 0.01)
+    at = oracle.z_dof(0.3, 0.15)
+    M[at, at] += 0.5
+    poles = oracle.poles(M, D, 1.02 * K)[:6]
+    rng = np.random.default_rng(3)
+    std = 2e-5 * np.abs(poles)
+    noise = (rng.normal(size=6) + 1j * rng.normal(size=6)) * std / np.sqrt(2)
+    data = [Eigenvalues(MeasuredModes(poles + noise, modes=range(4, 10), covariance=std**2))]
+    masses = [AddedMass(label, name=label) for label in plate.grid]
+    stiffer = MatrixParameter("stiffness", dK=rom.K)
+    found = localise(rom, data, masses, nuisance=[stiffer], most=1)
+    assert found.chosen == (plate.z8,)
+    assert found.chosen_values[0] == pytest.approx(0.5, rel=2e-3)
+    assert found.nuisance == ("stiffness",)
+    assert found.nuisance_values[0] == pytest.approx(0.02, rel=2e-3)
+    assert "beside stiffness = 0.0" in repr(found)
+    alone = localise(rom, data, masses, most=1)
+    assert alone.chosen != (plate.z8,) or abs(alone.chosen_values[0] - 0.5) > 0.1
+    with pytest.raises(ModelError, match="at once"):
+        localise(rom, data, masses, nuisance=masses[:1])
+    with pytest.raises(ModelError, match="data do not tell"):
+        localise(rom, [data[0].select([4])], masses[:3], nuisance=masses[3:6])
+
+
 def test_localisation_says_when_nothing_changed(chain):
     data = Eigenvalues(measured(changed(chain), 1e-3, seed=4))
     found = localise(chain, [data], [AddedMass(f"{i}:z") for i in range(1, 5)])

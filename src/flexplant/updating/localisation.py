@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations
 from typing import Any
 
@@ -11,10 +11,11 @@ import numpy as np
 
 from ..errors import ModelError, SolverError, unknown_label
 from ..values import FloatArray, Value
+from ..values import whole as counted
 from .methods import TrustRegion
 from .objective import Objective, checked_residuals
 from .parameters import Parameter
-from .search import trust_region
+from .search import Found, trust_region
 from .sensitivity import checked_parameters
 from .sparse_search import bic
 
@@ -47,6 +48,10 @@ class Localisation(Value):
         Its values.
     chosen_bic, nothing_bic : float
         BIC of the subset, and of no change.
+    nuisance : sequence of n str
+        Parameters that were fitted along with every candidate, and with none.
+    nuisance_values : (n,) array
+        Theirs beside the chosen subset.
     """
 
     candidates: tuple[str, ...]
@@ -57,10 +62,16 @@ class Localisation(Value):
     chosen_values: FloatArray
     chosen_bic: float
     nothing_bic: float
+    nuisance: tuple[str, ...] = ()
+    nuisance_values: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
         self._set(
-            values=self.values, score=self.score, bic=self.bic, chosen_values=self.chosen_values
+            values=self.values,
+            score=self.score,
+            bic=self.bic,
+            chosen_values=self.chosen_values,
+            nuisance_values=self.nuisance_values,
         )
 
     def __getitem__(self, name: str) -> float:
@@ -92,6 +103,12 @@ class Localisation(Value):
         )
         if len(self.alike) > 1:
             best += f"; {len(self.alike)} alike"
+        if self.nuisance:
+            beside = ", ".join(
+                f"{name} = {value:.4g}"
+                for name, value in zip(self.nuisance, self.nuisance_values.tolist(), strict=True)
+            )
+            found = f"{found or 'no change'} beside {beside}"
         return (
             f"<Localisation: {found or 'no change'} (BIC {self.chosen_bic:.4g}, no change "
             f"{self.nothing_bic:.4g})\n  explained alone: {best}>"
@@ -103,6 +120,7 @@ def localise(
     residuals: Sequence[Any],
     candidates: Sequence[Parameter],
     *,
+    nuisance: Sequence[Parameter] = (),
     most: int = 3,
     screen: int = 40,
 ) -> Localisation:
@@ -114,6 +132,11 @@ def localise(
     Bayesian information criterion ``chi^2 + k ln n`` (``n ln(e/n) + k ln n`` where the noise is
     not known) chooses. To know what stands out, give more data than `most` unknowns.
 
+    What is wrong everywhere (Young's modulus, damping) hides what is wrong in one place: as
+    `nuisance` it is fitted anew with every candidate and with none at all, so that a candidate is
+    scored by what only it explains: ``(J_c^T r)^2 / (J_c^T J_c)`` with r and J_c free of what the
+    nuisance explains, before the exact fits.
+
     Parameters
     ----------
     model : ReducedModel or FEModel
@@ -122,6 +145,8 @@ def localise(
         Measured with the change.
     candidates : sequence of c Parameter
         Added masses or springs at every DOF in question, say.
+    nuisance : sequence of Parameter, optional
+        Unknowns beside the candidates; their priors are not used.
     most : int
         Largest subset.
     screen : int
@@ -134,24 +159,34 @@ def localise(
     Raises
     ------
     ModelError, LabelError
-        As `update`; or when the counts make no sense.
+        As `update`; or when the counts make no sense, a nuisance is a candidate too, or there
+        are no more data than nuisance parameters.
 
     References
     ----------
     Schwarz: Estimating the dimension of a model, Annals of Statistics 6, 1978.
     """
     listed = checked_parameters(candidates)
+    beside = checked_parameters(nuisance) if len(nuisance) else ()
+    both = sorted({q.name for q in listed} & {q.name for q in beside})
+    if both:
+        raise ModelError(
+            f"{', '.join(both)}: a candidate and a nuisance at once. Leave it out of one of them."
+        )
     given = checked_residuals(residuals)
-    for name, value in (("most", most), ("screen", screen)):
-        if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-            raise ModelError(f"{name} must be a whole number from 1, got {value!r}.")
-    whole = Objective(model, listed, given, prior=False)
-    start = whole.default_start
-    point = whole.begin(start)
+    most, screen = counted(most, "most"), counted(screen, "screen")
+    whole = Objective(model, [*listed, *beside], given, prior=False)
+    fits = _Fits(whole, given, len(listed))
+    begin = fits.begin()
+    point = whole.begin(begin)
     r = whole.values(point)
-    error, rows = float(r @ r), r.size
-    explained = _screened(whole, given, point, r)
-    fits = _Fits(whole, given, start)
+    error, rows, n = float(r @ r), r.size, len(beside)
+    if rows <= n:
+        raise ModelError(
+            f"{rows} data do not tell {n} nuisance parameters, let alone a candidate beside them: "
+            "measure more modes or lines."
+        )
+    explained = _screened(whole, given, point, r, len(listed))
     values, score = np.full(len(listed), np.nan), explained / error
     criterion = np.full(len(listed), np.inf)
     for i in np.argsort(-explained)[:screen].tolist():
@@ -159,20 +194,20 @@ def localise(
         score[i] = 0.0
         if found is not None:
             values[i], score[i] = found[0][0], 1 - found[1] / error
-            criterion[i] = bic(found[1], rows, 1, whole.noisy)
+            criterion[i] = bic(found[1], rows, 1 + n, whole.noisy)
     for i in np.argsort(-explained)[screen:].tolist():
         # known to first order only: never better than what was fitted exactly
         score[i] = min(score[i], float(np.nanmin(score[np.isfinite(criterion)], initial=1.0)))
-    nothing = bic(error, rows, 0, whole.noisy)
+    nothing = bic(error, rows, n, whole.noisy)
     best: tuple[float, tuple[int, ...]] = (nothing, ())
     ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
     layer = [(i,) for i in ranked]
-    for size in range(1, min(most, rows - 1) + 1):
+    for size in range(1, min(most, rows - 1 - n) + 1):
         scores = []
         for subset in layer:
             found = fits.fit(subset)
             if found is not None:
-                scores.append((bic(found[1], rows, size, whole.noisy), subset))
+                scores.append((bic(found[1], rows, size + n, whole.noisy), subset))
         if not scores:
             break
         least = min(scores)
@@ -181,63 +216,86 @@ def localise(
         grown |= set(combinations(sorted(ranked[:PAIRS]), 2)) if size == 1 else set()
         layer = sorted(grown)
     chosen = fits.fit(best[1]) if best[1] else None
+    end = begin[len(listed) :] if chosen is None else chosen[0][len(best[1]) :]
     return Localisation(
         candidates=tuple(q.name for q in listed),
         values=values,
         score=score,
         bic=criterion,
         chosen=tuple(listed[i].name for i in best[1]),
-        chosen_values=np.zeros(0) if chosen is None else np.array(chosen[0]),
+        chosen_values=np.zeros(0) if chosen is None else np.array(chosen[0][: len(best[1])]),
         chosen_bic=best[0],
         nothing_bic=nothing,
+        nuisance=tuple(q.name for q in beside),
+        nuisance_values=np.array(end),
     )
 
 
-def _screened(whole: Objective, residuals: Any, point: Any, r: FloatArray) -> FloatArray:
-    """Return what each candidate explains to first order: ``(J_c^T r)^2 / (J_c^T J_c)``.
+def _screened(
+    whole: Objective, residuals: Any, point: Any, r: FloatArray, count: int
+) -> FloatArray:
+    """Return what each candidate explains to first order, what the nuisance explains taken out.
 
     Where modes are repeated their slopes depend on the candidate, so each is taken by itself.
     """
     if not point.turned:
         J = whole.slopes(point)
-        length = np.sum(J**2, axis=0)
-        return np.asarray((J.T @ r) ** 2 / np.where(length > 0, length, np.inf))
+        return _explained(J[:, :count], J[:, count:], r)
     found = []
-    for b in range(point.p.size):
+    for b in range(count):
+        picked = [b, *range(count, point.p.size)]
         alone = Objective(
             whole.family.model,
-            whole.parameters[b : b + 1],
+            [whole.parameters[i] for i in picked],
             residuals,
             prior=False,
-            family=whole.family.of([b]),
+            family=whole.family.of(picked),
         )
-        J = alone.slopes(alone.begin(point.p[b : b + 1]))[:, 0]
-        found.append(float(J @ r) ** 2 / max(float(J @ J), 1e-300))
+        J = alone.slopes(alone.begin(point.p[picked]))
+        found.append(_explained(J[:, :1], J[:, 1:], r)[0])
     return np.array(found)
 
 
-class _Fits:
-    """Exact fits of subsets of the candidates, each done once."""
+def _explained(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
+    Q = np.linalg.qr(beside)[0]
+    whole = np.sum(J**2, axis=0)
+    J, r = J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
+    length = np.sum(J**2, axis=0)
+    # a candidate that is all nuisance explains nothing of its own
+    own = length > 1e-12 * whole
+    return np.asarray((J.T @ r) ** 2 / np.where(own, length, np.inf))
 
-    def __init__(self, whole: Objective, residuals: Any, start: FloatArray) -> None:
-        self.whole, self.residuals, self.start = whole, residuals, start
+
+class _Fits:
+    """Exact fits of subsets of the candidates, the nuisance beside them, each done once."""
+
+    def __init__(self, whole: Objective, residuals: Any, count: int) -> None:
+        self.whole, self.residuals = whole, residuals
+        self.beside = list(range(count, len(whole.parameters)))
+        self.start = whole.default_start
         self.done: dict[tuple[int, ...], tuple[FloatArray, float] | None] = {}
 
+    def begin(self) -> FloatArray:
+        """Return the start with the nuisance fitted alone."""
+        if self.beside:
+            p = self._search([]).p
+            self.start = self.start.copy()
+            self.start[self.beside] = p
+        return self.start
+
     def fit(self, subset: tuple[int, ...]) -> tuple[FloatArray, float] | None:
-        """Return the values and the error of a subset, None when it cannot be fitted."""
+        """Return values (those of the nuisance last) and error, None when it cannot be fitted."""
         if subset not in self.done:
-            self.done[subset] = self._fitted(subset)
+            try:
+                found = self._search([*subset])
+                self.done[subset] = found.p, 2 * found.cost
+            except (ModelError, SolverError):
+                self.done[subset] = None
         return self.done[subset]
 
-    def _fitted(self, subset: tuple[int, ...]) -> tuple[FloatArray, float] | None:
-        picked = list(subset)
+    def _search(self, subset: list[int]) -> Found:
+        picked = [*subset, *self.beside]
         family = self.whole.family.of(picked)
         parameters = [self.whole.parameters[i] for i in picked]
         objective = Objective(family.model, parameters, self.residuals, prior=False, family=family)
-        try:
-            found = trust_region(
-                objective, self.start[picked], TrustRegion(), most=50, tolerance=1e-8
-            )
-        except (ModelError, SolverError):
-            return None
-        return found.p, 2 * found.cost
+        return trust_region(objective, self.start[picked], TrustRegion(), most=50, tolerance=1e-8)
