@@ -96,7 +96,7 @@ def test_poles(zeta):
     assert tuple(found.modes) == (6, 7)
     if zeta == 0.01:
         assert np.abs(found.poles / PRINTED - 1).max() < 6e-3
-    more = stage(zeta).poles([4, 5, 8, 243])
+    more = stage(zeta).poles([4, 5, 8, 20])
     assert more.poles[0].imag == pytest.approx(2 * np.pi * 245.754, rel=1e-4)  # a mass on its node
     assert np.all(np.diff(np.abs(more.poles)) > 0)
 
@@ -325,7 +325,7 @@ def test_refusals():
             with pytest.raises(ModelError):
                 wafer_stage(**{name: bad})
     for bad in (0.5, -1):
-        with pytest.raises(ModelError, match="delay is a whole number"):
+        with pytest.raises(ModelError, match="delay must be a whole number"):
             wafer_stage(delay=bad)
     with pytest.raises(ModelError):
         wafer_stage(elements=(0, 8))
