@@ -121,12 +121,14 @@ def _search(
 ) -> FloatArray:
     """Return shapes (n, want) beside the locked ones, residuals down to rounding."""
     lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed)
-    theta, phi = lanczos.lowest(want)
+    extra = min(_EXTRA, want - 1)
+    theta, phi = lanczos.lowest(want, extra=extra)
     for tolerance in (1e-2 * FOUND, 1e-4 * FOUND):
         left, rounding = _residuals(model, factor.sigma + 1 / theta, phi)
-        if np.all(left <= np.maximum(_RESIDUAL, _ROUNDINGS * rounding)):
+        fine = left <= np.maximum(_RESIDUAL, _ROUNDINGS * rounding)
+        if np.all(fine[: want - extra]):
             break
-        theta, phi = lanczos.lowest(want, tolerance)
+        theta, phi = lanczos.lowest(want, tolerance, extra=extra)
     return phi
 
 

@@ -15,6 +15,8 @@ from .factor import by_rows
 BLOCK = 8
 #: residual of a Ritz pair of the inverse, relative to its value, at which it counts as found
 FOUND = 1e-11
+#: residual at which the value, in error by its square, is known to rounding
+VALUE = 1e-6
 #: steps between two restarts
 _STEPS = 16
 _RESTARTS = 60
@@ -69,8 +71,12 @@ class BlockLanczos:
         room = 2 * self._block + max(_STEPS * self._block, want + self._block)
         self._capacity = self._r + want + self._block + room
 
-    def lowest(self, count: int, tolerance: float = FOUND) -> tuple[FloatArray, FloatArray]:
+    def lowest(
+        self, count: int, tolerance: float = FOUND, *, extra: int = 0
+    ) -> tuple[FloatArray, FloatArray]:
         """Return the `count` largest theta found and their shapes (n, count).
+
+        The last `extra` of them need not be shapes yet, only values.
 
         Raises
         ------
@@ -83,7 +89,8 @@ class BlockLanczos:
             if self._m + self._r >= n or not self._next.shape[1]:
                 return self._ritz(count)
             theta, mix, error = self._step()
-            done = theta.size >= count and bool(np.all(error[:count] <= tolerance * theta[:count]))
+            asked = np.where(np.arange(count) < count - extra, tolerance, max(tolerance, VALUE))
+            done = theta.size >= count and bool(np.all(error[:count] <= asked * theta[:count]))
             if done:
                 return theta[:count], self._V[self._r : self._r + self._m].T @ mix[:, :count]
             if self._r + self._m + 2 * self._next.shape[1] > self._capacity:
