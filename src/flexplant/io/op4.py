@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -239,7 +240,8 @@ class _Words:
         return start, stop
 
     def integers(self, at: int, count: int) -> list[int]:
-        return [int(i) for i in np.frombuffer(self.content, self.kind, count, at)]
+        form = f"{self.layout.order}{count}{'i' if self.layout.integer == 4 else 'q'}"
+        return list(struct.unpack_from(form, self.content, at))
 
 
 def _binary(content: bytes, path: str) -> Iterable[tuple[str, Op4Matrix, int]]:
@@ -326,14 +328,19 @@ def _matrix(
     if row.size and (row.min() < 1 or np.any(row - 1 + length > shape[0])):
         bad = int(np.argmax((row < 1) | (row - 1 + length > shape[0])))
         raise _outside(words.path, int(place[bad]), name, int(row[bad] - 1 + length[bad]), shape)
+    # strings in the order of columns, as they are in the file
+    order = np.argsort(column, kind="stable")
+    place, length, row, column = place[order], length[order], row[order], column[order]
     # where each value of each string lies in the file, and which row it is of
     inside = np.arange(int(length.sum())) - np.repeat(np.cumsum(length) - length, length)
     at = np.repeat(place, length) + inside * per
     data = _gather(words.content, at, per).view(value).astype(target)
     rows = np.repeat(row - 1, length) + inside
-    return sp.csc_array(
-        sp.coo_array((data, (rows, np.repeat(column, length))), shape=shape), dtype=target
-    )
+    counts = np.bincount(column, weights=length, minlength=shape[1])
+    pointers = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    matrix = sp.csc_array((data, rows, pointers), shape=shape)
+    matrix.sum_duplicates()
+    return matrix
 
 
 def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str) -> Any:
