@@ -22,7 +22,7 @@ _WIDTH = 100
 class ModelCheck(Value):
     """What `check` found, line by line; printed it is a table.
 
-    Attributes
+    Parameters
     ----------
     lines : tuple of (verdict, subject, finding, next step)
         Verdicts are "ok", "note" (worth a look) and "fail" (no model, or a wrong one).

@@ -14,8 +14,11 @@ import scipy.sparse as sp
 from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray, IntArray, Value, name_list, real_array, short, whole
+from .completion import completed as completed
+from .completion import square
 from .condense import condensed, no_mass
 from .factor import is_positive_definite
+from .local_axes import cosines
 from .model import FEModel
 from .precision import endangered
 from .singular_mass import left_out, null_motions, projected
@@ -310,7 +313,7 @@ class FEMatrices(Value):
         """
         if self.dofs is None:
             raise LabelError("the rows have no names yet: with_dofs(dofs) gives them.")
-        C = _cosines(self.dofs, rotations)
+        C = cosines(self.dofs, rotations)
         turned: dict[str, Any] = {}
         for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D)):
             if matrix is not None:
@@ -437,105 +440,3 @@ def taken(dofs: DofSet | None, rows: IntArray) -> DofSet | None:
         return None
     names = np.array(DIRECTIONS, dtype=object)
     return DofSet(dofs.nodes[rows], tuple(names[dofs.kinds[rows]]), dofs.xyz[rows])
-
-
-def square(given: Any, name: str) -> sp.csc_array:
-    """Return a square sparse matrix with finite real entries, without stored zeros.
-
-    Raises
-    ------
-    ShapeError
-        When it is not square.
-    ModelError
-        When entries are no finite real numbers.
-    """
-    stored: Any = given
-    if not sp.issparse(given):
-        array = real_array(given, name)
-        if array.ndim != 2 or array.shape[0] != array.shape[1]:
-            raise ShapeError(f"{name} must be square, got shape {array.shape}.")
-        return sp.csc_array(array)
-    listed: Any = stored.tocoo()
-    if listed.ndim != 2 or listed.shape[0] != listed.shape[1]:
-        raise ShapeError(f"{name} must be square, got shape {listed.shape}.")
-    data: FloatArray = real_array(listed.data, f"stored entries of {name}")
-    matrix: Any = sp.csc_array((data, (listed.row, listed.col)), shape=listed.shape)
-    matrix.sum_duplicates()
-    matrix.eliminate_zeros()
-    return cast("sp.csc_array", matrix)
-
-
-def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
-    """Return a symmetric matrix of which a file holds one triangle, and a note of what was done.
-
-    A matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
-    one that stores both is left as it is, for `check` to compare them.
-
-    Parameters
-    ----------
-    given : (n, n) array or sparse matrix
-        As stored.
-    name : str
-        What to call it.
-
-    Returns
-    -------
-    matrix : (n, n) csc_array
-    note : str or None
-
-    Raises
-    ------
-    ShapeError
-        When it is not square.
-    ModelError
-        When entries are no finite real numbers.
-
-    Examples
-    --------
-    >>> completed(np.array([[2.0, -1.0], [0.0, 1.0]]), "K")[1]
-    'K: upper triangle only, completed'
-    """
-    matrix = square(given, name)
-    lower: Any = sp.tril(matrix, -1, format="csc")
-    upper: Any = sp.triu(matrix, 1, format="csc")
-    if not lower.nnz and not upper.nnz:
-        return matrix, None
-    pattern = [abs(part).astype(bool).astype(np.int8) for part in (lower, upper.T)]
-    if pattern[0].multiply(pattern[1]).nnz:
-        return matrix, None
-    half: Any = lower + upper
-    which = "each pair once" if lower.nnz and upper.nnz else None
-    which = which or ("upper triangle only" if upper.nnz else "lower triangle only")
-    full: Any = sp.csc_array(half + half.T + sp.diags_array(matrix.diagonal()))
-    return full, f"{name}: {which}, completed"
-
-
-def _cosines(dofs: DofSet, rotations: Any) -> Any:
-    """Return C (n, n), sparse, ``q_local = C q_global``."""
-    rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
-    for node, given in dict(rotations).items():
-        cosines = real_array(given, f"rotations[{node}]", (3, 3))
-        if np.abs(cosines @ cosines.T - np.eye(3)).max() > 1e-6:
-            raise ModelError(
-                f"the direction cosines of node {node} are not orthogonal, got "
-                f"{cosines.round(6).tolist()}: row i holds the global components of local axis i."
-            )
-        found = np.flatnonzero(dofs.nodes == node)
-        if not found.size:
-            raise LabelError(f"rotations name node {node}, which has no DOF: {dofs!r}.")
-        for first in (0, 3):
-            kinds = dofs.kinds[found]
-            three = found[(kinds >= first) & (kinds < first + 3)]
-            if three.size not in (0, 3):
-                raise ModelError(
-                    f"node {node} has a local coordinate system, but only {three.size} of three "
-                    "directions: the held one would be oblique in global directions. Leave its "
-                    "DOFs local, place ports elsewhere, or export it unconstrained."
-                )
-            three = three[np.argsort(dofs.kinds[three])]
-            if three.size:
-                rows.append(np.repeat(three, 3))
-                columns.append(np.tile(three, 3))
-                values.append((cosines - np.eye(3)).ravel())
-    entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    return sp.csc_array(entries, shape=(len(dofs), len(dofs)))
