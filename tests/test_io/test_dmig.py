@@ -203,15 +203,21 @@ def test_grids_in_coordinate_systems(tmp_path):
 
 
 def test_displacements_in_local_directions_are_turned(tmp_path):
-    """A spring in the local x of a node, which is the basic y."""
+    """Springs in the local directions of a node, quarter a turn off the basic ones."""
     text = "DMIG    KAAX           0       6       2       0                       3\n"
+    local = np.array([[4.0, 0.5, 0.25], [0.5, 5.0, -0.75], [0.25, -0.75, 6.0]])
     for i in (1, 2, 3):
         text += f"DMIG*   KAAX                           2               {i}\n"
-        text += f"*                      2               {i} {i}.000000000D+00\n"
+        for k in range(1, i + 1):
+            value = f"{local[i - 1, k - 1]:16.9E}".replace("E", "D")
+            text += f"*                      2               {k}{value}\n"
     bulk = BULK.replace("GRID    2       5       1.0     0.0     0.0     0", "GRID,2,5,1.,0.,0.,5")
     bdf = written(tmp_path, bulk, "x.bdf")
     found = read_dmig(written(tmp_path, text), bdf=bdf)
-    assert found.K.toarray() == pytest.approx(np.diag([2.0, 1.0, 3.0]))
+    # local x is basic y, local y is basic -x
+    assert found.K.toarray() == pytest.approx(
+        np.array([[5.0, -0.5, 0.75], [-0.5, 4.0, 0.25], [0.75, 0.25, 6.0]])
+    )
     assert found.notes
     some = text[: text.rindex("DMIG*")]
     with pytest.raises(ModelError, match="node 2"):
