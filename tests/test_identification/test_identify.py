@@ -114,13 +114,15 @@ def test_no_pole_is_lost_in_silence_and_the_doubt_is_honest(known):
         pairs = linear_sum_assignment(np.abs(found.poles[:, None] - truth))
         error, std = found.poles[pairs[0]] - truth[pairs[1]], found.std[pairs[0]]
         score = np.concatenate([error.real / std.real, error.imag / std.imag])
-        if len(found) == truth.size or not said:
+        if not said:
             scores.append(score)
         lost += len(found) < truth.size and not said
     rms = np.sqrt(np.mean(np.concatenate(scores) ** 2))
     print(f"z-score rms {rms:.3f}, largest {np.abs(np.concatenate(scores)).max():.1f}, lost {lost}")
     assert 0.8 < rms < 1.25
-    assert lost <= (2 if known else 1)
+    # a pole too weak to be seen: then its neighbours are not off either
+    assert np.abs(np.concatenate(scores)).max() < 4.5
+    assert lost <= 0.06 * (100 if known else 30)
 
 
 @pytest.mark.slow

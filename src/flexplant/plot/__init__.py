@@ -8,6 +8,7 @@ from .placement import sensor_map as sensor_map
 from .response import response as response
 from .structure import layout as layout
 from .structure import mode_shape as mode_shape
+from .update_summary import update as update
 from .updating import eigenvalues as eigenvalues
 from .updating import parameters as parameters
 from .updating import residual as residual
