@@ -12,7 +12,9 @@ import scipy.sparse.linalg as spla
 
 from ..errors import SolverError
 from ..values import FloatArray
-from .factor import dense, diagonal, negative_pivots, symmetric_lu
+from .factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
+from .multifrontal import MultifrontalCholesky, multifrontal_inertia
+from .ordering import Dissection, dissect
 
 #: up to this many DOFs dense LAPACK finds every eigenvalue
 _DENSE = 300
@@ -77,14 +79,16 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
     shift, asked, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
     floor = max(rounding, ROUNDING)
     limit = min(int(np.count_nonzero(heavy > 0)), _MOST)
+    # one elimination order serves all shifts
+    order = dissect(sp.csc_array(K + shift * M)) if K.shape[0] > DENSE_LIMIT else None
     for _ in range(6):
         asked = min(asked, limit)
-        shapes = _inverse_iteration(K, M, shift, asked)
+        shapes = _inverse_iteration(K, M, shift, asked, order)
         values = np.einsum("ij,ij->j", shapes, np.asarray(K @ shapes))
         spread = np.einsum("ij,ij->j", np.abs(shapes), np.asarray(size @ np.abs(shapes)))
         zero = np.abs(values) <= floor * spread
-        order = np.lexsort((np.abs(values), ~zero))
-        values, shapes, spread = values[order], shapes[:, order], spread[order]
+        rank = np.lexsort((np.abs(values), ~zero))
+        values, shapes, spread = values[rank], shapes[:, rank], spread[rank]
         n_zero = int(np.count_nonzero(zero))
         if n_zero == asked and asked < limit:
             asked *= 3
@@ -95,11 +99,13 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
             shift = max(float(elastic[0]), 10 * floor * float(spread[:n_zero].max(initial=0.0)))
             continue
         break
-    below = _count_below(K, M, values, n_zero)
+    below = _count_below(K, M, values, n_zero, order)
     return Lowest(values, shapes, spread, n_zero, below)
 
 
-def _inverse_iteration(K: Any, M: Any, shift: float, count: int) -> FloatArray:
+def _inverse_iteration(
+    K: Any, M: Any, shift: float, count: int, order: Dissection | None
+) -> FloatArray:
     """Return the shapes (n, count) with the largest 1 / |lambda + shift|, M-orthonormal."""
     n = K.shape[0]
     if n <= _DENSE or count > n // 3:
@@ -119,7 +125,7 @@ def _inverse_iteration(K: Any, M: Any, shift: float, count: int) -> FloatArray:
         best = np.argsort(-np.abs(mu))[:count]
         shapes = shapes[:, best]
     else:
-        lu = symmetric_lu(K + shift * M)
+        lu = _factor(K + shift * M, order)
         inverse: Any = spla.LinearOperator((n, n), matvec=lu.solve, dtype=np.float64)
         # the same start every time: the same answer every time
         start = lu.solve(M @ np.random.default_rng(0).standard_normal(n))
@@ -135,12 +141,27 @@ def _inverse_iteration(K: Any, M: Any, shift: float, count: int) -> FloatArray:
     return np.asarray(shapes / np.where(length > 0, length, 1.0), dtype=np.float64)
 
 
-def _count_below(K: Any, M: Any, values: FloatArray, n_zero: int) -> int | None:
+def _factor(matrix: Any, order: Dissection | None) -> Any:
+    """Return a factorisation with a method solve; by fronts where K + s M is definite and large."""
+    if order is not None:
+        try:
+            return MultifrontalCholesky(matrix, order)
+        except SolverError:
+            pass
+    return symmetric_lu(matrix)
+
+
+def _count_below(
+    K: Any, M: Any, values: FloatArray, n_zero: int, order: Dissection | None
+) -> int | None:
     """Return how many eigenvalues lie below the first positive one, by Sylvester's law."""
     positive = np.sort(values[n_zero:][values[n_zero:] > 0])
     if not positive.size:
         return None
+    shifted = sp.csc_array(K - 0.5 * positive[0] * M)
     try:
-        return negative_pivots(symmetric_lu(K - 0.5 * positive[0] * M))
+        if order is not None:
+            return multifrontal_inertia(shifted, order)
+        return negative_pivots(symmetric_lu(shifted))
     except SolverError:
         return None
