@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple, Protocol
 
 import numpy as np
 
@@ -11,28 +10,11 @@ from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant
-from ..values import FloatArray, name_list, short
+from ..values import name_list, short
 from .certificate import certified_norm
 from .controller import Controller
+from .method import Method
 from .riccati import Riccati
-
-
-class Solved(NamedTuple):
-    """A controller of the prepared problem, with what its method claims."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    D: FloatArray
-    gamma: float
-    lower: float
-
-
-class Method(Protocol):
-    """A way to solve the prepared problem: `Riccati()` or `Lmi()`."""
-
-    def solve(self, problem: Prepared) -> Solved:
-        """Return a controller of the prepared problem."""
 
 
 def design_hinf(

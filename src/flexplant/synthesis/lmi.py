@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg as la
@@ -24,9 +23,7 @@ from .lmi_programs import (
     same_states,
     smallest_gamma,
 )
-
-if TYPE_CHECKING:
-    from .hinf import Solved
+from .method import Solved
 
 #: gap between value and lower bound at which no other coordinates are tried
 _GAP = 5e-4
@@ -101,8 +98,6 @@ class Lmi(Value):
         SolverError
             When the solver stops early, or no controller keeps what the LMIs promise.
         """
-        from .hinf import Solved
-
         n = problem.A.shape[0]
         if not 0 < n <= self.max_states:
             raise ModelError(

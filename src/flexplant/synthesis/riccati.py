@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -16,9 +16,7 @@ from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive
 from .central import OnAxisError, central, quadratic, riccati_solutions
-
-if TYPE_CHECKING:
-    from .hinf import Solved
+from .method import Solved
 
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
@@ -70,8 +68,6 @@ class Riccati(Value):
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
-        from .hinf import Solved
-
         _require_full_rank(problem)
         # the least quadratic cost stabilises: its norm is where the search for less begins
         try:

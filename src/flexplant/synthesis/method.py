@@ -1,0 +1,26 @@
+"""What a method of H-infinity synthesis is, and what it hands back."""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+from ..lti.preparation import Prepared
+from ..values import FloatArray
+
+
+class Solved(NamedTuple):
+    """A controller of the prepared problem, with what its method claims."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    D: FloatArray
+    gamma: float
+    lower: float
+
+
+class Method(Protocol):
+    """A way to solve the prepared problem: `Riccati()` or `Lmi()`."""
+
+    def solve(self, problem: Prepared) -> Solved:
+        """Return a controller of the prepared problem."""
