@@ -1,9 +1,10 @@
 """A solid stage with six degrees of freedom, imported from foreign matrices.
 
-Run it: ``python examples/solid_stage.py``. A block of aluminium, meshed with eight-node bricks as a
-finite-element program would, is written as Matrix Market files and a table of its DOFs, and read
-back: flexplant then knows matrices and nodes, but no elements. The shapes between the nodes are
-interpolated, so that sensors, actuators and the point of interest may be anywhere in the block.
+Run it: ``python examples/solid_stage.py``. A block of aluminium, meshed with eight-node bricks, is
+written as a finite-element program would, in Matrix Market files in mm and t with a table of the
+DOFs, and read back in SI: flexplant then knows matrices and nodes, but no elements. The shapes
+between the nodes are interpolated, so that sensors, actuators and the point of interest may be
+anywhere in the block.
 
 Six sensors and six actuators (each through its amplifier, with 40 us of cable) control x, y, z, rx,
 ry and rz of a point that no sensor sees.
@@ -21,8 +22,6 @@ import scipy.io
 import scipy.sparse as sp
 
 import flexplant as fx
-from flexplant.plant import decouple
-from flexplant.structure import interpolated
 
 SIZE, ELEMENTS = (0.4, 0.3, 0.1), (4, 3, 1)  # m
 DENSITY, YOUNG, POISSON = 2700.0, 70e9, 0.33
@@ -95,28 +94,31 @@ def mesh() -> tuple[sp.csc_array, sp.csc_array, np.ndarray]:
 
 
 def export(folder: Path) -> None:
-    """Write what a finite-element program would: two matrices and a table."""
+    """Write what a finite-element program would, in mm and t: two matrices and a table."""
     M, K, nodes = mesh()
-    scipy.io.mmwrite(folder / "M.mtx", M)
-    scipy.io.mmwrite(folder / "K.mtx", K)
+    scipy.io.mmwrite(folder / "M.mtx", M / 1e3, symmetry="symmetric")  # kg -> t
+    scipy.io.mmwrite(folder / "K.mtx", K / 1e3, symmetry="symmetric")  # N/m -> N/mm
     with open(folder / "dofs.csv", "w", newline="", encoding="utf-8") as file:
         table = csv.writer(file)
         table.writerow(["node", "direction", "x", "y", "z"])
-        for number, xyz in enumerate(nodes, 1):
+        for number, xyz in enumerate(1e3 * nodes, 1):
             table.writerows([number, direction, *xyz.tolist()] for direction in "xyz")
 
 
 # %% Import
 def imported() -> fx.FEModel:
-    """Return the block from files, its shapes interpolated between the nodes."""
+    """Return the block from files, in SI, its shapes interpolated between the nodes."""
     with TemporaryDirectory() as name:
         folder = Path(name)
         export(folder)
-        read: Any = scipy.io.mmread
-        M, K = (sp.csc_array(read(folder / f"{part}.mtx")) for part in "MK")
-        dofs = fx.DofSet.from_table(folder / "dofs.csv")
-    symmetric = [0.5 * (part + part.T) for part in (M, K)]  # the files hold 16 digits
-    return interpolated(fx.FEModel(*symmetric, dofs=dofs, name="block"))
+        model = fx.read_model(
+            folder / "K.mtx",
+            mass=folder / "M.mtx",
+            dofs=folder / "dofs.csv",
+            units=("mm", "t", "s"),
+            name="block",
+        )
+    return fx.interpolated(model)
 
 
 def ports() -> fx.Ports:
@@ -141,7 +143,7 @@ def main() -> dict[str, Any]:
     modes = fx.solve_modes(model, count=20, damping=fx.ModalDamping(0.005))
     plant = fx.assemble_plant(modes, ports())
     report = plant.check()
-    axes = decouple(plant)
+    axes = fx.decouple(plant)
     sampled = plant.discretized(RATE, delay=DELAY)
     observer = fx.design_kalman(sampled)
     servo = fx.design_servo(sampled, bandwidth=BANDWIDTH)
@@ -162,6 +164,7 @@ def main() -> dict[str, Any]:
 
 def printed(found: dict[str, Any]) -> None:
     """Print the numbers."""
+    print(fx.check(found["model"]))
     print(found["model"], found["modes"], found["plant"], found["report"], sep="\n")
     axes = found["decoupling"]
     print(axes)
