@@ -208,3 +208,43 @@ def complex_step_vector(M, D, K, parts, mode, step=1e-20):
         u = u - la.solve(J, residual)
     slope = (u[-2].imag + 1j * u[-1].imag) / step
     return slope, (u[:n].imag + 1j * u[n : 2 * n].imag) / step
+
+
+# ---- a sampled machine behind a zero-order hold
+
+
+def sampled_response(M, D, K, B, C, freq, *, rate, delay=0.0, velocity=False):
+    """H(z) (o, i, f) of positions (or velocities) at samples, forces held and delayed.
+
+    Stepped with the exponential of [A B; 0 0] over a sample, its two parts where the delay splits
+    it. Also for complex M, D and K: real and imaginary parts in z are kept apart, so that a complex
+    step in M, D or K passes: the parts of H are returned as [Re; Im] along a first axis.
+    """
+    k, i = B.shape
+    h = 1 / rate
+    whole = int(np.floor(delay))
+    part = delay - whole
+    inverse = np.linalg.inv(M)
+    S = np.zeros((2 * k + i, 2 * k + i), dtype=np.result_type(M, D, K))
+    S[:k, k : 2 * k] = np.eye(k)
+    S[k : 2 * k, :k], S[k : 2 * k, k : 2 * k] = -inverse @ K, -inverse @ D
+    S[k : 2 * k, 2 * k :] = inverse @ B
+    first, second = la.expm(S * h * part), la.expm(S * h * (1 - part))
+    n = 2 * k
+    A = second[:n, :n] @ first[:n, :n]
+    older, newer = second[:n, :n] @ first[:n, n:], second[:n, n:]
+    rows = np.hstack([C * 0, C]) if velocity else np.hstack([C, C * 0])
+    found = np.zeros((2, C.shape[0], i, len(freq)), dtype=S.dtype)
+    for f, line in enumerate(freq):
+        z = np.exp(2j * np.pi * line * h)
+        system = np.block(
+            [
+                [z.real * np.eye(n) - A, -z.imag * np.eye(n)],
+                [z.imag * np.eye(n), z.real * np.eye(n) - A],
+            ]
+        )
+        a, b = z ** (-whole), z ** (-whole - 1)
+        load = np.vstack([newer * a.real + older * b.real, newer * a.imag + older * b.imag])
+        x = np.linalg.solve(system, load)
+        found[0, :, :, f], found[1, :, :, f] = rows @ x[:n], rows @ x[n:]
+    return found

@@ -191,7 +191,7 @@ def _response(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:
     for label, model, color in (("before", before, REDUCED), ("after", after, UPDATED)):
         objective = Objective(model, [], [residual])
         tied: Any = objective.bounds[0]
-        H = tied.responses(objective.begin(np.zeros(0)))[0][:, o, i]
+        H = tied.responses(objective.begin(np.zeros(0)))[:, o, i]
         ax.semilogy(freq, np.abs(H), color=color, label=label, linewidth=1.1)
     ax.legend(frameon=False, fontsize=8)
     name = f"|{frf.outputs[int(o)]} / {frf.inputs[int(i)]}|"

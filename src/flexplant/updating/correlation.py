@@ -187,7 +187,7 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
             if isinstance(residual, ModeShapes):
                 shapes = mac(residual.shapes, tied.rows @ point.eigen.X[:, columns])
         if isinstance(residual, FrfResidual):
-            H = tied.responses(point)[0]
+            H = tied.responses(point)
             responses = frac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
             spectrum = fdac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
     return Correlation(

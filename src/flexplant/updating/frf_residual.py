@@ -11,7 +11,8 @@ import numpy as np
 from ..errors import ModelError, ShapeError
 from ..labels import Place
 from ..lti import Frf
-from ..values import ComplexArray, FloatArray, real_array
+from ..values import ComplexArray, FloatArray, flag, positive, real_array
+from .held import Held
 from .pencil import Family
 from .point import Point
 from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
@@ -27,7 +28,9 @@ class FrfResidual(Residual):
     """Residuals of measured frequency responses, complex or of the logarithm of their magnitude.
 
     ``r = (H_exp - H(p)) / sigma`` as [Re; Im], or ``r = ln |H_exp / H(p)| / (sigma / |H_exp|)``,
-    with ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B`` and ``sigma^2 = variance / 2``.
+    with ``H = C (i omega)^d (K + i omega D - omega^2 M)^-1 B`` and ``sigma^2 = variance / 2``; of a
+    sampled machine, ``H = z^-n C (z - e^{AT})^-1 (Gamma_1 + Gamma_0/z)``, its exact equivalent
+    behind a zero-order hold.
 
     Parameters
     ----------
@@ -46,17 +49,27 @@ class FrfResidual(Residual):
         Of the motion and force at points.
     magnitude : bool
         Compare ln |H| instead of H: forgiving of phase errors, convergent from farther away.
+    hold : float, optional [Hz]
+        Rate of the zero-order hold between the inputs and the machine, where the response is that
+        of the sampled machine (modes above half the rate then fold into the band, as in the
+        measurement). None: a response of continuous signals.
+    delay : float [samples]
+        From the command to the held force, of any fraction, where the measurement contains it.
 
     Raises
     ------
     ModelError, ShapeError, LabelError
-        When no line is left, the variance is not positive, or channels are unknown.
+        When no line is left, the variance is not positive, channels are unknown, lines lie above
+        half the rate of the hold, a delay comes without one, or accelerations with one (they jump
+        at the very instant they are sampled).
 
     Examples
     --------
     >>> frf = Frf([1.0, 2.0], [[[1.0, 0.5j]]], inputs=["1:z"], outputs=["2:z"])
     >>> FrfResidual(frf, variance=1e-4)
     <FrfResidual: 1 x 1 channels, 2 of 2 lines, complex, noise known>
+    >>> FrfResidual(frf, hold=100.0, delay=1)
+    <FrfResidual: 1 x 1 channels, 2 of 2 lines, complex, noise not known, held at 100 Hz, delay 1>
     """
 
     measured: Frf
@@ -65,6 +78,8 @@ class FrfResidual(Residual):
     places: Mapping[str, Place] | None = field(default=None, kw_only=True)
     direction: str = field(default="z", kw_only=True)
     magnitude: bool = field(default=False, kw_only=True)
+    hold: float | None = field(default=None, kw_only=True)
+    delay: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         frf = self.measured
@@ -87,15 +102,20 @@ class FrfResidual(Residual):
             if variance.min() <= 0:
                 raise ModelError(f"variance must be positive, got {variance.min():g}.")
         channel_places([*frf.outputs, *frf.inputs], self.places)
-        self._set(variance=variance, lines=_checked_lines(self.lines, frf, variance))
+        lines = _checked_lines(self.lines, frf, variance)
+        hold, delay = _checked_hold(self.hold, self.delay, frf, lines)
+        self._set(variance=variance, lines=lines, hold=hold, delay=delay)
+        self._set(magnitude=flag(self.magnitude, "magnitude"))
 
     def __repr__(self) -> str:
         frf = self.measured
         kind = "log-magnitude" if self.magnitude else "complex"
         known = "not known" if self.variance is None else "known"
+        held = "" if self.hold is None else f", held at {self.hold:g} Hz"
+        late = f", delay {self.delay:g}" if self.delay else ""
         return (
             f"<FrfResidual: {len(frf.outputs)} x {len(frf.inputs)} channels, {self.lines.size} of "
-            f"{frf.freq.size} lines, {kind}, noise {known}>"
+            f"{frf.freq.size} lines, {kind}, noise {known}{held}{late}>"
         )
 
     def select(self, lines: Sequence[int]) -> FrfResidual:
@@ -115,7 +135,9 @@ class _BoundFrf(Bound):
         self.C = place_rows(family, places[:count], residual.direction)
         self.B = place_rows(family, places[count:], residual.direction).T
         self.omega = 2 * np.pi * frf.freq[lines]
-        self.factor = (1j * self.omega) ** ORDERS[frf.quantity or "displacement"]
+        self.order = ORDERS[frf.quantity or "displacement"]
+        self.factor = (1j * self.omega) ** self.order
+        self.hold, self.delay = residual.hold, residual.delay
         self.data = np.moveaxis(frf.data[:, :, lines], 2, 0)
         self.magnitude = residual.magnitude
         self.noisy = residual.variance is not None
@@ -130,25 +152,40 @@ class _BoundFrf(Bound):
             sigma = sigma / np.abs(self.data)
         self.sigma = sigma
         self.name = f"{lines.size} lines of FRFs"
-        self._last: tuple[Point, ComplexArray, ComplexArray, ComplexArray] | None = None
+        self._last: tuple[Point, ComplexArray, Any] | None = None
 
-    def responses(self, point: Point) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
-        """Return H (l, o, i), the motions X (l, k, i) and adjoint motions Y (l, k, o)."""
+    def responses(self, point: Point) -> ComplexArray:
+        """Return H (l, o, i)."""
+        return self._solved(point)[0]
+
+    def _solved(self, point: Point) -> tuple[ComplexArray, Any]:
+        """Return H and what its slopes are made from."""
         if self._last is None or self._last[0] is not point:
-            X, Y = motions(point, self.omega, self.B, self.C)
-            H = np.matmul(self.C, X) * self.factor[:, None, None]
-            self._last = (point, H, X, Y)
+            if self.hold is None:
+                X, Y = motions(point, self.omega, self.B, self.C)
+                H = np.matmul(self.C, X) * self.factor[:, None, None]
+                self._last = (point, H, (X, Y))
+            else:
+                held = Held(
+                    point, self.B, self.C, rate=self.hold, delay=self.delay, order=self.order
+                )
+                H, z, X = held.responses(self.omega)
+                self._last = (point, H, (held, z, X))
         return self._last[1:]
 
     def values(self, point: Point) -> FloatArray:
-        H, _, _ = self.responses(point)
+        H = self.responses(point)
         if self.magnitude:
             return np.asarray((np.log(np.abs(self.data / H)) / self.sigma).ravel())
         return split_parts(((self.data - H) / self.sigma).ravel())
 
     def slopes(self, point: Point) -> FloatArray:
-        H, X, Y = self.responses(point)
-        dH = response_slopes(point, self.omega, X, Y) * self.factor[:, None, None]
+        H, made = self._solved(point)
+        if self.hold is None:
+            dH = response_slopes(point, self.omega, *made) * self.factor[:, None, None]
+        else:
+            held, z, X = made
+            dH = held.slopes(z, X)
         q = point.p.size
         if self.magnitude:
             return np.asarray(-(np.real(dH / H) / self.sigma).reshape(q, -1).T)
@@ -177,6 +214,30 @@ def response_slopes(
     moved = family.moved(flat, (s**2, s, np.ones_like(s))).reshape(q, k, lines, n_in)
     slopes: ComplexArray = -np.matmul(Y.transpose(0, 2, 1), moved.transpose(0, 2, 1, 3))
     return slopes
+
+
+def _checked_hold(hold: Any, delay: Any, frf: Frf, lines: Any) -> tuple[float | None, float]:
+    late = positive(delay, "delay", zero=True)
+    if hold is None:
+        if late:
+            raise ModelError(
+                f"delay={late:g} is in samples of a hold: give hold= its rate, or, of continuous "
+                "signals, turn the phase of the measurement back."
+            )
+        return None, late
+    rate = positive(hold, "hold")
+    if frf.quantity == "acceleration":
+        raise ModelError(
+            "accelerations behind a zero-order hold jump at the instants they are sampled: their "
+            "response depends on which side was taken. Measure positions or velocities, or divide "
+            "the hold's own response out of the measurement and leave hold= out."
+        )
+    if frf.freq[lines].max() >= rate / 2:
+        raise ModelError(
+            f"lines up to {frf.freq[lines].max():g} Hz and a hold at {rate:g} Hz do not go "
+            f"together: nothing is known above {rate / 2:g} Hz. Choose lines= below it."
+        )
+    return rate, late
 
 
 def _checked_lines(lines: Any, frf: Frf, variance: FloatArray | None) -> Any:
