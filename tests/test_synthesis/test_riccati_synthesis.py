@@ -6,17 +6,24 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from flexplant.errors import AssumptionError, CertificateError, ModelError, SolverError
+from flexplant.errors import (
+    AssumptionError,
+    CertificateError,
+    InfeasibleError,
+    ModelError,
+    SolverError,
+)
 from flexplant.lti import StateSpace, tustin
-from flexplant.synthesis import Riccati, design_hinf
+from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.certificate import certified_norm
 from oracles_synthesis import (
     brute_norm,
     closed_loop,
     coprime_problem,
+    gains,
     scalar_optimum,
     split,
     stability,
@@ -128,6 +135,62 @@ def test_random_plants_with_feedthrough_everywhere(seed, unit, dt):
     other = design_hinf(P.replace(B=B * w, D=D * w), u=u, y=y)
     assert other.gamma == pytest.approx(10.0**unit * found.gamma, rel=1e-6)
     assert other.lower == pytest.approx(10.0**unit * found.lower, rel=1e-6)
+
+
+def one_block(A, B, C, D, dt=0.0):
+    """z = W (w + G u), y = w + G u, with W = 0.5 + 1 / (s + 0.1) in each channel."""
+    A, B, C, D = map(np.asarray, (A, B, C, D))
+    (n, m), eye = B.shape, np.eye(B.shape[1])
+    A = np.block([[A, np.zeros((n, m))], [C, -0.1 * eye]])
+    B = np.block([[np.zeros((n, m)), B], [eye, D]])
+    C = np.block([[0.5 * C, eye], [C, np.zeros((m, m))]])
+    g, u, y = named(A, B, C, np.block([[0.5 * eye, 0.5 * D], [eye, D]]), m, m)
+    return (tustin(g, 1 / dt) if dt else g), u, y
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+@pytest.mark.parametrize(("zero", "pole"), [(1.0, -2.0), (0.2, -1.0), (3.0, 0.5), (1.0, 4.0)])
+def test_the_sensitivity_of_a_plant_with_feedthrough(zero, pole, dt):
+    """G = (s - a) / (s - p): the optimum is |W(a)|, times |(a + p) / (a - p)| for p > 0.
+
+    The central controller makes S zero at infinite frequency, by infinite gain.
+    """
+    best = 0.5 + 1 / (zero + 0.1)
+    if pole > 0:
+        best *= abs((zero + pole) / (zero - pole))
+    P, u, y = one_block([[pole]], [[1.0]], [[pole - zero]], [[1.0]], dt)
+    found = checked(P, u, y)
+    assert best * (1 - 2e-3) <= found.lower <= best * (1 + 1e-6)
+    assert best * (1 - 1e-6) <= found.gamma <= 1.06 * best
+    at = np.array([-1.0 if dt else 1e12j])
+    assert gains(*(getattr(found.system, name) for name in "ABCD"), at)[0] < 1e3
+
+
+@pytest.mark.slow
+@settings(max_examples=15)
+@given(seed=st.integers(0, 10**6), dt=st.sampled_from([0.0, 0.1]))
+def test_sensitivities_of_random_plants_are_those_of_the_lmis(seed, dt):
+    """Two channels, poles on both sides, at least one zero in the right half plane."""
+    rng = np.random.default_rng(seed)
+    A, B, C = rng.normal(size=(3, 3)), rng.normal(size=(3, 2)), rng.normal(size=(2, 3))
+    D = rng.normal(size=(2, 2))
+    zeros, poles = np.linalg.eigvals(A - B @ np.linalg.solve(D, C)), np.linalg.eigvals(A)
+    apart = np.abs(np.subtract.outer(zeros, poles)).min()
+    assume(zeros.real.max() > 0.1 and apart > 0.1)
+    assume(min(np.abs(zeros.real).min(), np.abs(poles.real).min()) > 0.05)
+    P, u, y = one_block(A, B, C, D, dt)
+    found, other = checked(P, u, y), checked(P, u, y, Lmi())
+    assert found.gamma <= 1.06 * found.lower
+    assert found.gamma == pytest.approx(other.gamma, rel=0.08)
+
+
+@pytest.mark.parametrize("method", [Riccati(), Lmi()], ids=["Riccati", "Lmi"])
+@pytest.mark.parametrize("dt", [0.0, 0.1])
+def test_a_sensitivity_that_infinite_gain_makes_zero_has_no_smallest_gamma(method, dt):
+    """G = (s + 1) / (s + 2) can be inverted."""
+    P, u, y = one_block([[-2.0]], [[1.0]], [[-1.0]], [[1.0]], dt)
+    with pytest.raises(InfeasibleError, match=r"no smallest gamma.* at no cost\. Weight"):
+        design_hinf(P, method, u=u, y=y)
 
 
 def test_lower_is_never_undercut_by_another_controller():

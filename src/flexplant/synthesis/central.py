@@ -16,6 +16,10 @@ from ..values import FloatArray
 
 #: relative: what counts as on the imaginary axis; the largest residual of a Riccati equation
 _AXIS, _RESIDUAL = 1e-10, 1e-6
+#: relative: a difference of the costs of z that is rounding
+_CANCELLED = 1e-12
+#: sensitivity at infinite frequency below which a controller is taken for one of infinite gain
+_SINGULAR = 1e-3
 
 
 class OnAxisError(Exception):
@@ -43,9 +47,12 @@ def riccati_solutions(
 def central(
     p: Prepared, gamma: float, X: FloatArray, F: FloatArray, Y: FloatArray, H: FloatArray
 ) -> StateSpace:
-    """Return the central controller of Glover and Doyle for ||w -> z|| < gamma.
+    """Return a controller of Glover and Doyle for ||w -> z|| < gamma: central unless D22 forbids.
 
-    Their normalisation is D12 = [0; I], D21 = [0, I]; D11 is partitioned accordingly.
+    Their normalisation is D12 = [0; I], D21 = [0, I]; D11 is partitioned accordingly. All
+    controllers are F_l(K, Q) with ||Q|| < gamma, the central one has Q = 0. It may need infinite
+    gain once D22 is put back (where D12 and D21 are square it makes the sensitivity zero at
+    infinite frequency); then Q is a constant that keeps I + D22 K away from singular.
 
     Raises
     ------
@@ -59,14 +66,35 @@ def central(
     D11, D12 = p.D11[: p1 - m2, : m1 - p2], p.D11[: p1 - m2, m1 - p2 :]
     D21, D22 = p.D11[p1 - m2 :, : m1 - p2], p.D11[p1 - m2 :, m1 - p2 :]
     inner = np.linalg.solve(gamma**2 * np.eye(p1 - m2) - D11 @ D11.T, D12)
+    outer = np.linalg.solve(gamma**2 * np.eye(m1 - p2) - D11.T @ D11, D21.T)
     Dk = -D21 @ D11.T @ inner - D22
+    Dk12 = la.cholesky(np.eye(m2) - D21 @ outer, lower=True)
     Dk21 = la.cholesky(np.eye(p2) - D12.T @ inner)
     Z = np.linalg.inv(np.eye(p.A.shape[0]) - Y @ X / gamma**2)
     C2k = -Dk21 @ (p.C2 + F12)
+    B2k = Z @ (p.B2 + H12) @ Dk12
+    Q = gamma * _contraction(np.eye(p2) + p.D22 @ Dk, p.D22 @ Dk12, Dk21)
     B1k = -Z @ H2 + Z @ (p.B2 + H12) @ Dk
     C1k = F2 + Dk @ np.linalg.solve(Dk21, C2k)
     Ak = p.A + B @ F + B1k @ np.linalg.solve(Dk21, C2k)
-    return StateSpace(Ak, B1k, C1k, Dk, inputs=p.y, outputs=p.u)
+    return StateSpace(
+        Ak + B2k @ Q @ C2k,
+        B1k + B2k @ Q @ Dk21,
+        C1k + Dk12 @ Q @ C2k,
+        Dk + Dk12 @ Q @ Dk21,
+        inputs=p.y,
+        outputs=p.u,
+    )
+
+
+def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArray:
+    """Return Q, zero or of norm 1/2, that lifts the small singular values of M + left Q right."""
+    U, sizes, Vt = la.svd(M)
+    small = sizes < _SINGULAR
+    pull = left.T @ U[:, small] @ Vt[small] @ right.T
+    W, gains, Xt = la.svd(pull, full_matrices=False)
+    reached = gains > 1e-12 * np.max(gains, initial=0.0)
+    return np.asarray(0.5 * W[:, reached] @ Xt[reached])
 
 
 def quadratic(p: Prepared) -> StateSpace:
@@ -152,10 +180,16 @@ def stabilising(
     rest = Q - S @ SR
     # units of the states from A, B and C together, and one of the adjoint states: still Hamiltonian
     d = state_scale(A, B, np.sqrt(np.abs(Q.diagonal()))[None, :])
-    beside = [
-        float(np.linalg.norm(part)) for part in (rest * d * d[:, None], spread / d / d[:, None])
-    ]
-    unit = float(2.0 ** np.round(0.5 * np.log2(beside[0] / beside[1]))) if all(beside) else 1.0
+    scaled = (
+        drift * d / d[:, None],
+        spread / d / d[:, None],
+        rest * d * d[:, None],
+        Q * d * d[:, None],
+    )
+    inner_size, reach, cost, own = (float(np.linalg.norm(part)) for part in scaled)
+    if cost <= _CANCELLED * own:  # nothing but rounding: X has the size of drift over spread
+        cost = inner_size**2 / reach if reach else 0.0
+    unit = float(2.0 ** np.round(0.5 * np.log2(cost / reach))) if cost and reach else 1.0
     scale = np.concatenate([d, unit / d])
     hamiltonian = np.block([[drift, -spread], [-rest, -drift.T]])
     balanced = hamiltonian * scale / scale[:, None]

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantError, SolverError
+from ..errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
@@ -22,6 +22,8 @@ from .method import Solved
 _BISECTION, _GROWTH = 60, 12
 #: a norm beside that of the least quadratic cost at which nothing is left to gain
 _NOTHING = 1e-9
+#: sensitivity at infinite frequency that is taken for zero
+_ILL_POSED = 1e-6
 #: relative: by how much rounding may put a gain above its gamma; what is nothing but rounding
 _SLACK, _ROUNDING = 1e-6, 1e-14
 
@@ -65,6 +67,8 @@ class Riccati(Value):
         ------
         AssumptionError
             When D12 or D21 has not full rank, or z or w misses a mode on the stability boundary.
+        InfeasibleError
+            When gamma has a greatest lower bound that only infinite gain reaches.
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
@@ -90,6 +94,7 @@ class Riccati(Value):
         if controller is None:  # nothing below it holds
             controller = least.replace(C=least.C / unit)
             norm = _norm(scaled, controller)
+        _require_finite_gain(scaled, controller, unit * norm)
         return Solved(
             controller.A,
             controller.B,
@@ -143,6 +148,19 @@ def _require_full_rank(problem: Prepared) -> None:
                 f"{name} has rank {rank}, {needed} are needed: a combination of {', '.join(names)} "
                 f"{short}. Weight the efforts in z (or give each sensor noise in w), or use Lmi()."
             )
+
+
+def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float) -> None:
+    """Raise InfeasibleError when putting D22 back takes infinite gain at infinite frequency."""
+    loop = np.eye(len(problem.y)) + problem.D22 @ controller.D
+    if la.svdvals(loop)[-1] < _ILL_POSED:
+        where = "at half the rate" if problem.dt else "at infinite frequency"
+        raise InfeasibleError(
+            f"there is no smallest gamma: {gamma:.3g} is reached, by infinite gain {where}, where "
+            f"u ({', '.join(problem.u)}) acts on y ({', '.join(problem.y)}) directly and cancels w "
+            "in z at no cost. Weight the efforts in z, give the sensors noise in w, or give u a "
+            "sample of delay or a low-pass."
+        )
 
 
 def _open_size(problem: Prepared) -> float:
