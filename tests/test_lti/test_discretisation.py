@@ -1,5 +1,7 @@
 """Sampling against scipy.linalg.expm, and delays against runs at ten times the rate."""
 
+from decimal import Decimal, localcontext
+
 import numpy as np
 import pytest
 import scipy.linalg as la
@@ -187,3 +189,27 @@ def test_tustin_refuses():
     pole = StateSpace([[2 * RATE]], [[1.0]], [[1.0]], [[0.0]])
     with pytest.raises(ModelError, match="infinity"):
         tustin(pole, RATE)
+
+
+@pytest.mark.parametrize(("omega", "rate"), [(10.0, 1e9), (1e3, 1e8), (1e4, 3e7), (1.0, 2.0000001)])
+@pytest.mark.parametrize("h", [1e-4, 1e-2])
+def test_heavy_overdamping_neither_overflows_nor_loses_the_slow_pole(omega, rate, h):
+    """Against the poles of s^2 + c s + w^2 in fifty digits: cosh of half c h overflows."""
+    with localcontext(prec=50):
+        w, c, t = Decimal(omega), Decimal(rate), Decimal(h)
+        root = (c * c / 4 - w * w).sqrt()
+        slow, fast = -c / 2 + root, -c / 2 - root
+        es, ef = (slow * t).exp(), (fast * t).exp()
+        odd = (es - ef) / (slow - fast)
+        first = (slow * ef - fast * es) / (slow - fast)
+        second = (slow * es - fast * ef) / (slow - fast)
+        wanted = np.array([[first, w * odd], [-w * odd, second]], dtype=float)
+    pair = np.array([[[0.0, omega], [-omega, -rate]]])
+    with np.errstate(all="raise", under="ignore"):
+        found, integral = pair_exponential(pair, h)
+    np.testing.assert_allclose(found[0], wanted, rtol=1e-9, atol=1e-15)
+    assert abs(found[0, 0, 0] - wanted[0, 0]) < 4e-16
+    # A int = e^(A h) - I, whose first row is omega times that of the integral's second
+    np.testing.assert_allclose(
+        omega * integral[0, 1], wanted[0] - [1.0, 0.0], rtol=1e-9, atol=1e-15
+    )

@@ -294,3 +294,22 @@ def test_modes_fed_by_delay_lines(delay):
     found = frequency_response(g, freq).data.transpose(2, 0, 1)
     size = np.abs(dense).max(axis=(1, 2), keepdims=True)
     assert np.max(np.abs(found - dense) / size) < 1e-10
+
+
+@pytest.mark.parametrize("blocks", [[2, 2, 2], None])
+@pytest.mark.parametrize("omega", [(2.0, 63.0, 400.0), (63.0, 63.0, 64.0)])
+def test_a_grid_of_our_own_leaves_undamped_resonances_out(omega, blocks):
+    """Structures without D are common: their response is shown beside the poles, not refused."""
+    A = la.block_diag(*([[0.0, w], [-w, 0.0]] for w in omega))
+    g = StateSpace(
+        A, np.tile([[0.0], [1.0]], (3, 1)), np.tile([[1.0, 0.0]], 3), [[0.0]], blocks=blocks
+    )
+    found = frequency_response(g)
+    assert np.all(np.isfinite(found.data))
+    for w in omega:
+        off = np.abs(2 * np.pi * found.freq - w)
+        assert off.min() < 1e-4 * w  # close enough to show the resonance
+        assert np.abs(found.data).max() > 1e3
+    s = 2j * np.pi * found.freq
+    wanted = sum(w / (s**2 + w**2) for w in omega)
+    assert np.max(np.abs(found["y1", "u1"] / wanted - 1)) < 1e-6

@@ -236,3 +236,15 @@ def test_blocks_survive_renaming_and_reordering():
     for k, f in enumerate(freq):
         single = gain(pair, 2j * np.pi * f)
         np.testing.assert_allclose(found[:, :, k], single @ single @ single, rtol=1e-10)
+
+
+@pytest.mark.parametrize("gain", [1e10, 1e25, 1e80])
+def test_a_loop_of_very_large_and_very_small_gains_is_well_posed(gain):
+    """a = gain b, b = 0.1 / gain a + w: units so far apart stay within one balanced loop."""
+    up = StateSpace([], [], [], [[gain]], inputs=["b"], outputs=["a"])
+    down = StateSpace([], [], [], [[0.1 / gain, 1.0]], inputs=["a", "w"], outputs=["b"])
+    ring = connect([up, down], ["w"], ["a", "b"])
+    np.testing.assert_allclose(ring.D[:, 0], [gain / 0.9, 1 / 0.9], rtol=1e-14)
+    alone = down.replace(D=[[1.0 / gain, 1.0]])
+    with pytest.raises(ModelError, match="ill-posed"):
+        connect([up, alone], ["w"], ["a"])

@@ -20,7 +20,7 @@ from flexplant.plant import (
     lowpass,
 )
 from flexplant.plant.zeros import axis_zeros
-from flexplant.structure import FEModel
+from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from flexplant.synthesis import design_hinf
 from stages import CORNERS, RATE, L, ports, reduced, some_modes
 
@@ -339,3 +339,32 @@ def test_a_check_costs_milliseconds():
         plant.check().require(("excited", "detectable", "stabilisable", "performance"), "it")
         best = min(best, perf_counter() - start)
     assert best < 0.03
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "acceleration"])
+@pytest.mark.parametrize("where", ["sensor", "actuator", "both"])
+def test_a_filter_of_large_rows_hides_no_rigid_body(quantity, where):
+    """A filter that reads accelerations has rows of A far above those of the modes.
+
+    The plate is free, its four corners push and measure: everything is reached and seen.
+    """
+    lag = lowpass(2000.0, order=2)
+    own = ports()
+    at_y = lag if where != "actuator" else None
+    at_u = lag if where != "sensor" else None
+    sensor = Sensor("extra", at=(0.3, 0.1, 0.0), quantity=quantity, asd=1e-5, dynamics=at_y)
+    moved = own.replace(
+        y=[*own.y, sensor], u=[actuator.replace(dynamics=at_u) for actuator in own.u]
+    )
+    model = kirchhoff_plate(
+        size=(L, L), thickness=0.0272, elements=(4, 4), density=2702.0,
+        youngs_modulus=70e9, poisson_ratio=0.35,
+    ).with_damping(ModalDamping(0.001))  # fmt: skip
+    plant = assemble_plant(model, moved)
+    for key in ("detectable", "performance", "stabilisable"):
+        item = plant.check()[key]
+        assert item.holds, item
+        assert item.finding.startswith("all 3 rigid-body modes, by")
+    # and a sensor that sees nothing of them is still found out
+    blind = moved.replace(y=[sensor], references=())
+    assert not assemble_plant(model, blind).check()["detectable"].holds

@@ -168,18 +168,29 @@ def pair_exponential(pairs: FloatArray, h: float) -> tuple[FloatArray, FloatArra
 
 
 def pair_expm(pairs: FloatArray, h: float) -> FloatArray:
-    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form."""
+    """Return ``e^(A h)`` of (b, 2, 2) blocks in closed form.
+
+    An overdamped pair has poles m +- r whose exponentials are formed each by itself: cosh(r h) of
+    its own overflows long before the decay e^(m h) that tames it. The smaller of the two poles is
+    the determinant over the larger, which keeps the digits that m +- r would cancel.
+    """
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs - mean[:, None, None] * np.eye(2)
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
     root = np.sqrt(np.abs(q))
     safe = np.where(root > 0, root, 1.0)
     swing = q < 0
-    even = np.where(swing, np.cos(root * h), np.cosh(np.where(swing, 0.0, root * h)))
-    odd = np.where(swing, np.sin(root * h), np.sinh(np.where(swing, 0.0, root * h))) / safe
-    odd = np.where(root > 0, odd, h)
-    scale = np.exp(mean * h)
-    return np.asarray((scale * even)[:, None, None] * np.eye(2) + (scale * odd)[:, None, None] * N)
+    determinant = pairs[:, 0, 0] * pairs[:, 1, 1] - pairs[:, 0, 1] * pairs[:, 1, 0]
+    large = mean + np.where(mean > 0, root, -root)
+    small = np.where(large != 0, determinant / np.where(large != 0, large, 1.0), 0.0)
+    upper, lower = np.maximum(large, small), np.minimum(large, small)
+    turning, decay = np.where(swing, root * h, 0.0), np.where(swing, mean * h, upper * h)
+    decay = np.exp(decay)
+    apart = np.where(swing, 0.0, root * h)
+    even = np.where(swing, decay * np.cos(turning), 0.5 * (decay + np.exp(lower * h)))
+    odd = np.where(swing, np.sin(turning), -0.5 * np.expm1(-2.0 * apart)) / safe
+    odd = decay * np.where(root > 0, odd, h)
+    return np.asarray(even[:, None, None] * np.eye(2) + odd[:, None, None] * N)
 
 
 def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSpace:

@@ -13,6 +13,8 @@ from .statespace import StateSpace, System, as_statespace
 TURN = 0.6
 #: a channel this far below the others of its row and column at a frequency is taken for zero
 FLOOR = 1e-6
+#: a pole with less damping than this has no finite response at its frequency: none is asked there
+UNDAMPED = 1e-12
 #: relative width of the narrowest interval that is halved
 NARROWEST = 1e-8
 
@@ -24,7 +26,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     with points through every resonance; then intervals are halved, the worst first, until in the
     middle of each the logarithm of every channel's magnitude lies within `tolerance` of the line
     between its ends, and no phase turns by more than 0.6 rad: a line drawn through the points is
-    the response.
+    the response. At an undamped resonance, where there is none, the grid leaves a gap.
 
     Parameters
     ----------
@@ -43,7 +45,7 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     Raises
     ------
     ModelError
-        When points or tolerance is not positive, or an undamped resonance meets the grid.
+        When points or tolerance is not positive.
     """
     g = as_statespace(sys)
     tolerance = positive(tolerance, "tolerance")
@@ -58,23 +60,31 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     low = min(low, 1e-3 * high)
     freq = [np.geomspace(low, high, 200)]
     zeta = np.abs(poles.real) / np.maximum(np.abs(poles), 1e-300)
+    undamped: list[float] = []
     around = np.sinh(np.linspace(-4.0, 4.0, 9)) / np.sinh(1.0)
     for f, z in zip(np.abs(poles.imag) / (2 * np.pi), zeta, strict=True):
         if low < f < high and z < 0.3:
-            freq.append(f * (1 + max(z, 1e-6) * around))
+            near = f * (1 + max(z, 1e-6) * around)
+            if z <= UNDAMPED:  # infinite there: a gap is left around it
+                near, undamped = np.delete(near, around.size // 2), [*undamped, f]
+            freq.append(near)
     grid = np.unique(np.concatenate(freq))
     grid = grid[(grid >= low) & (grid <= high)]
     if grid.size > points:
         grid = grid[np.round(np.linspace(0, grid.size - 1, points)).astype(int)]
-    return _refined(g, grid, points, tolerance)
+    return _refined(g, grid, points, tolerance, np.array(sorted(undamped)))
 
 
-def _refined(g: StateSpace, grid: FloatArray, points: int, tolerance: float) -> FloatArray:
-    """Halve intervals until the middle of each is as its ends say."""
+def _refined(
+    g: StateSpace, grid: FloatArray, points: int, tolerance: float, gaps: FloatArray
+) -> FloatArray:
+    """Halve intervals until the middle of each is as its ends say, those over gaps left alone."""
     find = responder(g)
     values = _seen(find(grid))
     left = np.arange(grid.size - 1)  # intervals [left, right] that are not settled, by their ends
     right = left + 1
+    whole = np.searchsorted(gaps, grid[left]) == np.searchsorted(gaps, grid[right])
+    left, right = left[whole], right[whole]
     while left.size and grid.size < points:
         middle = 0.5 * (grid[left] + grid[right])
         open_ = grid[right] - grid[left] > NARROWEST * middle

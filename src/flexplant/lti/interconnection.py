@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
-import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray
+from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -310,7 +310,7 @@ def _well_posed(loop: FloatArray) -> FloatArray:
     count, part = csgraph.connected_components(loop != 0, connection="strong")
     for i in range(count):
         inside = np.flatnonzero(part == i)
-        balanced, _ = la.matrix_balance(loop[np.ix_(inside, inside)], permute=False)
+        balanced = balanced_matrix(loop[np.ix_(inside, inside)])
         condition = float(np.linalg.cond(np.eye(inside.size) - balanced))
         if condition > 1e12:
             raise ModelError(

@@ -42,7 +42,7 @@ def obstacle(g: StateSpace, *, axis_only: bool = False) -> Obstacle | None:
     worst = int(np.argmax(np.where(beyond if beyond.any() else on_axis, growth, -np.inf)))
     pole, unsure = poles[worst], float(doubt[worst])
     edge = "the unit circle" if g.dt else "the imaginary axis"
-    freq = abs(float(np.angle(pole)) / g.dt if g.dt else pole.imag) / (2 * np.pi)
+    freq = float(abs(np.angle(pole) / g.dt if g.dt else pole.imag)) / (2 * np.pi)
     if beyond[worst]:
         return Obstacle(
             f"unstable: a pole at {freq:.6g} Hz lies {growth[worst]:.3g}"

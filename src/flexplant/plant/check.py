@@ -220,15 +220,34 @@ def _undying(g: StateSpace) -> list[_Pole]:
     poles = g.poles()
     margin = np.abs(poles) - 1 if g.dt else poles.real / np.maximum(np.abs(poles), 1.0)
     size = max(float(np.linalg.norm(g.A, 2)), 1e-300) if poles.size else 1.0
+    near = 1e-7 * float(np.max(np.abs(poles), initial=1e-300))
     found: list[_Pole] = []
     for pole in poles[(margin > -_AXIS) & (poles.imag >= 0)]:
-        if any(abs(pole - other.value) < 1e-7 * size for other in found):
+        if any(abs(pole - other.value) < near for other in found):
             continue
         shifted = g.A - (pole if pole.imag else pole.real) * np.eye(g.n_states)
         left, sizes, right = la.svd(shifted)
         count = max(int(np.count_nonzero(sizes <= _ABSENT * size)), 1)
+        count = min(count, _most(g, complex(pole), near))
         found.append(_Pole(complex(pole), left[:, -count:], right[-count:].conj().T))
     return found
+
+
+def _most(g: StateSpace, pole: complex, near: float) -> int:
+    """Return how many eigenvectors a pole has at most: one in each 2 x 2 block [[a, b], [c, d]].
+
+    A filter that reads accelerations has rows far larger than those of the modes, beside which
+    more than the motions that are free looks like rounding.
+    """
+    if g.blocks is None:
+        return g.n_states
+    most, start = 0, 0
+    for n in g.blocks:
+        block = g.A[start : start + n, start : start + n]
+        if np.any(np.abs(np.linalg.eigvals(block) - pole) <= near):
+            most += 1 if n == 2 and np.any(block - block[0, 0] * np.eye(2)) else n
+        start += n
+    return max(most, 1)
 
 
 def _lacks(plant: StandardPlant, pole: _Pole, case: _Case) -> list[str]:
@@ -363,7 +382,7 @@ def _zeros(plant: StandardPlant) -> list[Assumption]:
             g = evened(g)
         zeros = axis_zeros(g if key == "P12" else _transposed(g))
         if zeros.size:
-            listed = ", ".join(_frequency(plant, zero) for zero in zeros[:3])
+            listed = ", ".join(dict.fromkeys(_frequency(plant, zero) for zero in zeros[:3]))
             text = f"{fro} -> {to} has an invariant zero on the stability limit at {listed}."
             found.append(Assumption(key, False, text, remedy))
         else:
