@@ -15,7 +15,7 @@ from ..errors import ModelError
 from ..structure.eigen import elastic_modes
 from ..structure.factor import dense
 from ..structure.rigid import orthonormalised
-from ..values import ComplexArray, FloatArray, IntArray
+from ..values import ComplexArray, FloatArray
 from .parameters import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
@@ -58,8 +58,8 @@ class Family:
     In SI a reduced pencil's rigid-body modes come out at 1e-4 rad/s and its lowest elastic modes
     lose digits to the highest; in the modal coordinates of the start, the rigid-body basis
     deflated, neither happens. DOFs that no mass and no damper touches (rotations of a lumped mass
-    matrix) are condensed statically at each value of the parameters; then the coordinates are the
-    model's own.
+    matrix, the boundary of MacNeal's reduction) are condensed statically at each value of the
+    parameters; then the coordinates are the model's own.
 
     Parameters
     ----------
@@ -92,13 +92,13 @@ class Family:
             for stack, part in zip(self.physical, parameter.matrices(model), strict=True):
                 if part is not None:
                     stack[b] = part
-        self.massive = _massive(M, D, self.physical)
-        if self.massive.size < k and not self.n_rigid:
-            self.V = np.eye(k)
+        self.massive = np.flatnonzero(np.any(M != 0, axis=0))
+        if self.massive.size < k:
+            self.V, self.rigid = np.eye(k), rigid
             self.M, self.D, self.K = M, D, K
             self.dM, self.dD, self.dK = self.physical
         else:
-            self.massive = np.arange(k)
+            self.massive, self.rigid = np.arange(k), np.eye(k)[:, : self.n_rigid]
             omega, self.V = _modal_basis(M, K, rigid)
             self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
             self.dM, self.dD, self.dK = (self.V.T @ stack @ self.V for stack in self.physical)
@@ -128,7 +128,7 @@ class Family:
     def rigid_left(self, p: FloatArray) -> FloatArray:
         """Return the rigid-body modes (r, r') that no spring to the ground holds at `p`."""
         r = self.n_rigid
-        active = [part[:, :r] / np.abs(part).max() for part in self.dK[p != 0] if np.any(part)]
+        active = [part @ self.rigid / np.abs(part).max() for part in self.dK[p != 0] if part.any()]
         if not r or not active:
             return np.eye(r)
         _, sizes, right = la.svd(np.vstack(active))
@@ -143,13 +143,10 @@ class Family:
             When M is not positive definite there, or K is indefinite.
         """
         M, D, K = self.matrices(p)
-        k = K.shape[0]
-        rigid = np.zeros((self.massive.size, 0))
-        if self.n_rigid:
-            rigid = np.eye(k)[:, : self.n_rigid] @ self.rigid_left(p)
+        rigid = self.rigid @ self.rigid_left(p)
         try:
             if self.condensed:
-                return self._condensed(M, D, K)
+                return self._condensed(M, D, K, rigid)
             omega, W = _modal_basis(M, K, rigid)
         except ModelError as error:
             raise ModelError(f"with {self.text(p)}: {error}") from None
@@ -183,10 +180,19 @@ class Family:
                 total += part.reshape(-1, k, m) * factor
         return total
 
-    def _condensed(self, M: FloatArray, D: FloatArray, K: FloatArray) -> Eigen:
+    def _condensed(self, M: FloatArray, D: FloatArray, K: FloatArray, rigid: FloatArray) -> Eigen:
         """Return the modes with the DOFs without mass condensed statically."""
-        m = self.massive
+        m = np.flatnonzero(np.any(M != 0, axis=0))
         s = np.setdiff1d(np.arange(M.shape[0]), m)
+        rigid = rigid[m]
+        damped = s[np.any(D[s] != 0, axis=1)]
+        if damped.size:
+            names = getattr(self.model, "coordinates", None) or tuple(self.model.dofs)
+            raise ModelError(
+                f"{', '.join(str(names[i]) for i in damped[:4])} has a damper but no mass, so its "
+                "motion is of first order. Give it a mass (a start of AddedMass that is not zero), "
+                "or reduce with Rubin or DesiredDofs, which leave mass everywhere."
+            )
         try:
             follow = la.cho_solve(la.cho_factor(K[np.ix_(s, s)]), K[np.ix_(s, m)])
         except la.LinAlgError:
@@ -199,12 +205,13 @@ class Family:
         count = None
         if self.highest is not None and not np.any(Dm):
             count = self.highest + 6
-        omega, W = _modal_basis(Mm, (Km + Km.T) / 2, np.zeros((m.size, 0)), count)
-        poles, velocities = _oscillating(omega, W.T @ Dm @ W, 0)
+        r = rigid.shape[1]
+        omega, W = _modal_basis(Mm, (Km + Km.T) / 2, rigid, count)
+        poles, velocities = _oscillating(omega, W.T @ Dm @ W, r)
         X = np.zeros((M.shape[0], poles.size), dtype=np.complex128)
         X[m] = W @ velocities
         X[s] = -follow @ X[m]
-        return Eigen(poles, X, X.conj(), M, D, 0, K)
+        return Eigen(poles, X, X.conj(), M, D, r, K)
 
     def weighted(self, X: ComplexArray) -> ComplexArray:
         """Return shapes in coordinates where the start's mass matrix is the unit matrix."""
@@ -276,13 +283,6 @@ def _stacked(stack: FloatArray) -> Any:
         return None
     flat = stack.reshape(q * k, k)
     return sp.csr_array(flat) if k > 60 and filled < 0.2 * flat.size else flat
-
-
-def _massive(M: FloatArray, D: FloatArray, stacks: Sequence[FloatArray]) -> IntArray:
-    """Return the DOFs that some mass or damper touches."""
-    touched = np.any(M != 0, axis=0) | np.any(D != 0, axis=0)
-    touched |= np.any(stacks[0] != 0, axis=(0, 1)) | np.any(stacks[1] != 0, axis=(0, 1))
-    return np.flatnonzero(touched).astype(np.int64)
 
 
 def _modal_basis(

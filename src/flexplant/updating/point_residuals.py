@@ -183,10 +183,9 @@ class _BoundStatic(Bound):
 
     def _solved(self, point: Point) -> tuple[Any, FloatArray, FloatArray]:
         M, _, K = point.matrices
-        k, r = K.shape[0], point.family.n_rigid
-        R = np.zeros((k, 0))
-        if r:
-            R = np.eye(k)[:, :r] @ point.family.rigid_left(point.p)
+        k = K.shape[0]
+        R = point.family.rigid @ point.family.rigid_left(point.p)
+        r = R.shape[1]
         border = M @ R
         size = np.abs(K).max() / max(float(np.abs(border).max(initial=0.0)), 1e-300) if r else 1.0
         system = np.block([[K, border * size], [border.T * size, np.zeros((R.shape[1],) * 2)]])

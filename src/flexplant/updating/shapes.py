@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 from scipy.optimize import linear_sum_assignment
 
 from ..errors import LabelError, ModelError, ShapeError
 from ..identification import MeasuredModes
 from ..labels import Place
-from ..values import ComplexArray, FloatArray, real_array
+from ..values import ComplexArray, FloatArray, flag, real_array
 from .pairing import CLUSTER, mac
 from .pencil import Family, groups
 from .point import Point
-from .residuals_base import Bound, Residual, place_rows, split_parts
+from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -33,15 +34,20 @@ class ModeShapes(Residual):
     ----------
     measured : MeasuredModes
         Poles with their mode numbers.
-    shapes : (m, modes) real or complex array
-        In the order of the poles; any scale.
-    at : sequence of m places
-        DOF labels, points or mappings.
+    shapes : (m, modes) real or complex array, optional
+        In the order of the poles; any scale. None: those of `measured`.
+    at : sequence of m places, optional
+        DOF labels, points or mappings. None: the labels of `measured`'s rows; a mapping
+        {row's label: place} where these are names of channels.
     direction : str
         Of the motion at points.
     std : float or (m, modes) array, optional
         Standard deviation of the entries (of a complex one: ``E|n|^2 = std^2``), in their own
         scale. None: all equal, not known.
+    covariance : (modes, m, m) array, optional
+        ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; what it says of the scale
+        is not used, so it may be singular there (a shape whose largest entry was set to 1). That of
+        `measured`, where its shapes are taken and it knows one (`shape_covariance`).
     assign : bool
         Whether modes are assigned by MAC with the measured shapes; False: by continuation.
 
@@ -58,10 +64,11 @@ class ModeShapes(Residual):
     """
 
     measured: MeasuredModes
-    shapes: FloatArray | ComplexArray
-    at: Sequence[Place]
+    shapes: FloatArray | ComplexArray | None = None
+    at: Sequence[Place] | Mapping[str, Place] | None = field(default=None)
     direction: str = field(default="z", kw_only=True)
     std: FloatArray | None = field(default=None, kw_only=True)
+    covariance: ComplexArray | FloatArray | None = field(default=None, kw_only=True)
     assign: bool = field(default=True, kw_only=True)
 
     def __post_init__(self) -> None:
@@ -70,13 +77,13 @@ class ModeShapes(Residual):
             raise ModelError(f"{name} needs MeasuredModes, got {type(self.measured).__name__}.")
         if self.measured.modes is None:
             raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
-        at = [self.at] if isinstance(self.at, str) else list(self.at)
+        at, given = _rows(self, name)
         shape = (len(at), len(self.measured))
-        real = real_array(np.real(self.shapes), "shapes", shape)
-        imag = real_array(np.imag(self.shapes), "the imaginary part of shapes", shape)
+        real = real_array(np.real(given), "shapes", shape)
+        imag = real_array(np.imag(given), "the imaginary part of shapes", shape)
         if len(at) < 2:
             raise ShapeError(f"{name} needs two places at least: the scale of one is not known.")
-        shapes: Any = real + 1j * imag if np.iscomplexobj(self.shapes) else real
+        shapes: Any = real + 1j * imag if np.iscomplexobj(given) else real
         empty = np.flatnonzero(np.all(shapes == 0, axis=0))
         if empty.size:
             raise ModelError(f"the shape of mode {self.measured.modes[empty[0]]} is zero.")
@@ -86,12 +93,21 @@ class ModeShapes(Residual):
             std = real_array(std, "std", shape)
             if std.min() <= 0:
                 raise ModelError(f"std must be positive, got {std.min():g}.")
-        self._set(shapes=shapes, at=tuple(at), std=std)
+        covariance = self.covariance
+        if covariance is None and self.shapes is None and std is None:
+            covariance = getattr(self.measured, "shape_covariance", None)
+        if covariance is not None:
+            if std is not None:
+                raise ModelError("std and covariance say the same thing: give one of them.")
+            covariance = _checked_covariance(covariance, (shape[1], shape[0]))
+        self._set(shapes=shapes, at=tuple(at), std=std, covariance=covariance)
+        self._set(assign=flag(self.assign, "assign"))
 
     def __repr__(self) -> str:
         numbers = ", ".join(str(n) for n in self.measured.modes or ())
-        known = "not known" if self.std is None else "known"
-        return f"<{type(self).__name__}: modes {numbers} at {len(self.at)} places, noise {known}>"
+        known = "not known" if self.std is None and self.covariance is None else "known"
+        places = len(self.at or ())
+        return f"<{type(self).__name__}: modes {numbers} at {places} places, noise {known}>"
 
     def select(self, modes: Sequence[int]) -> ModeShapes:
         """Return the residual of some of its modes, by number.
@@ -103,7 +119,9 @@ class ModeShapes(Residual):
         """
         chosen, columns = chosen_modes(self.measured, modes)
         std = None if self.std is None else self.std[:, columns]
-        return self.replace(measured=chosen, shapes=self.shapes[:, columns], std=std)
+        covariance = None if self.covariance is None else self.covariance[columns]
+        shapes = np.asarray(self.shapes)[:, columns]
+        return self.replace(measured=chosen, shapes=shapes, std=std, covariance=covariance)
 
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""
@@ -121,14 +139,16 @@ class ShapeCorrelation(ModeShapes):
     ----------
     measured : MeasuredModes
         Poles with their mode numbers.
-    shapes : (m, modes) real or complex array
-        In the order of the poles; any scale.
-    at : sequence of m places
-        DOF labels, points or mappings.
+    shapes : (m, modes) real or complex array, optional
+        In the order of the poles; any scale. None: those of `measured`.
+    at : sequence of m places or mapping, optional
+        DOF labels, points or mappings; as in `ModeShapes`.
     direction : str
         Of the motion at points.
     std : float or (m, modes) array, optional
         Weighs the entries in the MAC by 1/std; the residuals themselves have no known noise.
+    covariance : (modes, m, m) array, optional
+        Instead of `std`.
     assign : bool
         Whether modes are assigned by MAC with the measured shapes.
 
@@ -153,14 +173,10 @@ class _BoundShapes(Bound):
         self.sets = [*alone, *near]
         self.own = own
         self.numbers = own
-        self.noisy = residual.std is not None
-        self.rows = place_rows(family, residual.at, residual.direction)
+        self.noisy = residual.std is not None or residual.covariance is not None
+        self.rows = place_rows(family, list(residual.at or ()), residual.direction)
         self.psi = np.asarray(residual.shapes)
-        size = np.linalg.norm(self.psi, axis=0)
-        # Re and Im of complex noise have half the variance each
-        part = np.sqrt(2.0) if np.iscomplexobj(self.psi) else 1.0
-        std = size * np.ones(self.psi.shape) if residual.std is None else residual.std / part
-        self.weight = 1 / std
+        self.white = _whitening(self.psi, residual)
         self.assign = residual.assign
         self.name = f"shapes of modes {', '.join(map(str, own))}"
 
@@ -182,12 +198,12 @@ class _BoundShapes(Bound):
     def _parts(self, point: Point, group: list[int], i: int) -> tuple[Any, Any, Any]:
         """Return the whitened model shapes of a group (m, s), its basis Q and the measured one."""
         columns = point.columns([self.own[j] for j in group])
-        weight = self.weight[:, i]
-        Phi = weight[:, None] * (self.rows @ point.eigen.X[:, columns])
+        white = self.white[i]
+        Phi = white @ (self.rows @ point.eigen.X[:, columns])
         if not np.any(Phi.imag):
             Phi = Phi.real
         Q = np.linalg.qr(Phi)[0]
-        return Phi, Q, weight * self.psi[:, i]
+        return Phi, Q, white @ self.psi[:, i]
 
     def values(self, point: Point) -> FloatArray:
         found = []
@@ -204,7 +220,7 @@ class _BoundShapes(Bound):
             dY = self.rows @ dX
             for i in group:
                 Phi, Q, psi = self._parts(point, group, i)
-                dPhi = self.weight[:, i][:, None] * (dY if np.iscomplexobj(Phi) else dY.real)
+                dPhi = self.white[i] @ (dY if np.iscomplexobj(Phi) else dY.real)
                 plus = np.linalg.pinv(Phi)
                 left = psi - Q @ (Q.conj().T @ psi)
                 inner = dPhi @ (plus @ psi)
@@ -240,7 +256,7 @@ class _BoundMac(_BoundShapes):
             dY = self.rows @ dX
             for i in group:
                 Phi, Q, psi = self._parts(point, group, i)
-                dPhi = self.weight[:, i][:, None] * dY
+                dPhi = self.white[i] @ dY
                 plus = np.linalg.pinv(Phi)
                 left = psi - Q @ (Q.conj().T @ psi)
                 # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
@@ -258,10 +274,62 @@ def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[Measure
     if missing or not wanted:
         raise LabelError(f"modes {missing or '[]'} were not measured; measured are {list(known)}.")
     columns = [known.index(n) for n in wanted]
-    covariance = measured.covariance
-    if covariance is not None:
-        at = columns + [c + len(measured) for c in columns]
-        covariance = covariance[np.ix_(at, at)]
-    return MeasuredModes(
-        measured.poles[columns], modes=tuple(wanted), covariance=covariance
-    ), columns
+    return measured.select(columns), columns
+
+
+def _rows(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
+    """Return the places and the shapes there, from the measured modes where none are given."""
+    measured, at = residual.measured, residual.at
+    if residual.shapes is not None:
+        if at is None or isinstance(at, Mapping):
+            raise ShapeError(f"{name} needs at=, the place of each row of the shapes given.")
+        return [at] if isinstance(at, str) else list(at), residual.shapes
+    if measured.shapes is None:
+        raise ShapeError(
+            f"{measured!r} holds no shapes: give them, {name}(measured, shapes, at), or identify "
+            "them."
+        )
+    labels = measured.dofs or ()
+    if at is None or isinstance(at, Mapping):
+        return list(channel_places(labels, at)), measured.shapes
+    return [at] if isinstance(at, str) else list(at), measured.shapes
+
+
+def _checked_covariance(value: Any, size: tuple[int, int]) -> Any:
+    shape = (size[0], size[1], size[1])
+    real = real_array(np.real(value), "covariance", shape)
+    imag = real_array(np.imag(value), "the imaginary part of covariance", shape)
+    whole = real + 1j * imag if np.any(imag) else real
+    mirrored = np.swapaxes(whole, 1, 2).conj()
+    if not np.allclose(whole, mirrored, rtol=1e-6, atol=1e-9 * np.abs(whole).max(initial=0.0)):
+        raise ModelError("covariance of shapes must be Hermitian: E[n n^H] of each.")
+    if np.linalg.eigvalsh(whole).min() < -1e-9 * np.abs(whole).max(initial=0.0):
+        raise ModelError("covariance of shapes must be positive semi-definite, E[n n^H] of each.")
+    return (whole + mirrored) / 2
+
+
+def _whitening(psi: Any, residual: ModeShapes) -> list[Any]:
+    """Return a matrix for each shape that gives its real residuals unit variance."""
+    # Re and Im of complex noise have half the variance each
+    part = 2.0 if np.iscomplexobj(psi) else 1.0
+    found: list[Any] = []
+    for i, shape in enumerate(psi.T):
+        if residual.covariance is not None:
+            known = residual.covariance[i]
+            size = float(np.trace(known).real) / shape.size
+            # noise along the shape is scale, which is free: any amount of it changes nothing
+            along = np.outer(shape, shape.conj()) / float(np.vdot(shape, shape).real)
+            known = known + size * (along + 1e-10 * np.eye(shape.size))
+            try:
+                factor = la.cholesky(known / part, lower=True)
+            except la.LinAlgError:
+                raise ModelError(
+                    f"the covariance of shape {i + 1} is zero: a shape without noise would count "
+                    "infinitely. Leave covariance= out."
+                ) from None
+            found.append(la.solve_triangular(factor, np.eye(shape.size), lower=True))
+        elif residual.std is not None:
+            found.append(np.diag(np.sqrt(part) / residual.std[:, i]))
+        else:
+            found.append(np.eye(shape.size) / np.linalg.norm(shape))
+    return found
