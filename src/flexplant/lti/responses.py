@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,8 @@ CHUNK = 2_000_000
 #: frequencies at a time in block form: the scalar functions of all modes stay in cache
 MODAL_STEP = 512
 
+#: responses (p, m, n_s), and whether they are finite for certain: large arrays are not read again
+Modal: TypeAlias = Callable[[ComplexArray], tuple[ComplexArray, bool]]
 #: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument
 Solver = Callable[[ComplexArray, ComplexArray], None]
 
@@ -34,7 +37,12 @@ def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
         return lambda freq: np.repeat(g.D[:, :, None], freq.size, axis=2).astype(np.complex128)
     modal = _modal(g) or _fed_by_lines(g)
     if modal is not None:
-        return lambda freq: _finite(modal(_points(g, freq)), freq)
+
+        def by_modes(freq: FloatArray) -> ComplexArray:
+            data, tame = modal(_points(g, freq))
+            return data if tame else _finite(data, freq)
+
+        return by_modes
     solve = _solver(g)
     step = max(1, CHUNK // (g.n_states * (len(g.inputs) + 2)))
 
@@ -99,7 +107,7 @@ def _paired(g: StateSpace) -> tuple[FloatArray, IntArray, FloatArray]:
     return pairs, slots, coupling
 
 
-def _modal(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | None:
+def _modal(g: StateSpace) -> Modal | None:
     """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
 
     With m half the trace of a block, N = A - m I and N^2 = q I (Cayley-Hamilton),
@@ -124,43 +132,57 @@ def _modal(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | None:
     C = (g.C[:, slots] * real).transpose(1, 2, 0)  # (b, 2, p)
     with_s = np.einsum("bip,bim->pmb", C, B).reshape(g.D.size, -1)
     without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(g.D.size, -1)
-    moving, fixed = np.any(with_s, axis=0), np.any(without, axis=0)
+    moving, fixed = _chosen(with_s), _chosen(without)
     through = g.D.reshape(-1, 1) if np.any(g.D) else np.zeros((g.D.size, 0))
     residues = np.hstack([with_s[:, moving], without[:, fixed], through])
-    n_moving, n_both = int(moving.sum()), int(moving.sum() + fixed.sum())
+    n_moving = with_s[:, moving].shape[1]
+    n_both = n_moving + without[:, fixed].shape[1]
 
-    def found(s: ComplexArray) -> ComplexArray:
+    # functions below this, times the residues, cannot overflow
+    ceiling = 1e300 / (float(np.abs(residues).sum(axis=1).max(initial=0.0)) or 1.0)
+
+    def found(s: ComplexArray) -> tuple[ComplexArray, bool]:
         data = np.empty((*g.D.shape, s.size), dtype=np.complex128)
         out = data.reshape(g.D.size, -1).view(np.float64)
+        tame = True
         for start in range(0, s.size, MODAL_STEP):
             part = s[start : start + MODAL_STEP]
-            x, y = part.real - mean[:, None], part.imag
-            real_part = (x - split[:, None]) * (x + split[:, None])
-            real_part += (swing[:, None] - y) * (swing[:, None] + y)
-            imag_part = 2.0 * x * y
+            y = part.imag
+            # on the imaginary axis a mode's x is one number: what stays (b, 1) costs nothing
+            x = part.real - mean[:, None] if g.dt else -mean[:, None]
             functions = np.empty((residues.shape[1], part.size, 2))
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                size = 1.0 / (real_part * real_part + imag_part * imag_part)
+                real_part = (swing[:, None] - y) * (swing[:, None] + y)
+                real_part += (x - split[:, None]) * (x + split[:, None])
+                imag_part = (2.0 * x) * y
+                size = real_part * real_part
+                size += imag_part * imag_part
+                np.divide(1.0, size, out=size)
                 real_part *= size
-                imag_part *= -size  # (real_part, imag_part) is 1 / ((s - m)^2 - q) now
+                imag_part *= np.negative(size, out=size)
+                # (real_part, imag_part) is 1 / ((s - m)^2 - q) now
                 if n_moving:
-                    r, i, x = real_part[moving], imag_part[moving], x[moving]
-                    functions[:n_moving, :, 0] = x * r - y * i
-                    functions[:n_moving, :, 1] = x * i + y * r
+                    x, r, i = x[moving], real_part[moving], imag_part[moving]
+                    np.subtract(x * r, y * i, out=functions[:n_moving, :, 0])
+                    np.add(x * i, y * r, out=functions[:n_moving, :, 1])
                 functions[n_moving:n_both, :, 0] = real_part[fixed]
                 functions[n_moving:n_both, :, 1] = imag_part[fixed]
                 functions[n_both:] = (1.0, 0.0)
-                np.matmul(
-                    residues,
-                    functions.reshape(residues.shape[1], -1),
-                    out=out[:, 2 * start : 2 * (start + part.size)],
-                )
-        return data
+                flat = functions.reshape(residues.shape[1], -1)
+                tame = tame and -ceiling < flat.min(initial=0.0) and flat.max(initial=0.0) < ceiling
+                np.matmul(residues, flat, out=out[:, 2 * start : 2 * (start + part.size)])
+        return data, tame
 
     return found
 
 
-def _fed_by_lines(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | None:
+def _chosen(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
+    """Return which columns are not zero; all of them as a slice, which copies nothing."""
+    some = np.any(residues, axis=0)
+    return slice(None) if some.all() else some
+
+
+def _fed_by_lines(g: StateSpace) -> Modal | None:
     """Modes fed by a few further states, such as the delay lines of a sampled plant.
 
     With A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
@@ -194,11 +216,11 @@ def _fed_by_lines(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | Non
     reached = _reached(g.A[head:, head:], g.B[head:])
     direct = np.setdiff1d(np.flatnonzero(np.any(g.C[:, head:], axis=0)), feeding)
 
-    def found(s: ComplexArray) -> ComplexArray:
+    def found(s: ComplexArray) -> tuple[ComplexArray, bool]:
         X = np.zeros((n - head, m, s.size), dtype=np.complex128)
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             tail(s, X)
-        both = driven(s)
+        both, _ = driven(s)
         data = np.ascontiguousarray(both[:, :m])
         for i, line in enumerate(feeding):
             for j in np.flatnonzero(reached[line]):
@@ -206,7 +228,7 @@ def _fed_by_lines(g: StateSpace) -> Callable[[ComplexArray], ComplexArray] | Non
         for line in direct:
             for j in np.flatnonzero(reached[line]):
                 data[:, j] += g.C[:, head + line, None] * X[line, j]
-        return data
+        return data, False
 
     return found
 
