@@ -144,6 +144,12 @@ DOORS = [
     ("plot.sensor_map", lambda x: fx.plot.sensor_map(x), ()),
 ]  # fmt: skip
 
+#: a sentence or clause that says what to do, or what there is to choose from
+VERBS = "add call check choose convert give leave make move name pass put raise remove say take try"
+NEXT_STEP = re.compile(
+    rf"[.;:,?] (?:{VERBS.replace(' ', '|')}|type|use|known are|close matches)\b", re.IGNORECASE
+)
+
 CASES = [
     pytest.param(call, kind, id=f"{name} {kind}")
     for name, call, allowed in DOORS
@@ -158,8 +164,14 @@ def test_wrong_kinds(call, kind):
         call(KINDS[kind])
     text = str(caught.value)
     assert len(text) < 600
-    # something to do, or what is there to choose from
-    assert re.search(r"[.:;?] ?[A-Z][a-z]|Type|Known are|Close matches|use |Pass|: \w+", text), text
+    assert NEXT_STEP.search(text), f"what to do next? {text}"
+
+
+def test_what_counts_as_a_next_step():
+    for text in ("a plant is missing.", "got 'a': str", "need a plant, got 2. It has none.", "Use"):
+        assert not NEXT_STEP.search(text)
+    for text in ("got 'a'. Pass a float.", "no 'a'. Known are b, c.", "got 2: choose 3 or more."):
+        assert NEXT_STEP.search(text)
 
 
 def test_the_rate_of_these_tests_is_the_stages():

@@ -347,7 +347,7 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     if len(ports.z) != 1:
         raise LabelError(
             f"the plant has {len(ports.z)} POIs ({', '.join(p.name for p in ports.z)}): say which "
-            "one counts, such as PoiVariance('die')."
+            f"one counts, such as PoiVariance({ports.z[0].name!r})."
         )
     return ports.z[0]
 

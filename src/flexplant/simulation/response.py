@@ -225,7 +225,8 @@ class Response(Value, Mapping[str, FloatArray]):
         keep = self.time >= first - 0.5 * self.dt
         if not np.any(keep):
             raise ModelError(
-                f"start={first:g} s leaves nothing: the response ends at {self.time[-1]:g} s."
+                f"start={first:g} s leaves nothing: the response ends at {self.time[-1]:g} s. "
+                "Choose an earlier start, or simulate for longer."
             )
         return signal[..., keep]
 

@@ -117,7 +117,8 @@ def simulate(
     """
     if not isinstance(loop, ClosedLoop):
         raise ModelError(
-            f"simulate needs a ClosedLoop, got {type(loop).__name__}: close_loop(plant, *blocks)."
+            f"simulate needs a ClosedLoop, got {type(loop).__name__}. "
+            "Make it by close_loop(plant, *blocks)."
         )
     plant = loop.plant
     _check_sampled(loop)

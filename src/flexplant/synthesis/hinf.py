@@ -66,8 +66,9 @@ def design_hinf(
     if not isinstance(plant, StandardPlant):
         if u is None or y is None:
             raise ModelError(
-                f"design_hinf needs a StandardPlant, got {type(plant).__name__}. For a StateSpace "
-                "name the controller's channels: design_hinf(sys, u=(...), y=(...))."
+                f"design_hinf needs a StandardPlant, got {type(plant).__name__}. Make it by "
+                "assemble_plant(model, ports); of a StateSpace, name the controller's channels: "
+                "design_hinf(sys, u=(...), y=(...))."
             )
         u, y = name_list(u, "u"), name_list(y, "y")
         plant = StandardPlant.from_statespace(plant, u=u, y=y)

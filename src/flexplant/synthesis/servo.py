@@ -116,7 +116,8 @@ def _below_nyquist(freq: float, name: str, rate: float) -> None:
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
     if not isinstance(plant, StandardPlant):
         raise ModelError(
-            f"need a StandardPlant, got {type(plant).__name__}: assemble_plant(model, ports)."
+            f"need a StandardPlant, got {type(plant).__name__}. "
+            "Make it by assemble_plant(model, ports)."
         )
     if plant.unweighted is not None:
         raise ModelError(
@@ -125,7 +126,11 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     if plant.ports is None or not plant.ports.z:
         raise AssumptionError("a servo needs a plant assembled from ports with a POI.")
     if name is None and len(plant.ports.z) > 1:
-        raise LabelError(f"the plant has {len(plant.ports.z)} POIs: say which, poi=...")
+        names = ", ".join(poi.name for poi in plant.ports.z)
+        raise LabelError(
+            f"the plant has {len(plant.ports.z)} POIs ({names}): say which one the servo moves, "
+            f"such as poi={plant.ports.z[0].name!r}."
+        )
     return plant.ports.poi(name if name is not None else plant.ports.z[0].name)
 
 
