@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
 from ..errors import SolverError
 from ..values import FloatArray
@@ -122,32 +125,55 @@ def _search(
     """Return shapes (n, want) beside the locked ones, residuals down to rounding."""
     lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed)
     extra = min(_EXTRA, want - 1)
-    theta, phi = lanczos.lowest(want, extra=extra)
-    for tolerance in (1e-2 * FOUND, 1e-4 * FOUND):
-        left, rounding = _residuals(model, factor.sigma + 1 / theta, phi)
-        fine = left <= np.maximum(_RESIDUAL, _ROUNDINGS * rounding)
-        if np.all(fine[: want - extra]):
+    asked = want - extra
+    mass, stiffness = by_rows(model.M), by_rows(model.K)
+    deflated = np.asarray(mass @ locked)
+    best, found = np.inf, np.zeros((locked.shape[0], 0))
+    for tolerance in FOUND * np.array([1, 2e-3, 1e-5]):
+        _, phi = lanczos.lowest(want, tolerance, extra=extra)
+        # one inverse iteration: what is left in phi of high modes, most of its residual, is gone
+        force = mass @ phi
+        force -= deflated @ (locked.T @ force)
+        phi = factor.solve(force)
+        phi -= locked @ (deflated.T @ phi)
+        phi, left = _ritz_residual(mass, stiffness, phi, asked)
+        if left < best:
+            best, found = left, phi
+        if left <= 1:
             break
-        theta, phi = lanczos.lowest(want, tolerance, extra=extra)
-    return phi
+    return found
 
 
-def _residuals(
-    model: FEModel, squares: FloatArray, phi: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Return ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode, and the rounding in it."""
-    K = by_rows(model.K)
-    force = K @ phi
+def _ritz_residual(M: Any, K: Any, phi: FloatArray, asked: int) -> tuple[FloatArray, float]:
+    """Return the Rayleigh-Ritz shapes in the span of phi, and the worst residual of `asked` ones.
+
+    ``||K phi - omega^2 M phi|| / ||K phi||`` in units of what is let pass.
+    """
+    force, mass = K @ phi, M @ phi
+    squares, mix = la.eigh(_even(phi.T @ force), _even(phi.T @ mass))
+    mine = np.ascontiguousarray(mix[:, :asked])
+    force, mass = force @ mine, mass @ mine
     size = np.linalg.norm(force, axis=0)
-    left = np.linalg.norm(force - (by_rows(model.M) @ phi) * squares, axis=0)
-    rounding = np.finfo(np.float64).eps * np.linalg.norm(abs(K) @ np.abs(phi), axis=0)
-    return left / size, rounding / size
+    left = np.linalg.norm(force - mass * squares[:asked], axis=0)
+    phi = phi @ mix
+    rounding = np.finfo(np.float64).eps * np.linalg.norm(
+        _absolute(K) @ np.abs(phi[:, :asked]), axis=0
+    )
+    return phi, float(np.max(left / np.maximum(_RESIDUAL * size, _ROUNDINGS * rounding)))
+
+
+def _absolute(K: Any) -> Any:
+    return sp.csr_array((np.abs(K.data), K.indices, K.indptr), shape=K.shape)
+
+
+def _even(A: FloatArray) -> FloatArray:
+    return np.asarray(0.5 * (A + A.T))
 
 
 def _rayleigh_ritz(model: FEModel, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
     stiffness = phi.T @ (by_rows(model.K) @ phi)
     mass = phi.T @ (by_rows(model.M) @ phi)
-    squares, mix = la.eigh(0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T))
+    squares, mix = la.eigh(_even(stiffness), _even(mass))
     return squares, np.asarray(phi @ mix)
 
 
