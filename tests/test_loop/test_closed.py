@@ -8,11 +8,14 @@ from hypothesis import strategies as st
 
 import oracles_loop as oracle
 from flexplant.errors import LabelError, ModelError
+from flexplant.estimation import design_static
 from flexplant.loop import ClosedLoop, close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
 from flexplant.store import load
+from flexplant.synthesis import design_servo
 from machines import RATE, block, matrices, observer, servo, stage
+from stages import reduced, sampled
 
 DT = 1.0 / RATE
 
@@ -238,9 +241,10 @@ def test_idle_must_be_true():
         close_loop(stage(), observer(), servo(), idle=["u9"])
 
 
-def test_only_a_standard_plant_can_be_closed():
-    with pytest.raises(ModelError, match="from_statespace"):
-        close_loop(stage().system, observer(), servo())
+def test_a_system_whose_names_do_not_tell_cannot_be_closed():
+    plain = stage().system.renamed(outputs={"u1:effort": "force1", "u2:effort": "force2"})
+    with pytest.raises(LabelError, match="from_statespace"):
+        close_loop(plain, observer(), servo())
 
 
 def test_the_recursion_itself(loop):
@@ -277,3 +281,26 @@ def test_frequency_response_by_structure_equals_the_closed_system(loop):
     ).transpose(1, 2, 0)
     assert (tuple(found.inputs), tuple(found.outputs)) == (loop.plant.w, loop.plant.z)
     np.testing.assert_allclose(found.data, dense, rtol=1e-7, atol=1e-9 * np.abs(dense).max())
+
+
+def test_a_plant_of_python_control_with_our_names_closes_the_same_loop():
+    """Names tell w, u, z and y; a system whose names do not is refused with the line to type."""
+    plant = sampled(reduced())
+    twin = plant.to_control()
+    again = StandardPlant.from_statespace(twin)
+    assert (again.w, again.u, again.z, again.y) == (plant.w, plant.u, plant.z, plant.y)
+    blocks = design_static(plant), design_servo(plant, bandwidth=30.0)
+    ours, theirs = close_loop(plant, *blocks), close_loop(twin, *blocks)
+    assert theirs.system.inputs == ours.system.inputs
+    assert theirs.modulus_margin == pytest.approx(ours.modulus_margin, rel=1e-6)
+    for system in (
+        twin[:3, :],  # no efforts: what are actuators?
+        plant.system.select(inputs=plant.w),
+        plant.system.renamed(outputs={plant.y[0]: "y1:measured"}),
+    ):
+        with pytest.raises(LabelError, match=r"from_statespace\(sys, w="):
+            close_loop(system, *blocks)
+    with pytest.raises(LabelError, match="name both u and y"):
+        StandardPlant.from_statespace(twin, u=plant.u)
+    with pytest.raises(ModelError, match="need a StandardPlant, got 3"):
+        close_loop(3, *blocks)

@@ -134,5 +134,5 @@ def test_several_references_must_be_named():
     np.testing.assert_allclose(block.D[:, -1], expected, atol=1e-9)
     weights = stage_weights(plant, 30.0, poi="edge")
     assert {"die:error", "edge:error"} <= set(weights.z)
-    with pytest.raises(ModelError, match="need a StandardPlant, got str"):
+    with pytest.raises(ModelError, match="need a StandardPlant, got 'plant'"):
         stage_weights("plant", 30.0)

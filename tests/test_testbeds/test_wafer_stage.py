@@ -345,3 +345,21 @@ def test_refusals():
     observer, servo = servo_on(0.01)
     with pytest.raises(ModelError, match="duration"):
         machine_.run(ports(), observer, servo, duration=-1.0)
+
+
+def block_of(model, name):
+    matrix = getattr(model, name)
+    return matrix.toarray() if hasattr(matrix, "toarray") else np.asarray(matrix)
+
+
+@pytest.mark.parametrize("damper", [1e2, 1e4])
+def test_poles_of_a_machine_whose_damper_couples_its_modes(damper):
+    """Against the companion matrix: blocks of coupled modes have no poles of their own."""
+    bare = wafer_stage(elements=(4, 4)).truth
+    row = bare.dofs.row((L / 2, L / 4, 0.0), "z")
+    M, D, K = (block_of(bare, name) for name in "MDK")
+    D = D + damper * np.outer(row, row)
+    found = WaferStage(bare.replace(D=D), RATE, 1).poles([4, 5, 6, 7]).poles
+    expected = dense_poles(M, D, K)
+    swinging = expected[expected.imag > 100.0]
+    np.testing.assert_allclose(found, swinging[:4], rtol=1e-9)

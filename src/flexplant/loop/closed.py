@@ -13,8 +13,8 @@ import numpy.typing as npt
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.frequency import Frf, frequency_response
 from ..lti.interconnection import connect, lft
-from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..lti.statespace import StateSpace, System
+from ..plant import StandardPlant, standard_plant
 from ..values import Value, name_list, real_array
 
 
@@ -184,7 +184,7 @@ class ClosedLoop(Value):
         return modulus_margin(self)
 
 
-def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> ClosedLoop:
+def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] = ()) -> ClosedLoop:
     """Return the closed loop of a plant with controller blocks, connected by name.
 
     An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
@@ -194,8 +194,9 @@ def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> 
 
     Parameters
     ----------
-    plant : StandardPlant
-        The plant.
+    plant : StandardPlant, StateSpace or control.StateSpace
+        The plant; a system whose channels are named like those of an assembled plant (see
+        `StandardPlant.from_statespace`) is one.
     *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
         The controller in any number of parts. Sampled at the plant's rate, or static gains.
     idle : iterable of str
@@ -209,7 +210,8 @@ def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> 
     Raises
     ------
     LabelError
-        When an input is connected to nothing, an actuator is driven by nothing (and not idle), or
+        When the names of a system do not tell which channels are w, u, z and y, an input is
+        connected to nothing, an actuator is driven by nothing (and not idle), or
         a name other than an actuator's is driven twice.
     ModelError
         When there is no block, a block is no system, sampling times differ, or the algebraic loop
@@ -227,11 +229,7 @@ def close_loop(plant: StandardPlant, *blocks: Any, idle: Iterable[str] = ()) -> 
     >>> loop.is_stable, round(loop.spectral_abscissa, 6)
     (True, -10.0)
     """
-    if not isinstance(plant, StandardPlant):
-        raise ModelError(
-            f"close_loop needs a StandardPlant first, got {type(plant).__name__}. Use "
-            "assemble_plant(model, ports), or StandardPlant.from_statespace(sys, u=, y=)."
-        )
+    plant = standard_plant(plant)
     systems = tuple(_block(block, i, plant.dt) for i, block in enumerate(blocks, 1))
     if not systems:
         raise ModelError(

@@ -22,6 +22,13 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     matched at one frequency. Notches keep their frequency and depth exactly, which Tustin only
     does at one.
 
+    Of one input and one output alone, as in MATLAB's c2d: the zeros of several channels are
+    properties of all of them together (with their directions), and no state space with mapped
+    poles and mapped transmission zeros keeps the gains of the single entries; entry by entry, the
+    poles would be there once for each entry. Sampling the residues of a modal form is impulse
+    invariance, another method, which aliases. A filter with a section for each channel is sampled
+    section by section: ``append(*(matched(f, rate) for f in sections))``.
+
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
@@ -54,7 +61,8 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     if g.D.shape != (1, 1):
         raise ModelError(
             f"matched needs one input and one output, got {len(g.inputs)} and {len(g.outputs)}: "
-            "zeros of several channels cannot be mapped one by one. Use tustin, or select channels."
+            "zeros of several channels cannot be mapped one by one. Use tustin, or sample each "
+            "channel by itself: append(matched(g['y1', 'u1'], rate), ...)."
         )
     if at >= 0.5 * rate:
         raise ModelError(f"at must lie below half the rate ({0.5 * rate:g} Hz), got {at:g}.")

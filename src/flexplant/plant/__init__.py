@@ -22,6 +22,7 @@ from .stage import StageWeights as StageWeights
 from .stage import reference_errors as reference_errors
 from .stage import stage_weights as stage_weights
 from .standard import StandardPlant as StandardPlant
+from .standard import standard_plant as standard_plant
 from .suspension import GroundSpring as GroundSpring
 from .suspension import suspend as suspend
 from .uncertainty import Delta as Delta

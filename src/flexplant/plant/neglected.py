@@ -9,11 +9,11 @@ import numpy as np
 from ..errors import CertificateError, ModelError
 from ..lti.frequency import default_freq, frequency_response
 from ..lti.interconnection import series
-from ..lti.statespace import StateSpace
+from ..lti.statespace import StateSpace, System
 from ..values import FloatArray, Value
 from .assembly import assemble_plant
 from .realisation import Structure
-from .standard import StandardPlant
+from .standard import StandardPlant, standard_plant
 
 #: the weight lies this far above the largest difference found
 _MARGIN = 1.05
@@ -22,6 +22,11 @@ _MARGIN = 1.05
 @dataclass(frozen=True, eq=False, repr=False)
 class NeglectedModes(Value):
     """``y = (G + diag(sizes) Delta w(s)) u``, Delta any stable system of gain at most 1.
+
+    The bound is of the loop, u -> y: it answers whether a controller stays stable on the larger
+    model. What neglected modes do from w and to z at a point of interest is no part of it (Delta
+    would tie forces in N to motions in m of other places, a bound far too wide to be of use):
+    judge performance on the larger model itself, or on machines that `sample` draws.
 
     Parameters
     ----------
@@ -48,7 +53,9 @@ class NeglectedModes(Value):
         return f"<NeglectedModes: {len(self.u)} u -> {len(self.y)} y, bounded {self.tightest:.3g}>"
 
 
-def neglected_modes(plant: StandardPlant, larger: StandardPlant | Structure) -> NeglectedModes:
+def neglected_modes(
+    plant: StandardPlant | System, larger: StandardPlant | System | Structure
+) -> NeglectedModes:
     """Return a weight that bounds what a larger model has and a plant has not, from u to y.
 
     ``sigma_max(diag(1/sizes) (G_larger - G)(i omega)) <= |w(i omega)|`` at all frequencies, with
@@ -74,7 +81,10 @@ def neglected_modes(plant: StandardPlant, larger: StandardPlant | Structure) -> 
     CertificateError
         When the sweep finds a larger difference than the weight.
     """
+    plant = standard_plant(plant)
     small = plant.continuous or plant
+    if hasattr(larger, "A"):
+        larger = standard_plant(larger)
     if not isinstance(larger, StandardPlant):
         if plant.ports is None:
             raise ModelError("the plant has no ports to assemble the larger model with.")

@@ -15,7 +15,7 @@ from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive
 from .forces import BaseAcceleration, OutputDisturbance
 from .ports import Ports
-from .standard import StandardPlant
+from .standard import StandardPlant, standard_plant
 from .weights import inverse_sensitivity, leadlag
 
 #: |S| of the finished loop crosses 1 below the weight's crossing, by gamma, which is near 1.6
@@ -234,10 +234,7 @@ def stage_weights(
 
 
 def _ports(plant: StandardPlant) -> Ports:
-    if not isinstance(plant, StandardPlant):
-        raise ModelError(
-            f"need a StandardPlant, got {type(plant).__name__}: assemble_plant(model, ports)."
-        )
+    plant = standard_plant(plant)
     if plant.ports is None or not plant.n_rigid:
         raise AssumptionError(
             "this is for a plant assembled from a free structure: assemble_plant(model, ports)."

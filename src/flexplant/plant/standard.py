@@ -13,7 +13,8 @@ import numpy.typing as npt
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, IntArray, Value, name_list, positive
+from ..values import FloatArray, IntArray, Value, name_list, positive, short
+from .door import TYPE_THIS, sides
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation
@@ -116,8 +117,8 @@ class StandardPlant(Partition, Value):
         cls,
         sys: System,
         *,
-        u: Sequence[str],
-        y: Sequence[str],
+        u: Sequence[str] | None = None,
+        y: Sequence[str] | None = None,
         w: Sequence[str] | None = None,
         z: Sequence[str] | None = None,
         asd: Mapping[str, float] | None = None,
@@ -128,8 +129,10 @@ class StandardPlant(Partition, Value):
         ----------
         sys : StateSpace or control.StateSpace
             With named channels.
-        u, y : sequences of str
-            Inputs that the controller drives, outputs that it reads.
+        u, y : sequences of str, optional
+            Inputs that the controller drives, outputs that it reads. Both may be left out when
+            the channels are named like those of an assembled plant (`u1:effort`, `y1:noise`,
+            `die:z`, `die:ref`), as those of `plant.to_control()` are.
         w, z : sequences of str, optional
             Disturbances and performance; the remaining channels when not given.
         asd : mapping, optional
@@ -143,9 +146,16 @@ class StandardPlant(Partition, Value):
         Raises
         ------
         LabelError
-            When a name is unknown or on two sides.
+            When a name is unknown or on two sides, or none is given and the channels do not tell.
         """
         g = as_statespace(sys)
+        if u is None and y is None and w is None and z is None:
+            w, u, z, y = sides(g)
+        if u is None or y is None:
+            raise LabelError(
+                f"name both u and y, got u = {u} and y = {y}. Type {TYPE_THIS}, or leave all four "
+                "out when the channels are named like those of an assembled plant."
+            )
         u, y = name_list(u, "u"), name_list(y, "y")
         w = [n for n in g.inputs if n not in u] if w is None else list(name_list(w, "w"))
         z = [n for n in g.outputs if n not in y] if z is None else list(name_list(z, "z"))
@@ -390,7 +400,8 @@ class StandardPlant(Partition, Value):
         deviations : float
             Standard deviations at which a delta is 1.
         neglected : StandardPlant, FEModel, Modes or ReducedModel, optional
-            A larger model with the same u and y: the difference is bounded by an additive weight.
+            A larger model with the same u and y: the difference from u to y is bounded by an
+            additive weight (not that from w or to z; see `NeglectedModes`).
 
         Returns
         -------
@@ -425,3 +436,25 @@ class StandardPlant(Partition, Value):
         from .check import report
 
         return report(self)
+
+
+def standard_plant(given: StandardPlant | System) -> StandardPlant:
+    """Return a StandardPlant; of a system with labels when these tell w, u, z and y.
+
+    The one door of all functions that take a plant.
+
+    Raises
+    ------
+    LabelError
+        When the labels do not tell.
+    ModelError
+        When it is neither.
+    """
+    if isinstance(given, StandardPlant):
+        return given
+    if isinstance(given, StateSpace) or hasattr(given, "input_labels"):
+        return StandardPlant.from_statespace(given)
+    raise ModelError(
+        f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports), or by "
+        f"{TYPE_THIS}."
+    )
