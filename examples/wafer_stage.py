@@ -12,6 +12,7 @@ import os
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # two processes share the work: one thread each
 
+import json
 from concurrent.futures import ProcessPoolExecutor
 from itertools import combinations
 from pathlib import Path
@@ -466,9 +467,9 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
         shown = {name: frfs[name] for name in names}
         return fx.plot.frf(shown, "y1", "u1", colors=colors)
 
-    def keep(name: str) -> None:
+    def keep(name: str, **metadata: str) -> None:
         drawn.append(folder / f"{name}.png")
-        plt.savefig(drawn[-1], dpi=110)
+        plt.savefig(drawn[-1], dpi=110, metadata=metadata)
         plt.close("all")
 
     fx.plot.layout(plate.dofs, ports=ports(), desired=grid25, marked={"z8": z8})
@@ -493,7 +494,8 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
     frf("measured", "reduced", "updated").set(**zoom)
     keep("figure_11_zoom")
     draw_loops(case["loops"])
-    keep("closed_loop")
+    # the README shows a copy of this one, beside this file: the numbers in it tell when it is old
+    keep("closed_loop", Comment=json.dumps(shown_numbers(case["loops"])))
     fx.plot.sensor_map(result["placement"]["fifth"], ports=ports())
     keep("fifth_sensor")
     return drawn
@@ -517,6 +519,19 @@ def draw_loops(both: dict[str, Any]) -> None:
     dashed = [label for label in curves if label.endswith("machine")]
     fx.plot.sensitivity(curves, colors=colors, dashed=dashed, ax=right)
     right.set_title("sensitivity, die:ref to die:error")
+
+
+def shown_numbers(both: dict[str, Any]) -> dict[str, list[float]]:
+    """Return points of the curves in the README's picture: errors [nm] and |S| [dB]."""
+    shown = {}
+    for name, loop in both.items():
+        run = loop["run"]
+        every = run.time.size // 25
+        shown[f"{name}, die:error [nm]"] = [round(1e9 * x, 2) for x in run["die:error"][::every]]
+        for where, (freq, size) in loop["S"].items():
+            at = np.interp(np.geomspace(1.0, 4000.0, 25), freq, 20 * np.log10(size))
+            shown[f"{name}, {where}, |S| [dB]"] = [round(float(x), 3) for x in at]
+    return shown
 
 
 if __name__ == "__main__":
