@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy.sparse as sp
@@ -15,6 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .numbers import printed_digits, spaced_numbers
+from .paths import file_path
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
 _HELD = 1e35
@@ -69,7 +70,9 @@ def read_abaqus(
     `*MATRIX INPUT` and `*MATRIX OUTPUT`. Units are those of the model: `.converted(...)`.
     """
     files = [stiffness, mass, damping]
-    parts = [None if file is None else _triplets(file) for file in files]
+    parts = [
+        None if file is None and i else _triplets(cast(Any, file)) for i, file in enumerate(files)
+    ]
     there = [part for part in parts if part is not None]
     if len({part.named for part in there}) > 1:
         raise ModelError(
@@ -150,7 +153,7 @@ def symmetric(matrix: sp.csc_array) -> sp.csc_array:
 
 
 def _triplets(path: str | Path) -> _Triplets:
-    content = Path(path).read_bytes()
+    content = file_path(path).read_bytes()
     lines = content.splitlines()
     scale = 1.0
     data = [line for line in lines if line.strip() and line[:1] != b"*"]
@@ -235,7 +238,9 @@ def _nodes(path: str | Path) -> dict[int, list[float]]:
     """Return the coordinates of an input file's nodes."""
     places: dict[int, list[float]] = {}
     inside, instances, in_instance = False, 0, False
-    for number, raw in enumerate(Path(path).read_text(encoding="latin-1").splitlines(), 1):
+    for number, raw in enumerate(
+        file_path(path, "inp").read_text(encoding="latin-1").splitlines(), 1
+    ):
         line = raw.strip()
         if not line or line.startswith("**"):
             continue

@@ -13,6 +13,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra, quiet
+from .paths import file_path
 from .tables import at_nodes, read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none
@@ -59,7 +60,7 @@ def read_ansys(
     FileNotFoundError
         When there is no such file.
     """
-    path = Path(path)
+    path = file_path(path)
     full = _opened(path)
     header = getattr(full, "_header", {})
     with quiet():
@@ -150,7 +151,7 @@ def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatAr
         known = np.array(list(nodes), dtype=np.int64)
         xyz = np.array([np.asarray(place, dtype=np.float64) for place in nodes.values()])
         return at_nodes(wanted, known, xyz.reshape(-1, 3), "nodes"), {}
-    path = Path(nodes)
+    path = file_path(nodes, "nodes")
     if path.suffix.lower() not in (".rst", ".cdb"):
         known, xyz = read_nodes_table(path)
         return at_nodes(wanted, known, xyz, str(path)), {}

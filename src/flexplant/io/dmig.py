@@ -16,6 +16,7 @@ from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .nastran import Nodes, nastran_float, read_nodes
 from .numbers import fixed_numbers, printed_digits
+from .paths import file_path
 
 _STIFFNESS = ("KAAX", "KAA", "KGG", "K2GG", "K2PP", "K")
 _MASS = ("MAAX", "MAA", "MGG", "M2GG", "M2PP", "M")
@@ -72,7 +73,7 @@ def read_dmig(
     Format: MSC Nastran Quick Reference Guide, DMIG. Lengths and masses are in the units of the
     model: `.converted(...)` brings them to SI.
     """
-    content = Path(path).read_bytes()
+    content = file_path(path).read_bytes()
     lines = content.splitlines()
     blocks = _blocks(lines, str(path))
     ends = content.endswith((b"\n", b"\r"))

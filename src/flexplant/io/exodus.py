@@ -16,6 +16,7 @@ from ..errors import FlexplantError, LabelError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
 from ..reduction import Modes
 from ..values import FloatArray, Matrix, positive, real_array
+from .paths import file_path
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
 
@@ -176,7 +177,7 @@ def opened(path: str | Path) -> ExodusFile:
     FileNotFoundError
         When there is no such file.
     """
-    with Path(path).open("rb") as file:
+    with file_path(path).open("rb") as file:
         start = file.read(8)
     if start == b"\x89HDF\r\n\x1a\n":
         try:

@@ -12,6 +12,7 @@ import scipy.io
 
 from ..errors import FlexplantError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
+from .paths import file_path
 
 _OPTIONAL = ("inputs", "outputs", "quantity", "coherence", "variance")
 
@@ -65,7 +66,7 @@ def read_frf_npz(
     >>> read_frf_npz(path).quantity
     'velocity'
     """
-    with Path(path).open("rb") as file:
+    with file_path(path).open("rb") as file:
         try:
             archive = np.load(file, allow_pickle=False)
             if not isinstance(archive, np.lib.npyio.NpzFile):
@@ -119,7 +120,7 @@ def read_frf_mat(
         When there is no such file.
     """
     file: Any  # the stubs know names of files only
-    with Path(path).open("rb") as file:
+    with file_path(path).open("rb") as file:
         try:
             content = scipy.io.loadmat(file, chars_as_strings=True)
         except Exception as error:

@@ -14,6 +14,7 @@ from ..errors import FlexplantError, LabelError, ModelError
 from ..lti.frequency import Frf
 from ..store import written
 from ..values import FloatArray
+from .paths import file_path
 
 _FREQ = "frequency [Hz]"
 _ARROW = " <- "
@@ -100,7 +101,7 @@ def read_frf_csv(path: str | Path) -> Frf:
     FileNotFoundError
         When there is no such file.
     """
-    lines = Path(path).read_text(encoding="utf-8").splitlines()
+    lines = file_path(path).read_text(encoding="utf-8").splitlines()
     comments = [line for line in lines if line.startswith("#")]
     quantity = next((c.split(":", 1)[1].strip() for c in comments if "quantity:" in c), "unknown")
     first = len(comments) + 1

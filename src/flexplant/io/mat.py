@@ -13,6 +13,7 @@ from ..errors import FlexplantError, ModelError
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..plant import StandardPlant
 from ..store import written
+from .paths import file_path
 
 
 def write_mat(path: str | Path, system: System | StandardPlant) -> None:
@@ -76,7 +77,7 @@ def read_mat(path: str | Path) -> StateSpace | StandardPlant:
         When there is no such file.
     """
     file: Any  # the stubs know names of files only
-    with Path(path).open("rb") as file:
+    with file_path(path).open("rb") as file:
         try:
             content = scipy.io.loadmat(file)
         except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:

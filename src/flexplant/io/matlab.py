@@ -15,6 +15,7 @@ from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
+from .paths import file_path
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -54,7 +55,7 @@ def read_matlab(
     FileNotFoundError
         When there is no such file.
     """
-    path = Path(path)
+    path = file_path(path)
     with path.open("rb") as file:
         head = file.read(512 + len(_HDF5))
     wanted = {"K": stiffness, "M": mass, "D": damping}
@@ -100,7 +101,7 @@ def read_npz(
     parts: dict[str, Any] = {}
     for name, path in (("K", stiffness), ("M", mass), ("D", damping)):
         if path is not None:
-            found = _numpy(Path(path), name)
+            found = _numpy(file_path(path, name), name)
             parts |= found if name == "K" else {name: found[name]}
     return assembled(parts, dofs=dofs, source=Path(stiffness).name)
 

@@ -18,6 +18,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, text_digits
 from .numbers import fixed_numbers, spaced_numbers
+from .paths import file_path
 
 #: entries whose digits are counted
 _SAMPLE = 4000
@@ -113,7 +114,7 @@ def _read(
     for name, path in paths.items():
         if path is None:
             continue
-        parts[name], printed = reader(Path(path))
+        parts[name], printed = reader(file_path(path, name))
         if printed is not None and name == "K":
             digits.append(printed)
     source = Path(str(paths["K"])).name

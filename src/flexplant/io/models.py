@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import inspect
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from .dmig import read_dmig
 from .matlab import read_matlab, read_npz
 from .matrix_market import read_harwell_boeing, read_matrix_market
 from .op4 import read_op4
+from .paths import file_path
 from .sierra import read_sierra
 from .tables import at_nodes, read_dofs, read_nodes_table
 
@@ -37,6 +39,19 @@ _BY_SUFFIX = {
     ".dmig": "dmig",
     ".m": "sierra",
 }
+_READERS: dict[str, Callable[..., FEMatrices]] = {
+    "matrix market": read_matrix_market,
+    "harwell-boeing": read_harwell_boeing,
+    "numpy": read_npz,
+    "matlab": read_matlab,
+    "abaqus": read_abaqus,
+    "sierra": read_sierra,
+    "op4": read_op4,
+    "dmig": read_dmig,
+    "ansys": read_ansys,
+}
+#: what a reader calls the file that holds its nodes
+_OWN_NODES = {"abaqus": "inp", "dmig": "bdf", "ansys": "nodes"}
 #: what holds results, not matrices, and who reads it
 _OTHERS = {
     ".exo": "modes: flexplant.io.read_exodus_modes",
@@ -59,6 +74,7 @@ def read_matrices(
     damping: str | Path | None = None,
     dofs: DofSet | str | Path | None = None,
     nodes: str | Path | None = None,
+    **options: Any,
 ) -> FEMatrices:
     """Return the matrices of a file, whichever program wrote it, for `check` to look at.
 
@@ -78,6 +94,9 @@ def read_matrices(
     nodes : str or Path, optional
         Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
         .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
+    **options
+        What else the reader of this format takes: `scalar_direction` of `read_dmig`, `rotations` of
+        `read_ansys`, `dof_map` and `exodus` of `read_sierra`, ...
 
     Returns
     -------
@@ -86,40 +105,34 @@ def read_matrices(
     Raises
     ------
     FlexplantError
-        When the format is not known, holds no matrices, or the file is damaged.
+        When the format is not known, holds no matrices, or the file is damaged; when the reader of
+        this format has no such option (those that it has are named).
     ModelError, LabelError, ShapeError
         What the reader of the format raises.
     FileNotFoundError
         When there is no such file.
     """
-    path = Path(path)
+    path = file_path(path)
     form = _format(path)
     if form in _ONE_EACH and stiffness is not None:
         raise ModelError(
             f"stiffness= names a variable; {path.name!r} holds one matrix. Leave it out."
         )
     named = read_dofs(dofs) if isinstance(dofs, str | Path) else dofs
-    names: dict[str, Any] = {"stiffness": stiffness, "mass": mass, "damping": damping}
-    files: dict[str, Any] = {"mass": mass, "damping": damping}
     table, own = _split(nodes, form)
-    if form == "matrix market":
-        found = read_matrix_market(path, mass, damping=damping, dofs=named)
-    elif form == "harwell-boeing":
-        found = read_harwell_boeing(path, mass, damping=damping, dofs=named)
-    elif form == "numpy":
-        found = read_npz(path, mass, damping=damping, dofs=named)
-    elif form == "matlab":
-        found = read_matlab(path, **names, dofs=named)
-    elif form == "abaqus":
-        found = read_abaqus(path, **files, inp=own, dofs=named)
-    elif form == "sierra":
-        found = read_sierra(path, **files, dofs=named)
-    elif form == "op4":
-        found = read_op4(path, **names, dofs=named)
-    elif form == "dmig":
-        found = read_dmig(path, **names, bdf=own)
-    else:
-        found = read_ansys(path, nodes=own)
+    given: dict[str, Any] = {"mass": mass, "damping": damping}
+    if form not in _ONE_EACH:
+        given["stiffness"] = stiffness
+    given = {} if form == "ansys" else given
+    if form not in ("dmig", "ansys"):
+        given["dofs"] = named
+    if form in _OWN_NODES:
+        given[_OWN_NODES[form]] = own
+    if form == "ansys" and not (stiffness is mass is damping is None):
+        raise ModelError(f"{path.name!r} holds one K and one M: leave stiffness=, mass= out.")
+    reader = _READERS[form]
+    _check_options(options, reader, given, path.name)
+    found = reader(path, **given, **options)
     if form in ("dmig", "ansys") and named is not None:
         found = found.with_dofs(named)
     if table is not None:
@@ -144,7 +157,9 @@ def read_model(
     nodes: str | Path | None = None,
     units: Sequence[str | float] = ("m", "kg", "s"),
     massless: str = "refuse",
+    free: bool = False,
     name: str | None = None,
+    **options: Any,
 ) -> FEModel:
     """Return the model of a file, whichever program wrote it.
 
@@ -168,8 +183,12 @@ def read_model(
         Of the file: ("mm", "t", "s") for instance; the model is in SI.
     massless : "refuse" or "condense"
         What to do with DOFs and motions without mass; condensing them is exact.
+    free : bool
+        Free the rigid-body motions that only lost digits of a text hold.
     name : str, optional
         For display; the name of the file when not given.
+    **options
+        What else the reader of this format takes; see `read_matrices`.
 
     Returns
     -------
@@ -178,7 +197,8 @@ def read_model(
     Raises
     ------
     FlexplantError
-        When the format is not known, holds no matrices, or the file is damaged.
+        When the format is not known, holds no matrices, or the file is damaged; when the reader of
+        this format has no such option (those that it has are named).
     ModelError, LabelError, ShapeError
         What the reader of the format raises, or when the matrices make no model.
     FileNotFoundError
@@ -189,17 +209,36 @@ def read_model(
     FlexplantWarning
         When the digits of a text file endanger the soft modes.
     """
-    if isinstance(units, str) or len(tuple(units)) != 3:
+    sizes = tuple(units) if isinstance(units, Iterable) and not isinstance(units, str) else ()
+    if len(sizes) != 3:
         raise ModelError(
             f"units must be three, of length, mass and time, got {short(units)}: "
             "('mm', 't', 's') for instance."
         )
     found = read_matrices(
-        path, stiffness=stiffness, mass=mass, damping=damping, dofs=dofs, nodes=nodes
+        path, stiffness=stiffness, mass=mass, damping=damping, dofs=dofs, nodes=nodes, **options
     )
-    if tuple(units) != ("m", "kg", "s"):
-        found = found.converted(*units)
-    return found.model(massless=massless, name=name or Path(path).name)
+    if sizes != ("m", "kg", "s"):
+        found = found.converted(*sizes)
+    return found.model(massless=massless, free=free, name=name or Path(path).name)
+
+
+def _check_options(
+    options: dict[str, Any], reader: Callable[..., FEMatrices], given: dict[str, Any], name: str
+) -> None:
+    """Raise FlexplantError for an option that the reader does not take, naming those it does."""
+    taken = {
+        parameter.name
+        for parameter in inspect.signature(reader).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    } - set(given)
+    wrong = sorted(set(options) - taken)
+    if wrong:
+        more = f"beside these it takes {sorted(taken)}" if taken else "it takes no others"
+        raise FlexplantError(
+            f"{name!r} is read by {reader.__name__}, which has no option {wrong[0]!r}: {more}. "
+            "Common to all formats are stiffness, mass, damping, dofs, nodes."
+        )
 
 
 def _split(nodes: str | Path | None, form: str) -> tuple[Any, Any]:

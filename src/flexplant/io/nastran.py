@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import FlexplantError, LabelError, ModelError
 from ..values import FloatArray
+from .paths import file_path
 
 _BARE = re.compile(r"(?<=[\d.])([+-]\d)")
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S", "SPOINT")
@@ -45,7 +46,7 @@ def read_nodes(path: str | Path) -> Nodes:
     FileNotFoundError
         When there is no such file.
     """
-    text = Path(path).read_text(encoding="latin-1")
+    text = file_path(path, "bdf").read_text(encoding="latin-1")
     grids: dict[int, list[str]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
     scalar: set[int] = set()

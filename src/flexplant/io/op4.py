@@ -16,6 +16,7 @@ from ..labels import DofSet
 from ..structure.matrices import FEMatrices
 from ..values import name_list
 from .op4_text import text_matrices
+from .paths import file_path
 
 #: a matrix of the file: dense where the file holds it dense, real or complex
 Op4Matrix: TypeAlias = Any
@@ -150,7 +151,7 @@ def _read(
     path: str | Path, names: tuple[str, ...] | None
 ) -> tuple[dict[str, tuple[Op4Matrix, int]], int | None]:
     """Return {name: (matrix, form)}, and the digits of a text file."""
-    content = Path(path).read_bytes()
+    content = file_path(path).read_bytes()
     digits: int | None = None
     if len(content) < 16:
         raise FlexplantError(

@@ -15,6 +15,7 @@ from ..values import FloatArray
 from .abaqus import symmetric
 from .exodus import opened
 from .numbers import printed_digits, spaced_numbers
+from .paths import file_path
 
 _WORD = re.compile(rb"[^\s,;]+")
 #: the map has so many entries a node: x, y, z, rx, ry, rz and two that are no motion
@@ -98,7 +99,7 @@ def read_sierra(
 
 def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
     """Return the numbers of the first bracketed table (m, width), and the digits printed."""
-    content = Path(path).read_bytes()
+    content = file_path(path).read_bytes()
     start, stop = content.find(b"["), content.find(b"]")
     if start < 0:  # a bare table
         start, stop = -1, len(content)

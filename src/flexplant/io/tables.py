@@ -14,6 +14,7 @@ from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
 from ..values import FloatArray, IntArray
+from .paths import file_path
 
 #: what other programs call the six directions
 _DIRECTION = {
@@ -160,7 +161,7 @@ def _nodes(columns: Mapping[str, list[str]], path: str | Path) -> tuple[IntArray
 
 
 def _table(path: str | Path, plain: Sequence[str] = ()) -> dict[str, list[str]]:
-    text = Path(path).read_text(encoding="utf-8-sig")
+    text = file_path(path).read_text(encoding="utf-8-sig")
     lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] not in "#%!$"]
     if not lines:
         raise FlexplantError(f"{str(path)!r} is empty: a table was expected.")

@@ -15,6 +15,7 @@ from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import Frf
 from ..values import FloatArray, positive, short
+from .paths import file_path
 from .uff_units import KINDS, ORDERS, record_scale
 
 
@@ -242,7 +243,7 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
 
 def _sets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
     """Return the datasets of some kinds, as pyuff reads them."""
-    with Path(path).open("rb") as file:
+    with file_path(path).open("rb") as file:
         start = file.read(200)
     try:
         pyuff = importlib.import_module("pyuff")

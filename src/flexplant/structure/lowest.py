@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -139,6 +140,26 @@ def _inverse_iteration(
             ) from error
     length = np.sqrt(np.abs(np.einsum("ij,ij->j", shapes, np.asarray(M @ shapes))))
     return np.asarray(shapes / np.where(length > 0, length, 1.0), dtype=np.float64)
+
+
+def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], FloatArray]:
+    """Return the solution of ``(K + shift M) x = b`` as a function of b (n, m).
+
+    Raises
+    ------
+    SolverError
+        When the sum is singular.
+    """
+    small = K.shape[0] <= _DENSE
+    if small or not all(sp.issparse(part) for part in (K, M)):
+        try:
+            factor = la.cho_factor(dense(K) + shift * dense(M))
+        except la.LinAlgError as error:
+            raise SolverError("K + s M is not positive definite: K has a negative part.") from error
+        return lambda b: np.asarray(la.cho_solve(factor, b))
+    matrix = sp.csc_array(K + shift * M)
+    held = _factor(matrix, dissect(matrix) if K.shape[0] > DENSE_LIMIT else None)
+    return lambda b: np.column_stack([held.solve(column) for column in b.T])
 
 
 def _factor(matrix: Any, order: Dissection | None) -> Any:

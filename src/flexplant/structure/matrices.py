@@ -21,6 +21,7 @@ from .factor import is_positive_definite
 from .local_axes import cosines
 from .model import FEModel
 from .precision import endangered
+from .rigid import force_free
 from .singular_mass import left_out, null_motions, projected
 from .units import units
 from .zero_energy import freed, nearly_free
@@ -321,7 +322,9 @@ class FEMatrices(Value):
                 turned[name] = 0.5 * (full + full.T)
         return self.replace(**turned)
 
-    def model(self, *, massless: str = "refuse", name: str | None = None) -> FEModel:
+    def model(
+        self, *, massless: str = "refuse", free: bool = False, name: str | None = None
+    ) -> FEModel:
         """Return the FEModel.
 
         Parameters
@@ -329,6 +332,9 @@ class FEMatrices(Value):
         massless : "refuse" or "condense"
             What to do with DOFs without mass. "condense" removes them statically,
             ``K = K_mm - K_ms K_ss^-1 K_sm``: exact, since they follow without inertia.
+        free : bool
+            Free the rigid-body motions that only lost digits of a text hold, as `freed` does, where
+            there are such.
         name : str, optional
             For display.
 
@@ -336,7 +342,8 @@ class FEMatrices(Value):
         ------
         ModelError
             When M is missing or singular, the DOFs are not known, coordinates are needed (the
-            structure is free) and not there, or massless DOFs are to be refused.
+            structure is free) and not there, massless DOFs are to be refused, or the structure is
+            to be free and is held.
 
         Warns
         -----
@@ -353,6 +360,10 @@ class FEMatrices(Value):
                 "coordinates. with_dofs(DofSet(nodes, directions, xyz)) tells it."
             )
         ready = self
+        if not isinstance(free, bool | np.bool_):
+            raise ModelError(f"free must be True or False, got {short(free)}.")
+        if free and (self.digits is not None or not self.located):
+            ready = ready.freed()
         without = no_mass(self.M)
         if without.any():
             ready = ready._condensed(without, massless)
@@ -368,9 +379,14 @@ class FEMatrices(Value):
             )
         parts: Any = ready
         label = name or self.source
-        model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=label)
+        try:
+            model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=label)
+        except ModelError as error:
+            held = None if free else _stuck(ready, None)
+            raise ModelError(f"{error} {held[0].upper()}{held[1:]}") if held else error from None
         if self.digits is not None:
-            for said in (endangered(ready.K, ready.M, self.digits), _stuck(ready, model)):
+            stuck = None if free else _stuck(ready, model)
+            for said in (endangered(ready.K, ready.M, self.digits), stuck):
                 if said:
                     warnings.warn(f"{self.source or 'text file'}: {said}", FlexplantWarning, 2)
         return model
@@ -421,16 +437,19 @@ class FEMatrices(Value):
         return self.replace(K=K, M=M, D=D, dofs=dofs, notes=(*self.notes, note))
 
 
-def _stuck(given: FEMatrices, model: FEModel) -> str | None:
+def _stuck(given: FEMatrices, model: FEModel | None) -> str | None:
     """Return what to say when rounding alone holds rigid-body motions."""
-    if given.dofs is None or not given.located:
+    if given.digits is None or given.dofs is None or not given.located:
         return None
-    nearly = nearly_free(given.K, given.dofs, given.digits)
-    if nearly.shape[1] <= model.rigid_body.shape[1]:
+    nearly = nearly_free(given.K, given.dofs, given.digits).shape[1]
+    if model is not None:
+        found = model.rigid_body
+        nearly -= found.shape[1] if force_free(model.M, model.K, found) else 0
+    if nearly <= 0:
         return None
     return (
-        f"{nearly.shape[1] - model.rigid_body.shape[1]} of its rigid-body motions are held by "
-        "nothing but the rounding of the text. Export in binary, or free them: FEMatrices.freed()."
+        f"{nearly} of its rigid-body motions are held by nothing but the rounding of the text, and "
+        "modes at or below 0 would follow. Export in binary, or free them: model(free=True)."
     )
 
 

@@ -105,7 +105,9 @@ class FEModel(Value):
         """The rigid-body motions (n, r), ``K R = 0`` and ``R^T M R = I``.
 
         From the coordinates, hence exact: translations first, then rotations about the centre of
-        gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0) when held.
+        gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0) when held. Where
+        coordinates have few digits (down to four), rotations are the null vectors of K next to
+        theirs; what a spring holds, however softly, has none.
         """
         basis = rigid_body_basis(self.M, self.K, self.dofs)
         basis.flags.writeable = False

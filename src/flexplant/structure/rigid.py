@@ -7,12 +7,23 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, SolverError
 from ..labels import DofSet
 from ..values import FloatArray, Matrix
+from .lowest import ROUNDING, definite_solver
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
 _ENERGY_TOLERANCE = 1e-10
+#: the same for motions that coordinates of few digits keep from being free: worth a closer look
+_NEARLY = 1e-2
+#: largest force of such a motion at any DOF, of the largest that its parts make anywhere
+_EVERYWHERE = 3e-4
+#: force of a motion at 0, of the largest eigenvalue of the model, that its modes are checked for
+_RESIDUAL = 1e-12
+#: steps of inverse iteration from the geometry's motions to the null vectors of K
+_STEPS = 4
+#: part of a motion that may be lost on this way
+_ASIDE = 1e-3
 
 
 def rigid_motions(dofs: DofSet) -> FloatArray:
@@ -39,14 +50,17 @@ def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
 
     They come from the coordinates, not from an eigenvalue solver, so that they are exact.
     Translations come first, then rotations about the centre of gravity. Partly held structures
-    (a hinge, say) keep the combinations of the six motions that cost no energy.
+    (a hinge, say) keep the combinations of the six motions that cost no energy. Where coordinates
+    have few digits, rotations are the null vectors of K next to theirs.
     """
     # independent ones only: some are absent, and with few DOFs some of the six coincide
     motions = orthonormalised(M, rigid_motions(dofs), dependent="drop")
     # K and |K| |r|, row by row: forces of rounding size say that no energy is stored
     size_of_K: Any = abs(K)
-    scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
-    force = np.asarray(K @ motions) / np.where(scale > 0, scale, 1.0)
+    sizes = np.asarray(size_of_K @ np.abs(motions))
+    scale = np.linalg.norm(sizes, axis=0)
+    scale = np.where(scale > 0, scale, 1.0)
+    force = np.asarray(K @ motions) / scale
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
     if np.all(free):
         return motions
@@ -55,9 +69,69 @@ def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     values = np.zeros(scale.size)
     values[: found.size] = found
     null = right[values < _ENERGY_TOLERANCE].T
-    if null.shape[1] > np.count_nonzero(free):
-        return orthonormalised(M, motions @ (null / np.where(scale > 0, scale, 1.0)[:, None]))
-    return motions[:, free]
+    basis = motions[:, free]
+    if null.shape[1] > basis.shape[1]:
+        basis = orthonormalised(M, motions @ (null / scale[:, None]))
+    near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
+    if not near.shape[1]:
+        return basis
+    nearly = _everywhere_small(K, size_of_K, motions @ (near / scale[:, None]))
+    return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
+
+
+def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
+    """Return whether M-orthonormal motions pass for modes at 0 of (K, M), to rounding."""
+    root = np.sqrt(M.diagonal())[:, None]
+    force = np.linalg.norm(np.asarray(K @ motions) / root, axis=0)
+    return bool(np.all(force <= _RESIDUAL * float(np.max(K.diagonal() / M.diagonal()))))
+
+
+def _everywhere_small(K: Matrix, size_of_K: Any, motions: FloatArray) -> FloatArray:
+    """Return those of some motions that meet no large force at any DOF: nothing grounds them."""
+    entries: Any = K.diagonal()
+    weight = 1 / np.sqrt(np.where(entries > 0, entries, 1.0))[:, None]
+    force = np.abs(weight * np.asarray(K @ motions)).max(axis=0)
+    most = (weight * np.asarray(size_of_K @ np.abs(motions))).max(axis=0)
+    return motions[:, force < _EVERYWHERE * most]
+
+
+def _null_vectors(
+    M: Matrix,
+    K: Matrix,
+    size_of_K: Any,
+    motions: FloatArray,
+    basis: FloatArray,
+    nearly: FloatArray,
+) -> FloatArray:
+    """Return a basis and the null vectors of K next to nearly free motions, if there are such.
+
+    By inverse iteration, ``(K + s M) x' = s M x``: what the last digits of coordinates add are
+    elastic modes, which shrink by s / (lambda + s) each time, and motions without energy stay. A
+    motion that something holds, however softly, keeps its energy and is none.
+    """
+    start = orthonormalised(M, np.hstack([basis, nearly]), dependent="drop")
+    spread = float(np.einsum("ij,ij->j", np.abs(start), size_of_K @ np.abs(start)).max())
+    shift = 30 * ROUNDING * spread
+    try:
+        solve = definite_solver(K, M, shift)
+        found = start
+        for _ in range(_STEPS):
+            found = orthonormalised(M, np.asarray(solve(np.asarray(M @ found))))
+    except SolverError:
+        return basis  # K is indefinite: the solver of the modes says so
+    energy = np.asarray(found.T @ np.asarray(K @ found))
+    values, mix = la.eigh(0.5 * (energy + energy.T))
+    null = found @ mix[:, np.abs(values) < ROUNDING * spread]
+    # the geometry's own motions, seen in the null space: what turns stays a turn about its axis
+    for candidates in (motions, nearly):
+        seen = null.T @ np.asarray(M @ candidates)
+        size = np.sqrt(np.einsum("ij,ij->j", candidates, np.asarray(M @ candidates)))
+        kept = np.linalg.norm(seen, axis=0) > (1 - _ASIDE) * size
+        several = np.hstack([*([basis] if candidates is nearly else []), null @ seen[:, kept]])
+        whole = orthonormalised(M, several, dependent="drop")
+        if whole.shape[1] >= null.shape[1]:
+            break
+    return whole
 
 
 def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:

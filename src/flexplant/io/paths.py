@@ -1,0 +1,27 @@
+"""What names a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from ..errors import FlexplantError
+from ..values import short
+
+
+def file_path(path: Any, name: str = "path") -> Path:
+    """Return the path of a file; its absence is left to what opens it.
+
+    Raises
+    ------
+    FlexplantError
+        When it is no path, or that of a folder.
+    """
+    if not isinstance(path, str | Path):
+        raise FlexplantError(
+            f"{name} must name a file, got {short(path)}. Matrices that are in memory already go "
+            "into FEModel(M, K, dofs=...) or FEMatrices(K, M, dofs=...)."
+        )
+    if Path(path).is_dir():
+        raise FlexplantError(f"{str(path)!r} is a folder. Name the file in it.")
+    return Path(path)

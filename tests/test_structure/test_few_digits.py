@@ -1,0 +1,139 @@
+"""Models whose coordinates or matrices lost digits on their way: free bodies stay free."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+import scipy.sparse as sp
+
+import flexplant as fx
+from flexplant.errors import FlexplantWarning, ModelError
+from flexplant.structure import FEMatrices, FEModel, Spring
+from meshes import dofs_of, solid
+
+NASTRAN = Path("/work/shared/data/fe/nastran")
+
+
+def rounded(values, digits):
+    """To so many significant decimal digits each."""
+    return np.array([float(f"{v:.{digits - 1}e}") for v in np.ravel(values)]).reshape(
+        np.shape(values)
+    )
+
+
+def text_of(matrix, digits):
+    found = sp.coo_array(matrix)
+    return sp.csc_array((rounded(found.data, digits), found.coords), shape=found.shape)
+
+
+def plate(elements=(7, 5)):
+    return fx.kirchhoff_plate(
+        size=(0.61234567, 0.4712345), thickness=0.0272, elements=elements, density=2702,
+        youngs_modulus=70e9, poisson_ratio=0.35,
+    )  # fmt: skip
+
+
+def elastic(model, count=6):
+    """Dense, by the definite pencil (M, K + s M): no rigid-body basis enters."""
+    K, M = model.K.toarray(), model.M.toarray()
+    s = 1e4
+    found = 1 / la.eigh(M, K + s * M, eigvals_only=True)[::-1] - s
+    found = found[found > 1e3][:count]
+    return np.sqrt(found) / (2 * np.pi)
+
+
+@pytest.mark.parametrize("digits", [9, 6, 4])
+def test_a_free_plate_with_few_digits_in_its_coordinates(digits):
+    exact = plate()
+    few = exact.dofs.replace(xyz=rounded(exact.dofs.xyz, digits), interpolation=None)
+    model = FEModel(exact.M, exact.K, dofs=few)
+    R = model.rigid_body
+    assert R.shape == (144, 3)
+    assert np.abs(R.T @ (exact.M @ R) - np.eye(3)).max() < 1e-12
+    # the directions stay what they were called: z, rx, ry
+    same = np.diag(R.T @ (exact.M @ exact.rigid_body))
+    assert same == pytest.approx(1.0, abs=10.0 ** (1 - digits))
+    modes = fx.solve_modes(model, count=9)
+    assert modes.freq[:3].tolist() == [0, 0, 0]
+    assert modes.freq[3:] == pytest.approx(elastic(exact), rel=1e-9)
+
+
+def test_a_free_solid_with_six_digits_in_its_coordinates():
+    mesh = solid(3, 2, 2, size=(0.3123456789, 0.21234567, 0.2456789123))
+    dofs = dofs_of(mesh)
+    model = FEModel(mesh[0], mesh[1], dofs=dofs.replace(xyz=rounded(dofs.xyz, 6)))
+    assert model.rigid_body.shape[1] == 6
+    modes = fx.solve_modes(model, count=12)
+    assert modes.freq[:6].tolist() == [0] * 6
+    assert modes.freq[6:] == pytest.approx(elastic(model), rel=1e-9)
+
+
+def test_what_a_soft_spring_holds_is_not_freed():
+    """The suspended plate rocks at about 1 Hz, 1e-9 of its stiffness."""
+    exact = plate().with_parts([Spring(f"{n}:z", 100.0) for n in (1, 8, 41)])
+    few = exact.dofs.replace(xyz=rounded(exact.dofs.xyz, 6), interpolation=None)
+    model = FEModel(exact.M, exact.K, dofs=few)
+    assert model.rigid_body.shape[1] == 0
+    low = fx.solve_modes(model, count=3).freq
+    K, M, R = exact.K.toarray(), exact.M.toarray(), plate().rigid_body
+    # stiff plate: its three rigid motions on the springs
+    by_hand = np.sqrt(la.eigvalsh(R.T @ K @ R, R.T @ M @ R)) / (2 * np.pi)
+    assert low == pytest.approx(by_hand, rel=1e-4)
+
+
+def test_coordinates_of_another_shape_free_nothing():
+    exact = plate()
+    other = exact.dofs.replace(xyz=exact.dofs.xyz * [1.0, 1.05, 1.0], interpolation=None)
+    assert FEModel(exact.M, exact.K, dofs=other).rigid_body.shape[1] == 1 + 1  # z and ry
+
+
+@pytest.mark.parametrize("digits", [10, 9])
+def test_text_that_holds_a_free_plate_by_rounding_is_named_and_can_be_freed(digits):
+    exact = plate()
+    few = exact.dofs.replace(xyz=rounded(exact.dofs.xyz, 7), interpolation=None)
+    text = FEMatrices(text_of(exact.K, digits), text_of(exact.M, 16), dofs=few, digits=digits)
+    with pytest.warns(FlexplantWarning, match=r"rigid-body motions are held.*model\(free=True\)"):
+        text.model()
+    modes = fx.solve_modes(text.model(free=True), count=9)
+    assert modes.n_rigid == 3
+    assert modes.freq[3:] == pytest.approx(elastic(exact), rel=1e-6)
+
+
+def test_an_indefinite_text_says_that_its_digits_are_to_blame():
+    exact = plate(elements=(11, 7))
+    text = FEMatrices(text_of(exact.K, 8), exact.M, dofs=exact.dofs, digits=8)
+    with pytest.raises(ModelError, match=r"not positive semi-definite.*3 of its.*free=True"):
+        text.model()
+
+
+def test_freeing_what_is_held_is_refused():
+    held = plate().fixed(["1:z", "1:rx", "1:ry"])
+    text = FEMatrices(text_of(held.K, 12), held.M, dofs=held.dofs, digits=12)
+    with pytest.raises(ModelError, match="the structure is held"):
+        text.model(free=True)
+    with pytest.raises(ModelError, match="free must be True or False"):
+        text.model(free="yes")
+
+
+@pytest.mark.skipif(not NASTRAN.exists(), reason="needs the data of /work/shared")
+def test_the_aircraft_with_its_coordinates_becomes_a_free_model(tmp_path):
+    """Six rigid-body modes at exactly 0, the others as the f06 prints them."""
+    printed = (NASTRAN / "femv5p1.f06").read_text(encoding="latin-1")
+    cards = re.findall(r"^ +\d+- {8}(.{1,80}?) *$", printed, flags=re.MULTILINE)
+    (tmp_path / "plane.bdf").write_text("\n".join(cards) + "\n")
+    table = printed[printed.index("R E A L   E I G E N V A L U E S") :]
+    rows = re.findall(r"^ +(\d+) +\d+ +(\d\.\d+E[+-]\d+) ", table, flags=re.MULTILINE)
+    values = {int(mode): float(value) for mode, value in reversed(rows)}
+    with pytest.warns(FlexplantWarning, match="10 digits"):
+        model = fx.read_model(
+            NASTRAN / "femv5p1.pch", nodes=tmp_path / "plane.bdf", massless="condense", free=True
+        )
+    modes = fx.solve_modes(model, count=20)
+    assert modes.n_rigid == 6
+    assert modes.freq[:6].tolist() == [0] * 6
+    ours = modes.omega[6:] ** 2 / [values[mode] for mode in range(7, 21)] - 1
+    # ten printed digits lose the softest mode, as the warning says
+    assert -0.0075 < ours[0] < -0.006
+    assert np.abs(ours[1:]).max() < 3e-4
