@@ -17,6 +17,8 @@ from .threads import one_thread
 
 #: blocks smaller than this (entries, on average) are added by index lists, larger ones as slices
 _SLICE = 600
+#: pivot blocks of up to this many DOFs are kept as inverses
+_INVERTED = 128
 #: rounding let pass in the energies that accompany a count of negative eigenvalues
 _ENERGY = 1e-4
 
@@ -44,7 +46,7 @@ class MultifrontalCholesky:
     ) -> None:
         lower = sp.csc_array(matrix)
         self.dissection = dissect(lower) if dissection is None else dissection
-        self._blocks: list[tuple[FloatArray, FloatArray]] = []
+        self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
         with one_thread():
             for front, pivots, below, rest in _assembled(lower, self.dissection):
                 _, info = lapack.dpotrf(pivots, lower=1, overwrite_a=1, clean=0)
@@ -60,12 +62,12 @@ class MultifrontalCholesky:
                     )
                     blas.dsyrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
                 if keep:
-                    self._blocks.append((pivots, below))
+                    self._blocks.append(_stored(pivots, below))
 
     @property
     def n_entries(self) -> int:
         """Stored entries of the factor."""
-        return sum(pivots.size + below.size for pivots, below in self._blocks)
+        return sum(below.size + (0 if top is None else top.size) for top, below in self._blocks)
 
     def solve(self, right: FloatArray) -> FloatArray:
         """Return ``A^-1 right`` for (n,) or (n, m) right-hand sides, blocked."""
@@ -75,18 +77,42 @@ class MultifrontalCholesky:
         fronts = self.dissection.fronts
         with one_thread():
             for front, (pivots, below) in zip(fronts, self._blocks, strict=True):
-                part = x[front.first : front.last]
+                first, last, rows = front.first, front.last, front.rows
+                part = x[first:last]
+                if pivots is None:
+                    moved = below @ part
+                    x[first:last] = moved[: last - first]
+                    if rows.size:
+                        x[rows] -= moved[last - first :]
+                    continue
                 blas.dtrsm(1.0, pivots, part.T, side=1, lower=1, trans_a=1, overwrite_b=1)
-                if front.rows.size:
-                    x[front.rows] -= below @ part
+                if rows.size:
+                    x[rows] -= below @ part
             for front, (pivots, below) in zip(fronts[::-1], self._blocks[::-1], strict=True):
-                part = x[front.first : front.last]
-                if front.rows.size:
-                    part -= below.T @ x[front.rows]
+                first, last, rows = front.first, front.last, front.rows
+                part = x[first:last]
+                if pivots is None:
+                    size = last - first
+                    moved = below[:size].T @ part
+                    if rows.size:
+                        moved -= below[size:].T @ x[rows]
+                    x[first:last] = moved
+                    continue
+                if rows.size:
+                    part -= below.T @ x[rows]
                 blas.dtrsm(1.0, pivots, part.T, side=1, lower=1, overwrite_b=1)
         answer = np.empty_like(x)
         answer[order] = x
         return answer.reshape(right.shape)
+
+
+def _stored(pivots: FloatArray, below: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+    """Return a front as it is kept: small ones as ``[L^-1; B L^-1]``, for one product per solve."""
+    if pivots.shape[0] > _INVERTED:
+        return pivots, below
+    inverse, _ = lapack.dtrtri(pivots, lower=1, overwrite_c=1)
+    inverse = np.tril(inverse)
+    return None, np.vstack([inverse, below @ inverse])
 
 
 def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> int:
