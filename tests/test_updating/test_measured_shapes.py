@@ -158,3 +158,19 @@ def test_bad_covariances_are_refused(chain):
         ModeShapes(measured, shapes, PLACES, covariance=-good)
     with pytest.raises(ModelError, match="zero"):
         values(chain, ModeShapes(measured, shapes, PLACES, covariance=0 * good))
+
+
+def test_modes_that_look_alike_at_few_places_are_told_by_frequency(make):
+    """At its two ends all odd modes of a chain look the same: far ones must not be taken."""
+    links = [(i, i + 1, 100.0) for i in range(7)]
+    model = make([1.0] * 8, links)
+    # of the symmetric chain elastic modes are odd, even, odd, ...
+    omega = 2 * np.sqrt(100.0) * np.sin(np.arange(1, 4) * np.pi / 16)
+    ends = [[1.0, 1.0, 1.0], [-1.0, 1.0, -1.0]]
+    measured = MeasuredModes(1j * omega, modes=[2, 3, 4])
+    residual = ModeShapes(measured, ends, ["1:z", "8:z"])
+    objective = Objective(model, [AddedMass("4:z")], [residual])
+    for start in (0.0, 0.2):
+        point = objective.begin(np.array([start]))
+        found = point.eigen.poles[point.columns([2, 3, 4])].imag
+        assert np.abs(found / omega - 1).max() < 0.05

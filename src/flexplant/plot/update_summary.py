@@ -26,7 +26,7 @@ def update(
     before: Any,
     residuals: Sequence[Residual],
     *,
-    unused: Frf | None = None,
+    unused: Frf | FrfResidual | None = None,
     level: float = 0.95,
 ) -> dict[str, Axes]:
     """Draw all of an update on one page.
@@ -39,9 +39,9 @@ def update(
         The model that was updated.
     residuals : sequence of Residual
         What it was updated with, or anything measured that it shall be judged by.
-    unused : Frf, optional
-        A measurement that was not fitted, its channels named by their DOFs, drawn instead of that
-        of the residuals.
+    unused : Frf or FrfResidual, optional
+        A measurement that was not fitted, drawn instead of that of the residuals; as a residual
+        where its channels are not named by their DOFs, or it was measured behind a hold.
     level : float
         Of the confidence intervals.
 
@@ -65,7 +65,9 @@ def update(
     names += ["mac before", "mac after"] if old.mac.size else []
     names += ["parameters", "convergence"]
     shown = [r for r in residuals if isinstance(r, FrfResidual)]
-    if unused is not None:
+    if isinstance(unused, FrfResidual):
+        shown = [unused]
+    elif unused is not None:
         shown = [FrfResidual(unused, lines=np.flatnonzero(unused.freq > 0))]
     rows: Any = [names[i : i + 2] for i in range(0, len(names), 2)]
     if shown:
@@ -103,6 +105,7 @@ def _errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what:
             va="bottom" if above else "top",
             fontsize=7,
             color=UPDATED,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
         )
     ax.axhline(0.0, color="0.3", linewidth=0.8)
     ax.margins(y=0.2)

@@ -19,6 +19,9 @@ from .pencil import Family, groups
 from .point import Point
 from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
 
+#: of MAC that a distance of one in ln(frequency) outweighs when modes are assigned
+NEARNESS = 0.3
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModeShapes(Residual):
@@ -28,7 +31,7 @@ class ModeShapes(Residual):
     model's shape explains (the maximum-likelihood residual with the factor as a nuisance;
     ``|r|^2 = (1 - MAC) |psi|^2``). Modes whose measured poles are closer than 2 % are compared
     with the subspace of their cluster, which does not turn. While fitting, the model's modes are
-    assigned to the measured ones by MAC.
+    assigned to the measured ones by MAC, the nearer in frequency where few places tell no more.
 
     Parameters
     ----------
@@ -175,6 +178,7 @@ class _BoundShapes(Bound):
         self.numbers = own
         self.noisy = residual.std is not None or residual.covariance is not None
         self.rows = place_rows(family, list(residual.at or ()), residual.direction)
+        self.poles = measured.poles
         self.psi = np.asarray(residual.shapes)
         self.white = _whitening(self.psi, residual)
         self.assign = residual.assign
@@ -184,7 +188,9 @@ class _BoundShapes(Bound):
         if not self.assign:
             return point
         score = mac(self.psi.astype(complex), self.rows @ point.eigen.X)
-        measured, columns = linear_sum_assignment(-score)
+        # at few places many modes look alike: the nearest of those
+        far = np.log(np.abs(point.eigen.poles) / np.abs(self.poles)[:, None]) ** 2
+        measured, columns = linear_sum_assignment(NEARNESS * far - score)
         labels = point.labels.copy()
         for i, column in zip(measured.tolist(), columns.tolist(), strict=True):
             here = np.flatnonzero(labels == self.own[i])
