@@ -15,8 +15,9 @@ from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
 from .refine import Lines, refined
+from .separate import backed, separated
 from .support import freedom, supported
-from .unexplained import BROADEST, completed, lessened, unexplained, warned
+from .unexplained import BROADEST, completed, exact, lessened, unexplained, warned
 from .weights import Prepared, prepared
 from .windows import diagram_of, weighted_by_remainder, windows
 
@@ -205,7 +206,7 @@ def _identified(
     poles, part = chosen.poles, chosen.participation
     for _ in range(1 if ready.known else 2):
         # with all residual terms, so that no pole is kept or moved to stand in for one
-        lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate)
+        lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
         if start is None:
             poles, part = supported(lines, poles, part)
         fit = refined(lines, poles, part, steps=max_iterations)
@@ -216,6 +217,11 @@ def _identified(
                 fit = refined(lines, fewer, part, steps=max_iterations)
         lines, fit = lessened(lines, fit, tried[:-1], steps=max_iterations)
         if start is None:
+            fit, _ = completed(lines, fit, steps=max_iterations)
+            if not exact(lines, fit.model):
+                if upper is None:
+                    lines, fit = backed(lines, fit, steps=max_iterations)
+                fit = separated(lines, fit, steps=max_iterations)
             fit, left = completed(lines, fit, steps=max_iterations)
         else:
             left = unexplained(lines, fit)

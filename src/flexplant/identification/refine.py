@@ -12,6 +12,9 @@ from ..errors import SolverError
 from ..values import ComplexArray, FloatArray
 from .basis import axis, pole_terms, residual_terms
 
+#: largest entry of a participation vector beside the one held at 1
+RUNAWAY = 5.0
+
 
 @dataclass(frozen=True, eq=False)
 class Lines:
@@ -23,6 +26,7 @@ class Lines:
     lower: int
     upper: int
     hold: float | None
+    known: bool = True  # whether the weights are those of a known variance
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,7 +66,8 @@ def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, s
         for _ in range(12):
             step = _step(N / np.outer(size, size), g / size, damping) / size
             trial = _moved(poles, participation, pivots, step)
-            if np.all(trial[0].real < 0) and np.all(trial[0].imag > 0):
+            stays = np.abs(trial[1]).max() < 1e6
+            if stays and np.all(trial[0].real < 0) and np.all(trial[0].imag > 0):
                 better = _projected(lines, *trial, pivots)
                 gained = now.cost - better.cost
                 if gained >= 0:
@@ -74,6 +79,11 @@ def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, s
         predicted = float(g @ step)
         poles, participation = trial
         now, damping = better, damping / 10.0
+        if np.abs(participation).max() > RUNAWAY:
+            # the entry held at 1 is next to none: another is held
+            pivots = np.argmax(np.abs(participation), axis=0)
+            participation = participation / participation[pivots, columns]
+            now = _projected(lines, poles, participation, pivots)
         # a step of 3e-3 standard deviations of what is left is none
         if gained <= 1e-12 * now.cost or predicted <= 1e-5 * now.cost / (2 * lines.data.size):
             break

@@ -1,0 +1,106 @@
+"""Two modes that a fit took for one, and more behind all of them: added where data ask."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import scipy.linalg as la
+from scipy.stats import chi2
+
+from ..errors import SolverError
+from ..values import ComplexArray
+from .refine import Fit, Lines, projected_cost, refined
+from .support import CHANCE, freedom
+
+#: half the distance at which a pole is taken apart, in parts of its damping
+APART = 0.5
+#: numbers of residual terms tried where 9 leave more than noise
+MORE = (25, 17, 13)
+
+
+def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
+    r"""Return the fit with those poles taken apart that are two.
+
+    A pole of two modes, repeated or so close that one pole passes for both, asks for residues
+    of rank two (several inputs), or for a pole of its own at each output (one input):
+
+    .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
+        \quad\text{or}\quad \frac{\psi l^T}{s-\lambda-\delta} + \frac{\psi' l^T}{s-\lambda+\delta}
+
+    Both are tried at every pole; the fit that follows must lower chi-square by more than noise
+    does at any of them once in a thousand times.
+    """
+    for _ in range(fit.poles.size):
+        better = _apart(lines, fit, steps)
+        if better is None:
+            break
+        fit = better
+    return fit
+
+
+def least_of(lines: Lines, places: int) -> float:
+    """Return by how much a second pole must lower the cost at one of some places."""
+    n_out, n_in, _ = lines.data.shape
+    return float(chi2.isf(CHANCE / places, 2 * (n_out + n_in)))
+
+
+def _apart(lines: Lines, fit: Fit, steps: int) -> Fit | None:
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    least = least_of(lines, fit.poles.size) * unit
+    trials = []
+    for k in range(fit.poles.size):
+        for poles, part in _pairs(fit, k):
+            trials.append((fit.cost - projected_cost(lines, poles, part), poles, part))
+    trials.sort(key=lambda trial: -trial[0])
+    for gain, poles, part in trials[:3]:
+        if gain < least / 3:
+            break
+        try:
+            more = refined(lines, poles, part, steps=steps)
+        except SolverError:
+            continue
+        if fit.cost - more.cost > least and _narrow(more, fit):
+            return more
+    return None
+
+
+def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
+    """Return poles and participation with pole k twice: other directions, other places."""
+    pole, own = fit.poles[k], fit.participation[:, [k]]
+    delta = 1j * APART * abs(pole.real)
+    moved = fit.poles.copy()
+    moved[k] += delta
+    pairs = [(np.append(moved, pole - delta), np.hstack([fit.participation, own]))]
+    others = np.asarray(la.null_space(own.conj().T), dtype=np.complex128)
+    for other in others.T:
+        # a little of its own, so that the fit is free to turn both
+        mixed = other[:, None] * la.norm(own) + 1e-3 * own
+        pairs.append((np.append(fit.poles, pole), np.hstack([fit.participation, mixed])))
+    return pairs
+
+
+def _narrow(more: Fit, fit: Fit) -> bool:
+    """Whether no pole became broader than any was: then it stood in for something else."""
+    zeta = [-f.poles.real / np.abs(f.poles) for f in (more, fit)]
+    return bool(zeta[0].max() <= 1.5 * zeta[1].max())
+
+
+def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
+    """Return the fit with more residual terms where the data ask for them.
+
+    Sampling folds modes of more than half the rate into the band: each is weak and as broad as
+    its frequency and damping were, many together are no noise. What a first few of these terms
+    leave is too little to be seen and enough to bias, and in a wide band they cost next to
+    nothing: so as many as the lines afford.
+    """
+    channels = lines.data.shape[0] * lines.data.shape[1]
+    unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
+    for upper in MORE:
+        if lines.freq.size < 8 * (upper + lines.lower) or upper <= lines.upper:
+            continue
+        more = replace(lines, upper=upper)
+        gain = fit.cost - projected_cost(more, fit.poles, fit.participation)
+        if gain > unit * chi2.isf(CHANCE, channels * (upper - lines.upper)):
+            return more, refined(more, fit.poles, fit.participation, steps=steps)
+    return lines, fit
