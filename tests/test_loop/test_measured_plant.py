@@ -162,3 +162,24 @@ def test_what_was_not_measured_is_refused():
         control_sensitivity((frf, loop), freq=np.array([33.3]))
     gain = StateSpace([], [], [], [[1.0]], inputs=["y1"], outputs=["u1"])
     assert loop_gain((frf, gain)).data[0, 0, 3] == frf["y1", "u1"][3]
+
+
+def test_a_measurement_held_by_python_control_is_a_measured_plant():
+    control = pytest.importorskip("control")
+    loop, freq = loop_of(), np.geomspace(1.0, 4000.0, 300)
+    frf = frf_of(loop, freq)
+    shuffled = np.random.default_rng(0).permutation(freq.size)
+    frd = control.frd(
+        frf.data[:, :, shuffled],
+        2 * np.pi * freq[shuffled],
+        inputs=list(frf.inputs),
+        outputs=list(frf.outputs),
+    )
+    for quantity in QUANTITIES:
+        found, wanted = quantity((frd, loop)), quantity((frf, loop))
+        assert (found.inputs, found.outputs) == (wanted.inputs, wanted.outputs)
+        np.testing.assert_allclose(found.data, wanted.data, rtol=1e-9)
+    with pytest.raises(ModelError, match="controller is a frequency response"):
+        sensitivity((frf, frd))
+    with pytest.raises(ModelError, match="FrequencyResponseData, got int"):
+        Frf.from_control(3)

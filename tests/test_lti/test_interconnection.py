@@ -248,3 +248,29 @@ def test_a_loop_of_very_large_and_very_small_gains_is_well_posed(gain):
     alone = down.replace(D=[[1.0 / gain, 1.0]])
     with pytest.raises(ModelError, match="ill-posed"):
         connect([up, alone], ["w"], ["a"])
+
+
+@given(st.integers(0, 10_000), st.sampled_from([0.0, 0.1]))
+def test_operators_are_those_of_transfer_functions_with_names(seed, dt):
+    rng = np.random.default_rng(seed)
+    g, h = system(rng, 3, 2, 2, dt), system(rng, 2, 2, 2, dt)
+    h = h.replace(inputs=g.inputs, outputs=g.outputs)
+    for s in POINTS:
+        G, H = gain(g, s), gain(h, s)
+        for found, wanted in (
+            (g + h, G + H),
+            (g - h, G - H),
+            (g - h.to_control(), G - H),
+            (g * h, G @ H),
+            (-g, -G),
+            (np.float64(2.5) * g, 2.5 * G),
+            (g * 3, 3 * G),
+        ):
+            assert (found.inputs, found.outputs) == (g.inputs, g.outputs)
+            np.testing.assert_allclose(gain(found, s), wanted, rtol=1e-9, atol=1e-9)
+    with pytest.raises(LabelError, match="same channels"):
+        g + h.renamed(outputs={h.outputs[0]: "other"})
+    with pytest.raises(ModelError, match="got str"):
+        g * "h"
+    with pytest.raises(TypeError):
+        np.eye(2) * g

@@ -42,8 +42,8 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
     ----------
     loop : ClosedLoop, or (plant, controller)
         The plant a StandardPlant, a StateSpace or a measured Frf (with the delay that the loop
-        will have); the controller y -> u with the sign of the feedback in it, or a ClosedLoop,
-        whose controller is then closed on this plant.
+        will have), those of python-control too; the controller y -> u with the sign of the
+        feedback in it, or a ClosedLoop, whose controller is then closed on this plant.
     freq : (n_freq,) array, optional [Hz]
         A grid refined at resonances when not given; those of the Frf for a measured plant.
     at : {"u", "y"}
@@ -173,6 +173,8 @@ def taken_apart(loop: Loop) -> Pieces:
             "close_loop(plant, controller) or (plant, controller)."
         )
     plant, controller = loop[0], _controller(loop[1])
+    if hasattr(plant, "frdata"):  # python-control's
+        plant = Frf.from_control(plant)
     if isinstance(plant, Frf):
         return _measured(plant, controller, _quantities(loop[1]))
     if isinstance(plant, StandardPlant):
@@ -235,6 +237,11 @@ def _controller(law: Any) -> StateSpace:
     """Return the system y -> u of a controller; of a closed loop, its own."""
     if isinstance(law, ClosedLoop):
         return law.controller.select(law.driven, law.fed_back)
+    if isinstance(law, Frf) or hasattr(law, "frdata"):
+        raise ModelError(
+            "the controller is a frequency response, whose stability and own poles are not known. "
+            "Pass its StateSpace; a measured plant may be an Frf."
+        )
     law = getattr(law, "system", law)
     return law if isinstance(law, StateSpace) else StateSpace.from_control(law)
 

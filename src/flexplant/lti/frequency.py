@@ -183,6 +183,29 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             outputs=list(self.outputs),
         )
 
+    @classmethod
+    def from_control(cls, frd: Any) -> Frf:
+        """Return a `control.FrequencyResponseData` as Frf, with its names.
+
+        Raises
+        ------
+        ModelError
+            When it is none, or a frequency is there twice.
+        """
+        if not all(hasattr(frd, part) for part in ("frdata", "omega", "input_labels")):
+            raise ModelError(
+                f"need a python-control FrequencyResponseData, got {type(frd).__name__}. Make "
+                "one, control.frd(data, omega), or an Frf(freq, data)."
+            )
+        freq = np.asarray(frd.omega, dtype=np.float64) / (2 * np.pi)
+        order = np.argsort(freq, kind="stable")
+        return cls(
+            freq[order],
+            np.asarray(frd.frdata)[:, :, order],
+            inputs=frd.input_labels,
+            outputs=frd.output_labels,
+        )
+
     def _place(self, key: tuple[str, str]) -> tuple[int, int]:
         if not isinstance(key, tuple) or len(key) != 2:
             raise unknown_label("channel", key, [f"{a}, {b}" for a, b in self])

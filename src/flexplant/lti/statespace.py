@@ -177,6 +177,36 @@ class StateSpace(Value):
             [inputs] if isinstance(inputs, str) else inputs,
         )
 
+    #: arrays leave `2.0 * g` with a numpy number to this class
+    __array_ufunc__ = None
+
+    def __neg__(self) -> StateSpace:
+        """Return the system with its outputs negated."""
+        return self.replace(C=-self.C, D=-self.D)
+
+    def __add__(self, other: System) -> StateSpace:
+        """Return `parallel(self, other)`: same channels, outputs added."""
+        from .interconnection import parallel
+
+        return parallel(self, other)
+
+    def __sub__(self, other: System) -> StateSpace:
+        """Return self + (-other): same channels, outputs subtracted."""
+        return self + -as_statespace(other)
+
+    def __mul__(self, other: System | float) -> StateSpace:
+        """Return `series(other, self)`, as transfer functions multiply; a number scales outputs."""
+        if isinstance(other, int | float | np.number):
+            factor = float(real_array(other, "the factor", ()))
+            return self.replace(C=factor * self.C, D=factor * self.D)
+        from .interconnection import series
+
+        return series(other, self)
+
+    def __rmul__(self, other: float) -> StateSpace:
+        """Return the system with its outputs times a number."""
+        return self * other if isinstance(other, int | float | np.number) else NotImplemented
+
     def renamed(
         self, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None
     ) -> StateSpace:
