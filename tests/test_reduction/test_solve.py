@@ -156,6 +156,7 @@ def test_a_lost_partner_is_found_again(monkeypatch):
     assert_modes_of(model, modes)
 
 
+@pytest.mark.slow
 def test_a_count_that_does_not_agree_raises(monkeypatch):
     model = make_plate(elements=(24, 24))
     below = counted.modes_below
@@ -288,6 +289,34 @@ def test_unstable_large_models_are_refused():
     pull = sp.csc_array(([-1e4], ([row], [row])), shape=(n, n))
     with pytest.raises(ModelError, match="negative"):
         solve_modes(FEModel(model.M, model.K + pull, dofs=model.dofs), count=10)
+
+
+def test_the_certificate_holds_the_rigid_body_residual(plate):
+    modes = solve_modes(plate, count=6)
+    K, R = abs(plate.K).toarray(), plate.rigid_body
+    left = np.linalg.norm(plate.K @ R, axis=0) / np.linalg.norm(K @ np.abs(R), axis=0)
+    np.testing.assert_allclose(modes.certificate["rigid_residual"], left.max(), rtol=1e-6)
+    assert left.max() < 1e-12
+    # a spring to ground that is too weak to be noticed as one leaves its trace
+    spring = sp.csc_array(([1e-3], ([0], [0])), shape=plate.K.shape)
+    held = FEModel(plate.M, plate.K, dofs=plate.dofs)
+    object.__setattr__(held, "K", sp.csc_array(plate.K + spring))
+    assert solve._rigid_residual(held) > 1.5 * left.max()
+
+
+def test_below_a_frequency_is_sparse_from_some_hundred_dofs_on(monkeypatch):
+    model = make_plate(elements=(26, 26))
+    monkeypatch.setattr(solve, "elastic_modes", None)
+    modes = solve_modes(model, below=2000.0)
+    assert modes.certificate["counted"] == modes.n_modes
+    assert modes.freq[-1] < 2000.0 < solve_modes(model, count=modes.n_modes + 1).freq[-1]
+
+
+def test_too_many_modes_of_a_large_model_are_refused(monkeypatch):
+    model = make_plate(elements=(24, 24))
+    monkeypatch.setattr(counted, "_MOST", 40)
+    with pytest.raises(ModelError, match="more than 40 are not solved for at once"):
+        solve_modes(model, below=12000.0)
 
 
 @pytest.mark.slow

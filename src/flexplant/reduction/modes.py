@@ -49,8 +49,9 @@ class Modes(Value):
         ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode (rigid-body ones: 0), as
         `solve_modes` found it; empty where it is not known.
     certificate : mapping
-        What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I) and, for a
-        large model, the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
+        What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I),
+        `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||) and, for
+        a large model, the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
 
     Raises
     ------

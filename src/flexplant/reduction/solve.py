@@ -14,7 +14,7 @@ from ..structure import Damping, FEModel, ModalDamping
 from ..structure.counted import counted_modes
 from ..structure.eigen import elastic_modes, signed
 from ..structure.factor import DENSE_LIMIT, by_rows, dense, diagonal
-from ..structure.shifted import stiffness_factor
+from ..structure.shifted import modes_below, stiffness_factor
 from ..values import FloatArray, positive
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
@@ -101,6 +101,8 @@ def solve_modes(
     omega, phi, certificate = _undamped(model, kept, top)
     orthonormality, residual = _check(model, omega, phi)
     certificate["orthonormality"] = orthonormality
+    if model.rigid_body.shape[1]:
+        certificate["rigid_residual"] = _rigid_residual(model)
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _complex_modes(model, kept, top, names)
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
@@ -169,6 +171,9 @@ def _undamped(
     rigid = model.rigid_body
     n, r = rigid.shape
     certificate: dict[str, float] = {}
+    if np.isfinite(top) and DENSE_LIMIT < n <= _DENSE_MANY and _is_large(model):
+        # how many there are decides whether a dense solution is faster
+        count = min(count, max(modes_below(model, top), r))
     small = n <= DENSE_LIMIT or (n <= _DENSE_MANY and _MANY * count > n)
     if small or not sp.issparse(model.K) or not sp.issparse(model.M):
         omega, phi = elastic_modes(dense(model.M), dense(model.K), rigid, count - r)
@@ -216,6 +221,13 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[float, F
     elastic = omega > 0
     scale = np.where(elastic, np.linalg.norm(force, axis=0), 1.0)
     return error, np.where(elastic, np.linalg.norm(residual, axis=0), 0.0) / scale
+
+
+def _rigid_residual(model: FEModel) -> float:
+    """Return ``||K R||``, in terms of what would be there if nothing cancelled."""
+    K, R = by_rows(model.K), model.rigid_body
+    whole = np.linalg.norm(abs(K) @ np.abs(R), axis=0)
+    return float(np.max(np.linalg.norm(K @ R, axis=0) / np.where(whole > 0, whole, 1.0)))
 
 
 def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:

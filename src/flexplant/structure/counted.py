@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..errors import SolverError
+from ..errors import ModelError, SolverError
 from ..values import FloatArray
 from .eigen import check_stiffness
 from .factor import by_rows
@@ -19,8 +19,10 @@ from .threads import one_thread
 
 #: modes beyond the last wanted one among which a gap is looked for
 _EXTRA = 4
-#: frequencies closer than this (relative, squared) belong together
-_GAP = 1e-6
+#: frequencies closer than this (relative, squared), or than so many roundings, belong together
+_GAP, _GAP_ROUNDINGS = 1e-8, 4.0
+#: more modes than this are not looked for: their shapes and the basis fill the memory
+_MOST = 2000
 #: part of the largest omega^2 below which an elastic one is rounding
 _ROUNDING = 1e-14
 #: searches with what is found locked, before giving up
@@ -80,6 +82,12 @@ def _counted(
         if not below:
             return np.zeros(0), np.zeros((n, 0)), _certificate(top, r, r)
         count = min(count, below)
+        if count > _MOST:
+            raise ModelError(
+                f"below {np.sqrt(top) / (2 * np.pi):.6g} Hz this model of {n} DOFs has {below} "
+                f"elastic modes: more than {_MOST} are not solved for at once. Ask for a lower "
+                "frequency, or for the lowest ones with count=."
+            )
     squares, phi = np.zeros(0), np.zeros((n, 0))
     missing = min(count + _EXTRA, n - r)
     for search in range(_SEARCHES):
@@ -90,10 +98,10 @@ def _counted(
         check_stiffness(squares, _ROUNDING * largest, r)
         # the count needs the memory
         factor, more = None, np.zeros((n, 0))
-        if below == count and _apart(squares, count, top):
+        if below == count and _apart(squares, count, top, largest):
             counted, sure, shift = count, count, top
         else:
-            sure, shift = _gap(squares, count)
+            sure, shift = _gap(squares, count, largest)
             if not sure and squares.size < n - r:
                 missing = min(2 * _EXTRA, n - r - squares.size)
                 continue
@@ -177,17 +185,24 @@ def _rayleigh_ritz(model: FEModel, phi: FloatArray) -> tuple[FloatArray, FloatAr
     return squares, np.asarray(phi @ mix)
 
 
-def _apart(squares: FloatArray, count: int, top: float) -> bool:
+def _apart(squares: FloatArray, count: int, top: float, largest: float) -> bool:
     """Return whether `top` is well between the last mode below it and the next."""
     near = squares[count - 1 : count + 1]
-    return bool(np.all(np.abs(near - top) > _GAP * top) and near[0] < top < near[-1])
+    return bool(
+        np.all(np.abs(near - top) > _closest(top, largest) * top) and near[0] < top < near[-1]
+    )
 
 
-def _gap(squares: FloatArray, count: int) -> tuple[int, float]:
+def _closest(square: float, largest: float) -> float:
+    """Return the relative distance of two omega^2 that rounding of K and M lets tell apart."""
+    return max(_GAP, _GAP_ROUNDINGS * float(np.finfo(np.float64).eps) * largest / square)
+
+
+def _gap(squares: FloatArray, count: int, largest: float) -> tuple[int, float]:
     """Return how many modes lie below the widest gap after the last wanted one, and its middle."""
     above = squares[count - 1 :]
     wide = np.diff(above) / above[1:]
-    if not wide.size or wide.max() <= _GAP:
+    if not wide.size or wide.max() <= _closest(float(above[-1]), largest):
         return 0, 0.0
     i = int(np.argmax(wide))
     return count + i, 0.5 * float(above[i] + above[i + 1])
