@@ -173,3 +173,16 @@ def test_cut_files(tmp_path):
         whole = content[:cut].rstrip("\n") + "\n" in content
         assert whole or cut < content.index("\n")
         assert found.n_dof <= 4
+
+
+def test_format_labels_with_both_triangles(tmp_path):
+    """FORMAT=LABELS: the same five columns, with a header, and a symmetric matrix in full."""
+    full = "".join(
+        f"{a}, {b}, {c}, {d}, {K[i, j]:.15e}\n"
+        for i, (a, b) in enumerate(DOFS)
+        for j, (c, d) in enumerate(DOFS)
+        if K[i, j]
+    )
+    found = read_abaqus(written(tmp_path, "**\n** ASSEMBLED\n**\n" + full))
+    assert np.array_equal(found.K.toarray(), read_abaqus(written(tmp_path, entries(K))).K.toarray())
+    assert np.array_equal(found.K.toarray(), K)

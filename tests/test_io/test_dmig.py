@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import scipy.linalg as la
 
+import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io.dmig import read_dmig
 from flexplant.io.nastran import read_nodes
@@ -293,3 +294,15 @@ def test_a_header_that_announces_more_rows_is_noted(tmp_path):
     lines = (SHARED / "swept_plane.pch").read_text().splitlines()
     found = read_dmig(written(tmp_path, "\n".join(lines[:100]) + "\n"))
     assert "the header says 45 rows" in found.notes[0]
+
+
+def test_the_common_door_hands_on_what_this_reader_takes(tmp_path):
+    text = LARGE.replace("7               6", "7               0")
+    path = written(tmp_path, text)
+    assert fx.io.read_matrices(path, scalar_direction="z").dofs.labels == ("1:x", "1:y", "7:z")
+    with pytest.raises(FlexplantError, match=r"read_dmig, which has no option 'dof_map'.*scalar_d"):
+        fx.io.read_matrices(path, dof_map="map.m")
+    with pytest.raises(FlexplantError, match="read_sierra, which has no option 'scalar_direction'"):
+        fx.read_model(written(tmp_path, "1 1 2.0\n", "K.m"), scalar_direction="z")
+    with pytest.raises(FlexplantError, match="is a folder"):
+        fx.read_model(tmp_path)

@@ -330,8 +330,42 @@ def test_nodes(tmp_path, kind):
     assert read_nodes_uff(written(tmp_path, [nodes(kind)])).xyz[3].tolist() == [2.0, 4.0, 6.0]
     with pytest.raises(ModelError, match="node 8 in coordinate system 4"):
         read_nodes_uff(written(tmp_path, [nodes(kind, def_cs=[0, 4])]))
+    with pytest.raises(ModelError, match="moves node 3 in coordinate system 7"):
+        read_nodes_uff(written(tmp_path, [nodes(kind, disp_cs=[7, 0])]))
     with pytest.raises(FlexplantError, match="no nodes"):
         read_nodes_uff(written(tmp_path, [units()]))
+
+
+def systems(**changes):
+    straight = np.vstack([np.eye(3), np.zeros((1, 3))])
+    fields = {
+        "type": 2420,
+        "CS_sys_labels": [1],
+        "CS_types": [0],
+        "CS_colors": [8],
+        "CS_names": ["one"],
+        "CS_matrices": [straight],
+    }
+    return fields | changes
+
+
+def test_coordinate_systems_that_are_not_the_global_one_are_refused(tmp_path):
+    """Node 8 is given in system 1, which dataset 2420 defines."""
+    straight = systems()["CS_matrices"][0]
+    path = written(tmp_path, [systems(), nodes(2411)])
+    assert read_nodes_uff(path).xyz[3].tolist() == [2.0, 4.0, 6.0]
+    moved = straight.copy()
+    moved[3] = [0.1, 0.0, 0.0]
+    for changes in ({"CS_types": [1]}, {"CS_matrices": [moved]}):
+        with pytest.raises(ModelError, match="system 1 as a turned, moved or curved one"):
+            read_nodes_uff(written(tmp_path, [systems(**changes), nodes(2411)]))
+
+
+def test_shapes_of_a_finite_element_program_are_refused_with_a_reason(tmp_path):
+    path = tmp_path / "shapes.unv"
+    path.write_text("    -1\n  2414\n         1\nmode\n         1\n    -1\n")
+    with pytest.raises(FlexplantError, match=r"no mode shapes.*dataset 2414.*is not read"):
+        read_modes_uff(path)
 
 
 @pytest.mark.parametrize("binary", [0, 1])

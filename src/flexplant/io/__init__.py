@@ -1,4 +1,26 @@
-"""Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`."""
+"""Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`.
+
+`read_model` and `read_matrices` find the format themselves; the reader of one format says more.
+
+====================  ====================  =======================================================
+format                reader                what is read
+====================  ====================  =======================================================
+Matrix Market         read_matrix_market    .mtx, .mtx.gz: one matrix a file, triangle or full
+Harwell-Boeing        read_harwell_boeing   .rsa, .rua, .rb, .hb: one assembled matrix a file
+MATLAB                read_matlab           .mat v5; v7.3 with `flexplant[hdf5]`: K, M, D by name
+NumPy, SciPy          read_npz              .npz (dense, or save_npz), .npy
+ANSYS                 read_ansys            .full: K, M; with `flexplant[ansys]`; .rst, .cdb: nodes
+Nastran OUTPUT4       read_op4              .op4: text, binary, dense, sparse, both byte orders
+Nastran punch         read_dmig             .pch: DMIG in all fields; GRID, CORD2x of the bulk data
+Abaqus                read_abaqus           .mtx: *MATRIX OUTPUT as text; *NODE of the input file
+Sierra                read_sierra           .m: K, M as text; nodes of an Exodus file
+Exodus                read_exodus_modes     .exo, .e: modes (classic netCDF; HDF5 with an extra)
+universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 15, 2411 with `flexplant[uff]`
+tables                read_dofs             .csv, text: node, direction, x, y, z
+responses             read_frf_csv, ...     .csv, .mat, .npz: frequency responses
+state space           read_mat, write_mat   .mat: A, B, C, D with names
+====================  ====================  =======================================================
+"""
 
 from .abaqus import read_abaqus as read_abaqus
 from .ansys import read_ansys as read_ansys

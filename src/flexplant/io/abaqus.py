@@ -32,9 +32,10 @@ def read_abaqus(
 ) -> FEMatrices:
     """Return the matrices that Abaqus wrote with `*MATRIX OUTPUT`.
 
-    FORMAT=MATRIX INPUT (the default; lines `node, dof, node, dof, value`, one triangle) or
-    FORMAT=COORDINATE (lines `row column value`, counted from 1). Degrees of freedom held by a
-    boundary condition, which Abaqus marks with 1e36 on the diagonal of K, are dropped.
+    FORMAT=MATRIX INPUT (the default) and FORMAT=LABELS (lines `node, dof, node, dof, value`, one
+    triangle or both) or FORMAT=COORDINATE (lines `row column value`, counted from 1). Degrees of
+    freedom held by a boundary condition, which Abaqus marks with 1e36 on the diagonal of K, are
+    dropped.
 
     Parameters
     ----------

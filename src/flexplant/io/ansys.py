@@ -32,6 +32,11 @@ def read_ansys(
     are dropped and named in `constrained`. It does not hold coordinates, nor which nodes have a
     local coordinate system (NROTAT): both are in the .rst or .cdb file of the same model.
 
+    Refused are lumped mass (LUMPM,ON), unsymmetric matrices, DOFs that are no displacement or
+    rotation, and a file without M. A damping matrix in the file is not read, which `notes` say:
+    give damping by mode. Angles of local systems are ANSYS' THXY, THYZ, THZX: about z, then about
+    the new x, then about the new y.
+
     Parameters
     ----------
     path : str or Path

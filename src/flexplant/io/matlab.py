@@ -100,7 +100,7 @@ def read_npz(
     """
     parts: dict[str, Any] = {}
     for name, path in (("K", stiffness), ("M", mass), ("D", damping)):
-        if path is not None:
+        if path is not None or name == "K":
             found = _numpy(file_path(path, name), name)
             parts |= found if name == "K" else {name: found[name]}
     return assembled(parts, dofs=dofs, source=Path(stiffness).name)

@@ -66,7 +66,7 @@ def read_sierra(
     """
     if dof_map is not None and dofs is not None:
         raise ModelError("the rows are named twice, by dof_map and by dofs: give one of them.")
-    files = [file for file in (stiffness, mass, damping) if file is not None]
+    files = [stiffness, *(file for file in (mass, damping) if file is not None)]
     tables = {str(file): _table(file, 3) for file in files}
     n = max(int(table[:, :2].max()) for table, _ in tables.values())
 

@@ -157,9 +157,14 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
                 )
             parts[number] = part
     if not parts:
+        newer = (
+            " Its dataset 2414 (results of a finite-element program) is not read."
+            if 2414 in _types(path)
+            else ""
+        )
         raise FlexplantError(
             f"{str(path)!r} holds no mode shapes: dataset 55 of normal (2) or complex modes "
-            "(3, 7). Export these."
+            f"(3, 7).{newer} Export these."
         )
     chosen = list(parts) if modes is None else list(modes)
     for number in chosen:
@@ -213,32 +218,61 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     FlexplantError
         When pyuff is missing, the file is damaged, or holds no nodes.
     ModelError
-        When nodes are given in a coordinate system of their own.
+        When nodes are given, or move, in a coordinate system of their own (dataset 2420).
     LabelError
         When a direction is unknown or a node appears twice.
     FileNotFoundError
         When there is no such file.
     """
-    sets = _sets(path, (15, 2411, 164))
+    sets = _sets(path, (15, 2411, 164, 2420))
     length = next((float(part["length"]) for part in sets if part["type"] == 164), 1.0)
-    parts = [part for part in sets if part["type"] != 164]
+    _check_systems([part for part in sets if part["type"] == 2420], str(path))
+    parts = [part for part in sets if part["type"] in (15, 2411)]
     if not parts:
         raise FlexplantError(f"{str(path)!r} holds no nodes (datasets 15, 2411). Export them.")
     nodes, places = [], []
     for part in parts:
         numbers = np.atleast_1d(part["node_nums"]).astype(np.int64)
         system = np.atleast_1d(part.get("def_cs", 0)).astype(np.int64)
+        moved = np.atleast_1d(part.get("disp_cs", 0)).astype(np.int64)
         # 0 and 1 both stand for the global system in files of test software
-        if np.any(system > 1):
-            raise ModelError(
-                f"{str(path)!r} gives node {int(numbers[np.argmax(system > 1)])} in coordinate "
-                f"system {int(system.max())}: only global coordinates are read. Export these."
-            )
+        for what, of in (("gives", system), ("moves", moved)):
+            if np.any(of > 1):
+                raise ModelError(
+                    f"{str(path)!r} {what} node {int(numbers[np.argmax(of > 1)])} in coordinate "
+                    f"system {int(of.max())}: only global coordinates and directions are read. "
+                    "Export these."
+                )
         nodes.append(numbers)
         places.append(np.stack([np.atleast_1d(part[axis]) for axis in "xyz"], axis=1))
     count = len(directions)
     ids, xyz = np.concatenate(nodes), np.concatenate(places) / length
     return DofSet(np.repeat(ids, count), tuple(directions) * ids.size, np.repeat(xyz, count, 0))
+
+
+def _check_systems(parts: list[dict[str, Any]], path: str) -> None:
+    """Raise ModelError when system 0 or 1, which stands for the global one, is another (2420)."""
+    straight = np.vstack([np.eye(3), np.zeros((1, 3))])
+    for part in parts:
+        listed = zip(part["CS_sys_labels"], part["CS_types"], part["CS_matrices"], strict=True)
+        for label, kind, matrix in listed:
+            if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > 1e-9):
+                raise ModelError(
+                    f"{path!r} defines coordinate system {int(label)} as a turned, moved or curved "
+                    "one (dataset 2420), and nodes are given in it: only global coordinates are "
+                    "read. Export these."
+                )
+
+
+def _types(path: str | Path) -> list[int]:
+    """Return the types of the datasets in a file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            file = importlib.import_module("pyuff").UFF(str(path))
+            return [int(kind) for kind in file.get_set_types()]
+        except Exception as error:
+            raise _damaged(path, "its datasets", error) from None
 
 
 def _sets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
@@ -258,11 +292,8 @@ def _sets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
     found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy's of what pyuff calls
-        try:
-            file = pyuff.UFF(str(path))
-            types = [int(kind) for kind in file.get_set_types()]
-        except Exception as error:
-            raise _damaged(path, "its datasets", error) from None
+        types = _types(path)
+        file = pyuff.UFF(str(path))
         for place, kind in enumerate(types):
             if kind not in kinds:
                 continue

@@ -36,6 +36,30 @@ _SINGULAR = (
 )
 
 
+def _loose(model: FEModel, kept: IntArray) -> str:
+    """Return that kept DOFs leave rigid-body motions, and which others would hold them."""
+    rigid = model.rigid_body / np.linalg.norm(model.rigid_body, axis=0)
+    largest = float(np.linalg.norm(rigid[kept], axis=1).max(initial=0.0))
+    _, sizes, turned = la.svd(rigid[kept])
+    held = np.zeros(rigid.shape[1])
+    held[: sizes.size] = sizes
+    left = rigid @ turned[held < 1e-9 * max(largest, held.max(initial=0.0))].T
+    # the displacements that move most, one after the other; rotations where there are no others
+    names = model.dofs.labels
+    straight = model.dofs.kinds < 3
+    order = la.qr(np.where(straight[:, None], left, 0.0).T, mode="r", pivoting=True)
+    count = left.shape[1]
+    corner = np.abs(np.diag(order[0]))
+    if corner.size < count or corner[count - 1] < 1e-6 * corner[0]:
+        order = la.qr(left.T, mode="r", pivoting=True)
+    add = ", ".join(repr(names[i]) for i in order[1][:count])
+    return (
+        f"the kept DOFs leave {count} rigid-body motion{'s' * (count != 1)} free: with them held, "
+        f"the structure has no static shape. Keep {add} as well, say; or take Rubin or "
+        "ModalTruncation, which need nothing held."
+    )
+
+
 class Partition:
     """Kept rows, the others, and the static shapes ``-Kss^-1 Ksm`` between them."""
 
@@ -52,7 +76,7 @@ class Partition:
             # held at the kept DOFs, no rigid-body motion may be left
             size = la.svdvals(rigid[self.kept] / np.linalg.norm(rigid, axis=0))
             if size.size < rigid.shape[1] or size[-1] < 1e-9 * size[0]:
-                raise ModelError(_SINGULAR)
+                raise ModelError(_loose(model, self.kept))
         self.stiffness = block(model.K, self.others, self.others)
         self.solver = Solver(self.stiffness, _SINGULAR)
         coupling: Any = block(model.K, self.others, self.kept)

@@ -208,6 +208,11 @@ class Rayleigh(Damping):
             alpha=positive(self.alpha, "alpha", zero=True),
             beta=positive(self.beta, "beta", zero=True),
         )
+        if not isinstance(self.rigid, bool | np.bool_):
+            raise ModelError(
+                f"rigid must be True or False, got {short(self.rigid)}: whether alpha slows "
+                "rigid-body motions down too."
+            )
 
     @classmethod
     def fitted(cls, freq: Iterable[float], zeta: Iterable[float]) -> Rayleigh:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeAlias
@@ -98,6 +100,21 @@ def lengths_of(size: Any, count: int) -> tuple[float, ...]:
     )
 
 
+def _asked(function: Any, name: str, centres: FloatArray) -> list[Any]:
+    """Return what a user's function answers at the centres (elements, d)."""
+    names = ", ".join("xyz"[: centres.shape[1]])
+    try:
+        inspect.signature(function).bind(*centres.tolist()[0])
+    except TypeError as error:
+        raise ModelError(
+            f"{name} is asked at the centre ({names}) of each element, and this function cannot be "
+            f"called so: {error}. Write it as lambda {names}: ..."
+        ) from None
+    except (ValueError, IndexError):
+        pass  # a function of C tells nothing of its arguments
+    return [function(*centre) for centre in centres.tolist()]
+
+
 def counts_of(elements: Any, count: int) -> tuple[int, ...]:
     """Return `count` numbers of elements."""
     axes = "xyz"[:count]
@@ -136,7 +153,7 @@ def field_of(
         chosen = np.full(int(np.prod(counts)), True) if present is None else present.ravel()
         found = np.ones(chosen.size)
         centres = centres_of(lengths, counts)[chosen]
-        answers = [value(*centre) for centre in centres.tolist()]
+        answers = _asked(value, name, centres)
         found[chosen] = real_array(answers, f"{name} of the elements", (len(answers),))
         values = found.reshape(tuple(counts[::-1]))
     elif np.ndim(value) == 0:
@@ -163,7 +180,9 @@ def poisson_of(value: Any, lengths: Sequence[float], counts: Sequence[int], pres
     if callable(value) or np.ndim(value):
 
         def shifted(item: Any) -> Any:
-            return (lambda *at: 1.0 + item(*at)) if callable(item) else 1.0 + real_array(item, "nu")
+            if not callable(item):
+                return 1.0 + real_array(item, "poisson_ratio")
+            return functools.wraps(item)(lambda *at: 1.0 + item(*at))
 
         found = field_of(shifted(value), "1 + poisson_ratio", lengths, counts, present) - 1.0
         there = found if present is None else found[present]
@@ -218,7 +237,7 @@ def _missing(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any
             return given.T.ravel()
     centres = centres_of(lengths, counts)
     if callable(holes):
-        return np.array([bool(holes(*centre)) for centre in centres.tolist()])
+        return np.array([bool(answer) for answer in _asked(holes, "holes", centres)])
     listed = list(holes) if isinstance(holes, Iterable) else [holes]
     if len(counts) != 2 or not all(isinstance(hole, Hole) for hole in listed):
         raise ModelError(

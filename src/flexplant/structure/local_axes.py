@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError
 from ..labels import DofSet
-from ..values import real_array
+from ..values import real_array, short
 
 
 def cosines(dofs: DofSet, rotations: Any) -> Any:
@@ -23,7 +24,12 @@ def cosines(dofs: DofSet, rotations: Any) -> Any:
         When cosines are not orthogonal, or a node has only some of its three directions.
     """
     rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
-    for node, given in dict(rotations).items():
+    if not isinstance(rotations, Mapping):
+        raise LabelError(
+            f"rotations must be {{node: (3, 3) direction cosines}}, got {short(rotations)}. Row i "
+            "holds the global components of local axis i."
+        )
+    for node, given in rotations.items():
         matrix = real_array(given, f"rotations[{node}]", (3, 3))
         if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:
             raise ModelError(

@@ -161,6 +161,8 @@ class FEMatrices(Value):
             When their number is not that of the rows.
         """
         given = DofSet.from_table(dofs) if isinstance(dofs, str | Path) else dofs
+        if given is None:
+            raise ModelError("dofs must be a DofSet or the path of a table, got None.")
         return self.replace(dofs=given, located=True)
 
     def located_at(self, nodes: Iterable[int], xyz: Any) -> FEMatrices:
@@ -180,7 +182,9 @@ class FEMatrices(Value):
         """
         if self.dofs is None:
             raise LabelError("the rows have no names yet: with_dofs(dofs) gives these and places.")
-        numbers = np.asarray(list(nodes), dtype=np.int64)
+        if not isinstance(nodes, Iterable) or isinstance(nodes, str):
+            raise LabelError(f"nodes must be a list of node numbers, got {short(nodes)}.")
+        numbers = np.array([whole(node, "a node number", minimum=0) for node in nodes], np.int64)
         places = real_array(xyz, "xyz", (numbers.size, 3))
         missing = np.setdiff1d(self.dofs.nodes, numbers)
         if missing.size:

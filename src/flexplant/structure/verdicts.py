@@ -11,6 +11,7 @@ from ..labels import DIRECTIONS
 from ..values import FloatArray
 from .factor import diagonal
 from .facts import Facts
+from .zero_energy import ZeroEnergy
 
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
@@ -184,13 +185,7 @@ def rigid(found: Facts) -> list[Line]:
         ]
     motions = found.motions
     lines: list[Line] = []
-    free = ", ".join(motions.free) or "none"
-    combined = motions.n_rigid - len(motions.free)
-    if combined > 0:
-        free += f" and {combined} combination{'s' * (combined != 1)}"
-    held = f"; grounded in {', '.join(motions.grounded)}" if motions.grounded else ""
-    absent = f"; no DOFs for {', '.join(motions.absent)}" if motions.absent else ""
-    text = f"free in {free}{held}{absent}"
+    text = _freedom(motions)
     extra = motions.mechanisms.shape[1]
     expected = f"{motions.n_rigid} by the geometry, {found.n_zero} found in K"
     odd = motions.length_factor
@@ -230,6 +225,20 @@ def rigid(found: Facts) -> list[Line]:
             )
         )
     return lines
+
+
+def _freedom(motions: ZeroEnergy) -> str:
+    """Return what moves freely and what is held, in words."""
+    free, held = ", ".join(motions.free), ", ".join(motions.grounded)
+    combined = motions.n_rigid - len(motions.free)
+    absent = f"; no DOFs for {', '.join(motions.absent)}" if motions.absent else ""
+    if combined > 0:
+        alone = f"free in {free}, and " if free else ""
+        among = f"{combined} combination{'s' * (combined != 1)} of {held}"
+        what = "is" if combined == 1 else "are"
+        return f"{alone}{among} {what} free (each by itself is held){absent}"
+    grounded = f"; grounded in {held}" if held else ""
+    return f"{f'free in {free}' if free else 'held'}{grounded}{absent}"
 
 
 def masses(found: Facts) -> list[Line]:
