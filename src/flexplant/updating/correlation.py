@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..identification import MeasuredModes
-from ..values import ComplexArray, FloatArray, Value
+from ..values import ComplexArray, FloatArray, Value, short
 from .frf_residual import FrfResidual
 from .objective import Objective, checked_residuals
 from .pairing import mac as _mac
@@ -94,9 +94,9 @@ def fdac(H: Any, G: Any) -> FloatArray:
     Pascual, Golinval, Razeto: A frequency domain correlation technique for model correlation and
     updating, IMAC 1997.
     """
-    a, b = np.asarray(H, dtype=complex), np.asarray(G, dtype=complex)
+    a, b = _numbers(H, "H"), _numbers(G, "G")
     if a.shape[:-1] != b.shape[:-1] or a.ndim < 1:
-        raise ShapeError(f"H has channels {a.shape[:-1]} and G {b.shape[:-1]}.")
+        raise ShapeError(f"H has channels {a.shape[:-1]} and G {b.shape[:-1]}: choose the same.")
     a, b = a.reshape(-1, a.shape[-1]), b.reshape(-1, b.shape[-1])
     size = np.outer(np.linalg.norm(a, axis=0), np.linalg.norm(b, axis=0))
     if not np.all(np.isfinite(size)) or np.any(size == 0):
@@ -201,9 +201,11 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
 
 
 def _shapes(value: Any, name: str) -> ComplexArray:
-    array = np.asarray(value, dtype=np.complex128)
+    array = _numbers(value, name)
     if array.ndim != 2:
-        raise ShapeError(f"{name} must have shape (n, m), got {array.shape}.")
+        raise ShapeError(
+            f"{name} must have shape (n, m), got {array.shape}. Pass shapes in columns."
+        )
     if not np.all(np.isfinite(array)):
         raise ModelError(f"{name} has NaN or infinite entries.")
     if np.any(np.all(array == 0, axis=0)):
@@ -211,10 +213,19 @@ def _shapes(value: Any, name: str) -> ComplexArray:
     return array
 
 
+def _numbers(value: Any, name: str) -> ComplexArray:
+    try:
+        return np.asarray(value, dtype=np.complex128)
+    except (TypeError, ValueError):
+        raise ModelError(f"{name} must hold numbers, got {short(value)}. Pass an array.") from None
+
+
 def _responses(H: Any, G: Any) -> tuple[ComplexArray, ComplexArray]:
-    a, b = np.asarray(H, dtype=np.complex128), np.asarray(G, dtype=np.complex128)
+    a, b = _numbers(H, "H"), _numbers(G, "G")
     if a.shape != b.shape or a.ndim < 1:
-        raise ShapeError(f"H has shape {a.shape} and G {b.shape}: they must be equal.")
+        raise ShapeError(
+            f"H has shape {a.shape} and G {b.shape}: choose the same channels and lines."
+        )
     if not (np.all(np.isfinite(a)) and np.all(np.isfinite(b))):
         raise ModelError("responses have NaN or infinite entries: leave those lines out.")
     return a, b

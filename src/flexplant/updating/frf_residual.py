@@ -11,8 +11,9 @@ import numpy as np
 from ..errors import ModelError, ShapeError
 from ..labels import Place
 from ..lti import Frf
-from ..values import ComplexArray, FloatArray, flag, positive, real_array
+from ..values import ComplexArray, FloatArray, flag, positive, real_array, short
 from .held import Held
+from .parameters import checked_direction
 from .pencil import Family
 from .point import Point
 from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
@@ -84,7 +85,9 @@ class FrfResidual(Residual):
     def __post_init__(self) -> None:
         frf = self.measured
         if not isinstance(frf, Frf):
-            raise ModelError(f"FrfResidual needs an Frf, got {type(frf).__name__}.")
+            raise ModelError(
+                f"FrfResidual needs an Frf, got {type(frf).__name__}. Pass Frf(freq, data, ...)."
+            )
         if (frf.quantity or "displacement") not in ORDERS:
             raise ModelError(f"quantity {frf.quantity!r} is none of {', '.join(ORDERS)}.")
         variance = self.variance
@@ -100,7 +103,10 @@ class FrfResidual(Residual):
                     f"{frf.data.shape}."
                 ) from None
             if variance.min() <= 0:
-                raise ModelError(f"variance must be positive, got {variance.min():g}.")
+                raise ModelError(
+                    f"variance must be positive, got {variance.min():g}. Check its sign."
+                )
+        checked_direction(self.direction)
         channel_places([*frf.outputs, *frf.inputs], self.places)
         lines = _checked_lines(self.lines, frf, variance)
         hold, delay = _checked_hold(self.hold, self.delay, frf, lines)
@@ -120,7 +126,9 @@ class FrfResidual(Residual):
 
     def select(self, lines: Sequence[int]) -> FrfResidual:
         """Return the residual on some of the lines (numbers in the measured Frf)."""
-        return self.replace(lines=np.asarray(lines, dtype=np.int64))
+        if lines is None:
+            raise ModelError("select takes numbers of lines, got None. Pass [0, 4], say.")
+        return self.replace(lines=lines)
 
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""
@@ -249,11 +257,18 @@ def _checked_lines(lines: Any, frf: Frf, variance: FloatArray | None) -> Any:
             keep &= np.median(size / variance, axis=(0, 1)) > SIGNAL**2
         chosen = np.flatnonzero(keep)
     else:
-        chosen = np.asarray(lines)
+        try:
+            chosen = np.asarray(lines)
+        except (TypeError, ValueError):
+            raise ModelError(
+                f"lines must be numbers of lines, got {short(lines)}. Pass [0, 4], say."
+            ) from None
         if chosen.dtype == bool and chosen.shape == (count,):
             chosen = np.flatnonzero(chosen)
         if chosen.ndim != 1 or (chosen.size and chosen.dtype.kind not in "iu"):
-            raise ModelError(f"lines must be numbers of lines or {count} booleans.")
+            raise ModelError(
+                f"lines must be numbers of lines or {count} booleans. Pass [0, 4], say."
+            )
         if chosen.size and (chosen.min() < 0 or chosen.max() >= count):
             raise ModelError(f"lines must lie between 0 and {count - 1}.")
         chosen = np.unique(chosen)

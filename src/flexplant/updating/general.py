@@ -12,7 +12,7 @@ from scipy.stats import qmc
 
 from ..errors import FlexplantError, FlexplantWarning, ModelError, ShapeError, SolverError
 from ..structure.rigid import orthonormalised
-from ..values import FloatArray, Matrix, real_array
+from ..values import FloatArray, Matrix, generator, real_array, short
 from .methods import GaussNewton, Lasso, Method, Tikhonov, TrustRegion
 from .objective import Objective
 from .parameters import Parameter
@@ -132,7 +132,7 @@ def _all_starts(
         return [first]
     if np.ndim(starts) == 0:
         if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
-            raise ModelError(f"starts must be a whole number from 1 or values, got {starts!r}.")
+            raise ModelError(f"starts must be whole or values, got {short(starts)}. Pass 20, say.")
         low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)
         high = np.where(objective.has_prior, objective.prior_mean + 2 * objective.prior_std, np.inf)
         low, high = np.maximum(low, objective.lower), np.minimum(high, objective.upper)
@@ -146,7 +146,7 @@ def _all_starts(
                 f"starts of {', '.join(open_)} cannot be drawn: give them bounds= or prior=, or "
                 "give starts as values."
             )
-        drawn = qmc.LatinHypercube(q, rng=np.random.default_rng(seed)).random(int(starts) - 1)
+        drawn = qmc.LatinHypercube(q, rng=generator(seed, "seed")).random(int(starts) - 1)
         return [first, *(low + (high - low) * drawn)]
     values = real_array(starts, "starts")
     if values.ndim != 2 or values.shape[1] != q or not values.shape[0]:

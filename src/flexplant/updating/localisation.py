@@ -167,7 +167,8 @@ def localise(
     Schwarz: Estimating the dimension of a model, Annals of Statistics 6, 1978.
     """
     listed = checked_parameters(candidates)
-    beside = checked_parameters(nuisance) if len(nuisance) else ()
+    none = isinstance(nuisance, list | tuple) and not nuisance
+    beside = () if none else checked_parameters(nuisance)
     both = sorted({q.name for q in listed} & {q.name for q in beside})
     if both:
         raise ModelError(

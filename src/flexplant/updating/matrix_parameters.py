@@ -13,7 +13,7 @@ from ..errors import LabelError, ModelError, ShapeError
 from ..structure.eigen import elastic_modes
 from ..structure.factor import dense
 from ..values import FloatArray, Matrix, positive, real_array, short
-from .parameters import Derivatives, Parameter, checked_bounds, checked_prior
+from .parameters import Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images
 SYMMETRIC = 1e-9
@@ -60,7 +60,9 @@ class MatrixParameter(Parameter):
 
     def __post_init__(self) -> None:
         if not isinstance(self.name, str) or not self.name:
-            raise LabelError(f"a MatrixParameter needs a name, got {self.name!r}.")
+            raise LabelError(
+                f"a MatrixParameter needs a name, got {short(self.name)}. Pass a text."
+            )
         parts = {
             label: _checked_matrix(getattr(self, label), f"{label} of {self.name}")
             for label in ("dM", "dD", "dK")
@@ -68,7 +70,7 @@ class MatrixParameter(Parameter):
         if all(part is None for part in parts.values()):
             raise ModelError(f"{self.name} changes nothing: give dM=, dD= or dK=, not all zero.")
         bounds, prior = checked_bounds(self.bounds, self.name), checked_prior(self.prior, self.name)
-        self._set(**parts, bounds=bounds, prior=prior)
+        self._set(**parts, bounds=bounds, prior=prior, unit=checked_text(self.unit, "unit"))
 
     def __repr__(self) -> str:
         parts = ", ".join(a[1] for a in ("dM", "dD", "dK") if getattr(self, a) is not None)
@@ -113,6 +115,11 @@ class MatrixParameter(Parameter):
         ShapeError
             When the DOFs change.
         """
+        if not callable(build):
+            raise ModelError(
+                f"build must be a function from the value to an FEModel, got {short(build)}. Pass "
+                "e.g. lambda t: kirchhoff_plate(thickness=t, ...)."
+            )
         middle = float(real_array(value, "value", ()))
         h = positive(1e-3 * abs(middle) if step is None else step, "step")
         low, high = build(middle - h), build(middle + h)
@@ -280,10 +287,10 @@ class ModeDamping(Parameter):
         number = self.mode
         if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
             raise LabelError(
-                f"mode must be a whole number from 1, got {short(number)}. Count rigid-body modes "
-                "too."
+                f"mode must be a whole number from 1, got {short(number)}. Pass an int, "
+                "rigid-body modes counted."
             )
-        name = str(self.name or f"damping ratio of mode {number}")
+        name = checked_text(self.name, "name") or f"damping ratio of mode {number}"
         bounds, prior = checked_bounds(self.bounds, name), checked_prior(self.prior, name)
         self._set(mode=int(number), name=name, bounds=bounds, prior=prior)
 
@@ -317,8 +324,8 @@ def _mask(value: Any, name: Any) -> Any:
     mask = np.asarray(value)
     if mask.dtype != bool:
         raise ShapeError(
-            f"region {name!r} must be True or False for each element, got {short(value)}. Compare, "
-            "e.g. x < 0.3."
+            f"region {name!r} must be True or False for each element, got {short(value)}. Pass a "
+            "comparison, x < 0.3, say."
         )
     if not mask.any():
         raise ShapeError(f"region {name!r} has no elements: its change would do nothing.")
@@ -331,7 +338,7 @@ def _checked_matrix(value: Any, name: str) -> Matrix | None:
     given: Any = value
     matrix: Any = sp.csc_array(given) if sp.issparse(value) else real_array(value, name)
     if matrix.ndim != 2 or matrix.shape[0] != matrix.shape[1]:
-        raise ShapeError(f"{name} must be a square matrix, got shape {matrix.shape}.")
+        raise ShapeError(f"{name} must be a square matrix, got shape {matrix.shape}. Pass (k, k).")
     if sp.issparse(value):
         real_array(matrix.data, f"stored entries of {name}")
     largest = float(abs(matrix).max()) if matrix.shape[0] else 0.0

@@ -32,7 +32,7 @@ class GaussNewton(Method):
     def __post_init__(self) -> None:
         value = positive(self.truncate, "truncate", zero=True)
         if value >= 1:
-            raise ModelError(f"truncate must be below 1, got {value:g}.")
+            raise ModelError(f"truncate must be below 1, got {value:g}. Choose 1e-3, say.")
         self._set(truncate=value)
 
 
@@ -60,7 +60,9 @@ class TrustRegion(Method):
 
     def __post_init__(self) -> None:
         if self.loss not in LOSSES:
-            raise ModelError(f"loss must be one of {', '.join(LOSSES)}, got {self.loss!r}.")
+            raise ModelError(
+                f"loss must be one of {', '.join(LOSSES)}, got {self.loss!r}. Choose one."
+            )
         self._set(scale=positive(self.scale, "scale"))
 
 

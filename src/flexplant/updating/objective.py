@@ -159,8 +159,8 @@ def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
         if not isinstance(residual, Residual):
             raise ModelError(
                 "residuals must be a list of Eigenvalues, ModeShapes, FrfResidual, Antiresonances "
-                f"or StaticCompliance, got {type(residual).__name__}: wrap the measurement, "
-                "[Eigenvalues(measured)]."
+                f"or StaticCompliance, got {type(residual).__name__}. Pass the measurement "
+                "wrapped, [Eigenvalues(measured)]."
             )
     if not listed:
         raise ModelError("residuals is empty: nothing was measured to update from.")

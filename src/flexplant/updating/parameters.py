@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
-from ..values import FloatArray, Value, real_array
+from ..values import FloatArray, Value, real_array, short
 
 #: derivatives of M, D and K to one parameter, None where zero
 Derivatives: TypeAlias = "tuple[FloatArray | None, FloatArray | None, FloatArray | None]"
@@ -81,14 +81,13 @@ class PointParameter(Parameter):
     acts_on: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        if self.direction not in DIRECTIONS:
-            raise unknown_label("direction", self.direction, DIRECTIONS)
-        place, text = _checked_place(self.at, self.direction)
+        checked_direction(self.direction)
+        place, text = checked_place(self.at, self.direction)
         other = self.to
         if other is not None:
-            other, end = _checked_place(other, self.direction, "to")
+            other, end = checked_place(other, self.direction, "to")
             text += f" to {end}"
-        name = str(self.name or f"{self.quantity} at {text}")
+        name = checked_text(self.name, "name") or f"{self.quantity} at {text}"
         self._set(at=place, direction=self.direction, name=name, to=other)
         self._set(bounds=checked_bounds(self.bounds, name), prior=checked_prior(self.prior, name))
 
@@ -210,7 +209,8 @@ class AddedStiffness(PointParameter):
     acts_on = 2
 
 
-def _checked_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str]:
+def checked_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str]:
+    """Return a place and its name."""
     if isinstance(at, str):
         if not at:
             raise LabelError(f"{what}='' is no place: give a DOF label such as '41:z', or a point.")
@@ -227,13 +227,35 @@ def _checked_place(at: Any, direction: str, what: str = "at") -> tuple[Place, st
     return point, "(" + ", ".join(f"{x:g}" for x in point) + f") {direction}"
 
 
+def checked_text(value: Any, what: str) -> str:
+    """Return a text.
+
+    Raises
+    ------
+    LabelError
+        When it is another thing.
+    """
+    if not isinstance(value, str):
+        raise LabelError(f"{what} must be a text, got {short(value)}. Use quotes.")
+    return value
+
+
+def checked_direction(value: Any) -> str:
+    """Return a direction of motion."""
+    if not isinstance(value, str) or value not in DIRECTIONS:
+        raise unknown_label("direction", value, DIRECTIONS)
+    return value
+
+
 def checked_bounds(value: Any, name: str) -> tuple[float, float] | None:
     """Return (lowest, highest), None when there are none."""
     if value is None:
         return None
     pair = np.asarray(value, dtype=object)
     if pair.shape != (2,):
-        raise ModelError(f"bounds of {name} must be (lowest, highest), got {value!r:.60}.")
+        raise ModelError(
+            f"bounds of {name} must be (lowest, highest), got {short(value)}. Pass a pair."
+        )
     try:
         low = -np.inf if pair[0] is None else float(pair[0])
         high = np.inf if pair[1] is None else float(pair[1])

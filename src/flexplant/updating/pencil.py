@@ -78,7 +78,7 @@ class Family:
         if not all(hasattr(model, part) for part in ("M", "D", "K", "dofs", "rigid_body")):
             raise ModelError(
                 f"the model must have M, D, K, a rigid_body basis and dofs, as FEModel and "
-                f"ReducedModel do, got {type(model).__name__}."
+                f"ReducedModel do, got {type(model).__name__}. Pass one of them."
             )
         M, D, K = (_dense(part, model) for part in (model.M, model.D, model.K))
         rigid = np.asarray(model.rigid_body, dtype=np.float64)

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from ..errors import ModelError, ShapeError
 from ..labels import Place
 from ..values import ComplexArray, FloatArray, positive, real_array
+from .parameters import checked_direction, checked_place
 from .pencil import Family
 from .point import Point
 from .residuals_base import Bound, Residual, place_rows, split_parts
@@ -59,6 +60,7 @@ class Antiresonances(Residual):
         if np.any(imag == 0):
             raise ModelError("zeros must have an imaginary part: an antiresonance oscillates.")
         self._set(zeros=real + 1j * np.abs(imag), std=_checked_std(self.std, real.size))
+        _check_places(self)
 
     def __repr__(self) -> str:
         freq = ", ".join(f"{f:.1f}" for f in np.abs(self.zeros[:4]) / (2 * np.pi))
@@ -163,6 +165,7 @@ class StaticCompliance(Residual):
         if value == 0:
             raise ModelError("a compliance of zero cannot be compared relatively: check the value.")
         self._set(value=value, std=None if self.std is None else positive(self.std, "std"))
+        _check_places(self)
 
     def __repr__(self) -> str:
         return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
@@ -211,11 +214,17 @@ class _BoundStatic(Bound):
         return np.asarray(moved / self.std)[None, :]
 
 
+def _check_places(residual: Antiresonances | StaticCompliance) -> None:
+    checked_direction(residual.direction)
+    for what in ("output", "input"):
+        checked_place(getattr(residual, what), residual.direction, what)
+
+
 def _checked_std(value: Any, count: int) -> FloatArray | None:
     if value is None:
         return None
     std = real_array(value, "std")
     std = np.full(count, float(std)) if std.ndim == 0 else real_array(std, "std", (count,))
     if std.min() <= 0:
-        raise ModelError(f"std must be positive, got {std.min():g}.")
+        raise ModelError(f"std must be positive, got {std.min():g}. Check its sign.")
     return std

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, generator
 from .objective import Objective, checked_residuals
 from .parameters import Parameter
 from .result import UpdateResult
@@ -132,7 +132,7 @@ def sample_posterior(
             f"{count} walkers and {steps} steps: walkers must be even and at least "
             f"{max(4, 2 * q)}, steps 2, discard between 0 and 1."
         )
-    rng = np.random.default_rng(seed)
+    rng = generator(seed, "seed")
     objective.begin(fit.history.parameters[0])
     for p in fit.history.parameters[1:]:
         objective.at(p, refer=True)

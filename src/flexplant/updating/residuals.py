@@ -57,7 +57,7 @@ class Eigenvalues(Residual):
         if not isinstance(self.measured, MeasuredModes):
             raise ModelError(
                 f"Eigenvalues compares with MeasuredModes, got {type(self.measured).__name__}. "
-                "Wrap the poles: MeasuredModes(poles, modes=[...])."
+                "Pass the poles as MeasuredModes(poles, modes=[...])."
             )
         if self.measured.modes is None:
             raise LabelError(

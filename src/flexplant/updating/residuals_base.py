@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import LabelError
 from ..labels import Place
-from ..values import ComplexArray, FloatArray, Value
+from ..values import ComplexArray, FloatArray, Value, short
 from .pencil import Family
 from .point import Point
 
@@ -55,11 +55,16 @@ def channel_places(
     channels: Sequence[str], places: Mapping[str, Place] | None
 ) -> tuple[Place, ...]:
     """Return the place of each channel: of `places` where named there, else its name."""
+    if places is not None and not isinstance(places, Mapping):
+        raise LabelError(
+            f"places must be a mapping {{channel: place}}, got {short(places)}. Pass "
+            "{'y1': '41:z'}, say."
+        )
     known = dict(places or {})
     unknown = sorted(set(known) - set(channels))
     if unknown:
         raise LabelError(
-            f"places names {unknown}, which are no channels: {', '.join(channels[:6])}."
+            f"places names {unknown}, which are no channels. Known are {', '.join(channels[:6])}."
         )
     return tuple(known.get(channel, channel) for channel in channels)
 

@@ -10,7 +10,7 @@ from scipy.special import ndtri
 
 from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
-from ..values import ComplexArray, FloatArray, Value, positive
+from ..values import ComplexArray, FloatArray, Value, generator, positive
 from .parameters import Parameter
 
 
@@ -181,7 +181,7 @@ class UpdateResult(Value):
         """
         share = positive(level, "level")
         if share >= 1:
-            raise ModelError(f"level must be below 1, got {share:g}.")
+            raise ModelError(f"level must be below 1, got {share:g}. Choose 0.95, say.")
         std = self._known_std()
         half = float(ndtri((1 + share) / 2)) * std
         return np.column_stack([self.values - half, self.values + half])
@@ -199,7 +199,7 @@ class UpdateResult(Value):
         std = self._known_std()
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ModelError(f"count must be a whole number from 1, got {count!r}.")
-        white = np.random.default_rng(seed).standard_normal((int(count), std.size))
+        white = generator(seed, "seed").standard_normal((int(count), std.size))
         values, vectors = np.linalg.eigh(np.asarray(self.covariance) / np.outer(std, std))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(self.values + (white @ root.T) * std, dtype=np.float64)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
-from ..values import ComplexArray, FloatArray, Value, real_array
+from ..values import ComplexArray, FloatArray, Value, real_array, short
 from .parameters import Parameter
 from .pencil import Eigen, Family, repeated_groups
 
@@ -136,11 +136,14 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
     first, last = eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size
     if not eigen.poles.size:
         raise ModelError("the model has no oscillating mode: there is no eigenvalue to follow.")
+    if not isinstance(modes, Iterable) or isinstance(modes, str):
+        raise LabelError(f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say.")
     for number in modes:
-        if number not in range(1, last + 1):
+        if isinstance(number, bool) or number not in range(1, last + 1):
             raise LabelError(
                 f"no mode {number!r}: the model has {eigen.n_rigid} rigid-body and "
-                f"{eigen.poles.size} oscillating modes, numbered from 1 to {last}."
+                f"{eigen.poles.size} oscillating modes, numbered from 1 to {last}. Choose "
+                "among these."
             )
         if number < first:
             raise LabelError(
@@ -158,7 +161,7 @@ def checked_parameters(parameters: Any) -> tuple[Parameter, ...]:
         if not isinstance(parameter, Parameter):
             raise ModelError(
                 f"parameters must be a list of AddedMass, AddedDamping, AddedStiffness, got "
-                f"{type(parameter).__name__} {parameter!r:.60}."
+                f"{short(parameter)}. Pass [AddedMass('41:z')], say."
             )
     if not listed:
         raise ModelError("parameters is empty: there is nothing to update.")
@@ -179,7 +182,7 @@ def checked_values(values: Any, parameters: Sequence[Parameter], name: str) -> F
     if array.shape != (len(parameters),):
         raise ShapeError(
             f"{name} needs one value for each of {', '.join(p.name for p in parameters)}, got "
-            f"shape {array.shape}."
+            f"shape {array.shape}. Pass a list."
         )
     return array
 

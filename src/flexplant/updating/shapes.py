@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -13,8 +13,9 @@ from scipy.optimize import linear_sum_assignment
 from ..errors import LabelError, ModelError, ShapeError
 from ..identification import MeasuredModes
 from ..labels import Place
-from ..values import ComplexArray, FloatArray, flag, real_array
+from ..values import ComplexArray, FloatArray, flag, real_array, short, whole
 from .pairing import CLUSTER, mac
+from .parameters import checked_direction, checked_place
 from .pencil import Family, groups
 from .point import Point
 from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
@@ -77,9 +78,13 @@ class ModeShapes(Residual):
     def __post_init__(self) -> None:
         name = type(self).__name__
         if not isinstance(self.measured, MeasuredModes):
-            raise ModelError(f"{name} needs MeasuredModes, got {type(self.measured).__name__}.")
+            raise ModelError(
+                f"{name} needs MeasuredModes, got {type(self.measured).__name__}. Pass "
+                "MeasuredModes(poles, modes=[...])."
+            )
         if self.measured.modes is None:
             raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
+        checked_direction(self.direction)
         at, given = _rows(self, name)
         shape = (len(at), len(self.measured))
         real = real_array(np.real(given), "shapes", shape)
@@ -95,7 +100,7 @@ class ModeShapes(Residual):
             std = np.broadcast_to(real_array(std, "std"), shape).copy() if np.ndim(std) < 2 else std
             std = real_array(std, "std", shape)
             if std.min() <= 0:
-                raise ModelError(f"std must be positive, got {std.min():g}.")
+                raise ModelError(f"std must be positive, got {std.min():g}. Check its sign.")
         covariance = self.covariance
         if covariance is None and self.shapes is None and std is None:
             covariance = getattr(self.measured, "shape_covariance", None)
@@ -275,7 +280,9 @@ class _BoundMac(_BoundShapes):
 def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
     """Return the measured modes of some numbers, and their positions."""
     known = measured.modes or ()
-    wanted = [int(n) for n in modes]
+    if not isinstance(modes, Iterable) or isinstance(modes, str):
+        raise LabelError(f"modes must be a list of numbers, got {short(modes)}. Pass [6, 7], say.")
+    wanted = [whole(n, "a mode") for n in modes]
     missing = [n for n in wanted if n not in known]
     if missing or not wanted:
         raise LabelError(f"modes {missing or '[]'} were not measured; measured are {list(known)}.")
@@ -288,8 +295,8 @@ def _rows(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
     measured, at = residual.measured, residual.at
     if residual.shapes is not None:
         if at is None or isinstance(at, Mapping):
-            raise ShapeError(f"{name} needs at=, the place of each row of the shapes given.")
-        return [at] if isinstance(at, str) else list(at), residual.shapes
+            raise ShapeError(f"{name} needs at= with shapes=. Pass the place of each row.")
+        return _listed(at, residual.direction), residual.shapes
     if measured.shapes is None:
         raise ShapeError(
             f"{measured!r} holds no shapes: give them, {name}(measured, shapes, at), or identify "
@@ -298,7 +305,18 @@ def _rows(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
     labels = measured.dofs or ()
     if at is None or isinstance(at, Mapping):
         return list(channel_places(labels, at)), measured.shapes
-    return [at] if isinstance(at, str) else list(at), measured.shapes
+    return _listed(at, residual.direction), measured.shapes
+
+
+def _listed(at: Any, direction: str) -> list[Place]:
+    if isinstance(at, str):
+        return [at]
+    if not isinstance(at, Sequence | np.ndarray):
+        raise ShapeError(
+            f"at must be a list of places, got {short(at)}. Give DOF labels or points, one for "
+            "each row of the shapes."
+        )
+    return [checked_place(place, direction)[0] for place in at]
 
 
 def _checked_covariance(value: Any, size: tuple[int, int]) -> Any:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantWarning, ModelError
-from ..values import ComplexArray, FloatArray, positive
+from ..values import ComplexArray, FloatArray, flag, positive, seed_sequence
 from .general import changed_model, general_update
 from .methods import GaussNewton, Method, TrustRegion
 from .objective import checked_residuals
@@ -104,11 +104,14 @@ def update(
     given = checked_residuals(residuals)
     if method is not None and not isinstance(method, Method):
         raise ModelError(
-            f"method must be GaussNewton(), TrustRegion(), Tikhonov() or Lasso(), got {method!r}."
+            f"method must be GaussNewton(), TrustRegion(), Tikhonov() or Lasso(), got {method!r}. "
+            "Pass one of them, or None."
         )
     if max_iterations is not None:
         _checked_count(max_iterations)
     enough = positive(tolerance, "tolerance")
+    seed_sequence(seed, "seed")
+    takes_part = flag(prior, "prior")
     bounded = any(getattr(q, "bounds", None) is not None for q in listed)
     known = any(getattr(q, "prior", None) is not None for q in listed)
     plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given)
@@ -127,7 +130,7 @@ def update(
         start=start,
         starts=starts,
         seed=seed,
-        prior=bool(prior),
+        prior=takes_part,
         most=max_iterations or (20 if newton else 200),
         tolerance=enough,
     )
@@ -218,5 +221,7 @@ def _doubt(data: Data, S: ComplexArray, now: Iterate) -> tuple[FloatArray | None
 
 def _checked_count(value: Any) -> int:
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ModelError(f"max_iterations must be a whole number from 1, got {value!r}.")
+        raise ModelError(
+            f"max_iterations must be a whole number from 1, got {value!r}. Pass an int."
+        )
     return int(value)

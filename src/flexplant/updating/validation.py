@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, generator, positive
 from .correlation import Correlation, correlate
 from .methods import Method
 from .objective import Objective, checked_residuals
@@ -138,14 +138,17 @@ def split(residual: Any, *, share: float = 0.5, seed: int = 0) -> tuple[Any, Any
     if parts is None:
         parts = getattr(measured, "modes", None)
     if not isinstance(residual, Residual) or parts is None:
-        raise ModelError(f"split takes modes or lines apart, got {type(residual).__name__}.")
-    if not 0 < share < 1:
-        raise ModelError(f"share must lie between 0 and 1, got {share!r}.")
+        raise ModelError(
+            f"split takes modes or lines apart, got {type(residual).__name__}. Pass Eigenvalues, "
+            "ModeShapes or an FrfResidual."
+        )
+    if not positive(share, "share") < 1:
+        raise ModelError(f"share must lie between 0 and 1, got {share:g}. Choose 0.7, say.")
     items = np.asarray(parts)
     count = round(share * items.size)
     if not 0 < count < items.size:
         raise ModelError(f"a share of {share:g} of {items.size} leaves one side empty.")
-    order = np.random.default_rng(seed).permutation(items.size)
+    order = generator(seed, "seed").permutation(items.size)
     chosen: Any = residual
     first, rest = np.sort(items[order[:count]]), np.sort(items[order[count:]])
     return chosen.select(first.tolist()), chosen.select(rest.tolist())
