@@ -2,10 +2,11 @@
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
-from stages import CORNERS, NOISE, RATE, Z8, ports, reduced, some_modes
+from stages import CORNERS, INSET, NOISE, RATE, Z8, L, ports, reduced, some_modes
 
 
 @pytest.fixture(scope="module")
@@ -81,3 +82,30 @@ def test_a_fit_alone_opens_its_uncertainty():
 def test_a_reference_without_any_poi_says_so():
     with pytest.raises(fx.errors.LabelError, match="there is none yet"):
         fx.Ports(references=[fx.Reference("die")])
+
+
+def test_an_update_with_a_strong_damper_to_ground_becomes_a_plant():
+    """From poles to the plant and its filter; responses against one dense solve per frequency."""
+    before = reduced()
+    row = before.row(Z8, "z")
+    M, D, K = (np.asarray(part) for part in (before.M, before.D, before.K))
+    true = D + 300.0 * np.outer(row, row)
+    k = M.shape[0]
+    A = np.block([[np.zeros((k, k)), np.eye(k)], [-la.solve(M, K), -la.solve(M, true)]])
+    poles = la.eigvals(A)
+    poles = poles[poles.imag > 500.0]
+    poles = poles[np.argsort(np.abs(poles))][:3]
+    z8 = before.full_dofs.nearest(Z8, "z")
+    measured = fx.MeasuredModes(poles=poles, modes=[4, 5, 6])
+    fit = fx.update(before, [fx.AddedMass(z8), fx.AddedDamping(z8)], [fx.Eigenvalues(measured)])
+    np.testing.assert_allclose(fit.values, [0.0, 300.0], atol=1e-4)
+    with pytest.warns(fx.FlexplantWarning, match="drag rigid-body motion"):
+        plant = fx.assemble_plant(fit.model, ports())
+    freq = np.array([0.5, 5.0, 300.0, 900.0])
+    found = fx.frequency_response(plant.system, freq)["die:z", "u2"]
+    see, push = before.row((L / 2, L / 2, 0.0), "z"), before.row(INSET[1], "z")
+    for f, value in zip(freq, found, strict=True):
+        s = 2j * np.pi * f
+        assert value == pytest.approx(see @ la.solve(s**2 * M + s * true + K, push), rel=1e-5)
+    observer = fx.design_kalman(plant.discretized(RATE, delay=1))
+    assert 0 < observer.rms("die:z") < 1e-9

@@ -14,8 +14,8 @@ from ..values import ComplexArray, FloatArray, IntArray
 from .scaling import state_scale
 from .statespace import StateSpace
 
-#: entries of the largest intermediate array of a back substitution (complex)
-CHUNK = 2_000_000
+#: entries of the largest intermediate array of a back substitution (complex): it stays in cache
+CHUNK = 200_000
 #: frequencies at a time in block form: the scalar functions of all modes stay in cache
 MODAL_STEP = 512
 

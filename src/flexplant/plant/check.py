@@ -189,9 +189,11 @@ def _reach_and_sight(plant: StandardPlant) -> list[Assumption]:
         else:
             count = sum(pole.left.shape[1] for pole in poles) - rigid
             words = [f"all {rigid} rigid-body modes"] if rigid else []
-            words += [f"all {count} other poles that are not stable"] if count else []
-            text = " and ".join(words) or "every mode decays by itself"
-            found.append(Assumption(case.key, True, f"{text}, by {len(case.names)} channels."))
+            words += [f"{count} other poles that are not stable"] if count else []
+            text = f"{' and '.join(words)}, by {len(case.names)} channels."
+            found.append(
+                Assumption(case.key, True, text if words else "every mode decays by itself.")
+            )
     return found
 
 

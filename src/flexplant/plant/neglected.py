@@ -10,7 +10,7 @@ from ..errors import CertificateError, ModelError
 from ..lti.frequency import default_freq, frequency_response
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace, System
-from ..values import FloatArray, Value
+from ..values import ComplexArray, FloatArray, Value
 from .assembly import assemble_plant
 from .realisation import Structure
 from .standard import StandardPlant, standard_plant
@@ -95,11 +95,11 @@ def neglected_modes(
         raise ModelError(f"the larger plant has other channels: {big.u} -> {big.y}.")
     pair = small.system.select(moved, small.u), big.system.select(moved, small.u)
     grid = _grid(*pair)
-    gap = frequency_response(pair[1], grid).data - frequency_response(pair[0], grid).data
+    gap = _gap(*pair, grid)
     sizes = np.linalg.norm(gap, axis=1).max(axis=1)
     if not np.all(sizes > 0):
         raise ModelError("the larger model does not differ from the plant: nothing is neglected.")
-    height = _height(*pair, grid, sizes)
+    height = _height(gap, sizes)
     low = np.searchsorted(grid, 3 * grid[0])
     if height[0] > 3 * height[low]:
         raise ModelError(
@@ -109,7 +109,7 @@ def neglected_modes(
     weight = _fitted(grid, height)
     fine = np.unique(np.concatenate([grid[:-1] + f * np.diff(grid) for f in (0.25, 0.5, 0.75)]))
     gain = np.abs(frequency_response(weight, fine).data[0, 0])
-    tightest = float(np.max(_height(*pair, fine, sizes) / gain))
+    tightest = float(np.max(_height(_gap(*pair, fine), sizes) / gain))
     if tightest > 1:
         raise CertificateError(
             f"the difference is {tightest:.4g} times the weight somewhere: a resonance is "
@@ -171,9 +171,13 @@ def _grid(small: StateSpace, big: StateSpace) -> FloatArray:
     return np.asarray(grid[(grid >= flat[0]) & (grid <= top)])
 
 
-def _height(small: StateSpace, big: StateSpace, grid: FloatArray, sizes: FloatArray) -> FloatArray:
+def _gap(small: StateSpace, big: StateSpace, grid: FloatArray) -> ComplexArray:
+    """Return the difference of the responses (ny, nu, n_freq)."""
+    return frequency_response(big, grid).data - frequency_response(small, grid).data
+
+
+def _height(gap: ComplexArray, sizes: FloatArray) -> FloatArray:
     """Largest singular value (n_freq,) of the scaled difference."""
-    gap = frequency_response(big, grid).data - frequency_response(small, grid).data
     return np.asarray(np.linalg.norm(np.moveaxis(gap / sizes[:, None, None], -1, 0), 2, (1, 2)))
 
 
