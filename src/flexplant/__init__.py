@@ -143,6 +143,7 @@ from .structure import FEModel as FEModel
 from .structure import Hysteretic as Hysteretic
 from .structure import ModalDamping as ModalDamping
 from .structure import ModelCheck as ModelCheck
+from .structure import Pardiso as Pardiso
 from .structure import PointMass as PointMass
 from .structure import Rayleigh as Rayleigh
 from .structure import Rectangle as Rectangle

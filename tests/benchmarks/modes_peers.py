@@ -1,6 +1,6 @@
 """One measurement in a process of its own: 24 modes of a mesh by one method, as one JSON line.
 
-python modes_peers.py plate 181 ours|default|superlu|pardiso
+python modes_peers.py plate 181 ours|mixed|default|superlu|pardiso (mixed: ours on PARDISO)
 """
 
 import json
@@ -25,7 +25,7 @@ def peak():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
 
 
-def ours(mesh, times):
+def ours(mesh, times, **options):
     """CPU of the checked modes; making the model (its checks) is timed by itself."""
     from flexplant.reduction import solve_modes
     from flexplant.structure import FEModel, counted
@@ -47,7 +47,7 @@ def ours(mesh, times):
 
     counted.modes_below = timed
     begin = time.process_time()
-    modes = solve_modes(model, count=COUNT)
+    modes = solve_modes(model, count=COUNT, **options)
     times["modes"] = time.process_time() - begin
     r = modes.n_rigid
     return modes.omega[r:] ** 2, modes.phi[:, r:]
@@ -82,10 +82,11 @@ def superlu(A):
 
 
 def pardiso(A):
-    """MKL PARDISO, mtype 2."""
-    from pardiso_peer import factor
+    """MKL PARDISO, where MKL is installed (or MKLROOT tells where it is)."""
+    from flexplant.structure import Pardiso
+    from flexplant.structure.pardiso import PardisoCholesky
 
-    return factor(A)
+    return PardisoCholesky(A, Pardiso()).solve
 
 
 def main(kind, n, method):
@@ -94,6 +95,10 @@ def main(kind, n, method):
     times = {}
     if method == "ours":
         squares, phi = ours(mesh, times)
+    elif method == "mixed":
+        from flexplant.structure import Pardiso
+
+        squares, phi = ours(mesh, times, factor=Pardiso())
     else:
         squares, phi = peer(mesh, times, globals()[method])
     memory = peak()

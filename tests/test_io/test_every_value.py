@@ -78,6 +78,7 @@ def made():
     solution = fx.lti.solve_care(np.array([[-1.0]]), np.eye(1), Q=np.eye(1), R=np.eye(1))
     yield from (fe, modes, rom, fx.DesiredDofs(rom.dofs.labels), select_dofs(modes, 25))
     yield from (normal_form(rom.M, rom.D, rom.K, rom.rigid_body), fx.ModalDamping(0.01))
+    yield fx.Pardiso()
     yield from (fx.Rayleigh(1.0, 1e-6), fx.AddedStiffness(at), *unknowns, residual, poles, fit)
     yield eigenvalue_sensitivities(rom, unknowns, modes=[6])
     yield from of_updates(rom, unknowns, residual, fit)

@@ -14,6 +14,7 @@ from ..structure import Damping, FEModel, ModalDamping
 from ..structure.counted import counted_modes
 from ..structure.eigen import elastic_modes, signed
 from ..structure.factor import DENSE_LIMIT, by_rows, dense, diagonal
+from ..structure.pardiso import Pardiso
 from ..structure.shifted import modes_below, stiffness_factor
 from ..values import FloatArray, positive
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
@@ -36,6 +37,7 @@ def solve_modes(
     damping: Damping | None = None,
     compliance_at: Place | Iterable[Place] = (),
     compliance_damping: Damping | float | None = None,
+    factor: Pardiso | None = None,
 ) -> Modes:
     """Return the lowest modes of a structure, mass-normalised, rigid-body modes exactly at 0.
 
@@ -55,6 +57,8 @@ def solve_modes(
         modes is kept, by residual attachment vectors.
     compliance_damping : Damping or float, optional
         Of the attachment vectors; None: damped like the modes.
+    factor : Pardiso, optional
+        Solver of a large sparse model in place of the library's own.
 
     Returns
     -------
@@ -93,12 +97,17 @@ def solve_modes(
             f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}: "
             "1 % in all modes is ModalDamping(0.01)."
         )
+    if factor is not None and not isinstance(factor, Pardiso):
+        raise ModelError(
+            f"factor must be a Pardiso(), got {type(factor).__name__}: leave it out to use the "
+            "library's own factor."
+        )
     kept, top = _asked(model, count, below)
     at = places(compliance_at)
     names = labels_of(at, model.dofs)
     # one factor for the modes and for the attachment vectors, while it is held here
-    held = stiffness_factor(model) if at and _is_large(model) else None
-    omega, phi, certificate = _undamped(model, kept, top)
+    held = stiffness_factor(model, factor) if at and _is_large(model) else None
+    omega, phi, certificate = _undamped(model, kept, top, factor)
     orthonormality, residual = _check(model, omega, phi)
     certificate["orthonormality"] = orthonormality
     if model.rigid_body.shape[1]:
@@ -166,7 +175,7 @@ def _vector_zeta(
 
 
 def _undamped(
-    model: FEModel, count: int, top: float
+    model: FEModel, count: int, top: float, method: Pardiso | None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     rigid = model.rigid_body
     n, r = rigid.shape
@@ -178,7 +187,7 @@ def _undamped(
     if small or not sp.issparse(model.K) or not sp.issparse(model.M):
         omega, phi = elastic_modes(dense(model.M), dense(model.K), rigid, count - r)
     elif count > r:
-        squares, phi, certificate = counted_modes(model, count - r, top)
+        squares, phi, certificate = counted_modes(model, count - r, top, method)
         omega, phi = np.sqrt(squares), signed(phi) if squares.size else phi
     else:
         omega, phi = np.zeros(0), np.zeros((n, 0))

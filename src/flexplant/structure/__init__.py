@@ -13,6 +13,7 @@ from .fields import Disc as Disc
 from .fields import Rectangle as Rectangle
 from .matrices import FEMatrices as FEMatrices
 from .model import FEModel as FEModel
+from .pardiso import Pardiso as Pardiso
 from .parts import Damper as Damper
 from .parts import HeldShape as HeldShape
 from .parts import PointMass as PointMass

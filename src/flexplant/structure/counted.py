@@ -14,6 +14,7 @@ from .eigen import check_stiffness
 from .factor import by_rows
 from .lanczos import FOUND, BlockLanczos
 from .model import FEModel
+from .pardiso import Pardiso
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
 from .threads import one_thread
 
@@ -34,7 +35,7 @@ _ROUNDINGS = 10.0
 
 
 def counted_modes(
-    model: FEModel, count: int, top: float = np.inf
+    model: FEModel, count: int, top: float = np.inf, method: Pardiso | None = None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     """Return the lowest elastic modes with omega^2 up to `top`, and what was counted.
 
@@ -49,6 +50,8 @@ def counted_modes(
         How many elastic modes at most.
     top : float [rad^2/s^2]
         Largest omega^2.
+    method : Pardiso, optional
+        In place of the multifrontal factor; the count does without.
 
     Returns
     -------
@@ -67,14 +70,14 @@ def counted_modes(
         When the count does not agree, or is not sure.
     """
     with one_thread():
-        return _counted(model, count, top)
+        return _counted(model, count, top, method)
 
 
 def _counted(
-    model: FEModel, count: int, top: float
+    model: FEModel, count: int, top: float, method: Pardiso | None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
-    factor: StiffnessFactor | None = stiffness_factor(model)
+    factor: StiffnessFactor | None = stiffness_factor(model, method)
     largest = factor.largest if factor else 0.0
     below = None
     if np.isfinite(top):
@@ -91,7 +94,7 @@ def _counted(
     squares, phi = np.zeros(0), np.zeros((n, 0))
     missing = min(count + _EXTRA, n - r)
     for search in range(_SEARCHES):
-        factor = factor or stiffness_factor(model)
+        factor = factor or stiffness_factor(model, method)
         locked = np.hstack([model.rigid_body, phi])
         more = _search(model, factor, locked, missing, search)
         squares, phi = _rayleigh_ritz(model, np.hstack([phi, more]))

@@ -14,6 +14,7 @@ from .factor import diagonal
 from .model import FEModel
 from .multifrontal import MultifrontalCholesky, multifrontal_inertia
 from .ordering import Dissection, dissect
+from .pardiso import Pardiso, PardisoCholesky
 
 #: the shift, of the largest eigenvalue: far below the first elastic mode of nearly all models,
 #: yet K - sigma M is well away from singular
@@ -33,6 +34,8 @@ class StiffnessFactor:
     ----------
     model : FEModel
         The structure; K may be singular for its rigid-body motions.
+    method : Pardiso, optional
+        In place of the multifrontal factor.
 
     Raises
     ------
@@ -40,7 +43,7 @@ class StiffnessFactor:
         When K is indefinite.
     """
 
-    def __init__(self, model: FEModel) -> None:
+    def __init__(self, model: FEModel, method: Pardiso | None = None) -> None:
         self.M: Any = sp.csc_array(model.M)
         self.K: Any = sp.csc_array(model.K)
         self.rigid = model.rigid_body
@@ -49,7 +52,11 @@ class StiffnessFactor:
         shifted = sp.csc_array(self.K - self.sigma * self.M)
         self.dissection = dissection_of(model)
         try:
-            self._cholesky = MultifrontalCholesky(shifted, self.dissection)
+            self._cholesky: MultifrontalCholesky | PardisoCholesky = (
+                MultifrontalCholesky(shifted, self.dissection)
+                if method is None
+                else PardisoCholesky(shifted, method)
+            )
         except SolverError as error:
             negative = multifrontal_inertia(shifted, self.dissection)
             if not negative:
@@ -111,13 +118,15 @@ class StiffnessFactor:
         return u - R @ (inertia.T @ u)
 
 
-def stiffness_factor(model: FEModel) -> StiffnessFactor:
+def stiffness_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
     """Return the factor of a sparse model, the same one for as long as someone holds it.
 
     Parameters
     ----------
     model : FEModel
         The structure.
+    method : Pardiso, optional
+        How a new one is made; None: multifrontal.
 
     Raises
     ------
@@ -127,7 +136,7 @@ def stiffness_factor(model: FEModel) -> StiffnessFactor:
     known = _held.get(model)
     factor = known() if known is not None else None
     if factor is None:
-        factor = StiffnessFactor(model)
+        factor = StiffnessFactor(model, method)
         _held[model] = weakref.ref(factor)
     return factor
 
