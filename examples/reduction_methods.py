@@ -106,7 +106,7 @@ def table(result: dict[str, Any]) -> str:
         worst = 100 * np.abs(quality.freq_error[~lost]).max()
         errors = (quality.frf_error, quality.resonance_error, quality.static_error)
         frf, resonance, static = (100 * float(error.max()) for error in errors)
-        bound = f"{quality.bound.value / quality.true_error:.0f}" if quality.bound else "-"
+        bound = f"{quality.band_bound / quality.true_error:.3g}" if quality.bound else "-"
         text.append(
             f"{name:25s}{order:6d}{worst:11.2g}{lost.sum():5d}{frf:10.2g}{resonance:9.2g}"
             f"{static:10.2g}{bound:>12s}{1e3 * seconds:10.1f}"

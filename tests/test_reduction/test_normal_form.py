@@ -106,7 +106,7 @@ def test_weak_dampers_to_ground_leave_rigid_body_modes_alone():
     ground = np.diag([1e-4, 0, 0])
     form = normal_form(M, ground, K, np.ones((3, 1)))
     assert form.poles[0] == 0
-    with pytest.raises(ModelError, match="damper to ground"):
+    with pytest.raises(ModelError, match="dampers to ground"):
         normal_form(M, 1e6 * ground, K, np.ones((3, 1)))
 
 

@@ -23,14 +23,15 @@ def modes(plate):
     return solve_modes(plate, damping=LOW)
 
 
-def true_error(modes, model):
+def true_error(modes, model, below=np.inf):
     """The largest singular value of the error over a dense grid, resonances included."""
     rows = [modes.dofs.indices(names) for names in (INTO, OUT)]
     phi, omega, zeta = np.real(modes.phi), modes.omega, modes.zeta
     B, C = phi[rows[0]], phi[rows[1]]
     Br, Cr = model.T[rows[0]], model.T[rows[1]]
     worst = 0.0
-    for w in np.union1d(np.geomspace(30.0, 2e5, 1500), omega[3:] * np.sqrt(1 - 2 * zeta[3:] ** 2)):
+    grid = np.union1d(np.geomspace(30.0, 2e5, 1500), omega[3:] * np.sqrt(1 - 2 * zeta[3:] ** 2))
+    for w in grid[grid <= 2 * np.pi * below]:
         full = (C / (omega**2 - w**2 + 2j * zeta * omega * w)) @ B.T
         less = Cr @ np.linalg.solve(model.K + 1j * w * model.D - w**2 * model.M, Br.T)
         worst = max(worst, np.linalg.norm(full - less, 2))
@@ -146,3 +147,36 @@ def test_refusals(plate, modes):
         rank_modes(plate, inputs=INTO)
     undamped = reduce(solve_modes(plate), ModalTruncation(9, inputs=INTO))
     assert undamped.bound is None  # no finite one
+
+
+@pytest.mark.parametrize("share", [0.05, 0.5, 0.95, 1.001, 1.5])
+@pytest.mark.parametrize("count", [5, 9])
+@pytest.mark.parametrize("made", ["modes", "static", "balanced", "model"])
+def test_the_bound_below_a_frequency_holds_and_is_tight(plate, modes, made, count, share):
+    """Of bands that end below, at and above the first neglected mode."""
+    channels = {"inputs": INTO, "outputs": OUT}
+    model = {
+        "modes": lambda: reduce(modes, ModalTruncation(count, **channels)),
+        "static": lambda: reduce(modes, ModalTruncation(count, static_at=OUT, **channels)),
+        "balanced": lambda: reduce(modes, ModalBalanced(count, **channels)),
+        "model": lambda: reduce(plate, ModalTruncation(count, damping=LOW, **channels)),
+    }[made]()
+    end = share * modes.freq[count]
+    error, bound = true_error(modes, model, end), model.bound.below(end)
+    assert error <= bound * (1 + 1e-9)
+    assert bound <= model.bound.value
+    if share == 0.05 and made in ("modes", "balanced"):
+        assert bound < 1.2 * error
+    if share == 0.5 and made != "balanced":
+        assert bound < 0.1 * model.bound.value
+    assert model.bound.below(1e9) == pytest.approx(model.bound.value, rel=1e-9)
+
+
+def test_the_bound_of_chosen_modes_of_a_model_has_no_band(plate):
+    """What lies between the chosen modes was not looked at."""
+    method = ModalTruncation(modes=[1, 2, 3, 6], inputs=INTO, outputs=OUT, damping=LOW)
+    bound = reduce(plate, method).bound
+    assert bound.terms is None
+    assert bound.below(10.0) == bound.value
+    with pytest.raises(ModelError, match="freq"):
+        bound.below(-1.0)

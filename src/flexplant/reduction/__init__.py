@@ -1,5 +1,6 @@
 """Fewer degrees of freedom, same input-output behaviour: modes, attachment vectors, reduction."""
 
+from .bounds import ErrorBound as ErrorBound
 from .component import CraigBampton as CraigBampton
 from .component import MacNeal as MacNeal
 from .component import Rubin as Rubin
@@ -20,7 +21,6 @@ from .normal_form import normal_form as normal_form
 from .quality import ReductionQuality as ReductionQuality
 from .ranking import ModeRanking as ModeRanking
 from .ranking import rank_modes as rank_modes
-from .reduced import ErrorBound as ErrorBound
 from .reduced import ReducedModel as ReducedModel
 from .selection import DofSelection as DofSelection
 from .selection import select_dofs as select_dofs

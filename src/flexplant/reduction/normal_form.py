@@ -195,9 +195,9 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
     if drag > _RIGID_DRAG * omega[0]:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {_RIGID_DRAG:g} of the first "
-            f"elastic frequency ({omega[0]:.4g} rad/s): with a damper to ground this large they "
-            f"are no longer modes at 0. {_PLANT} Else put the damper between two DOFs of the "
-            "structure, or leave it out of D and close it as a loop."
+            f"elastic frequency ({omega[0]:.4g} rad/s): dampers to ground, and those between "
+            f"places that a rigid rotation moves apart, leave no modes at 0. {_PLANT} Else let the "
+            "damper act along the line between its ends, or close it as a loop."
         )
 
 

@@ -17,8 +17,9 @@ from ..structure.eigen import elastic_modes
 from ..structure.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..structure.multifrontal import MultifrontalCholesky
 from ..values import FloatArray, Matrix, name_list, rebuild
+from .bounds import ErrorBound
 from .modes import Modes
-from .reduced import ErrorBound, ReducedModel
+from .reduced import ReducedModel
 
 #: part of a rigid-body motion that a basis may miss
 _RIGID_TOLERANCE = 1e-7

@@ -12,47 +12,14 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..labels import DofSet, Place
 from ..structure.rigid import rigid_motions
-from ..values import ComplexArray, FloatArray, IntArray, Value, name_list, positive, real_array
+from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
+from .bounds import ErrorBound
 from .modes import Modes
 from .normal_form import normal_form
 
 if TYPE_CHECKING:
     from ..structure import FEModel
     from .quality import ReductionQuality
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class ErrorBound(Value):
-    """What a reduction cannot miss by more, known before any response is computed.
-
-    Parameters
-    ----------
-    value : float [m/N]
-        At least the largest singular value, over all frequencies, of full minus reduced
-        displacement per force between the channels.
-    inputs, outputs : sequence of str
-        The channels it holds for.
-    rule : str
-        Where it comes from.
-    """
-
-    value: float
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    rule: str
-
-    def __post_init__(self) -> None:
-        self._set(
-            value=positive(self.value, "value", zero=True),
-            inputs=name_list(self.inputs, "inputs"),
-            outputs=name_list(self.outputs, "outputs"),
-        )
-
-    def __repr__(self) -> str:
-        return (
-            f"<ErrorBound {self.value:.4g} m/N, {len(self.inputs)} inputs to {len(self.outputs)} "
-            f"outputs: {self.rule}>"
-        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)

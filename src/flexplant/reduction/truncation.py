@@ -14,12 +14,13 @@ from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
 from ..values import FloatArray, whole
 from .attachment import attachment_vectors, labels_of, places, static_response
+from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod
 from .modes import Modes
 from .projection import checked_damping, inner, undamped
 from .ranking import channels, peak_gains, rank_modes
-from .reduced import ErrorBound, ReducedModel
+from .reduced import ReducedModel
 from .solve import solve_modes
 
 _SUM = "sum of the peaks of the neglected modes"
@@ -58,7 +59,8 @@ class ModalTruncation(ReductionMethod):
     mode's own peak. From an FEModel with one damping ratio for all, it covers all modes of the
     structure unseen: by Cauchy-Schwarz the sum is at most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta
     sqrt(1 - zeta^2))``, G the residual flexibility of one static solution. With `static_at`, the
-    peaks of the vectors are added.
+    peaks of the vectors are added. Over a band, modes above it are far from their peaks:
+    `ErrorBound.below(freq)` is tighter by orders.
     """
 
     count: int | None = None
@@ -152,7 +154,12 @@ class ModalTruncation(ReductionMethod):
         both = float(np.sqrt(max(float(left), 0.0) * max(float(right), 0.0)))
         value = both * float(peak_gains(np.ones(1), np.array([law.ratio]))[0])
         value += _vector_peaks(kept, B, C)
-        return ErrorBound(value, into, out, _RESIDUE)
+        # of the lowest modes: none unseen is below the last, all are at most like one there
+        lowest = self._numbers == tuple(range(1, kept.n_modes + 1))
+        omega = kept.omega[-1] if lowest else 0.0
+        terms = [[both * omega**2, omega, law.ratio]] if omega else []
+        terms += _vector_terms(kept, B, C)
+        return ErrorBound(value, into, out, _RESIDUE, terms=np.array(terms) if omega else None)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -184,7 +191,8 @@ class ModalBalanced(ReductionMethod):
 
     Notes
     -----
-    The bound is the sum of the neglected modes' own peaks, exact for one neglected mode. Twice the
+    The bound is the sum of the neglected modes' own peaks, exact for one neglected mode; over a
+    band `ErrorBound.below(freq)` is tighter. Twice the
     sum of neglected Hankel values (K. Glover, 1984) bounds the truncation of the exactly balanced
     model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
     W. Gawronski, Advanced Structural Dynamics and Active Control of Structures, 2004, chapter 6.
@@ -268,8 +276,21 @@ def truncated(
         pushed = places(bound_of[0])
         watched = places(bound_of[1]) or pushed
         B = np.column_stack([modes.dofs.row(place) for place in pushed])
-        value += _vector_peaks(kept, B, np.array([modes.dofs.row(place) for place in watched]))
-        bound = ErrorBound(value, into, out, _SUM) if np.isfinite(value) else None
+        C = np.array([modes.dofs.row(place) for place in watched])
+        value += _vector_peaks(kept, B, C)
+        gain = np.linalg.norm(force, axis=1) * np.linalg.norm(seen, axis=0)
+        terms = np.vstack(
+            [
+                np.column_stack([gain, omega[others], zeta[others]]),
+                np.reshape(_vector_terms(kept, B, C), (-1, 3)),
+            ]
+        )
+        missed = (seen / omega[others] ** 2) @ force
+        if kept.n_vectors:
+            missed = missed - (C @ kept.vectors / kept.vector_omega**2) @ (kept.vectors.T @ B)
+        at_rest = float(np.linalg.norm(missed, 2)) if others.size else 0.0
+        if np.isfinite(value):
+            bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest)
     return _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
 
 
@@ -303,6 +324,14 @@ def _vector_peaks(kept: Modes, B: FloatArray, C: FloatArray) -> float:
     force = np.linalg.norm(kept.vectors.T @ B, axis=1)
     seen = np.linalg.norm(C @ kept.vectors, axis=0)
     return float(force * seen @ peak_gains(kept.vector_omega, kept.vector_zeta))
+
+
+def _vector_terms(kept: Modes, B: FloatArray, C: FloatArray) -> list[list[float]]:
+    """Return gain, frequency and damping of attachment vectors between channels."""
+    if not kept.n_vectors:
+        return []
+    gain = np.linalg.norm(kept.vectors.T @ B, axis=1) * np.linalg.norm(C @ kept.vectors, axis=0)
+    return list(np.column_stack([gain, kept.vector_omega, kept.vector_zeta]).tolist())
 
 
 def _diagonal(
