@@ -4,6 +4,9 @@ import re
 from pathlib import Path
 
 import pytest
+import scipy.io
+
+from flexplant import solid_block
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -30,11 +33,34 @@ def test_files_that_it_names_exist():
         assert (ROOT / path).exists() or path.startswith("examples/out"), path
 
 
+def write_stage(folder):
+    """Write the block of "A model of your own" as a finite-element program would, in mm and t."""
+    block = solid_block(
+        size=(0.4, 0.3, 0.1),
+        elements=(8, 6, 2),
+        density=2700,
+        youngs_modulus=70e9,
+        poisson_ratio=0.33,
+    )
+    scipy.io.mmwrite(folder / "stage_K.mtx", block.K / 1e3, symmetry="symmetric")
+    scipy.io.mmwrite(folder / "stage_M.mtx", block.M / 1e3, symmetry="symmetric")
+    dofs = block.dofs
+    lines = [
+        f"{node},{direction},{x!r},{y!r},{z!r}"
+        for node, direction, (x, y, z) in zip(
+            dofs.nodes.tolist(), dofs.directions, (1e3 * dofs.xyz).tolist(), strict=True
+        )
+    ]
+    table = "\n".join(["node,direction,x,y,z", *lines])
+    (folder / "stage_dofs.csv").write_text(table, encoding="utf-8")
+
+
 @pytest.mark.slow
 def test_the_code_runs(tmp_path, monkeypatch):
     """All python blocks, in order, in one namespace, as a reader would paste them."""
     assert BLOCKS
     monkeypatch.chdir(tmp_path)
+    write_stage(tmp_path)
     names = {"__name__": "readme"}
     for i, code in enumerate(BLOCKS, 1):
         exec(compile(code, f"README block {i}", "exec"), names)
