@@ -4,15 +4,15 @@ import time
 
 import numpy as np
 import pytest
-import scipy.linalg as la
 import scipy.optimize as so
 
 import oracles_updating as oracle
+from bridges import FILE, Bridge, ends, noisy_fits
 from flexplant.identification import MeasuredModes
-from flexplant.lti import Frf
-from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, FrfResidual, update
+from flexplant.updating import AddedMass, Eigenvalues
 from flexplant.updating.objective import Objective
-from stages import Z8, fitted, reduced
+from noisy_plate import Campaign, judged
+from stages import fitted, reduced
 
 pytestmark = pytest.mark.benchmark
 ZETA = 0.01
@@ -59,11 +59,11 @@ def test_one_iteration_of_25_dofs_and_10_parameters():
     taken = {}
     for name, step in (("flexplant", ours), ("least_squares, eig, differences", peer)):
         runs = []
-        for k in range(30):
+        for k in range(100 if step is ours else 10):
             begun = time.process_time()
             step(np.full(10, 0.011 + 1e-4 * k))
             runs.append(time.process_time() - begun)
-        taken[name] = np.min(runs)  # others work on the machine too
+        taken[name] = np.median(runs)
     one, other = taken.values()
     print(
         f"\niteration, 25 DOFs x 10: {1e3 * one:.2f} ms; {list(taken)[1]}: {1e3 * other:.2f} ms, "
@@ -86,36 +86,47 @@ def test_the_papers_example():
 
 
 def test_four_hundred_updates_from_noisy_responses():
-    rom, (M, D, K) = reduced(ZETA), truth()
-    freq, at = np.linspace(200, 720, 40), rom.full_dofs.nearest(Z8, "z")
-    labels = list(rom.dofs)
-    given, places = labels[0], [labels[4], labels[12]]
-    row = rom.full_dofs.index
-    load = np.eye(M.shape[0])[row(given)]
-    motion = [la.solve(K - w**2 * M + 1j * w * D, load) for w in 2 * np.pi * freq]
-    H = np.array(motion)[:, [row(place) for place in places]].T[:, None, :]
-    # the truncated compliance of channels without a vector is the model's own error: left out
-    rest = update(rom, [AddedMass(at)], [FrfResidual(Frf(freq, H, inputs=[given], outputs=places))])
-    residual = FrfResidual(Frf(freq, H, inputs=[given], outputs=places))
-    bound = Objective(rest.model, [], [residual])
-    exact = np.moveaxis(bound.bounds[0].responses(bound.begin(np.zeros(0))), 0, 2)
-    mass = rest.values[0]
-    variance = 1e-4 * np.mean(np.abs(exact) ** 2, axis=2, keepdims=True) * np.ones(exact.shape)
-    rng = np.random.default_rng(5)
-    covered, error, begun = 0, [], time.process_time()
-    for _ in range(400):
-        noise = rng.normal(size=exact.shape) + 1j * rng.normal(size=exact.shape)
-        data = exact + noise * np.sqrt(variance / 2)
-        frf = Frf(freq, data, inputs=[given], outputs=places, variance=variance)
-        fit = update(rom, [AddedMass(at), AddedDamping(at)], [FrfResidual(frf)])
-        low, high = fit.interval()[0]
-        covered += low <= mass <= high
-        error.append(abs(fit.values[0] - mass) / mass)
+    campaign, rng = Campaign(), np.random.default_rng(5)
+    begun = time.process_time()
+    fits = [campaign.fit(rng) for _ in range(400)]
     taken = time.process_time() - begun
+    covered, error = judged(fits)
     print(
-        f"\n400 updates at 40 dB: {taken:.1f} s, interval covers {covered / 4:.1f} %, median error "
-        f"{100 * np.median(error):.2f} %"
+        f"\n400 updates at 40 dB: {taken:.1f} s, interval covers {100 * covered:.1f} %, median "
+        f"error {100 * error:.2f} %"
     )
     assert taken < 20
-    assert 0.92 <= covered / 400 <= 0.98
-    assert np.median(error) < 0.01
+    assert 0.92 <= covered <= 0.98
+    assert error < 0.01
+
+
+@pytest.fixture(scope="module")
+def bridge():
+    if not FILE.exists():
+        pytest.skip("the bridge's data are not here")
+    return Bridge()
+
+
+def test_the_bridge_from_a_hundred_starts(bridge):
+    begun = time.process_time()
+    found = ends(bridge, bridge.starts)
+    taken = time.process_time() - begun
+    print(
+        f"\nbridge: truth to 1e-8 from {np.sum(found < 1e-8)} of {found.size} starts (median "
+        f"error {np.median(found):.0e}) in {taken:.1f} s altogether; the authors: 49-154 s each"
+    )
+    assert np.sum(found < 1e-8) >= 90
+    assert taken < 60
+
+
+def test_the_bridge_with_noise(bridge):
+    known = [noisy_fits(bridge, 40, seed=seed, bounds=(-1, 1)) for seed in (4, 5, 6)]
+    error, score = np.sqrt(np.mean(np.square(known), axis=0))
+    plain, _ = noisy_fits(bridge, 10)
+    print(
+        f"\nbridge, 0.5 / 1 % noise, 120 trials: rms error {error:.4f} "
+        f"({', '.join(f'{e:.4f}' for e, _ in known)}), z-score rms {score:.2f}; without "
+        f"prior {plain:.2f}"
+    )
+    assert error <= 0.11
+    assert 0.8 <= score <= 1.25

@@ -386,12 +386,25 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     assert set(found.ranking[:4]) == {hidden} | images
     assert found[hidden] > 1 - 1e-4
     assert found[found.ranking[4]] < 0.99
+    # told apart by little: said with names
+    assert found.alike == (hidden,)
+    assert set(found.rivals) == images
+    assert "told by less than 1% of the data from: mass at" in repr(found)
+    assert all(name in repr(found) for name in images)
+    rows = found.table.splitlines()
+    assert rows[1].startswith(hidden)
+    assert rows[1].endswith("chosen")
+    assert [row.split()[-1] for row in rows[2:5]] == ["rival"] * 3
+    assert rows[-1] == "and 13 more"
+    assert "1.0000" in rows[1]
     # as much noise as hides the truncated compliance: poles cannot tell mirror images
     std = 1e-3 * np.abs(poles)
     loud = MeasuredModes(poles + 50 * noise, modes=range(4, 10), covariance=std**2)
     found = localise(rom, [Eigenvalues(loud)], candidates, most=1)
     assert set(found.alike) == {hidden} | images
-    assert "4 alike" in repr(found)
+    assert "AMBIGUOUS, 4 alike: " in repr(found)
+    assert all(name in repr(found) for name in [hidden, *images])
+    assert sum(row.endswith("alike") for row in found.table.splitlines()) == 4
 
 
 def test_localisation_beside_a_wrong_stiffness(plate):

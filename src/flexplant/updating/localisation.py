@@ -25,6 +25,10 @@ PAIRS = 4
 JOIN = 8
 #: single candidates within this of the best BIC are as good
 ALIKE = 2.0
+#: share of the residual by which rivals explain less than the best at most
+NEAR = 0.01
+#: names in a line of a repr, lines in a table
+SHOWN, ROWS = 6, 12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -95,24 +99,61 @@ class Localisation(Value):
         near = np.flatnonzero(self.bic <= np.min(self.bic) + ALIKE)
         return tuple(self.candidates[i] for i in near[np.argsort(self.bic[near], kind="stable")])
 
+    @property
+    def rivals(self) -> tuple[str, ...]:
+        """Candidates that alone explain nearly as much as the best one, at most 1 % less.
+
+        The data tell those that are not `alike` from the best, but only by a small part of the
+        residual, which an error of the model itself could make or hide: mirror images on a
+        symmetric structure.
+        """
+        least = float(np.max(self.score)) - NEAR
+        return tuple(name for name in self.ranking[1:] if self[name] >= least)
+
+    @property
+    def table(self) -> str:
+        """The best candidates in lines: value alone, share explained, BIC above the least one's."""
+        width = max(len("candidate"), *(len(name) for name in self.ranking[:ROWS]))
+        lines = [f"{'candidate':{width}s}{'value alone':>13s}{'explained':>11s}{'BIC +':>10s}"]
+        least = float(np.min(self.bic))
+        for name in self.ranking[:ROWS]:
+            i = self.candidates.index(name)
+            known = np.isfinite(self.bic[i])
+            more = f"{self.bic[i] - least:10.1f}" if known else f"{'-':>10s}"
+            mark = "  chosen" if name in self.chosen else ""
+            others = len(self.alike) > 1 and name in self.alike
+            mark += "  alike" if others else "  rival" if name in self.rivals else ""
+            lines.append(f"{name:{width}s}{self.values[i]:13.5g}{self.score[i]:11.4f}{more}{mark}")
+        rest = len(self.candidates) - len(lines) + 1
+        return "\n".join([*lines, *([f"and {rest} more"] if rest else [])])
+
     def __repr__(self) -> str:
         best = ", ".join(f"{name} {self[name]:.4f}" for name in self.ranking[:3])
         found = ", ".join(
             f"{name} = {value:.4g}"
             for name, value in zip(self.chosen[:4], self.chosen_values.tolist(), strict=False)
         )
-        if len(self.alike) > 1:
-            best += f"; {len(self.alike)} alike"
         if self.nuisance:
             beside = ", ".join(
                 f"{name} = {value:.4g}"
                 for name, value in zip(self.nuisance, self.nuisance_values.tolist(), strict=True)
             )
             found = f"{found or 'no change'} beside {beside}"
-        return (
+        text = (
             f"<Localisation: {found or 'no change'} (BIC {self.chosen_bic:.4g}, no change "
-            f"{self.nothing_bic:.4g})\n  explained alone: {best}>"
+            f"{self.nothing_bic:.4g})\n  explained alone: {best}"
         )
+        if len(self.alike) > 1:
+            text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {_shown(self.alike)}"
+        rivals = [name for name in self.rivals if len(self.alike) < 2 or name not in self.alike]
+        if rivals and self.chosen:
+            text += f"\n  told by less than {NEAR:.0%} of the data from: {_shown(rivals)}"
+        return text + ">"
+
+
+def _shown(names: Sequence[str]) -> str:
+    more = f" and {len(names) - SHOWN} more" if len(names) > SHOWN else ""
+    return ", ".join(names[:SHOWN]) + more
 
 
 def localise(
