@@ -141,12 +141,8 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
         for front, pivots, below, rest in _assembled(lower, chosen):
             kept = pivots.copy(order="F")
             _, info = lapack.dpotrf(pivots, lower=1, overwrite_a=1, clean=0)
-            signs = None
-            if info:
-                pivots, signs = _signed_factor(kept)
-                negative += int(np.count_nonzero(signs < 0))
             y = b[front.first : front.last]
-            if signs is None:
+            if not info:
                 y = blas.dtrsm(1.0, pivots, y, lower=1)
                 energy += np.sum(y**2, axis=0)
                 if front.rows.size:
@@ -156,14 +152,14 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
                     b[front.rows] -= below @ y
                     blas.dsyrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
                 continue
-            # pivots^-1 in place of a triangle: A = G S G^T with G^-1 known
-            y = pivots @ y
+            # A = G S G^T, signs in S
+            y, moved, signs = _signed(kept, y, below)
+            negative += int(np.count_nonzero(signs < 0))
             energy += np.sum(signs[:, None] * y**2, axis=0)
             if front.rows.size:
-                below = np.asfortranarray(below @ pivots.T)
-                b[front.rows] -= below @ (signs[:, None] * y)
+                b[front.rows] -= moved.T @ (signs[:, None] * y)
                 for sign in (1.0, -1.0):
-                    some = np.asfortranarray(below[:, signs == sign])
+                    some = np.asfortranarray(moved[signs == sign].T)
                     if some.shape[1]:
                         blas.dsyrk(-sign, some, beta=1.0, c=rest, lower=1, overwrite_c=1)
     if not np.all(np.abs(energy - wanted) <= _ENERGY * size):
@@ -175,8 +171,10 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
     return negative
 
 
-def _signed_factor(block: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return H and signs s with ``H A H^T = diag(s)``, s of +1 and -1, by Bunch-Kaufman."""
+def _signed(
+    block: FloatArray, y: FloatArray, below: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return G^-1 y, G^-1 below^T and s of +1 and -1, ``A = G diag(s) G^T`` (Bunch-Kaufman)."""
     block = np.tril(block) + np.tril(block, -1).T
     factor, middle, order = la.ldl(block, lower=True, check_finite=False)
     main, off = np.diag(middle).copy(), np.diag(middle, -1).copy()
@@ -193,12 +191,14 @@ def _signed_factor(block: FloatArray) -> tuple[FloatArray, FloatArray]:
             "a count of eigenvalues by L D L^T met a zero pivot: the shift hits an eigenvalue. "
             "Count at another frequency."
         )
-    inverse = np.eye(main.size, order="F")[:, :]
-    inverse = blas.dtrsm(1.0, factor[order], inverse, lower=1, diag=1)[:, np.argsort(order)]
-    turned = cosine[:, None] * inverse
-    turned[pairs] += sine[pairs, None] * inverse[pairs + 1]
-    turned[pairs + 1] += sine[pairs + 1, None] * inverse[pairs]
-    return turned / np.sqrt(np.abs(main))[:, None], np.sign(main)
+    right = np.asfortranarray(np.hstack([y, below.T])[order])
+    right = blas.dtrsm(1.0, factor[order], right, lower=1, diag=1, overwrite_b=1)
+    turned = cosine[:, None] * right
+    turned[pairs] += sine[pairs, None] * right[pairs + 1]
+    turned[pairs + 1] += sine[pairs + 1, None] * right[pairs]
+    turned /= np.sqrt(np.abs(main))[:, None]
+    width = y.shape[1]
+    return turned[:, :width], turned[:, width:], np.sign(main)
 
 
 def _assembled(
