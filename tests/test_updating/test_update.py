@@ -259,7 +259,7 @@ def test_a_damper_to_the_ground_is_found_though_it_drags_the_rigid_body(make, as
     measured = MeasuredModes(poles, modes=[2, 3, 4])
     fit = update(free, [AddedDamping("4:z")], [Eigenvalues(measured)])
     assert fit.values[0] == pytest.approx(2.0, rel=1e-8)
-    with pytest.raises(ModelError, match="damper to ground"):
+    with pytest.raises(ModelError, match="dampers to ground"):
         fit.modes()
 
 

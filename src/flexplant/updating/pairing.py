@@ -57,6 +57,8 @@ def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:
     s = old.size
     new = np.sort(new)
     linked = shapes[np.ix_(old, new)] > FOREIGN
+    if linked.all() or (linked.diagonal().all() and np.count_nonzero(linked) == s):
+        return new
     # what a mode reaches through shapes in common: a few rounds of union
     reach = linked @ linked.T | np.eye(s, dtype=bool)
     for _ in range(int(s).bit_length()):
