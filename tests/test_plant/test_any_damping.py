@@ -325,7 +325,7 @@ def test_the_condition_of_complex_modes():
 
 
 def test_modes_still_refuse_and_point_to_the_plant():
-    for case, says in (("held overdamped", "overdamped"), ("free dragged", "damper to ground")):
+    for case, says in (("held overdamped", "overdamped"), ("free dragged", "dampers to ground")):
         model = model_of(*chain(case))
         with pytest.raises(ModelError, match=rf"{says}.*assemble_plant\(model, ports\)"):
             solve_modes(model)
