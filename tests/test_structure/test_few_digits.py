@@ -83,6 +83,24 @@ def test_what_a_soft_spring_holds_is_not_freed():
     assert low == pytest.approx(by_hand, rel=1e-4)
 
 
+@pytest.mark.parametrize("stiffness", [1e2, 1e3])
+def test_a_large_structure_on_soft_springs_is_not_free(stiffness):
+    """Suspended at 0.4 to 4 Hz, 1e-12 of the stiffness of its elements."""
+    free = fx.kirchhoff_plate(
+        size=(0.6, 0.45), thickness=0.0272, elements=(60, 45), density=2702, youngs_modulus=70e9,
+        poisson_ratio=0.35,
+    )  # fmt: skip
+    places = [free.dofs.nearest(p, "z") for p in ((0, 0, 0), (0.6, 0, 0), (0.3, 0.45, 0))]
+    model = free.with_parts([Spring(place, stiffness) for place in places])
+    assert free.rigid_body.shape[1] == 3
+    assert model.rigid_body.shape[1] == 0
+    R, rows = free.rigid_body, free.dofs.indices(places)
+    by_hand = np.sqrt(la.eigvalsh(stiffness * R[rows].T @ R[rows])) / (2 * np.pi)
+    assert fx.solve_modes(model, count=4).freq[:3] == pytest.approx(by_hand, rel=1e-3)
+    two = free.with_parts(Spring(places[0], stiffness))
+    assert two.rigid_body.shape[1] == 2
+
+
 def test_coordinates_of_another_shape_free_nothing():
     exact = plate()
     other = exact.dofs.replace(xyz=exact.dofs.xyz * [1.0, 1.05, 1.0], interpolation=None)

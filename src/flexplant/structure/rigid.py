@@ -14,6 +14,10 @@ from .lowest import ROUNDING, definite_solver
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
 _ENERGY_TOLERANCE = 1e-10
+#: of a K that was never written as text
+_ROUNDED = 1e-14
+#: part of all DOFs: forces at fewer are of springs, not of rounding
+_FEW = 0.02
 #: the same for motions that coordinates of few digits keep from being free: worth a closer look
 _NEARLY = 1e-2
 #: largest force of such a motion at any DOF, of the largest that its parts make anywhere
@@ -61,22 +65,41 @@ def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
     scale = np.linalg.norm(sizes, axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     force = np.asarray(K @ motions) / scale
-    free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
+    tolerance = _tolerance(K, force)
+    free = np.linalg.norm(force, axis=0) < tolerance
     if np.all(free):
         return motions
     # of the small triangle: the left factor of all DOFs would be a full square matrix
     _, found, right = la.svd(la.qr(force, mode="economic")[1])
     values = np.zeros(scale.size)
     values[: found.size] = found
-    null = right[values < _ENERGY_TOLERANCE].T
+    null = right[values < tolerance].T
     basis = motions[:, free]
     if null.shape[1] > basis.shape[1]:
         basis = orthonormalised(M, motions @ (null / scale[:, None]))
-    near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
+    near = right[(values >= tolerance) & (values < _NEARLY)].T
     if not near.shape[1]:
         return basis
     nearly = _everywhere_small(K, size_of_K, motions @ (near / scale[:, None]))
     return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
+
+
+def _tolerance(K: Matrix, force: FloatArray) -> float:
+    """Return the size of relative forces (n, r) that pass for rounding.
+
+    Rounding of K leaves forces everywhere; those of soft springs are at a few DOFs only, and are
+    looked at closer however small they are.
+    """
+    size = np.linalg.norm(force, axis=0)
+    small = (size > _ROUNDED) & (size < _ENERGY_TOLERANCE)
+    if not small.any():
+        return _ENERGY_TOLERANCE
+    entries: Any = K.diagonal()
+    weight = np.where(entries > 0, entries, np.inf)
+    squares = force[:, small] ** 2 / weight[:, None]
+    # the number of rows that share a force: of m equal ones it is m
+    rows = squares.sum(axis=0) ** 2 / np.maximum((squares**2).sum(axis=0), np.finfo(float).tiny)
+    return _ROUNDED if rows.min() < _FEW * force.shape[0] else _ENERGY_TOLERANCE
 
 
 def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
