@@ -15,7 +15,7 @@ from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
 from .refine import Lines, refined
-from .separate import backed, separated
+from .separate import backed, reseated, separated
 from .support import freedom, supported
 from .unexplained import BROADEST, completed, exact, lessened, unexplained, warned
 from .weights import Prepared, prepared
@@ -209,12 +209,13 @@ def _identified(
         lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
         if start is None:
             poles, part = supported(lines, poles, part)
-        fit = refined(lines, poles, part, steps=max_iterations)
+        # poles that turn out to be none may keep it from settling: judged at the end
+        fit = refined(lines, poles, part, steps=max_iterations, strict=start is not None)
         if start is None:
             light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
             fewer, part = supported(lines, fit.poles[light], fit.participation[:, light])
             if fewer.size < fit.poles.size:
-                fit = refined(lines, fewer, part, steps=max_iterations)
+                fit = refined(lines, fewer, part, steps=max_iterations, strict=False)
         lines, fit = lessened(lines, fit, tried[:-1], steps=max_iterations)
         if start is None:
             fit, _ = completed(lines, fit, steps=max_iterations)
@@ -222,6 +223,7 @@ def _identified(
                 if upper is None:
                     lines, fit = backed(lines, fit, steps=max_iterations)
                 fit = separated(lines, fit, steps=max_iterations)
+                fit = reseated(lines, fit, steps=max_iterations)
             fit, left = completed(lines, fit, steps=max_iterations)
         else:
             left = unexplained(lines, fit)
@@ -229,6 +231,8 @@ def _identified(
         if not ready.known:
             share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)
+    if not fit.settled:
+        fit = refined(lines, fit.poles, fit.participation, steps=max_iterations)
     warned(left)
     return answer(frf, ready, lines, fit, (low, high), labels, diagram)
 

@@ -14,6 +14,8 @@ from .basis import axis, pole_terms, residual_terms
 
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0
+#: least damping ratio of a pole
+LEAST = 1e-7
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,9 +43,17 @@ class Fit:
     N: FloatArray  # normal matrix of the nonlinear parameters
     jacobian: list[ComplexArray]  # per output (n_in, n_freq, n_parameters)
     model: ComplexArray  # the fitted responses
+    settled: bool = True
 
 
-def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, steps: int) -> Fit:
+def refined(
+    lines: Lines,
+    poles: ComplexArray,
+    participation: ComplexArray,
+    *,
+    steps: int,
+    strict: bool = True,
+) -> Fit:
     r"""Return the weighted least-squares fit of
 
     .. math:: H_{oi}(s) = \sum_k \frac{\psi_{ok} l_{ik}}{s - \lambda_k}
@@ -58,16 +68,23 @@ def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, s
     columns = np.arange(poles.size)
     participation = participation / participation[pivots, columns]
     now = _projected(lines, poles, participation, pivots)
-    damping = 1e-6
+    damping, settled, idle = 1e-6, True, 0
+    power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
     for _ in range(steps):
         N, g, _ = now.normal
         size = np.sqrt(np.maximum(np.diag(N), 1e-300))
+        scaled, slope = N / np.outer(size, size), g / size
+        # a pole outside the band may come to the axis: it stays there, the others go on
+        held = np.flatnonzero((poles.real >= -1.01 * LEAST * poles.imag) & (g[: poles.size] > 0))
+        scaled[held], scaled[:, held], slope[held] = 0.0, 0.0, 0.0
+        scaled[held, held] = 1.0
+        # what a full step would gain: a damped one is short, and says nothing of being there
+        predicted = float(slope @ _step(scaled, slope, 1e-8))
         better, gained = None, 0.0
         for _ in range(12):
-            step = _step(N / np.outer(size, size), g / size, damping) / size
+            step = _step(scaled, slope, damping) / size
             trial = _moved(poles, participation, pivots, step)
-            stays = np.abs(trial[1]).max() < 1e6
-            if stays and np.all(trial[0].real < 0) and np.all(trial[0].imag > 0):
+            if np.abs(trial[1]).max() < 1e6 and np.all(trial[0].imag > 0):
                 better = _projected(lines, *trial, pivots)
                 gained = now.cost - better.cost
                 if gained >= 0:
@@ -76,7 +93,6 @@ def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, s
             damping = max(10.0 * damping, 1e-8)
         if better is None:
             break
-        predicted = float(g @ step)
         poles, participation = trial
         now, damping = better, damping / 10.0
         if np.abs(participation).max() > RUNAWAY:
@@ -85,15 +101,27 @@ def refined(lines: Lines, poles: ComplexArray, participation: ComplexArray, *, s
             participation = participation / participation[pivots, columns]
             now = _projected(lines, poles, participation, pivots)
         # a step of 3e-3 standard deviations of what is left is none
-        if gained <= 1e-12 * now.cost or predicted <= 1e-5 * now.cost / (2 * lines.data.size):
+        if predicted <= 1e-5 * now.cost / (2 * lines.data.size):
+            break
+        idle = idle + 1 if gained <= 1e-12 * now.cost else 0
+        if idle >= 3 or (idle and damping <= 1e-3) or now.cost <= 1e-24 * power:
             break
     else:
-        raise SolverError(
-            f"the refinement of {poles.size} poles did not settle within {steps} steps: leave out "
-            "poles that do not stand out of the noise, or narrow the band."
-        )
+        settled = False
+        if strict:
+            raise unsettled(poles.size, steps)
     N, _, jacobian = now.normal
-    return Fit(poles, participation, now.shapes, now.terms, now.cost, N, jacobian, now.model)
+    return Fit(
+        poles, participation, now.shapes, now.terms, now.cost, N, jacobian, now.model, settled
+    )
+
+
+def unsettled(count: int, steps: int) -> SolverError:
+    """Return the error of a fit that goes on and on."""
+    return SolverError(
+        f"the refinement of {count} poles did not settle within {steps} steps: leave out "
+        "poles that do not stand out of the noise, or narrow the band."
+    )
 
 
 class _Projected:
@@ -203,7 +231,8 @@ def _moved(
         free = [i for i in range(n_in) if i != pivots[k]]
         for j, i in enumerate(free):
             moved[i, k] += parts[2 + 2 * j, k] + 1j * parts[3 + 2 * j, k]
-    return poles + parts[0] + 1j * parts[1], moved
+    real, imag = poles.real + parts[0], poles.imag + parts[1]
+    return np.minimum(real, -LEAST * np.abs(imag)) + 1j * imag, moved
 
 
 def _step(N: FloatArray, g: FloatArray, damping: float) -> FloatArray:

@@ -11,12 +11,14 @@ from scipy.stats import chi2
 from ..errors import SolverError
 from ..values import ComplexArray
 from .refine import Fit, Lines, projected_cost, refined
-from .support import CHANCE, freedom
+from .support import CHANCE, freedom, price
 
 #: half the distance at which a pole is taken apart, in parts of its damping
 APART = 0.5
 #: numbers of residual terms tried where 9 leave more than noise
 MORE = (25, 17, 13)
+#: a pole is weak whose cost is less than so many times the least that is asked of one
+WEAK = 4.0
 
 
 def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
@@ -86,6 +88,37 @@ def _narrow(more: Fit, fit: Fit) -> bool:
     return bool(zeta[0].max() <= 1.5 * zeta[1].max())
 
 
+def reseated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
+    """Return the fit with weak poles moved to where they lower the cost most.
+
+    Noise gives the likelihood of a mode that is hardly seen several peaks; the fit climbs the one
+    that it is started at. Its neighbourhood of seven half-widths is searched.
+    """
+    for k in range(fit.poles.size):
+        pole = fit.poles[k]
+        rest = np.delete(fit.poles, k)
+        if not rest.size or -pole.real > 0.05 * abs(pole):
+            continue
+        without = projected_cost(lines, rest, np.delete(fit.participation, k, axis=1))
+        if without - fit.cost > WEAK * price(lines):
+            continue
+        trials = []
+        for shift in np.arange(-7.0, 7.1, 0.7):
+            poles = fit.poles.copy()
+            poles[k] = pole + 1j * shift * abs(pole.real)
+            trials.append((projected_cost(lines, poles, fit.participation), poles))
+        for _, poles in sorted(trials, key=lambda trial: trial[0])[:3]:
+            if abs(poles[k] - pole) < 1.0 * abs(pole.real):
+                continue
+            try:
+                more = refined(lines, poles, fit.participation, steps=steps)
+            except SolverError:
+                continue
+            if more.cost < fit.cost and _narrow(more, fit):
+                fit = more
+    return fit
+
+
 def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
     """Return the fit with more residual terms where the data ask for them.
 
@@ -102,5 +135,5 @@ def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
         more = replace(lines, upper=upper)
         gain = fit.cost - projected_cost(more, fit.poles, fit.participation)
         if gain > unit * chi2.isf(CHANCE, channels * (upper - lines.upper)):
-            return more, refined(more, fit.poles, fit.participation, steps=steps)
+            return more, refined(more, fit.poles, fit.participation, steps=steps, strict=False)
     return lines, fit

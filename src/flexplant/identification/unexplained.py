@@ -137,7 +137,7 @@ def lessened(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tup
         lost = projected_cost(less, fit.poles, fit.participation) - fit.cost
         # a term too many costs next to nothing; one too few a bias: so noise may pass 1 in 10
         if lost < unit * chi2.isf(0.1, channels * (lines.upper - upper)):
-            return less, refined(less, fit.poles, fit.participation, steps=steps)
+            return less, refined(less, fit.poles, fit.participation, steps=steps, strict=False)
     return lines, fit
 
 
@@ -163,8 +163,10 @@ def _added(lines: Lines, fit: Fit, peak: Peak, steps: int) -> Fit | None:
         more = refined(lines, poles, part, steps=steps)
     except SolverError:
         return None
-    zeta = -more.poles.real / np.abs(more.poles)
-    return more if fit.cost - more.cost > least and zeta.max() < BROADEST else None
+    zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
+    # where a broad pole stands behind the others already, none shall become broader
+    broadest = max(BROADEST, 1.1 * before.max())
+    return more if fit.cost - more.cost > least and zeta.max() < broadest else None
 
 
 def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
