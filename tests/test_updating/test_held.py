@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 import oracles_updating as oracle
 from flexplant.errors import ModelError
@@ -10,6 +11,7 @@ from flexplant.updating import (
     AddedDamping,
     AddedMass,
     AddedStiffness,
+    Antiresonances,
     FrfResidual,
     correlate,
     update,
@@ -137,3 +139,46 @@ def test_what_a_hold_refuses(make):
     with pytest.raises(ModelError, match="positive"):
         FrfResidual(frf, hold=RATE, delay=-1.0)
     assert repr(FrfResidual(frf, hold=RATE, delay=1.5)).endswith("held at 20 Hz, delay 1.5>")
+
+
+def sampled_zeros(model, p, places=(0, 2)):
+    """Zeros of 1:z to 3:z near the frequency axis, from determinants of the stepped system."""
+    M, D, K = changed(model, p)
+    inverse = np.linalg.inv(M)
+    S = np.zeros((7, 7))
+    S[:3, 3:6] = np.eye(3)
+    S[3:6, :3], S[3:6, 3:6] = -inverse @ K, -inverse @ D
+    S[3:6, 6] = inverse[:, places[0]]
+    W = la.expm(S / RATE)
+    A, g, c = W[:6, :6], W[:6, 6], np.eye(6)[places[1]]
+    # numerator of c (z - A)^-1 g: poles with feedback g c less poles
+    numerator = np.poly(A - np.outer(g, c) * 1.0) - np.poly(A)
+    z = np.roots(numerator[1:])
+    s = np.log(z.astype(complex)) * RATE
+    return s[(s.imag > 1e-6) & (s.imag < 3.1 * RATE)]
+
+
+@pytest.mark.parametrize("kind", ["held", "dragged", "free"])
+def test_antiresonances_of_the_sampled_machine(make, kind):
+    model = cases(make)[kind]
+    base = np.array([0.2, 0.1, 2.0])
+    zeros = sampled_zeros(model, base, (0, 0))
+    assert zeros.size
+    residual = Antiresonances(zeros, "1:z", "1:z", std=1.0, hold=RATE)
+    objective = Objective(model, PARAMETERS, [residual])
+    point = objective.begin(base)
+    assert np.abs(objective.values(point)).max() < 1e-7 * np.abs(zeros).max()
+    J = objective.slopes(point)
+    steps = np.array([2e-3, 2e-2, 2e-2])
+    for b in range(3):
+
+        def at(k, b=b):
+            return objective.values(objective.at(base + k * steps[b] * np.eye(3)[b]))
+
+        moved = sum(c * (at(k) - at(-k)) for c, k in [(45, 1), (-9, 2), (1, 3)]) / (60 * steps[b])
+        assert np.abs(J[:, b] - moved).max() < 1e-7 * np.abs(J * steps).max() / steps[b]
+    # not those of continuous signals
+    plain = Objective(model, PARAMETERS, [residual.replace(hold=None)])
+    assert np.abs(plain.values(plain.begin(base))).max() > 1e-5
+    with pytest.raises(ModelError, match="half the rate"):
+        Antiresonances([1j * 70.0], "1:z", "1:z", hold=RATE)

@@ -94,6 +94,35 @@ class Held:
             found[b] = np.matmul(Y.transpose(0, 2, 1), pushed)
         return found
 
+    def zeros(self) -> tuple[ComplexArray, ComplexArray]:
+        """Return the zeros (m,) of one input to one output as s = ln(z)/T, and ds/dp (m, q).
+
+        Those of the upper half plane, below half the rate. ``[A - z, Gamma; C, 0] [x; u] = 0`` with
+        ``y`` from the left: ``dz = y^T (dA x + dGamma u) / y^T x``.
+        """
+        n = 2 * self.k
+        row = self.C / np.abs(self.C).max()
+        gain = self.stepped[:n, n:]
+        size = max(float(np.abs(gain).max()), 1e-300)
+        system = np.block([[self.stepped[:n, :n], gain / size], [row, np.zeros((1, 1))]])
+        unit = np.diag(np.append(np.ones(n), 0.0))
+        solve: Any = la.eig
+        (alpha, beta), left, right = solve(system, unit, left=True, homogeneous_eigvals=True)
+        # what is infinite has beta of rounding
+        kept = np.flatnonzero(np.abs(beta) > 1e-10 * np.abs(alpha))
+        z = alpha[kept] / beta[kept]
+        s = np.log(np.where(z == 0, 1e-300, z)) / self.T
+        upper = (s.imag > 1e-9 / self.T) & (s.imag < (np.pi - 1e-9) / self.T)
+        kept, z, s = kept[upper], z[upper], s[upper]
+        x, u = right[:n, kept], right[n:, kept] / size
+        y = left[:n, kept].conj()
+        scale = np.sum(y * x, axis=0) * z * self.T
+        slopes = np.zeros((z.size, self.point.p.size), dtype=np.complex128)
+        for b, direction in enumerate(self._directions()):
+            moved = _moved(self.S, direction)
+            slopes[:, b] = np.sum(y * (moved[:n, :n] @ x + moved[:n, n:] @ u), axis=0) / scale
+        return np.asarray(s, dtype=np.complex128), slopes
+
     @cached_property
     def stepped(self) -> FloatArray:
         """The exponential over one sample."""

@@ -12,6 +12,7 @@ from scipy.optimize import linear_sum_assignment
 from ..errors import ModelError, ShapeError
 from ..labels import Place
 from ..values import ComplexArray, FloatArray, positive, real_array
+from .held import Held
 from .parameters import checked_direction, checked_place
 from .pencil import Family
 from .point import Point
@@ -39,11 +40,14 @@ class Antiresonances(Residual):
         Of the motion and the force at points.
     std : float or (m,) array [rad/s], optional
         ``E|noise|^2 = std^2`` of each.
+    hold : float, optional [Hz]
+        Rate of the zero-order hold of a sampled measurement; its zeros are then ``ln(z) rate``,
+        which differ from the continuous ones. A delay of whole samples moves none.
 
     Raises
     ------
     ModelError, ShapeError
-        When zeros are not finite or real.
+        When zeros are not finite or real, or lie above half the rate.
     """
 
     zeros: ComplexArray
@@ -51,6 +55,7 @@ class Antiresonances(Residual):
     input: Place
     direction: str = field(default="z", kw_only=True)
     std: FloatArray | None = field(default=None, kw_only=True)
+    hold: float | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         real = real_array(np.real(self.zeros), "zeros", (None,))
@@ -61,6 +66,14 @@ class Antiresonances(Residual):
             raise ModelError("zeros must have an imaginary part: an antiresonance oscillates.")
         self._set(zeros=real + 1j * np.abs(imag), std=_checked_std(self.std, real.size))
         _check_places(self)
+        if self.hold is not None:
+            rate = positive(self.hold, "hold")
+            if np.abs(imag).max() >= np.pi * rate:
+                raise ModelError(
+                    f"zeros at up to {np.abs(imag).max() / (2 * np.pi):g} Hz and a hold at "
+                    f"{rate:g} Hz do not go together. Choose those below half the rate."
+                )
+            self._set(hold=rate)
 
     def __repr__(self) -> str:
         freq = ", ".join(f"{f:.1f}" for f in np.abs(self.zeros[:4]) / (2 * np.pi))
@@ -79,7 +92,27 @@ class _BoundZeros(Bound):
         self.noisy = residual.std is not None
         std = np.ones(self.target.size) if residual.std is None else residual.std / np.sqrt(2)
         self.std = std
+        self.hold = residual.hold
         self.name = f"{self.target.size} antiresonances"
+        self._last: tuple[Point, ComplexArray, ComplexArray] | None = None
+
+    def _sampled(self, point: Point) -> tuple[ComplexArray, ComplexArray]:
+        """Return the sampled zeros nearest to the measured ones and their slopes (m, q)."""
+        if self._last is None or self._last[0] is not point:
+            held = Held(
+                point, self.b[:, None], self.c[None], rate=self.hold or 1.0, delay=0.0, order=0
+            )
+            s, slopes = held.zeros()
+            columns = self._nearest(s)
+            self._last = point, s[columns], slopes[columns]
+        return self._last[1:]
+
+    def _nearest(self, s: Any) -> Any:
+        if s.size < self.target.size:
+            raise ModelError(
+                f"the model has {s.size} antiresonances there, {self.target.size} were measured."
+            )
+        return linear_sum_assignment(np.abs(self.target[:, None] - s))[1]
 
     def _found(self, point: Point) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
         """Return the zeros nearest to the measured ones with right and left vectors."""
@@ -105,22 +138,18 @@ class _BoundZeros(Bound):
         s = np.where(finite, alpha, 0) / np.where(finite, beta, 1) * w0
         finite &= s.imag > 1e-6 * w0
         columns = np.flatnonzero(finite)
-        if columns.size < self.target.size:
-            raise ModelError(
-                f"the model has {columns.size} antiresonances there, {self.target.size} were "
-                "measured."
-            )
-        gap = np.abs(self.target[:, None] - s[columns])
-        _, found = linear_sum_assignment(gap)
-        columns = columns[found]
+        columns = columns[self._nearest(s[columns])]
         zeros = np.asarray(s[columns], dtype=np.complex128)
         return zeros, right[:k, columns], left[k : 2 * k, columns].conj()
 
     def values(self, point: Point) -> FloatArray:
-        zeros, _, _ = self._found(point)
+        zeros = self._found(point)[0] if self.hold is None else self._sampled(point)[0]
         return split_parts((self.target - zeros) / self.std)
 
     def slopes(self, point: Point) -> FloatArray:
+        if self.hold is not None:
+            # measured minus model
+            return split_parts(-self._sampled(point)[1] / self.std[:, None])
         zeros, x, y = self._found(point)
         M, D, _ = point.matrices
         family = point.family
