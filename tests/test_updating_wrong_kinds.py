@@ -146,6 +146,7 @@ DOORS = [
         lambda x: fx.Antiresonances([3j], *AT, std=x),
         ("none", "fraction", "bool"),
     ),
+    ("Antiresonances hold", lambda x: fx.Antiresonances([3j], *AT, hold=x), ("none", "fraction")),
     ("Antiresonances direction", lambda x: fx.Antiresonances([3j], *AT, direction=x), ()),
     ("StaticCompliance", lambda x: fx.StaticCompliance(x, *AT), ("fraction", "negative", "bool")),
     ("StaticCompliance std", lambda x: fx.StaticCompliance(1.0, *AT, std=x), ("none", "fraction")),

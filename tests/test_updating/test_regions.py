@@ -7,7 +7,13 @@ from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.reduction import DesiredDofs, reduce, select_dofs, solve_modes
 from flexplant.structure import ModalDamping, kirchhoff_plate
-from flexplant.updating import Eigenvalues, MatrixParameter, eigenvalue_sensitivities, update
+from flexplant.updating import (
+    Eigenvalues,
+    MatrixParameter,
+    eigenvalue_sensitivities,
+    localise,
+    update,
+)
 
 THICK = 0.02
 LEFT = np.zeros((6, 4), dtype=bool)
@@ -102,3 +108,27 @@ def test_bad_regions_are_refused():
         MatrixParameter.regions(None, {"a": LEFT}, value=THICK)
     with pytest.raises(LabelError, match="name"):
         MatrixParameter.regions(build, {3: LEFT}, value=THICK)
+
+
+def test_a_soft_region_is_localised(rom):
+    """12 regions of 2 elements; one is 8 % softer: found up to the plate's mirror images."""
+    masks = {}
+    for i in range(6):
+        for j in range(2):
+            mask = np.zeros((6, 4), dtype=bool)
+            mask[i, 2 * j : 2 * j + 2] = True
+            masks[f"{i}{j}"] = mask
+    build = builder("youngs_modulus")
+    soft = solve_modes(plate(youngs_modulus=70e9 * np.where(masks["21"], 0.92, 1.0)), count=13)
+    omega = soft.omega[3:]
+    rng = np.random.default_rng(1)
+    poles = omega * (-0.01 + 1j * np.sqrt(1 - 1e-4))
+    std = 1e-5 * omega
+    noise = (rng.normal(size=10) + 1j * rng.normal(size=10)) * std / np.sqrt(2)
+    data = MeasuredModes(poles + noise, modes=range(4, 14), covariance=std**2)
+    pool = MatrixParameter.regions(build, masks, value=70e9)
+    found = localise(rom, [Eigenvalues(data)], pool, most=1)
+    images = {"20", "21", "30", "31"}
+    assert set(found.alike) | set(found.rivals) >= images
+    assert set(found.ranking[:4]) == images
+    assert found.chosen_values[0] == pytest.approx(-0.08, abs=0.01)
