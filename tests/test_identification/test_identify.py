@@ -368,6 +368,26 @@ def test_confidence_covers_the_truth(common):
         assert np.mean(np.array(blind) < chi2.ppf(0.95, 6)) < 0.95 - 1.5 * margin
 
 
+@pytest.mark.slow
+def test_covariance_of_shapes_is_that_of_many_measurements():
+    """Trials: whitened errors of shapes, their own direction (the scale) left out."""
+    H = modal_frf(COARSE, TRIAL, PHI[:, :3], PHI[:2, :3], static=np.full((5, 2), 1e-7))
+    deviation = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
+    rng, distance = np.random.default_rng(17), []
+    start = PoleSelection(TRIAL * (1 + 1e-5), PHI[:2, :3])
+    for _ in range(150):
+        frf = Frf(COARSE, noisy(H, deviation, rng), variance=np.full(H.shape, deviation**2))
+        found = identify_modes(frf, start=start, lower=0, upper=2)
+        for k in range(3):
+            shape = found.shapes[:, k]
+            off = np.linalg.svd(PHI[:, [k]].astype(complex))[0][:, 1:]
+            error = off.conj().T @ shape
+            known = off.conj().T @ found.shape_covariance[k] @ off
+            distance.append(2 * np.real(error.conj() @ np.linalg.solve(known, error)) / 8)
+    assert np.mean(distance) == pytest.approx(1.0, abs=0.08)
+    assert found.select([1]).shape_covariance.shape == (1, 5, 5)
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "text"),
     [

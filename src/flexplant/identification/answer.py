@@ -35,6 +35,7 @@ def answer(
     outputs = tuple(labels.get(name, name) for name in frf.outputs)
     inputs = tuple(labels.get(name, name) for name in frf.inputs)
     shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
+    raw = shapes
     shapes, part, normalised = _scaled(fit.poles, shapes, part, shared if labels else [])
     freq = np.abs(fit.poles) / (2 * np.pi)
     order = np.argsort(freq, kind="stable")
@@ -43,6 +44,13 @@ def answer(
     if not inside.size:
         raise SolverError("the fit moved every pole out of the band: widen it.")
     both = np.concatenate([inside, inside + fit.poles.size])
+    doubt = None
+    if not ready.swapped:
+        large = np.argmax(np.abs(raw), axis=0)
+        columns = np.arange(fit.poles.size)
+        factor = np.abs(shapes[large, columns] / raw[large, columns]) ** 2
+        doubt = _shape_covariance(fit) * factor[:, None, None] * max(1.0, misfit)
+        doubt = doubt[inside]
     return IdentifiedModes(
         fit.poles[inside],
         covariance=covariance[np.ix_(both, both)],
@@ -59,6 +67,7 @@ def answer(
         mass_normalised=normalised,
         misfit=misfit,
         diagram=diagram,
+        shape_covariance=doubt,
     )
 
 
@@ -86,6 +95,23 @@ def _covariance(fit: Fit, ready: Prepared) -> FloatArray:
                     meat += (flat.conj().T @ line.reshape(-1, both)).real
         chosen = meat
     return np.asarray((chosen + chosen.T) / 2)
+
+
+def _shape_covariance(fit: Fit) -> ComplexArray:
+    """Return E[n n^H] (m, n_out, n_out) of the errors n of each shape."""
+    m, n_out = fit.poles.size, len(fit.shape_maps)
+    size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
+    inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
+    slopes = np.array([slope for slope, _ in fit.shape_maps]).reshape(n_out, 2, m, -1)
+    held = np.array([own for _, own in fit.shape_maps]).reshape(n_out, 2, m, 2, m)
+    found = np.zeros((m, n_out, n_out), dtype=np.complex128)
+    outputs = np.arange(n_out)
+    for k in range(m):
+        # errors of poles and participation are common to all outputs, the others their own
+        S = np.einsum("oap,pq,ebq->oaeb", slopes[:, :, k], inverse, slopes[:, :, k])
+        S[outputs, :, outputs, :] += held[:, :, k, :, k]
+        found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
+    return np.asarray((found + found.conj().transpose(0, 2, 1)) / 2)
 
 
 def _scaled(

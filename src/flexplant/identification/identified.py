@@ -47,6 +47,9 @@ class IdentifiedModes(MeasuredModes):
         Cost per degree of freedom; 1 when only noise of the stated variance is left.
     diagram : StabilisationDiagram, optional
         The poles were chosen from.
+    shape_covariance : (m, n_out, n_out) complex array, optional
+        E[n n^H] of the error n of each shape at its scale, from the FRF's variance, errors of
+        different outputs independent; not known where there are fewer outputs than inputs.
     """
 
     participation: ComplexArray = field(kw_only=True)
@@ -60,12 +63,17 @@ class IdentifiedModes(MeasuredModes):
     mass_normalised: bool = field(default=False, kw_only=True)
     misfit: float = field(kw_only=True)
     diagram: StabilisationDiagram | None = field(default=None, kw_only=True)
+    shape_covariance: ComplexArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.shapes is None:
             raise ModelError("identified modes have shapes at their outputs.")
-        self._set(participation=self.participation, terms=self.terms)
+        self._set(
+            participation=self.participation,
+            terms=self.terms,
+            shape_covariance=self.shape_covariance,
+        )
 
     def frf(self, freq: FloatArray) -> Frf:
         """Return the identified response (displacement per input), to compare or to extend.
@@ -101,4 +109,8 @@ class IdentifiedModes(MeasuredModes):
         return Frf(freq, data, inputs=self.inputs, outputs=self.outputs, quantity="displacement")
 
     def _picked(self, places: list[int]) -> dict[str, Any]:
-        return super()._picked(places) | {"participation": self.participation[:, places]}
+        doubt = self.shape_covariance
+        return super()._picked(places) | {
+            "participation": self.participation[:, places],
+            "shape_covariance": None if doubt is None else doubt[places],
+        }

@@ -109,7 +109,9 @@ def identify_modes(
     and outputs. Rigid-body modes and modes below the band are in 1/s and 1/s^2, those above in
     the powers of s. Chosen poles that noise would feign once in a thousand times are left out;
     where more than noise is left a pole is added. With `start` neither is done. What then is
-    still not explained is warned of, with its frequency.
+    still not explained is warned of, with its frequency. A pole with another at the same place
+    (repeated, or too close for the diagram) is taken apart where that lowers chi-square by more
+    than noise does.
 
     Parameters
     ----------
@@ -126,11 +128,12 @@ def identify_modes(
     lower : int
         Number of residual terms of rigid-body modes and modes below the band.
     upper : int, optional
-        Number of those of modes above; when not given 3, and more where the data ask for them:
+        Number of those of modes above; when not given 3, and up to 25 where the data ask for them:
         with too few the poles are biased by a standard deviation before the misfit shows it.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of
-        a sampled plant.
+        a sampled plant. Modes above half the rate are seen folded, as broad ones, where no
+        filter keeps them out: a pole of several per cent of damping may be one of these.
     dofs : mapping {channel: DOF label}, optional
         Where outputs and inputs are; shapes are labelled by it, and mass-normalised where an
         input and an output share a DOF.

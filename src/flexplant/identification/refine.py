@@ -44,6 +44,7 @@ class Fit:
     jacobian: list[ComplexArray]  # per output (n_in, n_freq, n_parameters)
     model: ComplexArray  # the fitted responses
     settled: bool = True
+    shape_maps: tuple[tuple[FloatArray, FloatArray], ...] = ()  # see _Projected.shape_maps
 
 
 def refined(
@@ -112,7 +113,16 @@ def refined(
             raise unsettled(poles.size, steps)
     N, _, jacobian = now.normal
     return Fit(
-        poles, participation, now.shapes, now.terms, now.cost, N, jacobian, now.model, settled
+        poles,
+        participation,
+        now.shapes,
+        now.terms,
+        now.cost,
+        N,
+        jacobian,
+        now.model,
+        settled,
+        tuple(now.shape_maps),
     )
 
 
@@ -146,6 +156,9 @@ class _Projected:
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
         self.terms = np.zeros((n_out, n_in, smooth.shape[0]))
         self.model = np.zeros_like(lines.data)
+        #: per output, d[Re psi; Im psi]/d(poles, participation) and the covariance with these held
+        self.shape_maps: list[tuple[FloatArray, FloatArray]] = []
+        self.triangles: list[tuple[FloatArray, FloatArray]] = []
         self.bases: list[tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]] = []
         self.linear: list[tuple[FloatArray, FloatArray, float]] = []
         self.cost = 0.0
@@ -165,6 +178,7 @@ class _Projected:
             self.linear.append((stacked.T @ stacked, stacked.T @ right, float(right @ right)))
             x = la.lstsq(R, Q.T @ right, cond=1e-13)[0] / size
             self.shapes[o] = x[:m] + 1j * x[m:]
+            self.triangles.append((R, size))
             error = right - Q @ (Q.T @ right)
             self.cost += float(error @ error)
             self.bases.append((smooth_bases, Q, error, x))
@@ -189,6 +203,7 @@ class _Projected:
         """Return J^T J, J^T e and J of the nonlinear parameters, all outputs together."""
         n_in, n_freq = self.lines.data.shape[1:]
         count = 2 * self.m * n_in
+        self.shape_maps = []
         N, g, kept = np.zeros((count, count)), np.zeros(count), []
         for o, (smooth_bases, Q, error, _) in enumerate(self.bases):
             shape = self.shapes[o][:, None]
@@ -209,7 +224,11 @@ class _Projected:
                 rows = _real(parts.reshape(count, n_freq) * w).T
                 blocks.append(_off(smooth_bases[i], rows))
             J = np.concatenate(blocks)
-            J -= Q @ (Q.T @ J)
+            R, size = self.triangles[o]
+            inverse = la.pinv(R, rtol=1e-13) / size[:, None]
+            common = Q.T @ J
+            self.shape_maps.append((-inverse @ common, inverse @ inverse.T))
+            J -= Q @ common
             N += J.T @ J
             g += J.T @ error
             split = J.reshape(n_in, 2, n_freq, count)
