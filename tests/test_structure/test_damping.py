@@ -4,10 +4,12 @@ import pickle
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 
+import flexplant as fx
 import oracles_grids as grids
 import oracles_structure as oracle
-from flexplant.errors import ModelError, ShapeError
+from flexplant.errors import FlexplantWarning, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.reduction import solve_modes
 from flexplant.structure import Hysteretic, ModalDamping, Rayleigh, chain
@@ -213,3 +215,36 @@ def test_laws_in_solve_modes():
         np.testing.assert_allclose(solve_modes(model, damping=law).zeta, zeta, rtol=1e-6)
         # the same through the matrix
         np.testing.assert_allclose(solve_modes(model.with_damping(law)).zeta, zeta, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("law", "rate"), [(ModalDamping(0.01, rigid=0.5), 0.5), (Rayleigh(0.5, 1e-6, rigid=True), 0.5)]
+)
+def test_damped_rigid_body_motions_go_all_the_way_into_a_plant(law, rate):
+    """Responses against the dense matrices, and the poles of the dragged body."""
+    free = fx.kirchhoff_plate(
+        size=(0.6, 0.6), thickness=0.0272, elements=(3, 3), density=2702, youngs_modulus=70e9,
+        poisson_ratio=0.35,
+    )  # fmt: skip
+    model = free.with_damping(law)
+    corners = ["1:z", "4:z", "13:z", "16:z"]
+    ports = fx.Ports(
+        w=[fx.Disturbance(f"d{i}", at=at, asd=1e-3) for i, at in enumerate(corners)],
+        u=[fx.Actuator(f"u{i}", at=at) for i, at in enumerate(corners)],
+        z=[fx.Poi("die", at="6:z")],
+        y=[fx.Sensor(f"y{i}", at=at, asd=1e-11) for i, at in enumerate(corners)],
+    )
+    with pytest.warns(FlexplantWarning, match="not in modal blocks but dense"):
+        plant = fx.assemble_plant(model, ports)
+    freq = np.array([0.02, 1.0, 245.0, 1000.0])  # the dense oracle has 7 digits at the first
+    found = fx.frequency_response(plant.system, freq)["die:z", "u1"]
+    out, into = free.dofs.index("6:z"), free.dofs.index("4:z")
+    M, D, K = (
+        np.asarray(A.todense()) if sp.issparse(A) else A for A in (model.M, model.D, model.K)
+    )
+    for w, value in zip(2 * np.pi * freq, np.ravel(np.asarray(found)), strict=True):
+        wanted = np.linalg.inv(K + 1j * w * D - w**2 * M)[out, into]
+        assert abs(value - wanted) < 1e-6 * abs(wanted)
+    slow = plant.system.poles()
+    assert np.sort(slow[np.abs(slow) < 10].real) == pytest.approx([-rate] * 3 + [0] * 3, abs=1e-6)
+    assert fx.design_kalman(plant.discretized(rate=10e3, delay=1)).rms("die:z") > 0

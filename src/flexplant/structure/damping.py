@@ -45,7 +45,8 @@ class ModalDamping(Damping):
         For all modes beyond the array; without it there must be one entry for each mode.
     rigid : float [1/s]
         What slows rigid-body motions down in ``FEModel.with_damping``: their velocity decays with
-        this rate. Modes and plants, whose rigid-body modes are free, refuse a model with it.
+        this rate. `assemble_plant` takes such a model as it is, in dense form; `solve_modes`, whose
+        rigid-body modes are at 0, refuses it.
 
     Raises
     ------
@@ -185,8 +186,8 @@ class Rayleigh(Damping):
         Stiffness-proportional part.
     rigid : bool
         Let alpha slow rigid-body motions down too, in ``FEModel.with_damping``: D is then
-        ``alpha M + beta K`` as it stands. Modes and plants, whose rigid-body modes are free, refuse
-        such a model.
+        ``alpha M + beta K`` as it stands. `assemble_plant` takes such a model as it is, in dense
+        form; `solve_modes`, whose rigid-body modes are at 0, refuses it.
 
     Raises
     ------

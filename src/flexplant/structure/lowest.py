@@ -159,7 +159,7 @@ def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], Floa
         return lambda b: np.asarray(la.cho_solve(factor, b))
     matrix = sp.csc_array(K + shift * M)
     held = _factor(matrix, dissect(matrix) if K.shape[0] > DENSE_LIMIT else None)
-    return lambda b: np.column_stack([held.solve(column) for column in b.T])
+    return lambda b: np.asarray(held.solve(b))
 
 
 def _factor(matrix: Any, order: Dissection | None) -> Any:

@@ -118,7 +118,7 @@ def _damping_line(found: Facts) -> Line:
             "note",
             "damping",
             "D drags free rigid-body motions: a damper to ground, or alpha M",
-            "these are undamped here; FEModel.with_damping leaves them so",
+            "assemble_plant takes it, in dense form; modes at 0 need D without: with_damping(law)",
         )
     return ("ok", "definiteness of D", "positive semi-definite", "")
 
