@@ -107,3 +107,9 @@ def test_bad_mode_numbers_are_refused(modes, error, text):
 def test_bad_covariance_is_refused(covariance, error, text):
     with pytest.raises(error, match=text):
         MeasuredModes(POLES, covariance=covariance)
+
+
+@pytest.mark.parametrize("places", [5, "a", [True], [0.0], [0, 0], [3], []])
+def test_places_that_are_none_are_refused(places):
+    with pytest.raises((LabelError, ModelError), match="place"):
+        MeasuredModes([-1 + 10j, -1 + 20j]).select(places)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
 from ..structure.threads import one_thread
-from ..values import positive, real_array, whole
+from ..values import positive, real_array, short, whole
 from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
@@ -191,14 +191,14 @@ def _identified(
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
     labels = checked_channels(dofs, frf)
     listed = _checked_orders(orders)
+    if start is not None and not isinstance(start, PoleSelection):
+        raise ModelError(f"start is a PoleSelection, got {type(start).__name__}.")
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
     diagram = None
     if start is None:
         diagram = diagram_of(ready, _affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
         chosen = diagram.automatic()
-    elif not isinstance(start, PoleSelection):
-        raise ModelError(f"start is a PoleSelection, got {type(start).__name__}.")
     elif start.participation.shape[0] != ready.data.shape[1]:
         raise ShapeError(
             f"start was chosen with {start.participation.shape[0]} references, this FRF has "
@@ -264,9 +264,14 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
 
 
 def _checked_orders(orders: Iterable[int] | None) -> list[int]:
-    listed = sorted(set(range(2, 41) if orders is None else orders))
-    if len(listed) < 4 or not all(isinstance(n, int | np.integer) and n >= 1 for n in listed):
+    given = range(2, 41) if orders is None else orders
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise ModelError(
+            f"orders are whole numbers to compare, got {short(orders)}. Try range(2, 41)."
+        )
+    listed = sorted({whole(n, "each of orders") for n in given})
+    if len(listed) < 4:
         raise ModelError(
             f"orders must be at least four whole numbers from 1 to compare, got {listed!r:.60}."
         )
-    return [int(n) for n in listed]
+    return listed

@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
-from ..values import ComplexArray, FloatArray, Value, check_names, real_array
+from ..values import ComplexArray, FloatArray, Value, check_names, real_array, short, whole
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -110,8 +110,13 @@ class MeasuredModes(Value):
         ------
         LabelError
             When there is no such pole, or it is asked for twice.
+        ModelError
+            When a place is no whole number.
         """
-        places = list(poles)
+        listed = isinstance(poles, Iterable) and not isinstance(poles, str)
+        if not listed:
+            raise LabelError(f"select takes a list of places of the poles, got {short(poles)}.")
+        places = [whole(place, "each place", minimum=0) for place in poles]
         if not places or len(set(places)) < len(places) or not set(places) <= set(range(len(self))):
             raise LabelError(
                 f"select takes different places between 0 and {len(self) - 1} of the poles, got "

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, Value, positive
+from ..values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from .records import Records
 from .spectra import error_statistics
 
@@ -37,10 +37,8 @@ class Periodic(Value):
 
     def __post_init__(self) -> None:
         positive(self.period, "period")
-        if not isinstance(self.discard, int | np.integer) or self.discard < 0:
-            raise ModelError(f"discard must be a whole number from 0, got {self.discard!r}.")
-        if self.band is not None and not 0 <= self.band[0] < self.band[1]:
-            raise ModelError(f"band must be (low, high) in Hz, got {self.band!r}.")
+        whole(self.discard, "discard", minimum=0)
+        _check_band(self.band)
 
     def __repr__(self) -> str:
         return f"Periodic(period of {self.period:g} s, {self.discard} discarded)"
@@ -193,9 +191,9 @@ def multisine(
     ModelError
         When a number is out of range or no line lies in the band.
     """
-    for name, number in (("count", count), ("periods", periods)):
-        if not isinstance(number, int | np.integer) or number < 1:
-            raise ModelError(f"{name} must be a whole number from 1, got {number!r}.")
+    count, periods = whole(count, "count"), whole(periods, "periods")
+    random = generator(rng)
+    _check_band(band)
     exact = positive(period, "period") * positive(rate, "rate")
     samples = round(exact)
     if abs(samples - exact) > 1e-6 * exact or samples < 4:
@@ -205,10 +203,18 @@ def multisine(
         lines = lines[(lines >= band[0] * period) & (lines <= band[1] * period)]
     if not lines.size:
         raise ModelError(f"no line of a period of {period:g} s lies in the band {band!r} Hz.")
-    phases = np.exp(2j * np.pi * np.random.default_rng(rng).random(lines.size))
+    phases = np.exp(2j * np.pi * random.random(lines.size))
     turns = np.exp(2j * np.pi * np.outer(np.arange(count), np.arange(count)) / count)
     full = np.zeros((count, count, samples // 2 + 1), dtype=np.complex128)
     full[:, :, lines] = turns[:, :, None] * phases
     waves = np.fft.irfft(full, samples, axis=2)
     waves *= positive(rms, "rms") / np.sqrt(np.mean(waves**2, axis=2, keepdims=True))
     return np.asarray(np.tile(waves, (1, 1, int(periods))))
+
+
+def _check_band(band: Any) -> None:
+    if band is None:
+        return
+    low, high = real_array(band, "band", (2,)).tolist()
+    if not 0 <= low < high:
+        raise ModelError(f"band must be (low, high) in Hz, got {band!r}.")
