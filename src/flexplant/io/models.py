@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,10 @@ def read_matrices(
     damping: str | Path | None = None,
     dofs: DofSet | str | Path | None = None,
     nodes: str | Path | None = None,
-    **options: Any,
+    scalar_direction: str | None = None,
+    dof_map: str | Path | None = None,
+    exodus: str | Path | None = None,
+    rotations: Mapping[int, Any] | None = None,
 ) -> FEMatrices:
     """Return the matrices of a file, whichever program wrote it, for `check` to look at.
 
@@ -94,9 +97,9 @@ def read_matrices(
     nodes : str or Path, optional
         Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
         .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
-    **options
-        What else the reader of this format takes: `scalar_direction` of `read_dmig`, `rotations` of
-        `read_ansys`, `dof_map` and `exodus` of `read_sierra`, ...
+    scalar_direction, dof_map, exodus, rotations : optional
+        Of one format each: what scalar points move in (`read_dmig`), the map and the mesh of
+        `read_sierra`, local systems (`read_ansys`).
 
     Returns
     -------
@@ -131,6 +134,9 @@ def read_matrices(
     if form == "ansys" and not (stiffness is mass is damping is None):
         raise ModelError(f"{path.name!r} holds one K and one M: leave stiffness=, mass= out.")
     reader = _READERS[form]
+    options = _told(
+        scalar_direction=scalar_direction, dof_map=dof_map, exodus=exodus, rotations=rotations
+    )
     _check_options(options, reader, given, path.name)
     found = reader(path, **given, **options)
     if form in ("dmig", "ansys") and named is not None:
@@ -159,7 +165,10 @@ def read_model(
     massless: str = "refuse",
     free: bool = False,
     name: str | None = None,
-    **options: Any,
+    scalar_direction: str | None = None,
+    dof_map: str | Path | None = None,
+    exodus: str | Path | None = None,
+    rotations: Mapping[int, Any] | None = None,
 ) -> FEModel:
     """Return the model of a file, whichever program wrote it.
 
@@ -187,8 +196,8 @@ def read_model(
         Free the rigid-body motions that only lost digits of a text hold.
     name : str, optional
         For display; the name of the file when not given.
-    **options
-        What else the reader of this format takes; see `read_matrices`.
+    scalar_direction, dof_map, exodus, rotations : optional
+        Of one format each; see `read_matrices`.
 
     Returns
     -------
@@ -216,11 +225,24 @@ def read_model(
             "('mm', 't', 's') for instance."
         )
     found = read_matrices(
-        path, stiffness=stiffness, mass=mass, damping=damping, dofs=dofs, nodes=nodes, **options
+        path,
+        stiffness=stiffness,
+        mass=mass,
+        damping=damping,
+        dofs=dofs,
+        nodes=nodes,
+        scalar_direction=scalar_direction,
+        dof_map=dof_map,
+        exodus=exodus,
+        rotations=rotations,
     )
     if sizes != ("m", "kg", "s"):
         found = found.converted(*sizes)
     return found.model(massless=massless, free=free, name=name or Path(path).name)
+
+
+def _told(**options: Any) -> dict[str, Any]:
+    return {name: value for name, value in options.items() if value is not None}
 
 
 def _check_options(
