@@ -427,7 +427,8 @@ def _listed(items: Any, name: str, form: str) -> list[Any]:
 def _node_numbers(nodes: Any) -> IntArray:
     try:
         numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
-        whole = numbers.astype(np.int64)
+        with np.errstate(invalid="ignore"):  # NaN is told below
+            whole = numbers.astype(np.int64)
     except (TypeError, ValueError, OverflowError):
         numbers, whole = np.zeros(1), np.ones(1, dtype=np.int64)
     if numbers.dtype == bool or np.any(whole != numbers) or np.any(abs(whole) > _LARGEST_NODE):

@@ -16,7 +16,8 @@ SHARED = Path("/work/shared/data/fe/nastran")
 
 @pytest.fixture(scope="module")
 def op4():
-    return pytest.importorskip("pyyeti.nastran.op4")
+    with np.printoptions():  # importing it changes how all arrays are printed
+        return pytest.importorskip("pyyeti.nastran.op4")
 
 
 def matrices():
