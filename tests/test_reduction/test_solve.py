@@ -8,7 +8,7 @@ import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
 from flexplant.labels import DofSet
 from flexplant.reduction import solve, solve_modes
-from flexplant.structure import FEModel, ModalDamping, Rayleigh, counted
+from flexplant.structure import FEModel, ModalDamping, Rayleigh, Spring, counted
 from plates import make_plate
 
 # Hz, rad/s; oracle: oracles_structure (Gauss quadrature, scipy.linalg.eigh, first-order poles)
@@ -235,7 +235,7 @@ def test_signs_repeat(plate):
     assert np.all(modes.phi[first, range(6)][3:] > 0)
 
 
-@pytest.mark.parametrize("count", [0, 2, 244, 4.5, True, -1])
+@pytest.mark.parametrize("count", [0, 2, 244, 4.5, True, -1, "a", [], np.nan])
 def test_bad_counts(plate, count):
     with pytest.raises(ModelError, match="count must be"):
         solve_modes(plate, count=count)
@@ -325,3 +325,23 @@ def test_thirty_thousand_dofs():
     modes = solve_modes(model, count=24, compliance_at="1:z")
     assert_modes_of(model, modes)
     np.testing.assert_allclose(modes.freq[3], 245.39, rtol=1e-4)
+
+
+@pytest.mark.parametrize("at", [3, object(), [None], np.nan])
+def test_what_is_no_place_is_refused(plate, at):
+    with pytest.raises(ModelError, match="place must be a DOF label"):
+        solve_modes(plate, count=8, compliance_at=at)
+
+
+@pytest.mark.parametrize("stiffness", [20.0, 1000.0])
+def test_a_fine_mesh_on_soft_springs_has_suspension_modes(stiffness):
+    """The sum of the plate's stiffnesses is 1e11 times the springs': nothing is called rounding."""
+    plate = make_plate(elements=(60, 60))
+    corners = [(0.0, 0.0, 0.0), (0.6, 0.0, 0.0), (0.0, 0.6, 0.0), (0.6, 0.6, 0.0)]
+    model = plate.with_parts([Spring(at, stiffness) for at in corners])
+    heave = np.sqrt(4 * stiffness / plate.mass) / (2 * np.pi)
+    # about x: four springs at 0.3 m, the inertia m (0.6 m)^2 / 12
+    pitch = heave * np.sqrt(3.0)
+    freq = solve_modes(model, count=6).freq
+    assert model.rigid_body.shape[1] == 0
+    np.testing.assert_allclose(freq[:3], [heave, pitch, pitch], rtol=2e-3)

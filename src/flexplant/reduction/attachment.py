@@ -16,22 +16,42 @@ from ..structure.eigen import signed
 from ..structure.factor import DENSE_LIMIT, dense, diagonal
 from ..structure.multifrontal import MultifrontalCholesky
 from ..structure.shifted import stiffness_factor
-from ..values import FloatArray, Matrix
+from ..values import FloatArray, Matrix, short
 
 #: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
 _NEGLIGIBLE = 1e-9
 
 
 def places(at: Place | Iterable[Place]) -> list[Place]:
-    """Return one place, or several, as a list."""
+    """Return one place, or several, as a list.
+
+    Raises
+    ------
+    ModelError
+        When it is neither.
+    """
     if isinstance(at, str | Mapping):
         return [at]
-    listed: list[Any] = list(at)
+    try:
+        listed: list[Any] = list(at)
+    except TypeError as error:
+        raise _no_place(at) from error
+    numbers = [item for item in listed if np.ndim(item) == 0 and not isinstance(item, str)]
+    odd = [item for item in numbers if not isinstance(item, Mapping | int | float | np.number)]
+    if odd:
+        raise _no_place(odd[0])
     if listed and all(
         np.ndim(item) == 0 and not isinstance(item, str | Mapping) for item in listed
     ):
         return [listed]
     return listed
+
+
+def _no_place(given: object) -> ModelError:
+    return ModelError(
+        f"a place must be a DOF label, a point (x, y, z) or a mapping of these to weights, got "
+        f"{short(given)}. Name it, such as '41:z', or several in a list."
+    )
 
 
 def named(place: Place) -> str:

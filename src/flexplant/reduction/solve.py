@@ -16,7 +16,7 @@ from ..structure.eigen import elastic_modes, signed
 from ..structure.factor import DENSE_LIMIT, by_rows, dense, diagonal
 from ..structure.pardiso import Pardiso
 from ..structure.shifted import modes_below, stiffness_factor
-from ..values import FloatArray, positive
+from ..values import FloatArray, positive, short
 from .attachment import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
@@ -145,10 +145,11 @@ def _asked(model: FEModel, count: int | None, below: float | None) -> tuple[int,
         if below is None and n > DENSE_LIMIT:
             raise ModelError(f"a model of {n} DOFs needs count= or below= (Hz): not all its modes.")
         return n, top
-    if isinstance(count, bool) or int(count) != count or not max(r, 1) <= count <= n:
+    number = isinstance(count, int | np.integer) and not isinstance(count, bool)
+    if not number or not max(r, 1) <= count <= n:
         raise ModelError(
             f"count must be a whole number from {max(r, 1)} ({r} rigid-body modes are always kept) "
-            f"to {n} (all modes), got {count!r}."
+            f"to {n} (all modes), got {short(count)}. Choose one there, or give below= in Hz."
         )
     return int(count), top
 

@@ -24,8 +24,8 @@ _EXTRA = 4
 _GAP, _GAP_ROUNDINGS = 1e-8, 4.0
 #: more modes than this are not looked for: their shapes and the basis fill the memory
 _MOST = 2000
-#: part of the largest omega^2 below which an elastic one is rounding
-_ROUNDING = 1e-14
+#: roundings in the strain energy of an elastic mode below which omega^2 is none
+_ROUNDING = 30 * float(np.finfo(np.float64).eps)
 #: searches with what is found locked, before giving up
 _SEARCHES = 8
 #: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
@@ -98,7 +98,7 @@ def _counted(
         locked = np.hstack([model.rigid_body, phi])
         more = _search(model, factor, locked, missing, search)
         squares, phi = _rayleigh_ritz(model, np.hstack([phi, more]))
-        check_stiffness(squares, _ROUNDING * largest, r)
+        check_stiffness(squares, _rounding(model, phi[:, 0]), r)
         # the count needs the memory
         factor, more = None, np.zeros((n, 0))
         if below == count and _apart(squares, count, top, largest):
@@ -120,6 +120,11 @@ def _counted(
         f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count tells {counted + r} modes, "
         f"{sure + r} were found: closely repeated frequencies. Ask for some more or fewer modes."
     )
+
+
+def _rounding(model: FEModel, phi: FloatArray) -> float:
+    """Return the rounding in ``phi' K phi``: of the sum of what cancels in it."""
+    return _ROUNDING * float(np.abs(phi) @ (abs(by_rows(model.K)) @ np.abs(phi)))
 
 
 def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:

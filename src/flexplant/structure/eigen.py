@@ -63,8 +63,9 @@ def check_stiffness(squares: FloatArray, rounding: float, n_rigid: int) -> None:
         raise ModelError(
             f"an elastic mode has no stiffness (omega^2 = {squares[0]:.3g} 1/s^2, rounding is "
             f"about {rounding:.1g}): K is indefinite, or has a zero-energy motion beyond the "
-            f"{n_rigid} rigid-body motions of the geometry. Look for a sign, a mechanism or wrong "
-            "coordinates."
+            f"{n_rigid} rigid-body motions of the geometry, or springs too soft for the digits of "
+            "K. Look for a sign, a mechanism or wrong coordinates (check(model) tells); suspend "
+            "the modes rather than the model on soft springs."
         )
 
 
