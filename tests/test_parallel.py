@@ -123,6 +123,7 @@ def test_linear_algebra_runs_on_one_thread():
     assert {lib["filepath"]: lib["num_threads"] for lib in threadpool_info()} == before
 
 
+@pytest.mark.slow
 def test_chunks_last_about_half_a_second():
     here = Here()
 

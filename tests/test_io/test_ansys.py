@@ -19,6 +19,7 @@ FULL = Path("/work/shared/data/fe/ansys/file.full")
 
 @pytest.mark.skipif(not FULL.exists(), reason="no data folder")
 class TestSample:
+    @pytest.mark.slow
     def test_frequencies_of_the_held_beam(self):
         pytest.importorskip("ansys.mapdl.reader")
         found = fx.io.read_ansys(FULL)

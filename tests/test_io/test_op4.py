@@ -191,6 +191,7 @@ def test_doubled_names_are_kept_apart(op4, tmp_path):
 
 @pytest.mark.parametrize("sparse", ["dense", "bigmat", "nonbigmat"])
 @pytest.mark.parametrize("binary", [True, False])
+@pytest.mark.slow
 def test_cut_or_damaged_files_are_named(op4, tmp_path, binary, sparse):
     rng = np.random.default_rng(2)
     path, part = tmp_path / "x.op4", tmp_path / "part.op4"

@@ -217,6 +217,7 @@ def test_bad_reductions():
 
 
 @given(st.integers(0, 10_000), st.booleans())
+@pytest.mark.slow
 def test_peak_on_the_axis_of_unstable_systems(seed, sampled):
     rng = np.random.default_rng(seed)
     A = rng.standard_normal((5, 5))

@@ -171,6 +171,7 @@ def test_the_level_set_alone_finds_the_peak(monkeypatch, start, feedthrough, del
 
 @pytest.mark.parametrize("delay", [None, 1.0])
 @pytest.mark.parametrize("part", [0.02, 0.3, 0.9])
+@pytest.mark.slow
 def test_crossings_of_a_level_are_where_a_singular_value_equals_it(part, delay):
     g = machine(0, 6, zeta=1e-2, m=2, p=3)
     g = g.replace(D=5e-9 * np.arange(6.0).reshape(3, 2))

@@ -98,6 +98,7 @@ def test_control_forms_are_the_duals(seed):
     np.testing.assert_allclose(sol.gain, np.linalg.solve(R, B.T @ X), rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_equals_the_recursion_in_extended_precision_in_si_units():
     # one rigid body and two modes at 0.1 %: 1e-10 m, 1e-3 N; recursion from P = Q
     A, C, Q, R = machine(1, 2, inputs=2)

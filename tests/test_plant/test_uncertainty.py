@@ -190,6 +190,7 @@ def within_monte_carlo(values, wanted, sigmas=4.5):
     return np.all(np.abs(found - wanted) < sigmas * error)
 
 
+@pytest.mark.slow
 def test_machines_of_a_fit_spread_as_its_covariance_says():
     fit, unknowns = fitted(0.1)
     plant = updated(0.1)
@@ -211,6 +212,7 @@ def test_machines_of_a_fit_spread_as_its_covariance_says():
     assert all(m.w == plant.w and m.n_rigid == 3 for m in machines)
 
 
+@pytest.mark.slow
 def test_machines_of_measured_modes_spread_as_measured():
     plant = assemble_plant(some_modes(), ports())
     doubt = own_doubt(plant, (5, 6), 0.05)

@@ -139,6 +139,7 @@ def test_damping_of_vectors_by_projection(plate):
     assert 0.008 < modes.vector_zeta[0] < 0.01
 
 
+@pytest.mark.slow
 def test_held_structures_and_the_sparse_route():
     large = make_plate(elements=(24, 24))
     modes = solve_modes(large, count=24, compliance_at=CORNER)

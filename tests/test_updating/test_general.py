@@ -407,6 +407,7 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     assert sum(row.endswith("alike") for row in found.table.splitlines()) == 4
 
 
+@pytest.mark.slow
 def test_localisation_beside_a_wrong_stiffness(plate):
     """Hidden 0.5 kg and 2 % of stiffness: alone z8 is not found, with the nuisance it is."""
     rom = plate.reduced(0.01, True)
