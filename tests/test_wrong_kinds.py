@@ -188,8 +188,29 @@ def test_a_plant_where_a_system_is_needed_is_told_which_systems_it_has():
     assert fx.peak_gain(servo) == fx.peak_gain(servo.system)
 
 
-def test_a_system_where_a_plant_is_needed_is_told_what_to_type():
-    for function in (fx.design_kalman, fx.design_static):
-        for sys in (plant().system, plant().system.to_control()):
-            with pytest.raises(FlexplantError, match=r"from_statespace\(sys, w=\[.*noise_factor"):
+def test_a_system_where_a_plant_is_needed_is_told_what_it_lacks():
+    """Its labels tell w, u, z and y; densities, ports and shapes are not in it."""
+    names = [sensor.name for sensor in plant().ports.y]
+    lacking = {
+        fx.design_kalman: r"no noise density.*from_statespace\(sys, w=\[.*noise_factor",
+        fx.design_static: r"assembled from a .*structure: assemble_plant\(",
+        lambda s: fx.design_servo(s, bandwidth=50.0): r"assembled from a structure: assemble_plant",
+        lambda s: fx.stage_weights(s, 30.0): r"assembled from a .*structure: assemble_plant\(",
+        lambda s: fx.place_sensors(s, names, 4): r"no structure. Make it by assemble_plant\(",
+        lambda s: fx.score_sensors(s, [names]): r"no structure. Make it by assemble_plant\(",
+        lambda s: fx.sensor_map(s, [(0.3, 0.3, 0.0)], asd=1e-12): r"no structure. Make it by",
+    }
+    for sys in (plant().system, plant().system.to_control()):
+        for function, words in lacking.items():
+            with pytest.raises(FlexplantError, match=words):
                 function(sys)
+
+
+def test_a_system_whose_labels_tell_is_a_plant_where_no_more_is_needed():
+    """The H-infinity controller of an assembled plant, weighted, and of its bare system."""
+    small = sampled(some_modes(count=4, attached=False))
+    weights = fx.stage_weights(small, 30.0)
+    weighted = small.weighted(z=weights.z, w=weights.w)
+    whole = fx.design_hinf(weighted)
+    for sys in (weighted.system, weighted.system.to_control()):
+        assert fx.design_hinf(sys).gamma == pytest.approx(whole.gamma, rel=1e-6)

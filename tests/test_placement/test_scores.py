@@ -226,6 +226,8 @@ def test_bad_input(make):
     with pytest.raises(ModelError, match="unweighted"):
         score_sensors(plant.weighted(z={"die:z": 2.0}), [sensors[:3]])
     with pytest.raises(ModelError, match="need a StandardPlant"):
+        score_sensors("plant", [sensors[:3]])
+    with pytest.raises(ModelError, match="no structure"):
         score_sensors(plant.system, [sensors[:3]])
     bare = StandardPlant.from_statespace(plant.system, w=plant.w, u=plant.u, z=plant.z, y=plant.y)
     with pytest.raises(ModelError, match="no structure"):

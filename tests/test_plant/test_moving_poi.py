@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
-from flexplant.plant import Actuator, Feedthrough, Poi, assemble_plant, lowpass
+from flexplant.plant import Actuator, Feedthrough, Poi, Sensor, assemble_plant, lowpass
 from oracles_plant import motion_row, receptance, z_row
-from stages import AXES, INSET, OFF_NODE, RATE, Z8, L, full, ports, reduced, some_modes
+from stages import AXES, CORNERS, INSET, OFF_NODE, RATE, Z8, L, full, ports, reduced, some_modes
 
 PATH = np.column_stack([np.linspace(0.11, 0.53, 7), np.linspace(0.13, 0.46, 7), np.zeros(7)])
 
@@ -42,6 +42,28 @@ def test_rows_along_against_the_dense_plate():
     see = np.array([motion_row(*p[:2], axis) for p in PATH for axis in AXES])
     wanted = receptance(*machine(), see, z_row(*INSET[0][:2])[None], [abs(s)])[:, 0, 0]
     np.testing.assert_allclose((rows.C[:, :3] @ state).ravel(), wanted, rtol=1e-6)
+
+
+def test_a_force_along_against_the_dense_plate():
+    """What a force does to the POI, a sensor and an accelerometer, from wherever it acts."""
+    from oracles_plant import machine
+
+    die = (L / 2 + 0.01, L / 2 + 0.02, 0.0)
+    y = [*ports().y, Sensor("a", at=Z8, quantity="acceleration", asd=1e-3)]
+    plant = assemble_plant(full(), ports(y=y, die=die))
+    g, s = plant.system, 2j * np.pi * 200.0
+    see = [*(motion_row(*die[:2], axis) for axis in AXES), z_row(*CORNERS[0][:2]), z_row(*Z8[:2])]
+    push = np.array([z_row(*p[:2]) for p in PATH])
+    wanted = receptance(*machine(), np.array(see), push, [abs(s)])[:, :, 0]
+    wanted[4] *= s * s
+    size = np.abs(wanted).max(axis=1, keepdims=True)
+    assert np.all(np.ptp(wanted.real, axis=1) > 0.1 * size[:, 0])
+    rows = g.output_index(["die:z", "die:rx", "die:ry", "y1", "a"])
+    answer = g.C[rows] @ np.linalg.inv(s * np.eye(g.n_states) - g.A)
+    for name in ("u2", "amp1"):
+        moving = plant.along(name, PATH)
+        found = [answer @ B + D[rows] for B, D in zip(moving.B, moving.D, strict=True)]
+        np.testing.assert_allclose(np.hstack(found) / size, wanted / size, atol=1e-6)
 
 
 def test_a_feedthrough_moves_with_the_poi():

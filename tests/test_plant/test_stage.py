@@ -15,6 +15,7 @@ from flexplant.plant import (
     reference_errors,
     stage_weights,
 )
+from flexplant.synthesis import design_hinf
 from oracles_synthesis import rigid_sensor
 from stages import AXES, CORNERS, INSET, NOISE, OFF_NODE, L, ports, sampled, some_modes
 
@@ -103,9 +104,14 @@ def test_missing_references_axes_and_sensors_are_named():
     one_axis = ports(z=[Poi("die", at=INSET[0])])
     with pytest.raises(AssumptionError, match="all its axes"):
         reference_errors(sampled(some_modes(), one_axis))
-    blind = ports(y=[Sensor("v", at=CORNERS[0], quantity="velocity", asd=1e-9)])
-    with pytest.raises(AssumptionError, match="do not tell"):
-        reference_errors(sampled(some_modes(), blind))
+    kinds = ("velocity", "acceleration")
+    y = [Sensor(q, at=CORNERS[0], quantity=q, asd=1e-9) for q in kinds]
+    with pytest.raises(
+        AssumptionError, match=r"no displacement sensor.*acceleration, velocity.*Add Sensor"
+    ):
+        reference_errors(assemble_plant(some_modes(), ports(y=y)))
+    with pytest.raises(AssumptionError, match=r"no displacement sensor.*none"):
+        reference_errors(assemble_plant(some_modes(), ports(y=[])))
 
 
 @pytest.mark.parametrize(
@@ -136,3 +142,26 @@ def test_several_references_must_be_named():
     assert {"die:error", "edge:error"} <= set(weights.z)
     with pytest.raises(ModelError, match="need a StandardPlant, got 'plant'"):
         stage_weights("plant", 30.0)
+
+
+def test_other_points_of_the_body_move_with_the_reference_and_are_left_out():
+    """Held at rest beside a reference they would cost gamma 100, the weight's floor."""
+    left, right = (Poi(n, at=(x, 0.3, 0.0), axes=AXES) for n, x in (("left", 0.15), ("right", 0.4)))
+    model = some_modes(count=6, attached=False)
+    channels = ports(z=[left, right], references=[Reference("left")])
+    plant = sampled(model, channels)
+    weights = stage_weights(plant, 30.0, poi="left")
+    out = [name for name, weight in weights.z.items() if weight is None and "right" in name]
+    assert out == ["right:z", "right:rx", "right:ry"]
+    assert "left out of z: right (moved by the reference)" in repr(weights)
+    alone = sampled(model, ports(z=[left], references=[Reference("left")]))
+    single = stage_weights(alone, 30.0)
+    assert "left out" not in repr(single)
+    gammas = [
+        design_hinf(p.through(reference_errors(p)).weighted(z=w.z, w=w.w)).gamma
+        for p, w in ((plant, weights), (alone, single))
+    ]
+    assert gammas[0] == pytest.approx(gammas[1], rel=1e-2)
+    assert gammas[0] < 3.0
+    resting = stage_weights(sampled(model, ports(z=[left, right], references=[])), 30.0, poi="left")
+    assert None not in resting.z.values()

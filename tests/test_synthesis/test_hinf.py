@@ -249,9 +249,11 @@ def small():
 
 def test_wrong_arguments_are_refused():
     P = small()
-    with pytest.raises(ModelError, match=r"name the controller's channels"):
+    with pytest.raises(LabelError, match=r"do not tell which are w, u, z and y.*Type Standard"):
         design_hinf(P)
-    with pytest.raises(ModelError, match="got float"):
+    with pytest.raises(LabelError, match="name both u and y"):
+        design_hinf(P, u=["u"])
+    with pytest.raises(ModelError, match=r"need a StandardPlant, got 3\.0"):
         design_hinf(3.0)
     with pytest.raises(ModelError, match="got str"):
         design_hinf("plant", u=["u"], y=["y"])

@@ -232,7 +232,7 @@ def test_refusals():
     with pytest.raises(AssumptionError, match=r"axes that span them.*z, rx, ry"):
         design_servo(plant.at({"die": Z8}).with_ports(
             ports(z=[Poi("die", at=Z8, axes=("z", "rx"))])), bandwidth=50.0)  # fmt: skip
-    with pytest.raises(ModelError, match="need a StandardPlant, got str"):
+    with pytest.raises(ModelError, match="need a StandardPlant, got 'plant'"):
         design_servo("plant", bandwidth=50.0)
     with pytest.raises(ModelError, match=r"weighted.*plant.unweighted"):
         design_servo(plant.weighted(z={"die:z": 2.0}), bandwidth=50.0)

@@ -5,25 +5,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from ..errors import AssumptionError, ModelError, unknown_label
-from ..plant import StandardPlant
-from ..values import short
+from ..lti.statespace import System
+from ..plant import StandardPlant, standard_plant
 
 #: z channels that are not motions of a POI
 DERIVED = (":error", ":effort")
 
 
-def checked_plant(plant: StandardPlant) -> StandardPlant:
+def checked_plant(given: StandardPlant | System) -> StandardPlant:
     """Return a StandardPlant that has something to estimate and to measure.
 
     Raises
     ------
     ModelError
         When it is no plant, or weighted.
+    LabelError
+        When it is a system whose channels do not tell w, u, z and y.
     AssumptionError
         When it has no POI or no sensor.
     """
-    if not isinstance(plant, StandardPlant):
-        raise not_a_plant(plant)
+    plant = standard_plant(given)
     if plant.unweighted is not None:
         raise ModelError(
             "the plant is weighted: an estimator is of physical channels. Use plant.unweighted."
@@ -32,20 +33,6 @@ def checked_plant(plant: StandardPlant) -> StandardPlant:
         if not names:
             raise AssumptionError(f"the plant has no {side}: there is nothing to estimate with.")
     return plant
-
-
-def not_a_plant(given: object) -> ModelError:
-    """Return the error for something else where a StandardPlant is needed, with what to type."""
-    if hasattr(given, "A") and hasattr(given, "B"):
-        return ModelError(
-            f"need a StandardPlant, got a {type(given).__name__}, whose channels do not tell which "
-            "are disturbances and POIs. Type StandardPlant.from_statespace(sys, w=[...], u=[...], "
-            "z=[...], y=[...], asd={...}) and pass what it returns; for a Kalman filter with "
-            ".replace(noise_factor=G), G G' the covariance that w adds to x in one sample."
-        )
-    return ModelError(
-        f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports)."
-    )
 
 
 def sensors(plant: StandardPlant) -> tuple[str, ...]:

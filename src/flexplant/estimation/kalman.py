@@ -10,8 +10,9 @@ import numpy as np
 from ..errors import AssumptionError, CertificateError, ModelError, ShapeError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
-from ..lti.statespace import StateSpace
+from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
+from ..plant.door import TYPE_THIS
 from ..values import FloatArray, Value, real_array
 from .channels import checked_plant, estimates, poi_channels, row_of, sensors
 
@@ -130,7 +131,7 @@ class KalmanEstimator(Value):
         return twin
 
 
-def design_kalman(plant: StandardPlant) -> KalmanEstimator:
+def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
     The noise model is that of `simulate`: `plant.process_noise` per sample into x and
@@ -141,7 +142,8 @@ def design_kalman(plant: StandardPlant) -> KalmanEstimator:
     Parameters
     ----------
     plant : StandardPlant
-        Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`.
+        Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`. A system with labels
+        lacks noise densities: it is told how to give them.
 
     Returns
     -------
@@ -155,6 +157,8 @@ def design_kalman(plant: StandardPlant) -> KalmanEstimator:
         directly, w does not excite a rigid-body mode or y does not see it.
     ModelError
         When the plant is weighted or its noise is not known.
+    LabelError
+        When the labels of a system do not tell w, u, z and y.
     SolverError
         When no strictly stable filter exists for another reason.
     CertificateError
@@ -169,6 +173,13 @@ def design_kalman(plant: StandardPlant) -> KalmanEstimator:
         raise AssumptionError(
             "the plant is continuous, this filter runs at samples: use "
             "plant.discretized(rate, delay=1)."
+        )
+    if plant.noise_factor is None:
+        raise ModelError(
+            "labels carry no noise density: a Kalman filter needs the process noise of each sample "
+            "and the sensors' asd. Use assemble_plant(model, ports).discretized(rate), or type "
+            f"{TYPE_THIS}.replace(noise_factor=G), G G' the covariance that w adds to x in one "
+            "sample."
         )
     _check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")

@@ -10,6 +10,7 @@ from ..errors import AssumptionError
 from ..lti.lyapunov import controllability_gramian
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..plant.carried import carried, carried_of, seen, structure_of
 from ..values import FloatArray, Value
 from .channels import checked_plant, estimates, poi_channels, row_of, sensors
 
@@ -110,7 +111,7 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a structure with rigid-body modes, continuous or sampled.
+        Assembled from a structure that is free or on weak springs, continuous or sampled.
 
     Returns
     -------
@@ -120,8 +121,8 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
     Raises
     ------
     AssumptionError
-        When the structure has no rigid-body mode, or the displacement sensors do not determine
-        the POI's rigid-body motion.
+        When the structure has no rigid-body or suspension mode, or the displacement sensors do
+        not determine the POI's rigid-body motion.
     ModelError
         When the plant is weighted.
 
@@ -130,19 +131,12 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
     The paper, section 5: "the static geometric relation".
     """
     plant = checked_plant(plant)
-    if not plant.n_rigid or plant.realisation is None:
-        raise AssumptionError(
-            "the static geometric relation needs the rigid-body modes of a free structure, and "
-            "this plant has none. Use design_kalman(plant)."
-        )
-    ports = plant.ports
-    kinds = {s.name: s.quantity for s in ports.y} if ports is not None else {}
+    ports = structure_of(plant)[1]
+    motions = carried_of(plant)
+    kinds = {s.name: s.quantity for s in ports.y}
     used = [name for name in sensors(plant) if kinds.get(name) == "displacement"]
     channels = poi_channels(plant)
-    g = plant.structural  # filters of sensors and amplifiers count as their static gains
-    positions = np.arange(plant.n_rigid) * 2
-    R_y = g.C[np.ix_(g.output_index(used), positions)]
-    R_z = g.C[np.ix_(g.output_index(channels), positions)]
+    R_y, R_z = seen(plant, motions, used), seen(plant, motions, channels)
     gain = R_z @ np.linalg.pinv(R_y, rcond=_MISSED)
     missed = np.linalg.norm(R_z - gain @ R_y, axis=1)
     bad = missed > 1e-6 * np.linalg.norm(R_z, axis=1)
@@ -171,4 +165,5 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
 def _elastic(plant: StandardPlant) -> list[int]:
     """Return the states of elastic modes; delay lines of u come after all modes."""
     modes = (plant.continuous or plant).system.n_states
-    return list(range(2 * plant.n_rigid, modes))
+    rigid = carried(structure_of(plant)[0]).modes
+    return [i for i in range(modes) if i // 2 not in rigid]

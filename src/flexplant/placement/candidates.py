@@ -16,7 +16,7 @@ from ..errors import (
     ModelError,
     unknown_label,
 )
-from ..plant import Actuator, Sensor, StandardPlant, assemble_plant
+from ..plant import Actuator, Sensor, StandardPlant, assemble_plant, standard_plant
 from ..plant.ports import QUANTITIES
 from ..plant.realisation import ModalRealisation
 from ..values import FloatArray, Value, short
@@ -171,15 +171,11 @@ def scorer_of(
 
 def checked_plant(plant: StandardPlant) -> None:
     """Raise ModelError unless the plant is sampled, not weighted, and made of a structure."""
-    if not isinstance(plant, StandardPlant):
-        raise ModelError(
-            f"need a StandardPlant, got {short(plant)}. A state space has no rows for candidates: "
-            "make the plant from the structure, assemble_plant(model, ports).discretized(rate)."
-        )
+    plant = standard_plant(plant)  # a system with labels is one too, and told what it lacks
     if plant.realisation is None or plant.ports is None:
         raise ModelError(
             "placement asks the structure for rows of candidates, this plant has no structure. "
-            "Make it by assemble_plant(model, ports)."
+            "Make it by assemble_plant(model, ports).discretized(rate)."
         )
     if plant.unweighted is not None:
         raise ModelError("placement needs the plant before weights: use plant.unweighted.")

@@ -73,12 +73,16 @@ def inertia_load(
             "acceleration is not known: it is held, or has springs that were there before its "
             "modes were solved. Pass the FEModel, or solve it free and suspend(model, springs)."
         )
-    if isinstance(model, ReducedModel):
-        return -np.asarray(model.M @ motion)
-    # any load with these modal forces will do: basis' f = -c, where r = basis c
-    basis = _real_basis(model)
-    share = _share(basis, motion[:, None])[:, 0]
-    return -np.asarray(np.linalg.lstsq(basis.T, share, rcond=None)[0])
+    return -inertia(model, motion[:, None])[:, 0]
+
+
+def inertia(model: Structure, motions: FloatArray) -> FloatArray:
+    """Return loads (n, r) with the modal forces of ``M motions``, motions that the shapes make."""
+    if isinstance(model, Modes):
+        # any load with these modal forces will do: basis' f = c, where r = basis c
+        basis = _real_basis(model)
+        return np.asarray(np.linalg.lstsq(basis.T, _share(basis, motions), rcond=None)[0])
+    return np.asarray(model.M @ motions)
 
 
 def rigid_body_of(realisation: ModalRealisation) -> RigidBody:

@@ -104,9 +104,9 @@ def with_filters(structure: StateSpace, ports: Ports) -> StateSpace:
 
 def with_gains(structure: StateSpace, ports: Ports) -> StateSpace:
     """Return the structure with the static gains of its ports' filters in place of these."""
-    push = np.array([_static_gain(filter_of(port)) for port in ports.forces])
+    push = np.array([static_gain(filter_of(port)) for port in ports.forces])
     others = len(structure.outputs) - len(ports.y)
-    see = np.array([1.0] * others + [_static_gain(filter_of(sensor)) for sensor in ports.y])
+    see = np.array([1.0] * others + [static_gain(filter_of(sensor)) for sensor in ports.y])
     return structure.replace(
         B=structure.B * push,
         C=see[:, None] * structure.C,
@@ -118,5 +118,6 @@ def _named(part: StateSpace | None, name: str) -> StateSpace:
     return (part or as_statespace(1.0)).replace(inputs=[name], outputs=[name])
 
 
-def _static_gain(part: StateSpace | None) -> float:
+def static_gain(part: StateSpace | None) -> float:
+    """Return the gain of a filter at 0 Hz; 1 without one."""
     return 1.0 if part is None else float(part.evaluated(0.0)[0, 0].real)

@@ -12,7 +12,8 @@ from ..errors import AssumptionError, LabelError, ModelError, unknown_label
 from ..lti.discretisation import tustin
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, positive
+from ..values import Value, positive
+from .carried import Carried, carried_of, require_weak, rigid_gain, seen, structure_of
 from .forces import BaseAcceleration, OutputDisturbance
 from .ports import Ports
 from .standard import StandardPlant, standard_plant
@@ -20,33 +21,6 @@ from .weights import inverse_sensitivity, leadlag
 
 #: |S| of the finished loop crosses 1 below the weight's crossing, by gamma, which is near 1.6
 _HEADROOM = 1.6
-
-
-def rigid_gain(plant: StandardPlant, outputs: list[str], inputs: list[str]) -> FloatArray:
-    """Return the accelerations at outputs per force at inputs, of the rigid body alone.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Assembled from a free structure.
-    outputs, inputs : lists of str
-        Displacements in z or y; forces in w or u.
-
-    Returns
-    -------
-    (n_out, n_in) array [1/kg and the like]
-    """
-    shape, push = _rigid_parts(plant)
-    system = plant.structural
-    return np.asarray(shape[system.output_index(outputs)] @ push[:, system.input_index(inputs)])
-
-
-def _rigid_parts(plant: StandardPlant) -> tuple[FloatArray, FloatArray]:
-    """Return the rigid-body shapes at all outputs, and the modal forces of all inputs."""
-    system, r = plant.structural, plant.n_rigid
-    position, velocity = np.arange(r) * 2, np.arange(r) * 2 + 1
-    # displacement rows see omega_r q: the pair's own gain turns them into shapes
-    return system.C[:, position] * system.A[position, velocity], system.B[velocity]
 
 
 def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSpace:
@@ -59,7 +33,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a free structure, with a reference and displacement sensors.
+        Assembled from a free or suspended structure, with a reference and displacement sensors.
     poi : str, optional
         The POI whose reference the errors follow; the one that has a reference when not given.
 
@@ -76,24 +50,26 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     LabelError
         When several POIs have a reference and none is named, or the named one has none.
     """
-    ports = _ports(plant)
+    plant, motions = _stage(plant)
+    ports = structure_of(plant)[1]
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
     followed = ports.poi(_chosen([r.poi for r in ports.references], poi, "POI with a reference"))
     sensors = [s.name for s in ports.y if s.quantity == "displacement"]
-    system = plant.structural
-    shape, _ = _rigid_parts(plant)
-    axes = shape[system.output_index([followed.channel(axis) for axis in followed.axes])]
-    if (
-        not sensors
-        or len(followed.axes) < plant.n_rigid
-        or np.linalg.matrix_rank(axes) < plant.n_rigid
-    ):
+    if not sensors:
+        kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
         raise AssumptionError(
-            f"POI {followed.name!r} with axes {followed.axes} and sensors {sensors} do not tell "
-            f"the {plant.n_rigid} rigid-body motions: give the POI all its axes."
+            f"there is no displacement sensor in y (its sensors: {kinds}): where the rigid body is "
+            "they do not tell. Add Sensor(name, at=...)."
         )
-    moved = shape[system.output_index(sensors)] @ np.linalg.pinv(axes)[:, 0]
+    axes = seen(plant, motions, [followed.channel(axis) for axis in followed.axes])
+    count = motions.modes.size
+    if len(followed.axes) < count or np.linalg.matrix_rank(axes) < count:
+        raise AssumptionError(
+            f"POI {followed.name!r} with axes {followed.axes} does not tell the {count} rigid-body "
+            "motions: give the POI all its axes."
+        )
+    moved = seen(plant, motions, sensors) @ np.linalg.pinv(axes)[:, 0]
     return StateSpace(
         [],
         [],
@@ -163,11 +139,13 @@ def stage_weights(
     Parameters
     ----------
     plant : StandardPlant
-        Assembled from a free structure, continuous or sampled.
+        Assembled from a structure that is free or on springs that hold it at no more than a third
+        of the bandwidth; continuous or sampled.
     bandwidth : float [Hz]
         Below which |S| shall stay under 1.
     poi : str, optional
-        The POI whose first axis carries the length scale; needed when there are several.
+        The POI whose first axis carries the length scale; needed when there are several. The
+        others are left out of z when there is a reference: they move with it.
     peak : float
         Bound on |S| at high frequencies.
     disturbance, effort : float
@@ -182,13 +160,15 @@ def stage_weights(
     Raises
     ------
     AssumptionError
-        When the plant is not assembled from a free structure with POIs, actuators and sensors.
+        When the plant is not assembled from a free or weakly suspended structure with POIs,
+        actuators and sensors.
     LabelError
         When there are several POIs and none is named, or the name is unknown.
     ModelError
         When a number is out of range.
     """
-    ports = _ports(plant)
+    plant, motions = _stage(plant)
+    ports = structure_of(plant)[1]
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
     scale = ports.poi(_chosen([port.name for port in ports.z], poi, "POI"))
@@ -200,14 +180,20 @@ def stage_weights(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {1 / plant.dt:g} Hz: the "
             "weights could not be sampled. Ask for less, or raise the rate."
         )
+    require_weak(motions, bandwidth, "a set of weights")
     force = (2.0 * np.pi * crossing) ** 2 / float(push)
-    arm = _arm(plant, ports)
+    arm = _arm(plant, ports, motions)
     sense = inverse_sensitivity(crossing, peak=peak, floor=0.01)
     rolloff = leadlag(6.0 * crossing, 60.0 * crossing, gain=positive(effort, "effort") / force)
     z: dict[str, Any] = {}
+    # one rigid body: where a reference takes one POI, the others cannot stay
+    left = [goal.name for goal in ports.z if ports.references and goal is not scale]
     for goal in ports.z:
         for axis in goal.axes:
             error = goal.derived(axis, "error")
+            if goal.name in left:
+                z |= {name: None for name in (goal.channel(axis), error) if name in plant.z}
+                continue
             size = arm if axis.startswith("r") else 1.0
             weight = _sampled(series(sense, np.array([[size]])), plant)
             if error in plant.z:
@@ -230,29 +216,25 @@ def stage_weights(
         f"{bandwidth:g} Hz: |S| < {peak:g}, forces in {force:.4g} N, rotations in 1/{arm:.3g} rad, "
         f"disturbance {disturbance:g}, effort {effort:g}, noise {noise:g}"
     )
+    if left:
+        text += f"; on {scale.name}, left out of z: {', '.join(left)} (moved by the reference)"
     return StageWeights(z, w, text)
 
 
-def _ports(plant: StandardPlant) -> Ports:
-    plant = standard_plant(plant)
-    if plant.ports is None or not plant.n_rigid:
-        raise AssumptionError(
-            "this is for a plant assembled from a free structure: assemble_plant(model, ports)."
-        )
-    return plant.ports
+def _stage(given: StandardPlant) -> tuple[StandardPlant, Carried]:
+    """Return a plant that is a stage, and its rigid-body motions."""
+    plant = standard_plant(given)
+    return plant, carried_of(plant)
 
 
-def _arm(plant: StandardPlant, ports: Ports) -> float:
+def _arm(plant: StandardPlant, ports: Ports, motions: Carried) -> float:
     """Return the length that makes rotations displacements: how far the sensors are, in shape."""
-    shape, _ = _rigid_parts(plant)
-    system = plant.structural
     turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
     if not turning:
         return 1.0
-    seen = shape[system.output_index([sensor.name for sensor in ports.y])]
-    turned = shape[system.output_index(turning)]
-    ratio = np.linalg.norm(seen, axis=0) / np.sqrt(len(ports.y))
-    turns = np.linalg.norm(turned, axis=0)
+    ratio = np.linalg.norm(seen(plant, motions, [s.name for s in ports.y]), axis=0)
+    ratio = ratio / np.sqrt(len(ports.y))
+    turns = np.linalg.norm(seen(plant, motions, turning), axis=0)
     return float(np.max(ratio[turns > 1e-6 * turns.max()] / turns[turns > 1e-6 * turns.max()]))
 
 

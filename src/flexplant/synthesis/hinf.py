@@ -9,8 +9,8 @@ import numpy as np
 from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
-from ..plant import StandardPlant
-from ..values import name_list, short
+from ..plant import StandardPlant, standard_plant
+from ..values import short
 from .certificate import certified_norm
 from .controller import Controller
 from .method import Method
@@ -34,7 +34,7 @@ def design_hinf(
     ----------
     plant : StandardPlant
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
-        serves too, with u and y named.
+        serves too: by the names of its channels, or with u and y named.
     method : Riccati or Lmi, optional
         `Riccati()` unless given. `Lmi()` needs no full-rank D12 and D21, but suits small plants.
     u, y : sequences of str, optional
@@ -63,17 +63,12 @@ def design_hinf(
     Glover, Doyle, State-space formulae for all stabilizing controllers that satisfy an
     H-infinity-norm bound, Systems & Control Letters 11, 1988.
     """
-    if not isinstance(plant, StandardPlant):
-        if u is None or y is None:
-            raise ModelError(
-                f"design_hinf needs a StandardPlant, got {type(plant).__name__}. Make it by "
-                "assemble_plant(model, ports); of a StateSpace, name the controller's channels: "
-                "design_hinf(sys, u=(...), y=(...))."
-            )
-        u, y = name_list(u, "u"), name_list(y, "y")
-        plant = StandardPlant.from_statespace(plant, u=u, y=y)
-    elif u is not None or y is not None:
+    if u is None and y is None:
+        plant = standard_plant(plant)
+    elif isinstance(plant, StandardPlant):
         raise ModelError("a StandardPlant knows its u and y: leave them out.")
+    else:
+        plant = StandardPlant.from_statespace(plant, u=u, y=y)
     method = Riccati() if method is None else method
     if not hasattr(method, "solve"):
         raise ModelError(

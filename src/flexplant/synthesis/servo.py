@@ -10,8 +10,8 @@ from ..errors import AssumptionError, LabelError, ModelError, SolverError
 from ..lti.discretisation import discretized, tustin
 from ..lti.interconnection import append, lft, series
 from ..lti.statespace import StateSpace, as_statespace
-from ..plant import Poi, StandardPlant
-from ..plant.stage import rigid_gain
+from ..plant import Poi, StandardPlant, standard_plant
+from ..plant.carried import carried_of, require_weak, rigid_gain
 from ..plant.weights import leadlag, lowpass, notch
 from ..values import FloatArray, positive, real_array
 from .controller import Controller
@@ -36,12 +36,14 @@ def design_servo(
     ``u = T_u a`` with T_u the least-force right inverse of the rigid-body gain. Each axis gets
     ``a = k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s) (ref - hat)``, where F is a
     second-order roll-off and the notches, and k makes the open loop of the rigid body cross 1 at
-    the bandwidth.
+    the bandwidth. On weak springs (`suspend`) it is the same controller, by the geometry of the
+    rigid body: its motions are ``1 / (s^2 + w_s^2)`` then, w_s the suspension's frequencies.
 
     Parameters
     ----------
     plant : StandardPlant
-        Sampled, with a POI whose axes span its rigid-body modes.
+        Sampled, with a POI whose axes span its rigid-body modes; free, or on springs that hold it
+        at no more than a third of the bandwidth.
     bandwidth : float [Hz]
         Where the open loop of each axis crosses 1; below a fifth of the rate.
     poi : str, optional
@@ -60,12 +62,14 @@ def design_servo(
     Controller
         Inputs: the reference `die:ref` where there is one and the estimates `die:hat`,
         `die:rx:hat`, ...; outputs: the actuators. The certificate holds the spectral radius and the
-        modulus margin of the sampled, delayed loop of the rigid body.
+        modulus margin of the sampled, delayed loop of the rigid body, the worst of its motions
+        (on springs, without their damping).
 
     Raises
     ------
     AssumptionError
-        When the plant is continuous, or the axes or actuators do not span the rigid-body modes.
+        When the plant is continuous or held, its springs are too stiff for the bandwidth, or the
+        axes or actuators do not span the rigid-body modes.
     LabelError
         When the POI is unknown.
     ModelError
@@ -73,6 +77,7 @@ def design_servo(
     SolverError
         When the rigid-body loop is unstable: the bandwidth is too high for rate and delay.
     """
+    plant = standard_plant(plant)
     poi_port = _poi(plant, poi)
     if not plant.dt:
         raise AssumptionError(
@@ -89,7 +94,9 @@ def design_servo(
     depths = real_array(notches, "notches", (None,)).tolist()
     for name, freq in (("rolloff", corner), ("integrator", slow), *(("notch", f) for f in depths)):
         _below_nyquist(freq, name, rate)
-    decoupling = _decoupling(plant, poi_port)
+    motions = carried_of(plant)
+    require_weak(motions, bandwidth, "a servo")
+    decoupling = _decoupling(plant, poi_port, motions.modes.size)
     axis = _axis_controller(
         float(bandwidth),
         float(corner),
@@ -97,7 +104,7 @@ def design_servo(
         depths,
         rate,
     )
-    certificate = _certified(axis, rate, plant.delay, bandwidth)
+    certificate = _certified(axis, rate, plant.delay, bandwidth, np.unique(motions.freq))
     return Controller(
         _joined(plant, poi_port, axis, decoupling),
         f"servo {bandwidth:g} Hz on {poi_port.name!r}",
@@ -114,17 +121,15 @@ def _below_nyquist(freq: float, name: str, rate: float) -> None:
 
 
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
-    if not isinstance(plant, StandardPlant):
-        raise ModelError(
-            f"need a StandardPlant, got {type(plant).__name__}. "
-            "Make it by assemble_plant(model, ports)."
-        )
     if plant.unweighted is not None:
         raise ModelError(
             "the plant is weighted: a servo acts on physical channels. Use plant.unweighted."
         )
     if plant.ports is None or not plant.ports.z:
-        raise AssumptionError("a servo needs a plant assembled from ports with a POI.")
+        raise AssumptionError(
+            "a servo needs a plant with a POI, assembled from a structure: "
+            "assemble_plant(model, ports)."
+        )
     if name is None and len(plant.ports.z) > 1:
         names = ", ".join(poi.name for poi in plant.ports.z)
         raise LabelError(
@@ -134,14 +139,9 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     return plant.ports.poi(name if name is not None else plant.ports.z[0].name)
 
 
-def _decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
+def _decoupling(plant: StandardPlant, poi: Poi, r: int) -> FloatArray:
     """Return T_u: accelerations of the POI's axes to actuator forces, of least norm."""
     continuous = plant.continuous or plant
-    r = continuous.n_rigid
-    if not r:
-        raise AssumptionError(
-            "the plant has no rigid-body modes to servo: it is constrained. Use design_hinf."
-        )
     continuous.check().require(("stabilisable",), "a servo of the rigid body")
     gain = rigid_gain(plant, [poi.channel(axis) for axis in poi.axes], list(plant.u))
     size = np.linalg.norm(gain, axis=1, keepdims=True)
@@ -174,10 +174,31 @@ def _axis_controller(
     )
 
 
-def _certified(axis: StateSpace, rate: float, delay: float, bandwidth: float) -> dict[str, float]:
-    """Check the loop of one axis with the sampled, delayed double integrator."""
+def _certified(
+    axis: StateSpace, rate: float, delay: float, bandwidth: float, suspensions: FloatArray
+) -> dict[str, float]:
+    """Return radius and margin of the worst axis of the rigid body.
+
+    All axes have the same controller, so that the loop falls apart into those of the body's own
+    motions, whatever the axes: free ones (0 Hz) and suspension modes.
+    """
+    found = [_axis_loop(axis, rate, delay, bandwidth, float(freq)) for freq in suspensions]
+    radius, margin = max(r for r, _ in found), min(m for _, m in found)
+    if not radius < 1.0:
+        raise SolverError(
+            f"the rigid-body loop at {bandwidth:g} Hz is unstable (spectral radius {radius:.6f}): "
+            f"rate {rate:g} Hz and a delay of {delay:g} samples leave too little phase. "
+            "Lower the bandwidth or the delay, or raise the rate or the roll-off."
+        )
+    return {"rigid-body spectral radius": radius, "rigid-body modulus margin": margin}
+
+
+def _axis_loop(
+    axis: StateSpace, rate: float, delay: float, bandwidth: float, suspension: float
+) -> tuple[float, float]:
+    """Return spectral radius and modulus margin with one sampled, delayed axis of the body."""
     body = StateSpace(
-        [[0.0, 1.0], [0.0, 0.0]],
+        [[0.0, 1.0], [-((2.0 * np.pi * suspension) ** 2), 0.0]],
         [[0.0], [1.0]],
         [[-1.0, 0.0]],
         [[0.0]],
@@ -193,13 +214,7 @@ def _certified(axis: StateSpace, rate: float, delay: float, bandwidth: float) ->
         abs(1.0 - (sampled.evaluated(z) @ axis.evaluated(z))[0, 0])
         for z in np.exp(2j * np.pi * freq / rate)
     )
-    if not radius < 1.0:
-        raise SolverError(
-            f"the rigid-body loop at {bandwidth:g} Hz is unstable (spectral radius {radius:.6f}): "
-            f"rate {rate:g} Hz and a delay of {delay:g} samples leave too little phase. "
-            "Lower the bandwidth or the delay, or raise the rate or the roll-off."
-        )
-    return {"rigid-body spectral radius": radius, "rigid-body modulus margin": float(margin)}
+    return radius, float(margin)
 
 
 def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:

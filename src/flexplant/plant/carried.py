@@ -1,0 +1,184 @@
+"""The rigid-body motions of a plant, free or carried by weak springs: by geometry, not by modes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import AssumptionError, FlexplantError, unknown_label
+from ..values import FloatArray, IntArray
+from .body import inertia, rigid_body_of
+from .dynamics import load_of, poi_row, static_gain
+from .ports import Ports, filter_of
+from .realisation import ModalRealisation
+from .standard import StandardPlant
+
+#: part of its kinetic energy that a suspension mode has in rigid-body motion, at least. Springs at
+#: the corners of a plate that put it at 0.4 of its first elastic frequency leave more, a clamped
+#: beam's first mode has 0.990: that one bends
+_RIGID = 0.995
+#: a suspension mode is nothing to a loop whose bandwidth is this factor above
+_WEAK = 3.0
+
+
+class Carried(NamedTuple):
+    """The rigid-body motions that cost no force, or only that of weak springs.
+
+    Parameters
+    ----------
+    shapes : (n, r) array
+        Over the model's DOFs, mass-orthonormal.
+    modes : (r,) array of int
+        Which modes of the realisation they are, from 0: those at 0 Hz, then suspension modes.
+    freq : (r,) array [Hz]
+        Of these modes; 0 of the free ones.
+    """
+
+    shapes: FloatArray
+    modes: IntArray
+    freq: FloatArray
+
+
+def carried(realisation: ModalRealisation) -> Carried:
+    """Return the rigid-body motions of a structure that is free, or on weak springs.
+
+    With R the motions of `rigid_body_of`, m their mass and S = R m^(-1/2), mode i has the part
+    ``tr(S' M G_i M S)`` of its kinetic energy in them, G_i its velocities per impulse. Motions
+    of a structure without springs are its modes at 0 Hz; there may be none of either.
+    """
+    r = realisation.n_rigid
+    place = np.arange(r) * 2
+    swing = realisation.pairs[:r, 0, 1]
+    free = Carried(realisation.outputs[:, place] * swing, np.arange(r), np.zeros(r))
+    try:
+        body = rigid_body_of(realisation)
+    except FlexplantError:  # held, or without a geometry: no rigid-body motion but modes at 0 Hz
+        return free
+    if len(body.axes) <= r:
+        return free
+    root = np.linalg.cholesky(body.mass)
+    shapes = la.solve_triangular(root, body.motions.T, lower=True).T
+    load = inertia(realisation.model, shapes)
+    b = realisation.pairs.shape[0]
+    see = (load.T @ realisation.outputs).reshape(-1, b, 2)
+    push = (load.T @ realisation.inputs).reshape(-1, b, 2)
+    parts = np.einsum("ibk,bkl,jbl->bij", see, realisation.pairs, push)
+    share = np.trace(parts, axis1=1, axis2=2)
+    share[:r] = 1.0
+    modes = np.flatnonzero(share > _RIGID)
+    total = parts[modes].sum(axis=0)
+    values, vectors = np.linalg.eigh(0.5 * (total + total.T))
+    kept = values > _RIGID
+    if modes.size == r or np.count_nonzero(kept) != modes.size:
+        return free
+    if not np.all(kept):
+        shapes = shapes @ vectors[:, kept]
+    size = np.sqrt(np.abs(np.linalg.det(realisation.pairs[modes])))
+    return Carried(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
+
+
+def structure_of(plant: StandardPlant) -> tuple[ModalRealisation, Ports]:
+    """Return a plant's modes and ports.
+
+    Raises
+    ------
+    AssumptionError
+        When it was not assembled from a structure.
+    """
+    if plant.realisation is None or plant.ports is None:
+        raise AssumptionError(
+            "this is for a plant assembled from a free or suspended structure: "
+            "assemble_plant(model, ports)."
+        )
+    return plant.realisation, plant.ports
+
+
+def carried_of(plant: StandardPlant) -> Carried:
+    """Return the rigid-body motions of a plant.
+
+    Raises
+    ------
+    AssumptionError
+        When it was not assembled from a structure, or this is held.
+    """
+    realisation, _ = structure_of(plant)
+    motions = carried(realisation)
+    if not motions.modes.size:
+        raise AssumptionError(
+            "the plant has no rigid-body modes and no suspension modes: it is constrained. This "
+            "is for a free structure, assemble_plant(model, ports), or one on weak springs, "
+            "suspend(model, springs). Use design_hinf with weights of your own for a held one."
+        )
+    return motions
+
+
+def require_weak(motions: Carried, bandwidth: float, what: str) -> None:
+    """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz]."""
+    worst = float(motions.freq.max(initial=0.0))
+    if worst > bandwidth / _WEAK:
+        raise AssumptionError(
+            f"the rigid-body motion is constrained by springs at {worst:.4g} Hz: {what} of "
+            f"{bandwidth:g} Hz takes it for free, which holds for suspension modes up to a third "
+            f"of that, {bandwidth / _WEAK:.4g} Hz. Use softer springs, raise the bandwidth above "
+            f"{_WEAK * worst:.4g} Hz, or use design_hinf with weights of your own."
+        )
+
+
+def seen(plant: StandardPlant, motions: Carried, channels: Sequence[str]) -> FloatArray:
+    """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
+    realisation, ports = structure_of(plant)
+    places = {
+        poi.channel(axis): (1.0, poi_row(realisation, poi, axis))
+        for poi in ports.z
+        for axis in poi.axes
+        if poi.channel(axis) in channels
+    }
+    for s in ports.y:
+        if s.name in channels:
+            gain = static_gain(filter_of(s)) if s.quantity == "displacement" else 0.0
+            places[s.name] = (gain, realisation.row(s.at, s.direction))
+    for name in channels:
+        if name not in places:
+            raise unknown_label("motion of a POI or a sensor", name, list(places))
+    rows = [places[name][0] * (places[name][1] @ motions.shapes) for name in channels]
+    return np.array(rows).reshape(len(rows), motions.shapes.shape[1])
+
+
+def rigid_gain(plant: StandardPlant, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
+    """Return the accelerations at outputs per force at inputs, of the rigid body alone.
+
+    ``rows R m^-1 R' pushes'`` with R the rigid-body motions and m their mass; filters of the ports
+    count with their static gains.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled from a free or suspended structure.
+    outputs, inputs : sequences of str
+        Displacements in z or y; forces in w or u.
+
+    Returns
+    -------
+    (n_out, n_in) array [1/kg and the like]
+
+    Raises
+    ------
+    AssumptionError
+        When the structure is held.
+    LabelError
+        When a name is unknown.
+    """
+    realisation, ports = structure_of(plant)
+    motions = carried_of(plant)
+    forces = {port.name: port for port in ports.forces}
+    for name in inputs:
+        if name not in forces:
+            raise unknown_label("force", name, list(forces))
+    loads = [
+        static_gain(filter_of(forces[name])) * load_of(realisation, forces[name]) for name in inputs
+    ]
+    push = np.array(loads).reshape(len(loads), -1) @ motions.shapes
+    return np.asarray(seen(plant, motions, outputs) @ push.T)

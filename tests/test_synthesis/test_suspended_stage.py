@@ -1,0 +1,219 @@
+"""A stage on weak springs: servo, weights and error measurements by the geometry of its body."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import AssumptionError
+from flexplant.estimation import design_kalman, design_static
+from flexplant.loop import close_loop
+from flexplant.plant import (
+    GroundSpring,
+    Poi,
+    assemble_plant,
+    reference_errors,
+    stage_weights,
+    suspend,
+)
+from flexplant.plant.carried import carried, rigid_gain
+from flexplant.simulation import simulate
+from flexplant.structure import FEModel
+from flexplant.synthesis import design_hinf, design_servo
+from plates import make_plate
+from stages import (
+    AXES,
+    CORNERS,
+    INSET,
+    OFF_NODE,
+    RATE,
+    L,
+    full,
+    ports,
+    reduced,
+    sampled,
+    some_modes,
+)
+
+MASS = L * L * 0.0272 * 2702
+INERTIA = MASS * L * L / 12
+MODELS = [some_modes, reduced, full]
+U = ["u1", "u2", "u3", "u4"]
+Z = ["die:z", "die:rx", "die:ry"]
+
+
+def springs(freq=1.5, zeta=1e-3, points=CORNERS):
+    """Springs in the corners: the bounce at a frequency, the rocking at sqrt(3) times it."""
+    omega = 2 * np.pi * freq
+    k, d = MASS * omega**2 / len(points), 2 * zeta * omega * MASS / len(points)
+    return [GroundSpring(p, k, d) for p in points]
+
+
+@cache
+def held(model=some_modes, freq=1.5, die=(L / 2, L / 2, 0.0), axes=AXES):
+    channels = ports(z=[Poi("die", at=die, axes=axes)])
+    return sampled(suspend(model(), springs(freq)), channels)
+
+
+def newton(die):
+    """Accelerations z, rx, ry at a point per force of each actuator, F = m a of a rigid plate."""
+    p = np.asarray(die[:2]) - L / 2
+    columns = []
+    for place in INSET:
+        x, y = np.asarray(place[:2]) - L / 2
+        rx, ry = y / INERTIA, -x / INERTIA
+        columns.append([1 / MASS + p[1] * rx - p[0] * ry, rx, ry])
+    return np.array(columns).T
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_the_rigid_gain_is_newtons_law_free_partly_and_wholly_suspended(model):
+    line = springs(points=[(L / 2, y, 0.0) for y in (0.1, 0.5)])
+    for die in ((L / 2, L / 2, 0.0), OFF_NODE):
+        wanted = newton(die)
+        for structure, n_rigid in (
+            (model(), 3),
+            (suspend(model(), line), 1),
+            (suspend(model(), springs()), 0),
+        ):
+            plant = sampled(structure, ports(die=die))
+            assert plant.n_rigid == n_rigid
+            found = rigid_gain(plant, Z, U)
+            np.testing.assert_allclose(found, wanted, rtol=1e-6, atol=1e-6 * abs(wanted).max())
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_free_and_suspended_gains_agree_to_rounding(model):
+    """The free one's by its modes at 0 Hz, as ever; the suspended one's by geometry."""
+    plant = sampled(model())
+    g = plant.structural
+    shapes = g.C[:, 0:6:2] * g.A[[0, 2, 4], [1, 3, 5]]
+    modal = shapes[g.output_index(Z)] @ g.B[1:6:2][:, g.input_index(U)]
+    for found in (rigid_gain(plant, Z, U), rigid_gain(held(model), Z, U)):
+        np.testing.assert_allclose(found, modal, rtol=1e-9, atol=1e-9 * abs(modal).max())
+
+
+def test_suspension_modes_are_told_from_those_that_bend():
+    body = carried(held().realisation)
+    np.testing.assert_array_equal(body.modes, [0, 1, 2])
+    np.testing.assert_allclose(body.freq, 1.5 * np.array([1, 3**0.5, 3**0.5]), rtol=1e-4)
+    line = springs(points=[(L / 2, y, 0.0) for y in (0.1, 0.5)])
+    partly = carried(sampled(suspend(some_modes(), line)).realisation)
+    assert partly.freq[0] == 0.0
+    rocking = 1.5 * np.sqrt(MASS * 0.2**2 / INERTIA)
+    np.testing.assert_allclose(np.sort(partly.freq), [0.0, 1.5, rocking], rtol=1e-4)
+    # a plate clamped along an edge bends in its first mode, however much of it moves
+    dofs = make_plate().dofs
+    inner = np.flatnonzero(dofs.xyz[:, 1] > 0)
+    plate = make_plate()
+    M, K = plate.M[inner][:, inner], plate.K[inner][:, inner]
+    clamped = FEModel(M, K, dofs=dofs.select([dofs.labels[i] for i in inner]))
+    channels = ports(
+        u=[], w=ports().w[:1], y=[], references=[], z=[Poi("die", at=clamped.dofs.labels[-3])]
+    )
+    assert not carried(assemble_plant(clamped, channels).realisation).modes.size
+
+
+@cache
+def loops(model):
+    free, soft = sampled(model()), held(model)
+    found = []
+    for plant in (free, soft):
+        servo = design_servo(plant, bandwidth=50.0)
+        found.append((servo, close_loop(plant, design_kalman(plant), servo)))
+    return found
+
+
+def test_the_servo_is_the_free_ones_and_its_loop_too():
+    (free, free_loop), (soft, soft_loop) = loops(some_modes)
+    for name in "ABCD":
+        wanted = getattr(free.system, name)
+        np.testing.assert_allclose(
+            getattr(soft.system, name), wanted, atol=1e-9 * max(abs(wanted).max(), 1e-300)
+        )
+    assert soft_loop.spectral_radius < 1
+    margin = "rigid-body modulus margin"
+    assert soft.certificate[margin] == pytest.approx(free.certificate[margin], rel=2e-2)
+    assert soft.certificate[margin] != free.certificate[margin]
+    assert soft_loop.modulus_margin == pytest.approx(free_loop.modulus_margin, rel=5e-2)
+
+
+def test_the_error_settles_on_springs():
+    """After a step of the reference, integral action holds the body against its springs."""
+    for _, loop in loops(some_modes):
+        run = simulate(loop, reference=1e-6, duration=2.0, noise=False)
+        error = run["die:error"]
+        assert abs(error[0]) > 0.9e-6
+        assert np.abs(error[-100:]).max() < 2e-9
+
+
+def test_the_loop_of_the_dense_rigid_plate_on_springs():
+    """The certificate against eigenvalues of a rigid plate with springs, held and late."""
+    from oracles_plant import hold
+
+    servo = design_servo(held(freq=4.0), bandwidth=50.0)
+    gain = newton((L / 2, L / 2))
+    omega = 2 * np.pi * 4.0 * np.array([1, 3**0.5, 3**0.5])
+    A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag(omega**2), np.zeros((3, 3))]])
+    Ad, Bd = hold(A, np.vstack([np.zeros((3, 4)), gain]), 1 / RATE)
+    P = np.block([[Ad, Bd], [np.zeros((4, 10))]])
+    B = np.vstack([np.zeros((6, 4)), np.eye(4)])
+    C = np.hstack([np.eye(3), np.zeros((3, 7))])
+    g = servo.system
+    Bc, Dc = g.B[:, 1:], g.D[:, 1:]
+    loop = np.block([[P + B @ Dc @ C, B @ g.C], [Bc @ C, g.A]])
+    radius = np.abs(np.linalg.eigvals(loop)).max()
+    assert servo.certificate["rigid-body spectral radius"] == pytest.approx(radius, abs=1e-5)
+    assert radius < 1
+
+
+def test_springs_that_are_not_weak_beside_the_bandwidth_are_refused():
+    plant = held(freq=4.0)  # rocks at 6.93 Hz
+    assert design_servo(plant, bandwidth=21.0).certificate
+    for call, what in (
+        (lambda: design_servo(plant, bandwidth=20.0), "a servo of 20 Hz"),
+        (lambda: stage_weights(plant, 20.0), "a set of weights of 20 Hz"),
+    ):
+        with pytest.raises(AssumptionError, match=rf"6\.927 Hz: {what}.*bandwidth above 20\.78 Hz"):
+            call()
+    stiff = sampled(suspend(full(), [GroundSpring(p, 1e9) for p in CORNERS]))
+    for call in (
+        lambda: design_servo(stiff, bandwidth=50.0),
+        lambda: stage_weights(stiff, 50.0),
+        lambda: reference_errors(stiff),
+    ):
+        with pytest.raises(AssumptionError, match=r"no suspension modes: it is constrained.*Use"):
+            call()
+
+
+@pytest.mark.parametrize("die", [(L / 2, L / 2, 0.0), OFF_NODE])
+def test_error_measurements_and_the_static_relation_are_the_free_ones(die):
+    free = sampled(some_modes(), ports(die=die))
+    soft = held(die=die)
+    for design in (lambda p: reference_errors(p).D, lambda p: design_static(p).system.D):
+        np.testing.assert_allclose(design(soft), design(free), atol=1e-9)
+
+
+def test_the_static_relation_predicts_the_same_rms_on_springs():
+    free, soft = design_static(sampled(some_modes())), design_static(held())
+    assert soft.rms("die") == pytest.approx(free.rms("die"), rel=5e-3)
+
+
+def test_weights_of_a_suspended_stage_are_the_free_ones_and_its_hinf_loop():
+    free = sampled(some_modes(count=6, attached=False))
+    soft = sampled(suspend(some_modes(count=6, attached=False), springs()))
+    gammas = []
+    for plant in (free, soft):
+        weights = stage_weights(plant, 30.0)
+        errors = reference_errors(plant)
+        found = design_hinf(plant.through(errors).weighted(z=weights.z, w=weights.w))
+        loop = close_loop(plant, errors, found)
+        assert loop.spectral_radius < 1
+        gammas.append((found.gamma, weights.w["amp1"], loop.modulus_margin))
+    np.testing.assert_allclose(gammas[1][1], gammas[0][1], rtol=1e-9)
+    np.testing.assert_allclose(gammas[1], gammas[0], rtol=0.05)
+
+
+def test_axes_that_do_not_span_the_suspended_body():
+    with pytest.raises(AssumptionError, match="3 rigid-body modes"):
+        design_servo(held(axes=AXES[:2]), bandwidth=50.0)
