@@ -15,7 +15,7 @@ from .dynamics import load_of
 from .forces import Actuator
 from .ports import Ports, Sensor, filter_of
 from .realisation import ModalRealisation
-from .standard import StandardPlant
+from .standard import StandardPlant, standard_plant
 
 #: relative: what the sensors show or the actuators push of other axes
 _CLEAN = 1e-6
@@ -100,7 +100,8 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     ModelError
         When the plant was not assembled from a structure, or it is held.
     """
-    if not isinstance(plant, StandardPlant) or plant.realisation is None or plant.ports is None:
+    plant = standard_plant(plant)
+    if plant.realisation is None or plant.ports is None:
         raise ModelError(
             "decoupling needs a plant assembled from a structure: assemble_plant(model, ports)."
         )
