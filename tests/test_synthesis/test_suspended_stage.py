@@ -9,6 +9,7 @@ from flexplant.errors import AssumptionError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
 from flexplant.plant import (
+    Actuator,
     GroundSpring,
     Poi,
     assemble_plant,
@@ -112,6 +113,29 @@ def test_suspension_modes_are_told_from_those_that_bend():
         u=[], w=ports().w[:1], y=[], references=[], z=[Poi("die", at=clamped.dofs.labels[-3])]
     )
     assert not carried(assemble_plant(clamped, channels).realisation).modes.size
+
+
+def test_a_door_on_a_weak_spring_has_one_motion():
+    """Hinged along an edge: of three motions of a free plate one combination is left."""
+    plate = make_plate()
+    dofs, kinds = plate.dofs, np.array(plate.dofs.directions)
+    inner = np.flatnonzero((dofs.xyz[:, 1] > 0) | (kinds == "rx"))
+    M, K = plate.M[inner][:, inner], plate.K[inner][:, inner]
+    door = FEModel(M, K, dofs=dofs.select([dofs.labels[i] for i in inner]))
+    die, *pushed = (dofs.nearest(place, "z") for place in ((L / 2, L / 2, 0.0), *INSET))
+    channels = ports(
+        w=[], y=[], references=[], z=[Poi("die", at=die, axes=("rx",))],
+        u=[Actuator(f"u{i}", at=label) for i, label in enumerate(pushed, 1)],
+    )  # fmt: skip
+    inertia = MASS * L**2 / 3
+    wanted = [[place[1] / inertia for place in INSET]]
+    stiffness = inertia * (2 * np.pi * 2.0) ** 2 / (2 * L**2)
+    held = [GroundSpring(dofs.nearest(place, "z"), stiffness) for place in CORNERS[2:]]
+    for model, freq in ((door, 0.0), (suspend(door, held), 2.0)):
+        plant = assemble_plant(model, channels)
+        assert plant.n_rigid == (freq == 0)
+        np.testing.assert_allclose(carried(plant.realisation).freq, [freq], rtol=1e-3)
+        np.testing.assert_allclose(rigid_gain(plant, ["die:rx"], U), wanted, rtol=1e-3)
 
 
 @cache
