@@ -49,7 +49,7 @@ def answer(
         large = np.argmax(np.abs(raw), axis=0)
         columns = np.arange(fit.poles.size)
         factor = np.abs(shapes[large, columns] / raw[large, columns]) ** 2
-        doubt = _shape_covariance(fit) * factor[:, None, None] * max(1.0, misfit)
+        doubt = _shape_covariance(fit, ready.correlation) * factor[:, None, None] * max(1.0, misfit)
         doubt = doubt[inside]
     return IdentifiedModes(
         fit.poles[inside],
@@ -97,19 +97,44 @@ def _covariance(fit: Fit, ready: Prepared) -> FloatArray:
     return np.asarray((chosen + chosen.T) / 2)
 
 
-def _shape_covariance(fit: Fit) -> ComplexArray:
-    """Return E[n n^H] (m, n_out, n_out) of the errors n of each shape."""
+def _shape_covariance(fit: Fit, correlation: ComplexArray | None) -> ComplexArray:
+    r"""Return E[n n^H] (m, n_out, n_out) of the errors n of each shape.
+
+    With poles and participation theta, the error of the shape at output a is
+    ``S_a d theta + D_a^T e_a``, ``d theta = N^{-1} sum_b J_b^T e_b``; D_a and J_a are orthogonal,
+    so that the two are independent unless outputs share errors. Noise that acts on the machine
+    is shared: near a resonance it moves all outputs along the shape, which is scale.
+    """
     m, n_out = fit.poles.size, len(fit.shape_maps)
     size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
     inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
     slopes = np.array([slope for slope, _ in fit.shape_maps]).reshape(n_out, 2, m, -1)
-    held = np.array([own for _, own in fit.shape_maps]).reshape(n_out, 2, m, 2, m)
+    direct = [own.reshape(-1, 2 * m) for _, own in fit.shape_maps]
+    common, mixed = inverse, np.zeros((n_out, inverse.shape[0], 2 * m))
+    held = np.zeros((n_out, n_out, 2 * m, 2 * m))
+    if correlation is None:
+        for a, own in enumerate(direct):
+            held[a, a] = (own.conj().T @ own).real
+    else:
+        gains = [J.reshape(-1, inverse.shape[0]) @ inverse for J in fit.jacobian]
+        common = np.zeros_like(inverse)
+        repeats = fit.model.shape[1]
+        for a in range(n_out):
+            for b in range(n_out):
+                shared = np.tile(correlation[a, b], repeats)[:, None]
+                other = shared * direct[b]
+                common = common + (gains[a].conj().T @ (shared * gains[b])).real
+                mixed[b] += (gains[a].conj().T @ other).real
+                held[a, b] = (direct[a].conj().T @ other).real
+    mixed = mixed.reshape(n_out, -1, 2, m)
+    held = held.reshape(n_out, n_out, 2, m, 2, m)
     found = np.zeros((m, n_out, n_out), dtype=np.complex128)
-    outputs = np.arange(n_out)
     for k in range(m):
-        # errors of poles and participation are common to all outputs, the others their own
-        S = np.einsum("oap,pq,ebq->oaeb", slopes[:, :, k], inverse, slopes[:, :, k])
-        S[outputs, :, outputs, :] += held[:, :, k, :, k]
+        slope = slopes[:, :, k]
+        S = np.einsum("oap,pq,ebq->oaeb", slope, common, slope, optimize=True)
+        cross = np.einsum("oap,epb->oaeb", slope, mixed[..., k])
+        S += cross + cross.transpose(2, 3, 0, 1)
+        S += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
     return np.asarray((found + found.conj().transpose(0, 2, 1)) / 2)
 

@@ -48,8 +48,9 @@ class IdentifiedModes(MeasuredModes):
     diagram : StabilisationDiagram, optional
         The poles were chosen from.
     shape_covariance : (m, n_out, n_out) complex array, optional
-        E[n n^H] of the error n of each shape at its scale, from the FRF's variance, errors of
-        different outputs independent; not known where there are fewer outputs than inputs.
+        E[n n^H] of the error n of each shape at its scale, from the FRF's variance and the
+        correlation of its outputs' errors (where not known, they are taken for independent); not
+        known where there are fewer outputs than inputs.
     """
 
     participation: ComplexArray = field(kw_only=True)

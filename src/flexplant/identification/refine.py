@@ -44,7 +44,7 @@ class Fit:
     jacobian: list[ComplexArray]  # per output (n_in, n_freq, n_parameters)
     model: ComplexArray  # the fitted responses
     settled: bool = True
-    shape_maps: tuple[tuple[FloatArray, FloatArray], ...] = ()  # see _Projected.shape_maps
+    shape_maps: tuple[tuple[FloatArray, ComplexArray], ...] = ()  # see _Projected.shape_maps
 
 
 def refined(
@@ -156,8 +156,9 @@ class _Projected:
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
         self.terms = np.zeros((n_out, n_in, smooth.shape[0]))
         self.model = np.zeros_like(lines.data)
-        #: per output, d[Re psi; Im psi]/d(poles, participation) and the covariance with these held
-        self.shape_maps: list[tuple[FloatArray, FloatArray]] = []
+        #: per output, d[Re psi; Im psi]/d(poles, participation) and, with these held, its rows
+        #: by the weighted data, (n_in, n_freq, 2 m)
+        self.shape_maps: list[tuple[FloatArray, ComplexArray]] = []
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
         self.bases: list[tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]] = []
         self.linear: list[tuple[FloatArray, FloatArray, float]] = []
@@ -221,13 +222,14 @@ class _Projected:
                         place = 2 + 2 * (i - (i > self.pivots[k]))
                         parts[place, k] = c[k] + d[k]
                         parts[place + 1, k] = 1j * (c[k] - d[k])
-                rows = _real(parts.reshape(count, n_freq) * w).T
-                blocks.append(_off(smooth_bases[i], rows))
+                columns = _real(parts.reshape(count, n_freq) * w).T
+                blocks.append(_off(smooth_bases[i], columns))
             J = np.concatenate(blocks)
             R, size = self.triangles[o]
             inverse = la.pinv(R, rtol=1e-13) / size[:, None]
             common = Q.T @ J
-            self.shape_maps.append((-inverse @ common, inverse @ inverse.T))
+            rows = (Q @ inverse.T).reshape(n_in, 2, n_freq, 2 * self.m)
+            self.shape_maps.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
             J -= Q @ common
             N += J.T @ J
             g += J.T @ error
