@@ -256,3 +256,21 @@ def test_h2_needs_as_many_outputs_as_inputs():
     for method in (H1, H2, Hv):
         frf = estimate_frf(u, mix @ u, RATE, method=method(segment=0.1))
         assert np.abs(frf.data - mix[:, :, None]).max() < 1e-6
+
+
+@pytest.mark.parametrize("periods", [2, 3, 4, 7])
+def test_drift_between_periods_is_not_taken_for_more_noise_than_it_makes(periods):
+    """A random walk leaks into all lines, of the mean of P periods with 1/P^2 of its power."""
+    rng = np.random.default_rng(periods)
+    score = []
+    for _ in range(20):
+        u = multisine(1, rate=400.0, period=1.0, periods=periods, rng=rng)
+        y = u + 0.01 * np.cumsum(rng.normal(size=u.shape), axis=2)
+        frf = estimate_frf(u, y, 400.0, method=Periodic(period=1.0, discard=0))
+        assert frf.freq.size == 199
+        assert np.all((frf.coherence >= 0) & (frf.coherence < 1))
+        # pooled over measurements: one has few degrees of freedom
+        score.append([np.abs(frf.data - 1).ravel() ** 2, frf.variance.ravel()])
+    error, said = np.mean(score, axis=0)
+    high = slice(20, None)
+    assert np.mean(error[high] / np.mean(said[high])) == pytest.approx(1.0, abs=0.35)

@@ -154,11 +154,31 @@ def test_a_measured_frf_is_the_truths_within_noise():
         gaps.append(np.abs(frf.data[:, :, at] - wanted).max(axis=(0, 1)) / size)
         assert frf.inputs == tuple(U)
         assert frf.outputs == tuple(Y)
+        seen = 1 - np.median(frf.coherence)
+        assert 0 < seen < {10.0: 1e-2, 100.0: 1e-4}[amplitude]
     # 1e-3 N/sqrt(Hz) against 10 N rms over 500 lines: per cent, most where G is small (3 kHz)
     assert np.all(gaps[0] < [0.04, 0.03, 0.03, 0.1, 0.04, 0.1, 0.05, 0.25])
     np.testing.assert_allclose(gaps[0] / gaps[1], 10.0, rtol=0.1)
     thick = held_response(truth(0.01, 0.0272 * 1.01), LINES)
     assert np.abs((thick - wanted) / size).max() > 0.2
+
+
+@pytest.mark.slow
+def test_what_changes_between_periods_is_the_doubt():
+    """The machine drifts, and drift leaks: the spread of single periods says six times too much."""
+    quiet_sensors = ports(sensor_asd=1e-14)
+    frf = stage(0.01).measure_frf(quiet_sensors, period=0.1, periods=6, discard=19, rng=4)
+    at = np.flatnonzero((frf.freq > 100.0) & (frf.freq < 3000.0))[::6]
+    error = frf.data[:, :, at] - held_response(truth(0.01), frf.freq[at])
+    score = np.abs(error) ** 2 / frf.variance[:, :, at]
+    print(f"squared error per variance {score.mean():.3f}")
+    assert 0.85 < score.mean() < 1.15
+    # errors of outputs that move together
+    e = error / np.sqrt(frf.variance[:, :, at])
+    together = np.einsum("aif,bif->ab", e, e.conj()) / np.einsum("aif->a", np.abs(e) ** 2)[:, None]
+    said = frf.correlation[:, :, at].mean(axis=2)
+    assert np.abs(together - said).max() < 0.15
+    assert np.abs(said - np.eye(len(Y))).max() > 0.3
 
 
 @pytest.mark.slow
@@ -172,6 +192,7 @@ def test_a_frf_without_noise_is_exact():
     assert gap.max() < 1e-6
     again = stage(0.01).measure_frf(quiet, period=0.1, periods=1, discard=29, rng=1)
     np.testing.assert_array_equal(again.data, frf.data)
+    assert frf.variance is frf.coherence is frf.correlation is None  # one period says nothing
 
 
 @pytest.mark.slow

@@ -15,6 +15,8 @@ from .spectra import error_statistics
 
 #: a line counts as excited when the weakest direction of the inputs is not this much below the rest
 EXCITED = 1e-3
+#: share of an output's power that is rounding, not noise
+ROUNDING = 1e-28
 
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
@@ -48,11 +50,13 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
     r"""Return ``G = Y X^H (U X^H)^-1`` from the mean periods; X is U, or R of a reference.
 
     With one experiment per input this is Y U^-1. Noise e = y - G u is what changes between
-    periods; its spectrum C_e gives the variance of every entry,
+    periods. It is read off the lines of all P periods together that lie between those of one,
+    where periodic signals have nothing; the mean C_e of the P - 1 nearest gives the variance
 
-    .. math:: \sigma^2_{oi} = \frac{[C_e]_{oo}}{P}\,\bigl[(U U^H)^{-1}\bigr]_{ii}
+    .. math:: \sigma^2_{oi} = [C_e]_{oo}\,\bigl[(U U^H)^{-1}\bigr]_{ii}
 
-    (Pintelon and Schoukens 2012, sec. 2.7).
+    (Pintelon and Schoukens 2012, sec. 2.7). A drift leaks as much into these as into the mean;
+    into the spectrum of each period up to P times more, in power.
     """
     n_exp, n_in, n_time = data.u.shape
     samples = round(method.period * data.rate)
@@ -72,52 +76,87 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
             f"{n_exp} experiments cannot tell {n_in} periodic inputs apart: make one per input, "
             "with the phases of `multisine`."
         )
-    Y, U = _spectra(data.y, samples, periods), _spectra(data.u, samples, periods)
+    Y, U = (line_spectra(side, samples, periods) for side in (data.y, data.u))
     lines = np.arange(1, (samples + 1) // 2)
     freq = lines / method.period
-    keep = _excited(U if data.r is None else _spectra(data.r, samples, periods))
+    X = U if data.r is None else line_spectra(data.r, samples, periods)
+    keep = _excited(X)
     if method.band is not None:
         keep &= (freq >= method.band[0]) & (freq <= method.band[1])
     if not np.any(keep):
         raise ModelError("no line is excited in all directions of the inputs: check the records.")
-    Y, U = Y[..., keep], U[..., keep]
-    y, u = _mean(Y), _mean(U)
-    x = u if data.r is None else _mean(_spectra(data.r, samples, periods)[..., keep])
+    return frf_of_periods(
+        freq[keep],
+        Y[..., keep],
+        U[..., keep],
+        X[..., keep],
+        periods,
+        inputs=data.inputs,
+        outputs=data.outputs,
+        quantity=quantity,
+    )
+
+
+def frf_of_periods(
+    freq: FloatArray,
+    Y: ComplexArray,
+    U: ComplexArray,
+    X: ComplexArray,
+    periods: int,
+    *,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    quantity: str | None,
+) -> Frf:
+    """Return ``Y X^H (U X^H)^-1`` of `line_spectra` with its variance, correlation, coherence."""
+    n_in = U.shape[1]
+    y, u, x = _mean(Y), _mean(U), _mean(X)
     xh = x.conj().transpose(0, 2, 1)
     back = u @ xh
     G: Any = np.linalg.solve(back.transpose(0, 2, 1), (y @ xh).transpose(0, 2, 1))
     G = G.transpose(0, 2, 1)
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
-    left, freedom = _noise(Y, U, y, u, G)
+    left, freedom = _noise(Y, U, G, periods)
     if freedom > 0:
         # the excitation's part of the inputs: U X^H (X X^H)^-1 X U^H
         inverse: Any = np.linalg.inv(back @ np.linalg.solve(x @ xh, back.conj().transpose(0, 2, 1)))
         variance, correlation = error_statistics(left, inverse)
-        if not np.all(variance > 0):
+        power = np.mean(np.abs(Y[:, :, 0]) ** 2, axis=(0, 2))
+        if not np.all(np.einsum("foo->fo", left).real > ROUNDING * power):
             variance = correlation = None  # no noise at all: nothing to weight by
     return Frf(
-        freq[keep],
+        freq,
         G.transpose(1, 2, 0),
-        inputs=data.inputs,
-        outputs=data.outputs,
+        inputs=inputs,
+        outputs=outputs,
         quantity=quantity,
-        coherence=_coherence(Y, left, periods, n_in) if variance is not None else None,
+        coherence=_coherence(y, left, periods, n_in) if variance is not None else None,
         variance=variance,
         correlation=correlation,
     )
 
 
-def _spectra(signals: FloatArray, samples: int, periods: int) -> ComplexArray:
-    """Return the spectra (n_exp, n_channel, periods, lines) of the last periods."""
-    tail = signals[:, :, signals.shape[2] - periods * samples :]
-    cut = tail.reshape(*signals.shape[:2], periods, samples)
-    return np.asarray(np.fft.rfft(cut, axis=3)[..., 1 : (samples + 1) // 2])
+def offsets(periods: int) -> tuple[Any, FloatArray]:
+    """Return offsets j of lines kP + j, zero first, and how much each counts for the noise at k."""
+    near = np.arange(1, periods // 2 + 1)
+    # half way to the next line of a period: each has half of it
+    weight = np.where(2 * near == periods, 0.5, 1.0)
+    both = np.concatenate([[0], near, -near])
+    return both, np.concatenate([[0.0], weight, weight])
+
+
+def line_spectra(signals: FloatArray, samples: int, periods: int) -> ComplexArray:
+    """Return spectra (..., n_offset, lines) of the last periods at and around lines of one."""
+    tail = signals[..., signals.shape[-1] - periods * samples :]
+    lines = np.arange(1, (samples + 1) // 2)
+    full = np.fft.rfft(tail, axis=-1) / periods
+    return np.asarray(full[..., periods * lines + offsets(periods)[0][:, None]])
 
 
 def _mean(spectra: ComplexArray) -> ComplexArray:
-    """Return means over periods (lines, n_channel, n_exp)."""
-    return np.asarray(spectra.mean(axis=2).transpose(2, 1, 0))
+    """Return those of the mean period (lines, n_channel, n_exp)."""
+    return np.asarray(spectra[:, :, 0].transpose(2, 1, 0))
 
 
 def _excited(spectra: ComplexArray) -> Any:
@@ -126,25 +165,23 @@ def _excited(spectra: ComplexArray) -> Any:
 
 
 def _noise(
-    Y: ComplexArray, U: ComplexArray, y: ComplexArray, u: ComplexArray, G: ComplexArray
+    Y: ComplexArray, U: ComplexArray, G: ComplexArray, periods: int
 ) -> tuple[ComplexArray, int]:
     """Return the noise spectrum of a mean period (lines, n_out, n_out) and its freedom."""
-    n_exp, periods, n_in = Y.shape[0], Y.shape[2], U.shape[1]
-    if periods > 1:
-        e = Y - np.einsum("foi,eipf->eopf", G, U)
-        e = e - e.mean(axis=2, keepdims=True)
-        freedom = n_exp * (periods - 1)
-        return np.einsum("eapf,ebpf->fab", e, e.conj()) / (freedom * periods), freedom
-    error = y - G @ u
-    freedom = n_exp - n_in
-    return error @ error.conj().transpose(0, 2, 1) / max(freedom, 1), freedom
+    n_exp, n_in = Y.shape[0], U.shape[1]
+    e = Y - np.einsum("foi,eipf->eopf", G, U)
+    weight, freedom = offsets(periods)[1], n_exp * (periods - 1)
+    if periods == 1:
+        weight, freedom = np.ones(1), n_exp - n_in
+    left = np.einsum("p,eapf,ebpf->fab", weight, e, e.conj(), optimize=True)
+    return np.asarray(left / max(freedom, 1)), freedom
 
 
-def _coherence(Y: ComplexArray, left: ComplexArray, periods: int, n_in: int) -> FloatArray:
+def _coherence(y: ComplexArray, left: ComplexArray, periods: int, n_in: int) -> FloatArray:
     """Return the share of the outputs' power in a period that is not noise."""
-    power = np.mean(np.abs(Y) ** 2, axis=(0, 2))
-    noise = np.einsum("foo->of", left).real * periods
-    coherence = np.clip(1.0 - noise / np.maximum(power, 1e-300), 0.0, 1.0)
+    noise = np.einsum("foo->of", left).real
+    power = np.mean(np.abs(y) ** 2, axis=2).T + (periods - 1) * noise
+    coherence = np.clip(1.0 - periods * noise / np.maximum(power, 1e-300), 0.0, 1.0)
     return np.repeat(coherence[:, None, :], n_in, axis=1)
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from ..errors import ModelError, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes
+from ..identification.periodic import frf_of_periods, line_spectra, offsets
 from ..loop import ClosedLoop, close_loop
 from ..lti.frequency import Frf
 from ..plant import Disturbance, Poi, Ports, StandardPlant, assemble_plant
@@ -231,7 +232,9 @@ class WaferStage(Value):
         Returns
         -------
         Frf
-            Of the plant with its zero-order hold, without the delay; zero frequency left out.
+            Of the plant with its zero-order hold, without the delay; zero frequency left out. With
+            two periods or more, what changes between them gives coherence, variance and
+            correlation.
 
         Raises
         ------
@@ -260,9 +263,11 @@ class WaferStage(Value):
         lines = np.arange(1, samples // 2)
         spectrum = np.exp(2j * np.pi * random.random(lines.size)) * np.sqrt(samples / 2.0)
         turns = np.exp(2j * np.pi * np.outer(np.arange(count), np.arange(count)) / count)
-        forces = np.zeros((count, count, lines.size), dtype=np.complex128)
-        motions = np.zeros((len(ports.y), count, lines.size), dtype=np.complex128)
-        lag = np.exp(-2j * np.pi * lines * self.delay / samples)
+        near = offsets(periods)[0][:, None] / periods
+        lag = np.exp(-2j * np.pi * (lines + near) * self.delay / samples)
+        shaken = np.zeros((count, count, *lag.shape), dtype=np.complex128)
+        forces = np.zeros_like(shaken)
+        motions = np.zeros((count, len(ports.y), *lag.shape), dtype=np.complex128)
         for experiment in range(count):
             waves = _multisine(spectrum[None, :] * turns[:, experiment, None], lines, samples)
             waves = positive(amplitude, "amplitude") * waves
@@ -273,15 +278,19 @@ class WaferStage(Value):
                 duration=(periods + discard) * samples / self.rate,
                 rng=int(random.integers(2**63)),
             )
-            commands = np.array([_lines(run[a.name], samples, periods, lines) for a in ports.u])
-            shaken = np.array([_lines(wave, samples, periods, lines) for wave in signal])
-            forces[:, experiment] = shaken + lag * commands
-            motions[:, experiment] = [_lines(run[s.name], samples, periods, lines) for s in ports.y]
+            sent, seen = ([run[port.name] for port in side] for side in (ports.u, ports.y))
+            commands, motions[experiment], shaken[experiment] = (
+                line_spectra(np.array(part), samples, periods)[..., : lines.size]
+                for part in (sent, seen, signal)
+            )
+            forces[experiment] = shaken[experiment] + lag * commands
         kinds = {sensor.quantity for sensor in ports.y}
-        data: Any = np.linalg.solve(forces.transpose(2, 1, 0), motions.transpose(2, 1, 0))
-        return Frf(
+        return frf_of_periods(
             lines / period,
-            data.transpose(2, 1, 0),
+            motions,
+            forces,
+            shaken,
+            periods,
             inputs=tuple(port.name for port in ports.u),
             outputs=tuple(port.name for port in ports.y),
             quantity=kinds.pop() if len(kinds) == 1 else None,
@@ -310,9 +319,3 @@ def _multisine(spectrum: Any, lines: Any, samples: int) -> FloatArray:
     full[:, lines] = spectrum
     waves = np.fft.irfft(full, samples)
     return np.asarray(waves / np.sqrt(np.mean(waves**2, axis=1, keepdims=True)))
-
-
-def _lines(signal: FloatArray, samples: int, periods: int, lines: Any) -> Any:
-    """Return the spectrum at the lines of the mean of the last periods."""
-    tail = np.asarray(signal)[-periods * samples :].reshape(periods, samples).mean(axis=0)
-    return np.fft.rfft(tail)[lines]
