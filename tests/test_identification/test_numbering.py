@@ -49,6 +49,15 @@ def test_shapes_decide_where_frequencies_would_mislead():
     assert numbered(bare, modes(), tolerance=0.5).modes == (5, 4)
 
 
+@pytest.mark.parametrize("mix", [0.0, 0.3, np.pi / 4, 1.2, np.pi / 2, 2.0])
+@pytest.mark.parametrize("numbers", [(7, 8), (8, 7)])
+def test_a_repeated_pair_that_split_is_numbered_by_frequency(mix, numbers):
+    """A mass splits a pair: any shapes of the span, the lower pole is the lower number."""
+    found = answer([*numbers, 4], mix=mix)
+    poles = found.poles * np.array([0.975, 0.96, 1.0])
+    assert numbered(found.replace(poles=poles), modes()).modes == (8, 7, 4)
+
+
 def test_poles_without_partner_are_refused_or_left_out():
     good = answer([4, 6])
     stranger = MeasuredModes(

@@ -34,7 +34,7 @@ def numbered(
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
     over the measured DOFs; for repeated modes of the model (within 0.5 %) it is the MAC with the
-    nearest shape of their span.
+    nearest shape of their span, which cannot tell them apart: they are numbered by frequency.
 
     Parameters
     ----------
@@ -102,9 +102,21 @@ def numbered(
             f"{alike[worst, int(np.argmin(distance[worst]))]:.2f}. Add modes to the model, loosen "
             "tolerance=, or leave these poles out with partial=True."
         )
+    _in_order(pairs, measured.freq, modes.omega)
     kept = sorted(pairs)
     chosen = measured if len(kept) == len(measured) else measured.select(kept)
     return chosen.replace(modes=tuple(pairs[i] for i in kept))
+
+
+def _in_order(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> None:
+    """Give the numbers of each family of modes to its poles by frequency; rounding chose else."""
+    free = sorted(pairs, key=lambda i: pairs[i])
+    while free:
+        first = pairs[free[0]] - 1
+        family = [i for i in free if omega[pairs[i] - 1] <= omega[first] * (1.0 + FAMILY)]
+        free = free[len(family) :]
+        numbers = [pairs[i] for i in family]
+        pairs.update(zip(sorted(family, key=lambda i: float(freq[i])), numbers, strict=True))
 
 
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
