@@ -48,8 +48,9 @@ def z_scores(found, truth):
 
 
 def test_close_and_repeated_modes_with_rigid_body_motion():
-    frf = measured()
-    found = identify_modes(frf, orders=ORDERS, dofs={"u1": "7:z", "y1": "7:z", "y2": "9:z"})
+    freq = np.arange(30.0, 180.0, 0.2)
+    frf = measured(freq=freq)
+    found = identify_modes(frf, orders=range(2, 25), dofs={"u1": "7:z", "y1": "7:z", "y2": "9:z"})
     assert isinstance(found, MeasuredModes)
     assert len(found) == 7
     order = np.array([0, 1, 2, 3, *(4 + np.argsort(np.abs(found.poles[4:6] - CLOSE[4]))), 6])
@@ -65,7 +66,7 @@ def test_close_and_repeated_modes_with_rigid_body_motion():
     for k in (4, 5):
         unit = found.shapes[:, k] / np.linalg.norm(found.shapes[:, k])
         assert np.linalg.norm(span.T @ unit) ** 2 > 0.999
-    rest = np.abs(found.frf(FREQ).data - frf.data) / np.sqrt(frf.variance)
+    rest = np.abs(found.frf(freq).data - frf.data) / np.sqrt(frf.variance)
     assert np.sqrt(np.mean(rest**2)) < 1.05
 
 
@@ -431,7 +432,7 @@ def test_bad_frfs_are_refused():
 
 
 def test_bad_choices_are_refused():
-    diagram = stabilisation_diagram(measured(), orders=ORDERS)
+    diagram = stabilisation_diagram(measured(), orders=range(2, 9))
     with pytest.raises(ModelError, match="within 3 %"):
         diagram.select(freq=[75.0])
     with pytest.raises(ModelError, match="at least one"):
@@ -445,7 +446,7 @@ def test_bad_choices_are_refused():
 
 
 def test_identified_response_is_asked_at_positive_frequencies():
-    found = identify_modes(measured(CLOSE[:2], PHI[:, :2], n_in=2), orders=ORDERS)
+    found = identify_modes(measured(CLOSE[:2], PHI[:, :2], n_in=2), orders=range(2, 12))
     assert isinstance(found, IdentifiedModes)
     with pytest.raises(ModelError, match="positive"):
         found.frf(np.array([0.0, 1.0]))
