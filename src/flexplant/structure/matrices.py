@@ -361,7 +361,8 @@ class FEMatrices(Value):
         if self.dofs is None:
             raise ModelError(
                 f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
-                "coordinates. with_dofs(DofSet(nodes, directions, xyz)) tells it, or dofs= of read_model."
+                "coordinates. with_dofs(DofSet(nodes, directions, xyz)) tells it, or dofs= of "
+                "read_model."
             )
         ready = self
         if not isinstance(free, bool | np.bool_):
