@@ -26,6 +26,8 @@ _GAP, _GAP_ROUNDINGS = 1e-8, 4.0
 _MOST = 2000
 #: roundings in the strain energy of an elastic mode below which omega^2 is none
 _ROUNDING = 30 * float(np.finfo(np.float64).eps)
+#: rows that are mixed at a time
+_ROWS = 65536
 #: searches with what is found locked, before giving up
 _SEARCHES = 8
 #: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
@@ -124,7 +126,7 @@ def _counted(
 
 def _rounding(model: FEModel, phi: FloatArray) -> float:
     """Return the rounding in ``phi' K phi``: of the sum of what cancels in it."""
-    return _ROUNDING * float(np.abs(phi) @ (abs(by_rows(model.K)) @ np.abs(phi)))
+    return _ROUNDING * float(np.abs(phi) @ (_absolute(by_rows(model.K)) @ np.abs(phi)))
 
 
 def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
@@ -167,15 +169,25 @@ def _ritz_residual(M: Any, K: Any, phi: FloatArray, asked: int) -> tuple[FloatAr
     """
     force, mass = K @ phi, M @ phi
     squares, mix = la.eigh(_even(phi.T @ force), _even(phi.T @ mass))
-    mine = np.ascontiguousarray(mix[:, :asked])
-    force, mass = force @ mine, mass @ mine
+    force, mass = _mixed(force, mix[:, :asked]), _mixed(mass, mix[:, :asked])
+    phi = _mixed(phi, mix)
     size = np.linalg.norm(force, axis=0)
-    left = np.linalg.norm(force - mass * squares[:asked], axis=0)
-    phi = phi @ mix
+    mass *= squares[:asked]
+    force -= mass
+    left = np.linalg.norm(force, axis=0)
+    del force, mass
     rounding = np.finfo(np.float64).eps * np.linalg.norm(
         _absolute(K) @ np.abs(phi[:, :asked]), axis=0
     )
     return phi, float(np.max(left / np.maximum(_RESIDUAL * size, _ROUNDINGS * rounding)))
+
+
+def _mixed(X: FloatArray, mix: FloatArray) -> FloatArray:
+    """Return ``X mix`` in the place of X: a second array of this size is memory at its peak."""
+    for begin in range(0, X.shape[0], _ROWS):
+        rows = slice(begin, begin + _ROWS)
+        X[rows, : mix.shape[1]] = X[rows] @ mix
+    return X[:, : mix.shape[1]]
 
 
 def _absolute(K: Any) -> Any:
