@@ -2,13 +2,27 @@
 
 import numpy as np
 import pytest
+import scipy.linalg as la
+import scipy.sparse as sp
 
 import oracles_updating as oracle
-from flexplant.errors import FlexplantWarning
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import MeasuredModes
 from flexplant.lti import frequency_response
 from flexplant.plant import assemble_plant
-from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
+from flexplant.reduction import solve_modes
+from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
+from flexplant.updating import (
+    AddedDamping,
+    AddedMass,
+    AddedStiffness,
+    Eigenvalues,
+    History,
+    MatrixParameter,
+    ModeDamping,
+    UpdateResult,
+    update,
+)
 from stages import CORNERS, INSET, Z8, ports, reduced
 
 
@@ -56,3 +70,92 @@ def test_the_full_structure_takes_the_answer_too(plate):
     data = [Eigenvalues(MeasuredModes(poles, modes=range(4, 10)))]
     fit = update(rom, [AddedMass(plate.z8), AddedDamping(plate.z8)], data)
     np.testing.assert_allclose(fit.values, [0.5, 60.0], rtol=5e-3)
+
+
+def test_the_full_model_with_the_parameters_of_a_fit(plate):
+    """M, D and K of the full FEModel are its own plus the estimated mass, damper and modulus."""
+    rom = plate.reduced(0.01, True)
+    model = plate.model.with_damping(ModalDamping(0.01))
+    stiffer = MatrixParameter("E", dK=plate.model.K, prior=(0.0, 0.01))
+    unknowns = [AddedMass(plate.z8), AddedDamping(plate.z8), stiffer, ModeDamping(6)]
+    M, K = oracle.plate()
+    D = oracle.modal_damping(M, K, 0.01)
+    square, phi = la.eigh(K, M)
+    omega = np.sqrt(np.abs(square))
+    force = M @ phi[:, 5]
+    at = oracle.z_dof(0.3, 0.15)
+    D = D + 2 * 0.002 * omega[5] * np.outer(force, force)
+    K = 1.01 * K
+    M[at, at] += 0.3
+    D[at, at] += 5.0
+    exact = oracle.poles(M, D, K)
+    exact = exact[exact.imag > 500][:8]
+    noise = np.diag(np.tile(1e-8 * np.abs(exact) ** 2, 2))
+    data = [Eigenvalues(MeasuredModes(exact, modes=range(4, 12), covariance=noise))]
+    fit = update(rom, unknowns, data)
+    full = fit.applied_to(model)
+    assert isinstance(full, FEModel)
+    assert full.dofs is model.dofs
+    mass, damper, modulus, ratio = fit.values
+    rise = {"M": np.zeros_like(M), "K": modulus * model.K.toarray()}
+    rise["M"][at, at] = mass
+    rise["D"] = 2 * ratio * omega[5] * np.outer(force, force)
+    rise["D"][at, at] += damper
+    for name, change in rise.items():
+        before, after = (
+            np.asarray(sp.csc_array(getattr(m, name)).todense()) for m in (model, full)
+        )
+        error = np.abs(after - before - change).max()
+        assert error < 1e-9 * max(np.abs(change).max(), 1e-6 * np.abs(before).max())
+    # the structure that was measured: within what the fit leaves
+    found = oracle.poles(full.M.toarray(), full.D, full.K.toarray())
+    found = found[found.imag > 500][:8]
+    assert np.abs(found / exact - 1).max() < 1e-3
+
+
+def test_a_large_model_stays_sparse_and_a_model_without_damping_is_remarked_on():
+    """1587 DOFs: masses, springs and the damping of a mode; dampers beside no D of its own warn."""
+    model = kirchhoff_plate(
+        size=(0.6, 0.6), thickness=0.02, elements=(22, 22), density=2702,
+        youngs_modulus=70e9, poisson_ratio=0.35,
+    )  # fmt: skip
+    at = model.dofs.nearest((0.3, 0.15, 0.0), "z")
+    i = model.dofs.index(at)
+    unknowns = (AddedMass(at), AddedStiffness(at))
+    fit = _fit_of(unknowns, [0.5, 1e4])
+    full = fit.applied_to(model)
+    assert sp.issparse(full.M)
+    assert sp.issparse(full.K)
+    assert full.M[i, i] - model.M[i, i] == pytest.approx(0.5, rel=1e-12)
+    assert full.K[i, i] - model.K[i, i] == pytest.approx(1e4, rel=1e-6)
+    assert full.rigid_body.shape[1] == 2  # the spring holds the plate at one point
+    with pytest.warns(FlexplantWarning, match="has no D of its own"):
+        damped = _fit_of([ModeDamping(6)], [0.01]).applied_to(model)
+    modes = solve_modes(model, count=8)
+    omega, phi = modes.omega, modes.phi
+    np.testing.assert_allclose(
+        np.diag(phi.T @ damped.D @ phi)[3:] / (2 * omega[3:]), [0, 0, 0.01, 0, 0], atol=1e-9
+    )
+    with pytest.raises(ModelError, match="FEModel refuses"):
+        _fit_of([AddedMass(at)], [-5.0]).applied_to(model)
+    with pytest.raises(LabelError, match="9999:z"):
+        _fit_of([AddedMass("9999:z")], [1.0]).applied_to(model)
+    with pytest.raises(ModelError, match="needs an FEModel"):
+        fit.applied_to("plate")
+
+
+def _fit_of(unknowns, values):
+    """Return an UpdateResult with given values."""
+    q = len(values)
+    return UpdateResult(
+        parameters=tuple(p.name for p in unknowns),
+        units=tuple(p.unit for p in unknowns),
+        values=np.array(values),
+        covariance=None,
+        correlation=np.eye(q),
+        model=None,
+        history=History(np.zeros((1, q)), np.zeros((1, 1), complex), np.zeros(1), np.zeros(1)),
+        converged=True,
+        reason="given",
+        unknowns=tuple(unknowns),
+    )

@@ -7,21 +7,19 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 from scipy.stats import qmc
 
 from ..errors import FlexplantError, FlexplantWarning, ModelError, ShapeError, SolverError
-from ..structure.rigid import orthonormalised
-from ..values import FloatArray, Matrix, generator, real_array, short
+from ..values import FloatArray, generator, real_array, short
 from .methods import GaussNewton, Lasso, Method, Tikhonov, TrustRegion
 from .objective import Objective
 from .parameters import Parameter
-from .pencil import Family
 from .residuals_base import Residual
 from .result import History, Starts, UpdateResult
 from .search import Found, gauss_newton, tikhonov, trust_region
 from .sensitivity import checked_values
 from .sparse_search import lasso
+from .updated_model import changed_model
 
 #: a parameter this close to its bound, relative to their distance, is at it
 AT_BOUND = 1e-6
@@ -200,30 +198,3 @@ def _doubt(
     r = objective.values(point)
     spare = r.size - q
     return (unit * float(r @ r) / spare if spare > 0 else None), correlation
-
-
-def changed_model(model: Any, family: Family, p: FloatArray) -> Any:
-    """Return the model with the parameters at `p`; its own rigid-body basis, as far as left."""
-    changes: dict[str, Any] = {
-        name: _sum(getattr(model, name), change)
-        for name, change in zip("MDK", family.changes(p), strict=True)
-    }
-    if hasattr(model, "T"):
-        # Gram-Schmidt keeps translations first and moves the rotations to the new centre
-        left = model.rigid_body @ family.rigid_left(p)
-        changes["rigid_body"] = orthonormalised(changes["M"], left)
-    try:
-        return model.replace(**changes)
-    except ModelError as error:
-        raise ModelError(
-            f"the update ended at {family.text(p)}, which the {type(model).__name__} refuses: "
-            f"{error}"
-        ) from None
-
-
-def _sum(part: Matrix | None, change: FloatArray) -> Matrix | None:
-    if not np.any(change):
-        return part
-    if part is None:
-        return change
-    return sp.csc_array(part + sp.csc_array(change)) if sp.issparse(part) else part + change

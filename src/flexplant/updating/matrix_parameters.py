@@ -10,13 +10,17 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError, ShapeError
+from ..reduction import solve_modes
+from ..structure import ModalDamping
 from ..structure.eigen import elastic_modes
-from ..structure.factor import dense
+from ..structure.factor import DENSE_LIMIT, dense
 from ..values import FloatArray, Matrix, positive, real_array, short
 from .parameters import Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images
 SYMMETRIC = 1e-9
+#: the damping matrix of one mode is full; beyond this many DOFs it would not fit the memory
+DENSE_DAMPING_LIMIT = 5000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -235,12 +239,12 @@ class MatrixParameter(Parameter):
             self._projected(self.dK, model),
         )
 
-    def _projected(self, part: Matrix | None, model: Any) -> FloatArray | None:
+    def _projected(self, part: Matrix | None, model: Any) -> Matrix | None:
         if part is None:
             return None
         k, n = model.M.shape[0], len(getattr(model, "full_dofs", model.dofs))
         if part.shape[0] == k:
-            return dense(part)
+            return part
         if part.shape[0] != n:
             raise ShapeError(
                 f"{self.name} has matrices of {part.shape[0]} DOFs; the model has {k}, its full "
@@ -312,9 +316,17 @@ class ModeDamping(Parameter):
                 f"no elastic mode {self.mode}: the model has {r} rigid-body modes, which are "
                 f"undamped, and elastic ones to {k}."
             )
-        M, K = dense(model.M), dense(model.K)
-        omega, phi = elastic_modes(M, K, rigid, self.mode - r)
-        force = M @ phi[:, -1]
+        if k > DENSE_DAMPING_LIMIT:
+            raise ModelError(
+                f"{self.name} would fill the damping matrix of {k} DOFs (limit "
+                f"{DENSE_DAMPING_LIMIT}). Apply it to a reduced model."
+            )
+        if sp.issparse(model.K) and k > DENSE_LIMIT:
+            modes = solve_modes(model, count=self.mode, damping=ModalDamping(0.0))
+            omega, phi = modes.omega[r:], modes.phi[:, r:]
+        else:
+            omega, phi = elastic_modes(dense(model.M), dense(model.K), rigid, self.mode - r)
+        force = np.asarray(model.M @ phi[:, -1].real)
         return None, 2 * float(omega[-1]) * np.outer(force, force), None
 
 

@@ -7,13 +7,14 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeAlias
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
-from ..values import FloatArray, Value, real_array, short
+from ..values import Matrix, Value, real_array, short
 
 #: derivatives of M, D and K to one parameter, None where zero
-Derivatives: TypeAlias = "tuple[FloatArray | None, FloatArray | None, FloatArray | None]"
+Derivatives: TypeAlias = "tuple[Matrix | None, Matrix | None, Matrix | None]"
 
 
 class Parameter(Value):
@@ -97,6 +98,8 @@ class PointParameter(Parameter):
     def matrices(self, model: Any) -> Derivatives:
         """Return (dM, dD, dK) of the model, r r^T in the place of this quantity.
 
+        Sparse where the model's mass matrix is.
+
         Parameters
         ----------
         model : ReducedModel or FEModel
@@ -110,8 +113,12 @@ class PointParameter(Parameter):
             raise ModelError(
                 f"{self.name} acts on nothing: its weights are all zero. Give a place with motion."
             )
-        parts: list[FloatArray | None] = [None, None, None]
-        parts[self.acts_on] = np.outer(row, row)
+        parts: list[Matrix | None] = [None, None, None]
+        if sp.issparse(model.M):
+            column = sp.csc_array(row[:, None])
+            parts[self.acts_on] = sp.csc_array(column @ column.T)
+        else:
+            parts[self.acts_on] = np.outer(row, row)
         return parts[0], parts[1], parts[2]
 
 

@@ -91,7 +91,7 @@ class Family:
         for b, parameter in enumerate(self.parameters):
             for stack, part in zip(self.physical, parameter.matrices(model), strict=True):
                 if part is not None:
-                    stack[b] = part
+                    stack[b] = dense(part)
         self.massive = np.flatnonzero(np.any(M != 0, axis=0))
         if self.massive.size < k:
             self.V, self.rigid = np.eye(k), rigid

@@ -10,8 +10,9 @@ from scipy.special import ndtri
 
 from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
-from ..values import ComplexArray, FloatArray, Value, generator, positive
+from ..values import ComplexArray, FloatArray, Value, generator, positive, short
 from .parameters import Parameter
+from .updated_model import applied
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -212,6 +213,40 @@ class UpdateResult(Value):
                 "(covariance=, std=, variance=) or more data than parameters."
             )
         return std
+
+    def applied_to(self, model: Any) -> Any:
+        """Return another model of the same structure, the full FEModel say, updated likewise.
+
+        The estimated values of the parameters go into M, D and K of the model as it was before the
+        update. Damping that a model is given later, in ``solve_modes(model, damping=)``, is not
+        in it: give it first, ``fit.applied_to(model.with_damping(ModalDamping(0.01)))``.
+
+        Parameters
+        ----------
+        model : FEModel or ReducedModel
+            Its DOFs contain the places of the parameters. A sparse model stays sparse.
+
+        Returns
+        -------
+        FEModel or ReducedModel
+            Of the kind given.
+
+        Raises
+        ------
+        ModelError
+            When it is no model, or the parameters make its matrices indefinite.
+        LabelError, ShapeError
+            When it does not know the place of a parameter, or matrices of a parameter belong to
+            another number of DOFs.
+        """
+        if not hasattr(model, "rigid_body") or not hasattr(model, "dofs"):
+            raise ModelError(
+                f"applied_to needs an FEModel or a ReducedModel, got {short(model)}. Pass the "
+                "model the reduced one was made from."
+            )
+        if not self.unknowns:
+            raise ModelError("this result does not hold its parameters: run update() once more.")
+        return applied(model, self.unknowns, self.values)
 
     def modes(self) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import FlexplantWarning, ModelError
 from ..values import ComplexArray, FloatArray, flag, positive, seed_sequence
-from .general import changed_model, general_update
+from .general import general_update
 from .methods import GaussNewton, Method, TrustRegion
 from .objective import checked_residuals
 from .parameters import Parameter
@@ -20,6 +20,7 @@ from .residuals_base import Residual
 from .result import History, UpdateResult
 from .sensitivity import checked_parameters, checked_values, mode_columns
 from .steps import Iterate, advance, slopes, solve
+from .updated_model import changed_model
 
 
 def update(
