@@ -104,6 +104,7 @@ from .plant import assemble_plant as assemble_plant
 from .plant import decouple as decouple
 from .plant import highpass as highpass
 from .plant import inverse_sensitivity as inverse_sensitivity
+from .plant import larger_plant as larger_plant
 from .plant import leadlag as leadlag
 from .plant import lowpass as lowpass
 from .plant import neglected_modes as neglected_modes

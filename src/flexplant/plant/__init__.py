@@ -25,6 +25,7 @@ from .standard import StandardPlant as StandardPlant
 from .standard import standard_plant as standard_plant
 from .suspension import GroundSpring as GroundSpring
 from .suspension import suspend as suspend
+from .truncation import larger_plant as larger_plant
 from .uncertainty import Delta as Delta
 from .uncertainty import UncertainPlant as UncertainPlant
 from .visibility import ModeVisibility as ModeVisibility

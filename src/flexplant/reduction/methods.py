@@ -38,7 +38,9 @@ class DesiredDofs(ReductionMethod):
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
-        As many labels as there are modes plus attachment vectors.
+        As many labels as there are modes plus attachment vectors. With fewer labels than modes
+        and no attachment vectors, the lowest modes are kept, as many as there are labels; the
+        model knows the others as `truncated`.
 
     Raises
     ------
@@ -66,6 +68,10 @@ class DesiredDofs(ReductionMethod):
             )
         labels = tuple(self.dofs)
         modes.dofs.indices(labels)
+        truncated = None
+        if not modes.n_vectors and modes.n_rigid <= len(labels) < modes.n_modes:
+            truncated = modes.select(range(len(labels), modes.n_modes))
+            modes = modes.select(range(len(labels)))
         k = modes.n_modes + modes.n_vectors
         if np.iscomplexobj(modes.phi):
             raise ModelError(
@@ -100,6 +106,7 @@ class DesiredDofs(ReductionMethod):
             rigid_body=partition[:, : modes.n_rigid],
             method=f"{modes.n_modes} modes and {modes.n_vectors} attachment vectors",
             condition=condition,
+            truncated=truncated,
         )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet, Place
-from ..values import ComplexArray, FloatArray, Value, real_array
+from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
 
 
 def _nothing() -> FloatArray:
@@ -166,6 +166,24 @@ class Modes(Value):
     def basis_zeta(self) -> FloatArray:
         """Damping ratios (k + m,) of the basis."""
         return np.concatenate([self.zeta, self.vector_zeta])
+
+    def select(self, columns: Sequence[int] | IntArray) -> Modes:
+        """Return some of the modes, by position from 0, without the attachment vectors.
+
+        Raises
+        ------
+        ModelError
+            When elastic modes would stand before rigid-body ones.
+        """
+        chosen = np.asarray(columns, dtype=np.int64)
+        return Modes(
+            self.omega[chosen],
+            self.zeta[chosen],
+            self.phi[:, chosen],
+            self.dofs,
+            n_rigid=int(np.count_nonzero(chosen < self.n_rigid)),
+            residual=self.residual[chosen] if self.residual.size else self.residual,
+        )
 
     def at(self, place: Place, direction: str = "z") -> FloatArray | ComplexArray:
         """Return the modes' motion (k,) at a place.

@@ -22,6 +22,10 @@ if TYPE_CHECKING:
     from .quality import ReductionQuality
 
 
+#: how the names of coordinates begin that hold the static compliance of what was left out
+STATIC = "static "
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class ReducedModel(Value):
     """A reduced structure ``M* q_k'' + D* q_k' + K* q_k = T^T f``, ``q_n = T q_k``.
@@ -51,6 +55,10 @@ class ReducedModel(Value):
         Which matrix `condition` is of.
     bound : ErrorBound, optional
         On the error between channels, where the method has one.
+    truncated : Modes, optional
+        The modes over `full_dofs` that were known to `reduce` and left out, M-orthogonal to the
+        kept ones. They stay as they were solved when M, D or K change (an update): the modes of
+        the changed full structure are then nearer.
 
     Raises
     ------
@@ -70,6 +78,7 @@ class ReducedModel(Value):
     coordinates: Iterable[str] = ()
     condition_of: str = "phi_kk"
     bound: ErrorBound | None = None
+    truncated: Modes | None = None
 
     def __post_init__(self) -> None:
         names = tuple(str(name) for name in self.coordinates) or self.dofs.labels
@@ -88,6 +97,11 @@ class ReducedModel(Value):
             condition=positive(self.condition, "condition"),
             coordinates=names,
         )
+        if self.truncated is not None and self.truncated.dofs.labels != self.full_dofs.labels:
+            raise ModelError(
+                f"the truncated modes are over {len(self.truncated.dofs)} DOFs that are not the "
+                f"{n} of full_dofs, in this order. Take both from the same Modes."
+            )
 
     def __repr__(self) -> str:
         held = len(self.dofs)
@@ -95,9 +109,12 @@ class ReducedModel(Value):
         if held < self.n_dof:
             extra = f"{self.n_dof - held} generalised coordinates"
             shown = f"{shown} and {extra}" if held else f"{extra} for {len(self.full_dofs)} DOFs"
+        left = ""
+        if self.truncated is not None:
+            left = f", {self.truncated.n_modes} modes left out are known"
         return (
             f"<ReducedModel: {shown} by {self.method}, {self.rigid_body.shape[1]} rigid-body "
-            f"motions, cond({self.condition_of}) {self.condition:.3g}>"
+            f"motions, cond({self.condition_of}) {self.condition:.3g}{left}>"
         )
 
     @property
@@ -161,6 +178,49 @@ class ReducedModel(Value):
             coordinates=names,
         )
         return model, follow, flexibility
+
+    def completed(self) -> ReducedModel:
+        """Return the model with the modes that were left out, as further coordinates.
+
+        ``M = diag(M*, I)``, ``D = diag(D*, 2 Z Omega)``, ``K = diag(K*, Omega^2)``,
+        ``T = [T, phi]``: (5) and (8) side by side. Static coordinates ("static 1") are dropped,
+        since the truncated modes hold their compliance. Without truncated modes: the model itself.
+
+        Raises
+        ------
+        ModelError
+            When the truncated modes are complex.
+        """
+        if self.truncated is None:
+            return self
+        more = self.truncated
+        if np.iscomplexobj(more.phi):
+            raise ModelError(
+                "the truncated modes are complex, they cannot stand beside real coordinates. "
+                "Solve with damping=ModalDamping(...)."
+            )
+        names = tuple(self.coordinates)
+        kept = [i for i, name in enumerate(names) if not name.startswith(STATIC)]
+        block = np.ix_(kept, kept)
+        omega = more.basis_omega
+        return ReducedModel(
+            M=la.block_diag(self.M[block], np.eye(omega.size)),
+            D=la.block_diag(self.D[block], np.diag(2 * more.basis_zeta * omega)),
+            K=la.block_diag(self.K[block], np.diag(omega**2)),
+            T=np.hstack([self.T[:, kept], np.real(more.basis)]),
+            dofs=self.full_dofs.select(()),
+            full_dofs=self.full_dofs,
+            rigid_body=np.vstack(
+                [self.rigid_body[kept], np.zeros((omega.size, self.rigid_body.shape[1]))]
+            ),
+            method=f"{self.method}, with {more.n_modes} modes left out",
+            condition=self.condition,
+            condition_of=self.condition_of,
+            coordinates=[
+                *(f"kept {names[i]}" for i in kept),
+                *(f"left out {i}" for i in range(1, omega.size + 1)),
+            ],
+        )
 
     def modes(self) -> Modes:
         """Return all modes; rigid-body ones exactly at 0.

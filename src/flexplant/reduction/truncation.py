@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..labels import Place
 from ..structure import Damping, FEModel, ModalDamping
-from ..values import FloatArray, whole
+from ..values import FloatArray, IntArray, whole
 from .attachment import attachment_vectors, labels_of, places, static_response
 from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
@@ -20,7 +20,7 @@ from .methods import ReductionMethod
 from .modes import Modes
 from .projection import checked_damping, inner, undamped
 from .ranking import channels, peak_gains, rank_modes
-from .reduced import ReducedModel
+from .reduced import STATIC, ReducedModel
 from .solve import solve_modes
 
 _SUM = "sum of the peaks of the neglected modes"
@@ -291,7 +291,21 @@ def truncated(
         at_rest = float(np.linalg.norm(missed, 2)) if others.size else 0.0
         if np.isfinite(value):
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest)
-    return _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
+    found = _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
+    return found.replace(truncated=_left_out(modes, columns))
+
+
+def _left_out(modes: Modes, columns: IntArray) -> Modes | None:
+    """Return the modes that are not kept, with the attachment vectors of all of them."""
+    others = np.setdiff1d(np.arange(modes.n_modes), columns)
+    if not others.size and not modes.n_vectors:
+        return None
+    return modes.select(others).replace(
+        vectors=modes.vectors,
+        vector_omega=modes.vector_omega,
+        vector_zeta=modes.vector_zeta,
+        vector_dofs=modes.vector_dofs,
+    )
 
 
 def _corrected(
@@ -340,7 +354,7 @@ def _diagonal(
     """Return the reduced model whose coordinates are the modes themselves, equation (5)."""
     omega, zeta = modes.basis_omega, modes.basis_zeta
     k, r = omega.size, modes.n_rigid
-    static = [f"static {i}" for i in range(1, modes.n_vectors + 1)]
+    static = [f"{STATIC}{i}" for i in range(1, modes.n_vectors + 1)]
     extra = f" and {modes.n_vectors} static vectors" if modes.n_vectors else ""
     return ReducedModel(
         M=np.eye(k),

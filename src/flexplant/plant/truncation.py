@@ -1,0 +1,90 @@
+"""The plant with the modes that a reduction left out: what designs on the reduced one meet."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError, ModelError
+from ..lti.statespace import StateSpace
+from ..reduction import ReducedModel
+from .assembly import assemble_plant
+from .realisation import Structure
+from .standard import StandardPlant, standard_plant
+
+
+def larger_plant(
+    plant: StandardPlant, larger: StandardPlant | StateSpace | Structure | None = None
+) -> StandardPlant | None:
+    """Return the plant with the modes left out, sampled and delayed like the given one.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Of a weighted plant, or one seen `through` a block, the plain plant underneath counts.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        The larger model: a structure gets the plant's ports, a plant must have its channels. None:
+        the modes that the plant's reduced model still knows.
+
+    Returns
+    -------
+    StandardPlant or None
+        With the channels w, u, z and y of the plain plant. None without `larger`, where no modes
+        left out are known.
+
+    Raises
+    ------
+    ModelError
+        When the plant has no ports to assemble a structure with, or the larger plant has another
+        sampling time or delay.
+    LabelError
+        When the larger plant has other channels.
+    """
+    plain = standard_plant(plant)
+    plain = plain.unweighted or plain
+    if larger is None:
+        model = plain.model
+        if not isinstance(model, ReducedModel) or model.truncated is None:
+            return None
+        larger = model.completed()
+    if isinstance(larger, StandardPlant | StateSpace) or hasattr(larger, "input_labels"):
+        return _matched(plain, standard_plant(larger))
+    if plain.ports is None:
+        raise ModelError(
+            "this plant has no ports to assemble the larger model with: it was not assembled from "
+            "a structure. Pass larger= as a StandardPlant with the same channels."
+        )
+    return _sampled_like(plain, assemble_plant(larger, plain.ports))
+
+
+def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
+    """Return the larger plant, sampled like the given one, after a check of its channels."""
+    larger = larger.unweighted or larger
+    for side in "wuzy":
+        own, other = getattr(plant, side), getattr(larger, side)
+        if own != other:
+            raise LabelError(
+                f"the larger plant has other channels in {side}: {_listed(other)}, the plant has "
+                f"{_listed(own)}. Assemble both with the same ports."
+            )
+    if plant.dt and not larger.dt:
+        return _sampled_like(plant, larger)
+    same = bool(np.isclose(larger.dt, plant.dt, rtol=1e-9, atol=0.0))
+    if not same or larger.delay != plant.delay:
+        raise ModelError(
+            f"the larger plant has dt {larger.dt:g} s and delay {larger.delay:g}, the plant "
+            f"{plant.dt:g} s and {plant.delay:g}: their responses could not be compared. Pass it "
+            "continuous, or sampled like the plant."
+        )
+    return larger
+
+
+def _sampled_like(plant: StandardPlant, continuous: StandardPlant) -> StandardPlant:
+    if not plant.dt:
+        return continuous
+    return continuous.discretized(1.0 / plant.dt, delay=plant.delay)
+
+
+def _listed(names: Any) -> str:
+    return ", ".join(names[:6]) + (", ..." if len(names) > 6 else "")

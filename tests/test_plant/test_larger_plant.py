@@ -1,0 +1,76 @@
+"""The plant with the modes left out: from what the model knows, or from what is given."""
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import LabelError, ModelError
+from flexplant.lti import frequency_response
+from flexplant.plant import assemble_plant, larger_plant
+from flexplant.reduction import DesiredDofs, ModalTruncation, reduce, solve_modes
+from flexplant.structure import ModalDamping
+from plates import make_plate
+from stages import ports
+
+PLATE = make_plate(elements=(4, 4)).with_damping(ModalDamping(0.01))
+MODES = solve_modes(PLATE, count=30)
+GRID = [PLATE.dofs.nearest((x, y, 0), "z") for x in (0, 0.3, 0.6) for y in (0, 0.3, 0.6)]
+FREQ = np.array([3.0, 47.0, 290.0, 1410.0])
+
+
+def plant_of(model, *, rate=10e3, delay=1.5):
+    return assemble_plant(model, ports()).discretized(rate, delay=delay)
+
+
+def same_response(ours, theirs):
+    assert (ours.w, ours.u, ours.z, ours.y) == (theirs.w, theirs.u, theirs.z, theirs.y)
+    assert (ours.dt, ours.delay) == (theirs.dt, theirs.delay)
+    one, two = (frequency_response(plant.system, FREQ).data for plant in (ours, theirs))
+    np.testing.assert_allclose(one, two, rtol=1e-7, atol=1e-9 * np.abs(two).max(axis=2).min())
+
+
+@pytest.mark.parametrize("method", [DesiredDofs(GRID), ModalTruncation(9, static_at=["1:z"])])
+def test_what_the_model_knows_is_the_plant_of_all_modes(method):
+    plant = plant_of(reduce(MODES, method))
+    same_response(larger_plant(plant), plant_of(MODES))
+    continuous = plant.continuous
+    assert not larger_plant(continuous).dt
+
+
+@pytest.mark.parametrize("given", ["modes", "model", "reduced", "plant", "sampled plant"])
+def test_any_larger_model_serves(given):
+    larger = {
+        "modes": MODES,
+        "model": PLATE,
+        "reduced": reduce(MODES, ModalTruncation(30)),
+        "plant": assemble_plant(MODES, ports()),
+        "sampled plant": plant_of(MODES),
+    }[given]
+    plant = plant_of(reduce(MODES, ModalTruncation(9)))
+    expected = plant_of(PLATE if given == "model" else MODES)
+    same_response(larger_plant(plant, larger), expected)
+
+
+def test_weights_and_blocks_are_taken_off():
+    plant = plant_of(reduce(MODES, DesiredDofs(GRID)))
+    weighted = plant.through(fx.reference_errors(plant)).weighted(z={"die:error": 2.0})
+    same_response(larger_plant(weighted), plant_of(MODES))
+
+
+def test_nothing_known_is_none():
+    assert larger_plant(plant_of(solve_modes(PLATE, count=9))) is None
+    assert larger_plant(fx.StandardPlant.from_statespace(plant_of(MODES).system)) is None
+
+
+def test_refusals():
+    plant = plant_of(reduce(MODES, ModalTruncation(9)))
+    with pytest.raises(ModelError, match=r"delay 1, the plant .* and 1\.5"):
+        larger_plant(plant, plant_of(MODES, delay=1))
+    other = assemble_plant(MODES, ports().replace(y=ports().y[:3]))
+    with pytest.raises(LabelError, match="other channels in w"):
+        larger_plant(plant, other)
+    foreign = fx.StandardPlant.from_statespace(plant.system)
+    with pytest.raises(ModelError, match="no ports"):
+        larger_plant(foreign, MODES)
+    with pytest.raises(ModelError):
+        larger_plant(plant, "larger")
