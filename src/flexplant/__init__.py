@@ -38,6 +38,7 @@ from .labels import DofSet as DofSet
 from .loop import ClosedLoop as ClosedLoop
 from .loop import bandwidth as bandwidth
 from .loop import close_loop as close_loop
+from .loop import compare_loops as compare_loops
 from .loop import complementary_sensitivity as complementary_sensitivity
 from .loop import control_sensitivity as control_sensitivity
 from .loop import loop_gain as loop_gain

@@ -7,6 +7,7 @@ from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.placement import PoiVariance, sensor_map
 from flexplant.plant import Sensor
 from flexplant.store import load
+from flexplant.structure import Disc, Rectangle
 
 GRID = np.array([(x, y, 0.0) for y in (0.0, 0.2, 0.35) for x in (0.0, 0.25, 0.5)])
 
@@ -36,6 +37,28 @@ def test_a_plant_whose_sensors_do_not_suffice(make):
     assert np.isinf(found.values[0])  # three in a row
     assert np.all(np.isfinite(found.values[1:]))
     assert list(found.ratio) == [1.0, 0.0, 0.0]
+
+
+def test_no_sensor_is_tried_where_none_can_be(make, tmp_path):
+    plant, _, _ = make(21)
+    every = sensor_map(plant, GRID, asd=1e-11)
+    zones = [Disc(every.best[:2], 0.01), Rectangle((0.4, 0.1), (0.6, 0.3))]
+    found = sensor_map(plant, GRID, asd=1e-11, exclude=zones)
+    left = [
+        i
+        for i, (x, y, _) in enumerate(GRID)
+        if np.hypot(*(every.best[:2] - (x, y))) >= 0.01 and (x, y) != (0.5, 0.2)
+    ]
+    assert len(left) == len(GRID) - 2
+    np.testing.assert_array_equal(found.points, GRID[left])
+    np.testing.assert_allclose(found.values, every.values[left], rtol=1e-12)
+    assert found.values.min() > every.values.min()
+    found.save(tmp_path / "map.npz")
+    assert repr(load(tmp_path / "map.npz").excluded) == repr(tuple(zones))
+    with pytest.raises(ModelError, match="outside the excluded zones"):
+        sensor_map(plant, GRID[:1], asd=1e-11, exclude=Disc(GRID[0, :2], 0.01))
+    with pytest.raises(ModelError, match="a Rectangle or a Disc, got"):
+        sensor_map(plant, GRID, asd=1e-11, exclude=[(0.3, 0.3)])
 
 
 def test_names_do_not_collide(make):

@@ -2,6 +2,9 @@
 
 from .closed import ClosedLoop as ClosedLoop
 from .closed import close_loop as close_loop
+from .comparison import LoopComparison as LoopComparison
+from .comparison import LoopFigures as LoopFigures
+from .comparison import compare_loops as compare_loops
 from .margins import bandwidth as bandwidth
 from .margins import modulus_margin as modulus_margin
 from .sensitivity import complementary_sensitivity as complementary_sensitivity

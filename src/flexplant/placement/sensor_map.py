@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -12,7 +13,8 @@ from ..errors import ModelError
 from ..parallel import mapped
 from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
-from ..values import FloatArray, Value, positive, real_array
+from ..structure import Disc, Rectangle
+from ..values import FloatArray, Value, positive, real_array, short
 from .candidates import Criterion, checked_plant, confirmed, require_any, scorer_of
 
 
@@ -30,15 +32,18 @@ class SensorMap(Value):
         The score of the plant's own sensors alone (infinite when they do not suffice).
     criterion : str
         What was scored.
+    excluded : sequence of Rectangle or Disc
+        Zones in which nothing was tried.
     """
 
     points: FloatArray
     values: FloatArray
     without: float
     criterion: str
+    excluded: Sequence[Rectangle | Disc] = ()
 
     def __post_init__(self) -> None:
-        self._set(points=self.points, values=self.values)
+        self._set(points=self.points, values=self.values, excluded=tuple(self.excluded))
 
     def __repr__(self) -> str:
         x, y, z = self.best
@@ -68,6 +73,7 @@ def sensor_map(
     asd: float,
     direction: str = "z",
     quantity: Quantity = "displacement",
+    exclude: Sequence[Rectangle | Disc] = (),
     executor: Executor | None = None,
     progress: bool | None = None,
 ) -> SensorMap:
@@ -87,6 +93,9 @@ def sensor_map(
         What it measures at the point.
     quantity : {"displacement", "velocity", "acceleration"}
         What it measures.
+    exclude : sequence of Rectangle or Disc
+        Zones, seen from above, where no sensor can be: the die itself, say. Points inside are left
+        out.
     executor : concurrent.futures.Executor, optional
         Computes in chunks; the result is the same to the bit.
     progress : bool, optional
@@ -95,12 +104,13 @@ def sensor_map(
     Returns
     -------
     SensorMap
-        In the order of the points.
+        In the order of the points that are not excluded.
 
     Raises
     ------
     ModelError
-        When the plant is not sampled or has no structure, or there is no point.
+        When the plant is not sampled or has no structure, a zone is neither a Rectangle nor a Disc,
+        or there is no point outside all zones.
     ShapeError
         When the points are not (n, 3).
     LabelError
@@ -112,8 +122,14 @@ def sensor_map(
     """
     checked_plant(plant)
     places = real_array(points, "points", (None, 3))
+    zones = _zones(exclude)
+    inside = [zone.holds(places[:, :2]) for zone in zones]
+    places = places[~np.any(inside, axis=0)] if inside else places
     if not places.size:
-        raise ModelError("there is no point to try: give at least one.")
+        raise ModelError(
+            "there is no point to try: give at least one"
+            + (" outside the excluded zones." if zones else ".")
+        )
     noise = positive(asd, "asd", zero=True)
     own = plant.ports.y if plant.ports is not None else ()
     taken = {sensor.name for sensor in own}
@@ -130,4 +146,15 @@ def sensor_map(
     values = np.array([value for value, _ in found])
     best = 1 + int(np.argmin(values[1:]))
     confirmed(scorer, sets[best], float(values[best]))
-    return SensorMap(places, values[1:], float(values[0]), repr(scorer.criterion))
+    return SensorMap(places, values[1:], float(values[0]), repr(scorer.criterion), zones)
+
+
+def _zones(exclude: Sequence[Rectangle | Disc]) -> tuple[Rectangle | Disc, ...]:
+    listed = (exclude,) if isinstance(exclude, Rectangle | Disc) else tuple(exclude)
+    for zone in listed:
+        if not isinstance(zone, Rectangle | Disc):
+            raise ModelError(
+                f"an excluded zone is a Rectangle or a Disc, got {short(zone)}. Type "
+                "Disc((0.3, 0.3), radius=0.05)."
+            )
+    return listed

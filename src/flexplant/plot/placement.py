@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patches import Circle, Patch
+from matplotlib.patches import Rectangle as Box
 
 from ..errors import ModelError
 from ..placement import SensorMap
 from ..plant import Ports
+from ..structure import Disc, Rectangle
 from ..values import FloatArray, short
 from ._axes import MEASURED, UPDATED, axes, finish
 
@@ -28,7 +33,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     -------
     Axes
         Filled contours of the square root of the score's ratio: the error with the sensor over
-        the error without it.
+        the error without it; excluded zones hatched.
 
     Raises
     ------
@@ -43,11 +48,23 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     contours = ax.tricontourf(x, y, ratio, levels=20, cmap="viridis_r")
     ax.figure.colorbar(contours, ax=ax, label="POI error with / without a further sensor [1]")
     ax.plot(x, y, ".", color="white", markersize=1.5)
+    for i, zone in enumerate(found.excluded):
+        style = {"facecolor": "white", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
+        label = "no sensor possible" if i == 0 else None
+        ax.add_patch(_patch(zone, label=label, **style))
     there = [port.at for port in ports.y if isinstance(port.at, tuple)] if ports else []
     if there:
         points: FloatArray = np.array(there, dtype=np.float64)
         ax.plot(points[:, 0], points[:, 1], "P", color=MEASURED, label="sensors", clip_on=False)
     ax.plot(*found.best[:2], "*", color=UPDATED, markersize=14, label="best place", clip_on=False)
     ax.set_aspect("equal")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=2, frameon=False)
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
     return finish(ax, x="x [m]", y="y [m]")
+
+
+def _patch(zone: Rectangle | Disc, **style: Any) -> Patch:
+    """Return the outline of a zone."""
+    if isinstance(zone, Disc):
+        return Circle((zone.centre[0], zone.centre[1]), zone.radius, **style)
+    (x, y), (right, top) = zone.lower, zone.upper
+    return Box((x, y), right - x, top - y, **style)

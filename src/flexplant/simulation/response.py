@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
+from scipy.special import stdtrit
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray, IntArray, Value, check_names, positive, real_array
@@ -122,6 +123,50 @@ class Response(Value, Mapping[str, FloatArray]):
         signal = self._from(channel, start)
         unit = _unit(signal)
         return _numbers(unit * np.sqrt(np.mean((signal / unit) ** 2, axis=-1)))
+
+    def rms_interval(
+        self, channel: str, *, start: float = 0.0, level: float = 0.95
+    ) -> tuple[float, float, float]:
+        """Return the root mean square over all runs, and the ends of its confidence interval.
+
+        The mean squares of independent runs are taken as normal: Student's interval of their mean.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        start : float [s]
+            Samples before this time are left out: transients.
+        level : float
+            Of the interval.
+
+        Returns
+        -------
+        tuple of float
+            Value, lower and upper end, in the channel's unit; the lower end is not below zero.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When there is only one run, nothing is left after `start`, or the level is not
+            between 0 and 1.
+        """
+        if self.data.ndim != 3 or self.data.shape[0] < 2:
+            raise ModelError(
+                "an interval needs the scatter between runs: simulate(..., runs=5) or more."
+            )
+        if not 0.0 < positive(level, "level") < 1.0:
+            raise ModelError(f"level is a probability between 0 and 1, got {level:g}. Try 0.95.")
+        rms = np.asarray(self.rms(channel, start=start))
+        unit = float(rms.max()) or 1.0
+        power = (rms / unit) ** 2
+        quantile = float(stdtrit(power.size - 1, 0.5 + 0.5 * level))
+        half = quantile * float(power.std(ddof=1)) / np.sqrt(power.size)
+        ends = np.sqrt(np.maximum(power.mean() + np.array([0.0, -half, half]), 0.0))
+        value, low, high = (unit * ends).tolist()
+        return value, low, high
 
     def peak(self, channel: str, *, start: float = 0.0) -> Numbers:
         """Return the largest magnitude of a channel.

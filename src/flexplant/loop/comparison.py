@@ -1,0 +1,224 @@
+"""Several closed loops side by side: stability, sensitivity at the POI, margin at u."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..values import FloatArray, Value, short
+from .closed import ClosedLoop
+from .grid import refined, resonance_grid
+
+#: share of the bandwidth at which low-frequency suppression is compared
+LOW = 0.1
+
+
+@dataclass(frozen=True, eq=False)
+class LoopFigures(Value):
+    """What one closed loop reaches; S is the response from the reference to the error at the POI.
+
+    Parameters
+    ----------
+    stable : bool
+        Whether all eigenvalues are strictly inside the stability region.
+    decay : float
+        The spectral radius of a sampled loop, the spectral abscissa [rad/s] of a continuous one.
+    bandwidth : float [Hz]
+        Where |S| first crosses 1 from below; NaN without a reference or when unstable.
+    peak, peak_freq : float [1], [Hz]
+        The largest |S| and where it is.
+    low : float [1]
+        |S| at `low_freq`.
+    low_freq : float [Hz]
+        The same for all loops of a comparison.
+    margin : float
+        Modulus margin, broken at u: ``1 / max_f sigma_max(S_u)``; 0 when unstable.
+    """
+
+    stable: bool
+    decay: float
+    bandwidth: float
+    peak: float
+    peak_freq: float
+    low: float
+    low_freq: float
+    margin: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopComparison(Value):
+    """The figures of several loops; prints as a table.
+
+    Parameters
+    ----------
+    rows : mapping {name: LoopFigures}
+        One for each loop.
+    channel : str
+        What S is: ``die:ref to die:error``; empty when the loops have no reference.
+    """
+
+    rows: Mapping[str, LoopFigures]
+    channel: str
+
+    def __post_init__(self) -> None:
+        self._set(rows=dict(self.rows))
+
+    def __getitem__(self, name: str) -> LoopFigures:
+        if name not in self.rows:
+            raise unknown_label("loop", name, self.rows)
+        return self.rows[name]
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.rows)) + 2
+        first = next(iter(self.rows.values()))
+        low = f"|S| at {first.low_freq:.3g} Hz" if self.channel else "|S| low"
+        head = ("stable", "|S| < 1 up to", "max |S|", "at", low, "max |S| at u")
+        cells = [_cells(row) for row in self.rows.values()]
+        wide = [max(len(h), *(len(c[i]) for c in cells)) + 2 for i, h in enumerate(head)]
+        lines = [f"{'':{width}s}" + "".join(f"{h:>{w}s}" for h, w in zip(head, wide, strict=True))]
+        for name, cell in zip(self.rows, cells, strict=True):
+            shown = "".join(f"{c:>{w}s}" for c, w in zip(cell, wide, strict=True))
+            lines.append(f"{name:{width}s}{shown}")
+        if self.channel:
+            lines.append(f"S is {self.channel}; at u it is the largest singular value.")
+        return "\n".join(lines)
+
+
+def compare_loops(
+    loops: Mapping[str, ClosedLoop], *, reference: str | None = None, error: str | None = None
+) -> LoopComparison:
+    """Return stability, bandwidth and peaks of several loops side by side.
+
+    Parameters
+    ----------
+    loops : mapping {name: ClosedLoop}
+        What to compare: designs on one machine, or one design on a model and the machine.
+    reference : str, optional
+        The channel of w that S starts from; the first one named `...:ref` when not given.
+    error : str, optional
+        The channel of z that S ends at; that of the reference when not given.
+
+    Returns
+    -------
+    LoopComparison
+        |S| at low frequency is read at a tenth of the largest bandwidth of all loops.
+
+    Raises
+    ------
+    ModelError
+        When there is no mapping of closed loops.
+    LabelError
+        When a loop lacks the channels.
+    """
+    if not isinstance(loops, Mapping) or not loops:
+        raise ModelError(
+            f"need a mapping of names to closed loops, got {short(loops)}. Type "
+            "{'servo': close_loop(plant, observer, servo)}."
+        )
+    wrong = [loop for loop in loops.values() if not isinstance(loop, ClosedLoop)]
+    if wrong:
+        raise ModelError(f"need closed loops, got {short(wrong[0])}. Use close_loop(plant, ...).")
+    pair = _channels(next(iter(loops.values())), reference, error)
+    for name, loop in loops.items():
+        if pair and (pair[0] not in loop.plant.w or pair[1] not in loop.plant.z):
+            raise LabelError(
+                f"loop {name!r} has no {pair[0]!r} in w or no {pair[1]!r} in z. Compare loops of "
+                "the same Ports, or name the channels: reference=, error=."
+            )
+    curves = {
+        name: _sensitivity(loop, *pair) if pair and loop.is_stable else None
+        for name, loop in loops.items()
+    }
+    reached = {name: _bandwidth(curve) for name, curve in curves.items()}
+    known = [value for value in reached.values() if np.isfinite(value)]
+    low_freq = LOW * max(known, default=np.nan)
+    rows = {
+        name: _figures(loop, curves[name], reached[name], low_freq, pair)
+        for name, loop in loops.items()
+    }
+    return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "")
+
+
+def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:
+    """Return reference and error, or nothing when the loop has no reference."""
+    if reference is None:
+        reference = next((name for name in loop.plant.w if name.endswith(":ref")), None)
+        if reference is None:
+            return ()
+    return reference, error if error is not None else f"{reference.removesuffix(':ref')}:error"
+
+
+def _sensitivity(loop: ClosedLoop, reference: str, error: str) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies and |S|, refined where it is largest."""
+    freq = resonance_grid(loop.monitored.poles(), loop.plant.dt)
+    size = np.abs(loop.frequency_response(freq)[error, reference])
+    for _ in range(4):
+        fresh = refined(freq, size)
+        more = np.abs(loop.frequency_response(fresh)[error, reference])
+        order = np.argsort(np.concatenate([freq, fresh]))
+        freq = np.concatenate([freq, fresh])[order]
+        size = np.concatenate([size, more])[order]
+    return freq, size
+
+
+def _bandwidth(curve: tuple[FloatArray, FloatArray] | None) -> float:
+    """Return where |S| first crosses 1 from below, between two points of the grid by logarithms."""
+    if curve is None:
+        return float("nan")
+    freq, size = curve
+    below = np.flatnonzero(size < 1.0)
+    if not below.size:
+        return 0.0
+    above = np.flatnonzero(size[below[0] :] >= 1.0)
+    if not above.size:
+        return float("inf")
+    right = int(below[0] + above[0])
+    pair = slice(right - 1, right + 1)
+    return float(np.exp(np.interp(0.0, np.log(size[pair]), np.log(freq[pair]))))
+
+
+def _figures(
+    loop: ClosedLoop,
+    curve: tuple[FloatArray, FloatArray] | None,
+    reached: float,
+    low_freq: float,
+    pair: tuple[str, ...],
+) -> LoopFigures:
+    decay = loop.spectral_radius if loop.plant.dt else loop.spectral_abscissa
+    nan = float("nan")
+    if curve is None:
+        margin = loop.modulus_margin if loop.is_stable else 0.0
+        return LoopFigures(loop.is_stable, decay, nan, nan, nan, nan, low_freq, margin)
+    top = int(np.argmax(curve[1]))
+    low = nan
+    if np.isfinite(low_freq):
+        low = abs(complex(loop.frequency_response([low_freq])[pair[1], pair[0]][0]))
+    return LoopFigures(
+        True, decay, reached, float(curve[1][top]), float(curve[0][top]), low, low_freq,
+        loop.modulus_margin,
+    )  # fmt: skip
+
+
+def _cells(row: LoopFigures) -> tuple[str, ...]:
+    """Return the row of a table: Hz and dB."""
+    if not row.stable:
+        return (f"NO ({row.decay:.6f})", "-", "-", "-", "-", "-")
+    return (
+        f"yes ({row.decay:.6f})",
+        _text(row.bandwidth, "Hz"),
+        _decibel(row.peak),
+        _text(row.peak_freq, "Hz"),
+        _decibel(row.low),
+        _decibel(1.0 / row.margin),
+    )
+
+
+def _text(value: float, unit: str) -> str:
+    return "-" if np.isnan(value) else f"{value:.1f} {unit}"
+
+
+def _decibel(size: float) -> str:
+    return "-" if np.isnan(size) or size <= 0 else f"{20.0 * np.log10(size):.1f} dB"
