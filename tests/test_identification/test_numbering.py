@@ -58,6 +58,17 @@ def test_a_repeated_pair_that_split_is_numbered_by_frequency(mix, numbers):
     assert numbered(found.replace(poles=poles), modes()).modes == (8, 7, 4)
 
 
+@pytest.mark.parametrize("split", [-1e-9, 0.0, 1e-9])
+@pytest.mark.parametrize("seen", [[9], [10], [9, 10]])
+def test_one_pole_of_a_repeated_pair_has_the_lowest_number(seen, split):
+    """Modes 9 and 10 are the second pair; rounding splits it either way."""
+    omega = modes().omega.copy()
+    omega[8], omega[9] = omega[8] * (1 - abs(split)), omega[8] * (1 + split)
+    for shift in (0.97, 1.0, 1.03):
+        found = numbered(answer([*seen, 4], shift), modes().replace(omega=np.sort(omega)))
+        assert sorted(found.modes) == [4, 9, 10][: len(seen) + 1]
+
+
 def test_poles_without_partner_are_refused_or_left_out():
     good = answer([4, 6])
     stranger = MeasuredModes(

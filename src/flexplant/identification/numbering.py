@@ -16,6 +16,8 @@ from .measured import MeasuredModes
 
 #: modes of a model nearer than this share are one family, whose shapes are known as a span only
 FAMILY = 5e-3
+#: and nearer than this one frequency, which only rounding splits
+EQUAL = 1e-6
 
 
 def numbered(
@@ -34,7 +36,8 @@ def numbered(
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
     over the measured DOFs; for repeated modes of the model (within 0.5 %) it is the MAC with the
-    nearest shape of their span, which cannot tell them apart: they are numbered by frequency.
+    nearest shape of their span, which cannot tell them apart: they are numbered by frequency, and
+    where fewer poles than modes of one frequency are measured, by the lowest numbers.
 
     Parameters
     ----------
@@ -115,8 +118,19 @@ def _in_order(pairs: dict[int, int], freq: FloatArray, omega: FloatArray) -> Non
         first = pairs[free[0]] - 1
         family = [i for i in free if omega[pairs[i] - 1] <= omega[first] * (1.0 + FAMILY)]
         free = free[len(family) :]
-        numbers = [pairs[i] for i in family]
+        numbers = _lowest([pairs[i] for i in family], omega, set(pairs.values()))
         pairs.update(zip(sorted(family, key=lambda i: float(freq[i])), numbers, strict=True))
+
+
+def _lowest(numbers: list[int], omega: FloatArray, taken: set[int]) -> list[int]:
+    """Return rising numbers, each the lowest free one of the modes of its frequency."""
+    lowest = []
+    for number in numbers:
+        taken.discard(number)
+        equal = np.flatnonzero(np.abs(omega / omega[number - 1] - 1.0) <= EQUAL) + 1
+        lowest.append(next(int(n) for n in equal if n not in taken))
+        taken.add(lowest[-1])
+    return lowest
 
 
 def _likeness(measured: MeasuredModes, modes: Modes, elastic: Any, at: Any) -> FloatArray:
