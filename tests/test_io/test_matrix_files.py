@@ -11,6 +11,8 @@ import scipy.sparse as sp
 
 import flexplant as fx
 from flexplant.errors import FlexplantError, FlexplantWarning, ModelError, ShapeError
+from flexplant.io import models
+from flexplant.io.formats import Format
 
 FE = Path("/work/shared/data/fe")
 needs_data = pytest.mark.skipif(not FE.exists(), reason="no data folder")
@@ -362,3 +364,32 @@ def test_content_goes_before_the_suffix(tmp_path):
     assert placed.located
     with pytest.raises(ModelError, match="does not name its rows"):
         fx.read_matrices(tmp_path / "K.txt", nodes=tmp_path / "nodes.csv")
+
+
+def test_a_new_format_is_one_value(tmp_path, monkeypatch):
+    """A reader with options of its own, known by what the file begins with or by its suffix."""
+
+    def read_rows(path, *, mass=None, mesh=None):
+        K = np.loadtxt(path, comments="!", ndmin=2)
+        return fx.FEMatrices(K, None if mass is None else np.diag(np.loadtxt(mass)))
+
+    rows = Format((".rows",), read_rows, lambda head: head.startswith(b"!rows"), (".grid",), "mesh")
+    monkeypatch.setattr(models, "FORMATS", (*models.FORMATS, rows))
+    (tmp_path / "K.rows").write_text("2 -1\n-1 2\n")
+    (tmp_path / "K.txt").write_text("!rows\n2 -1\n-1 2\n")
+    (tmp_path / "M.txt").write_text("3 4\n")
+    for name in ("K.rows", "K.txt"):
+        found = fx.read_matrices(tmp_path / name, mass=tmp_path / "M.txt")
+        np.testing.assert_array_equal(found.K.toarray(), [[2, -1], [-1, 2]])
+        np.testing.assert_array_equal(found.M.toarray(), np.diag([3, 4]))
+    with pytest.raises(ModelError, match=r"no option 'damping'.*'mass', 'nodes'"):
+        fx.read_matrices(tmp_path / "K.rows", damping="D.txt")
+    (tmp_path / "a.grid").write_text("1 0 0 0\n")
+    with pytest.raises(FlexplantError, match=r"mesh.*read_rows\(..., mesh=...\)"):
+        fx.read_matrices(tmp_path / "a.grid")
+
+
+def test_no_suffix_has_two_formats():
+    known = [s for form in (*models.FORMATS, *models.ELSEWHERE) for s in form.suffixes]
+    known += [suffix for form in models.FORMATS for suffix in form.mesh]
+    assert len(set(known)) == len(known)

@@ -14,6 +14,7 @@ from ..errors import FlexplantError, LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
+from .formats import Format
 from .numbers import printed_digits, spaced_numbers
 from .paths import file_path
 
@@ -284,3 +285,6 @@ def _nodes(path: str | Path) -> dict[int, list[float]]:
                     f"{line[:72]!r}. Correct the line."
                 ) from None
     return places
+
+
+ABAQUS = Format((".mtx",), read_abaqus, mesh=(".inp",), mesh_option="inp")

@@ -13,6 +13,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra, quiet
+from .formats import Format
 from .paths import file_path
 from .tables import at_nodes, read_nodes_table
 
@@ -177,3 +178,6 @@ def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatAr
         for row in np.flatnonzero(np.abs(angles).max(axis=1) > _STRAIGHT).tolist():
             turned[int(known[row])] = cosines_of(angles[row])
     return at_nodes(wanted, known, places, str(path)), turned
+
+
+FULL = Format((".full",), read_ansys, mesh=(".rst", ".cdb"), mesh_option="nodes")

@@ -14,6 +14,7 @@ from ..errors import FlexplantError, LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
+from .formats import Format
 from .nastran import Nodes, nastran_float, read_nodes
 from .numbers import fixed_numbers, printed_digits
 from .paths import file_path
@@ -372,3 +373,10 @@ def _wrong(path: str, at: int, line: bytes, due: str) -> FlexplantError:
         f"{path!r}, line {at + 1}: {due} is due, got {line[:72].decode('latin-1')!r}. The file is "
         "cut off or damaged: write it again."
     )
+
+
+def _begins(head: bytes) -> bool:
+    return head.startswith((b"dmig", b"$")) and b"dmig" in head
+
+
+DMIG = Format((".pch", ".dmig"), read_dmig, _begins, (".bdf", ".dat", ".nas"), "bdf")

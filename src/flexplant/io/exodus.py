@@ -16,6 +16,7 @@ from ..errors import FlexplantError, LabelError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
 from ..reduction import Modes
 from ..values import FloatArray, Matrix, positive, real_array
+from .formats import Elsewhere
 from .paths import file_path
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
@@ -291,3 +292,7 @@ class ExodusFile:
         if "vals_nod_var" in self._names():
             return cast(Any, self.array("vals_nod_var"))[:, place]
         return self.array(f"vals_nod_var{place + 1}")
+
+
+MODES = Elsewhere((".exo", ".e"), "modes: flexplant.io.read_exodus_modes reads them")
+MESH = Elsewhere((".g",), "a mesh: give it to read_sierra(..., exodus=...)")

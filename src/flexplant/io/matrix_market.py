@@ -17,6 +17,7 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, text_digits
+from .formats import Format
 from .numbers import fixed_numbers, spaced_numbers
 from .paths import file_path
 
@@ -210,3 +211,9 @@ def _block(lines: list[bytes], per_line: int, width: int, size: int, path: Path)
             "something else among them. Is it cut short, or were its blanks lost?"
         )
     return numbers
+
+
+MATRIX_MARKET = Format(
+    (".mtx.gz",), read_matrix_market, lambda head: head.startswith(b"%%matrixmarket")
+)
+HARWELL_BOEING = Format((".rsa", ".rua", ".hb", ".rb"), read_harwell_boeing)

@@ -1,9 +1,8 @@
-"""One door for the files of all finite-element programs."""
+"""Matrices and models of the files of all finite-element programs."""
 
 from __future__ import annotations
 
-import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,57 +12,23 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices, FEModel
 from ..values import short
-from .abaqus import read_abaqus
-from .ansys import read_ansys
-from .dmig import read_dmig
-from .matlab import read_matlab, read_npz
-from .matrix_market import read_harwell_boeing, read_matrix_market
-from .op4 import read_op4
+from . import abaqus, ansys, dmig, exodus, mat_matrices, matrix_market, op4, sierra, uff
+from .formats import HEAD, Elsewhere, Format, ends
 from .paths import file_path
-from .sierra import read_sierra
 from .tables import at_nodes, read_dofs, read_nodes_table
 
-#: formats whose files hold one matrix each: mass= and damping= are files then
-_ONE_EACH = ("matrix market", "abaqus", "harwell-boeing", "numpy", "sierra")
-_BY_SUFFIX = {
-    ".rsa": "harwell-boeing",
-    ".rua": "harwell-boeing",
-    ".hb": "harwell-boeing",
-    ".rb": "harwell-boeing",
-    ".mat": "matlab",
-    ".npz": "numpy",
-    ".npy": "numpy",
-    ".full": "ansys",
-    ".op4": "op4",
-    ".pch": "dmig",
-    ".dmig": "dmig",
-    ".m": "sierra",
-}
-_READERS: dict[str, Callable[..., FEMatrices]] = {
-    "matrix market": read_matrix_market,
-    "harwell-boeing": read_harwell_boeing,
-    "numpy": read_npz,
-    "matlab": read_matlab,
-    "abaqus": read_abaqus,
-    "sierra": read_sierra,
-    "op4": read_op4,
-    "dmig": read_dmig,
-    "ansys": read_ansys,
-}
-#: what a reader calls the file that holds its nodes
-_OWN_NODES = {"abaqus": "inp", "dmig": "bdf", "ansys": "nodes"}
-#: what holds results, not matrices, and who reads it
-_OTHERS = {
-    ".exo": "modes: flexplant.io.read_exodus_modes",
-    ".e": "modes: flexplant.io.read_exodus_modes",
-    ".g": "a mesh: give it to read_sierra(..., exodus=...)",
-    ".unv": "measured data: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io",
-    ".uff": "measured data: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io",
-    ".rst": "results: give it to read_ansys(..., nodes=...)",
-    ".cdb": "a mesh: give it to read_ansys(..., nodes=...)",
-    ".bdf": "a mesh: give it to read_dmig(..., bdf=...)",
-    ".inp": "a mesh: give it to read_abaqus(..., inp=...)",
-}
+FORMATS: tuple[Format, ...] = (
+    matrix_market.MATRIX_MARKET,
+    matrix_market.HARWELL_BOEING,
+    mat_matrices.MATLAB,
+    mat_matrices.NUMPY,
+    ansys.FULL,
+    op4.OUTPUT4,
+    dmig.DMIG,
+    abaqus.ABAQUS,
+    sierra.SIERRA,
+)
+ELSEWHERE: tuple[Elsewhere, ...] = (exodus.MODES, exodus.MESH, uff.UNIVERSAL)
 
 
 def read_matrices(
@@ -108,48 +73,43 @@ def read_matrices(
     Raises
     ------
     FlexplantError
-        When the format is not known, holds no matrices, or the file is damaged; when the reader of
-        this format has no such option (those that it has are named).
+        When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
-        What the reader of the format raises.
+        When the reader of this format has no such option, and what it raises itself.
     FileNotFoundError
         When there is no such file.
     """
     path = file_path(path)
     form = _format(path)
-    if form in _ONE_EACH and stiffness is not None:
-        raise ModelError(
-            f"stiffness= names a variable; {path.name!r} holds one matrix. Leave it out."
-        )
     named = read_dofs(dofs) if isinstance(dofs, str | Path) else dofs
-    table, own = _split(nodes, form)
-    given: dict[str, Any] = {"mass": mass, "damping": damping}
-    if form not in _ONE_EACH:
-        given["stiffness"] = stiffness
-    given = {} if form == "ansys" else given
-    if form not in ("dmig", "ansys"):
-        given["dofs"] = named
-    if form in _OWN_NODES:
-        given[_OWN_NODES[form]] = own
-    if form == "ansys" and not (stiffness is mass is damping is None):
-        raise ModelError(f"{path.name!r} holds one K and one M: leave stiffness=, mass= out.")
-    reader = _READERS[form]
-    options = _told(
-        scalar_direction=scalar_direction, dof_map=dof_map, exodus=exodus, rotations=rotations
-    )
-    _check_options(options, reader, given, path.name)
-    found = reader(path, **given, **options)
-    if form in ("dmig", "ansys") and named is not None:
+    known_nodes = nodes is not None and ends(file_path(nodes, "nodes"), form.mesh)
+    given = {
+        "stiffness": stiffness,
+        "mass": mass,
+        "damping": damping,
+        "dofs": named if "dofs" in form.options else None,
+        "nodes": nodes if known_nodes else None,
+        "scalar_direction": scalar_direction,
+        "dof_map": dof_map,
+        "exodus": exodus,
+        "rotations": rotations,
+    }
+    options = {name: value for name, value in given.items() if value is not None}
+    _check_options(options, form, path.name)
+    if known_nodes:
+        options[form.mesh_option] = options.pop("nodes")
+    found = form.read(path, **options)
+    if named is not None and "dofs" not in form.options:
         found = found.with_dofs(named)
-    if table is not None:
+    if nodes is not None and not known_nodes:
         if found.dofs is None:
             raise ModelError(
                 f"{path.name!r} does not name its rows, so that coordinates of nodes are not "
                 "enough: give dofs=, a table node, direction, x, y, z in the order of the rows."
             )
-        known, xyz = read_nodes_table(table)
+        known, xyz = read_nodes_table(nodes)
         wanted = np.unique(found.dofs.nodes)
-        found = found.located_at(wanted.tolist(), at_nodes(wanted, known, xyz, str(table)))
+        found = found.located_at(wanted.tolist(), at_nodes(wanted, known, xyz, str(nodes)))
     return found.trimmed()
 
 
@@ -206,10 +166,10 @@ def read_model(
     Raises
     ------
     FlexplantError
-        When the format is not known, holds no matrices, or the file is damaged; when the reader of
-        this format has no such option (those that it has are named).
+        When the format is not known, holds no matrices, or the file is damaged.
     ModelError, LabelError, ShapeError
-        What the reader of the format raises, or when the matrices make no model.
+        When the reader of this format has no such option, and what it raises itself; when the
+        matrices make no model.
     FileNotFoundError
         When there is no such file.
 
@@ -241,63 +201,39 @@ def read_model(
     return found.model(massless=massless, free=free, name=name or Path(path).name)
 
 
-def _told(**options: Any) -> dict[str, Any]:
-    return {name: value for name, value in options.items() if value is not None}
-
-
-def _check_options(
-    options: dict[str, Any], reader: Callable[..., FEMatrices], given: dict[str, Any], name: str
-) -> None:
-    """Raise FlexplantError for an option that the reader does not take, naming those it does."""
-    taken = {
-        parameter.name
-        for parameter in inspect.signature(reader).parameters.values()
-        if parameter.kind is parameter.KEYWORD_ONLY
-    } - set(given)
-    wrong = sorted(set(options) - taken)
+def _check_options(options: Iterable[str], form: Format, name: str) -> None:
+    """Raise ModelError for an option that the reader does not take, naming those it does."""
+    wrong = sorted(set(options) - set(form.options))
     if wrong:
-        more = f"beside these it takes {sorted(taken)}" if taken else "it takes no others"
-        raise FlexplantError(
-            f"{name!r} is read by {reader.__name__}, which has no option {wrong[0]!r}: {more}. "
-            "Common to all formats are stiffness, mass, damping, dofs, nodes."
+        why = "its files hold one matrix of a kind, without names; " * (
+            wrong[0] in "stiffness mass"
+        )
+        raise ModelError(
+            f"{name!r} is read by {form.read.__name__}, which has no option {wrong[0]!r}: {why}it "
+            f"takes {sorted({*form.options, 'dofs', 'nodes'})}. Leave {wrong[0]}= out."
         )
 
 
-def _split(nodes: str | Path | None, form: str) -> tuple[Any, Any]:
-    """Return the coordinates as a text table, or as a file that the reader knows itself."""
-    if nodes is None:
-        return None, None
-    suffix = Path(nodes).suffix.lower()
-    own = {
-        "ansys": (".rst", ".cdb"),
-        "dmig": (".bdf", ".dat", ".nas"),
-        "abaqus": (".inp",),
-    }
-    return (None, nodes) if suffix in own.get(form, ()) else (nodes, None)
-
-
-def _format(path: Path) -> str:
-    suffixes = [suffix.lower() for suffix in path.suffixes]
-    last = suffixes[-1] if suffixes else ""
-    if last == ".gz" and suffixes[-2:-1] == [".mtx"]:
-        return "matrix market"
+def _format(path: Path) -> Format:
     with path.open("rb") as file:
-        head = file.read(80)
-    # what a file says of itself goes before its name
-    if head.lower().startswith(b"%%matrixmarket"):
-        return "matrix market"
-    if head.startswith(b"MATLAB "):
-        return "matlab"
-    if last == ".mtx":
-        return "abaqus"
-    if last in _BY_SUFFIX:
-        return _BY_SUFFIX[last]
-    if last in _OTHERS:
-        raise FlexplantError(f"{path.name!r} holds no matrices but {_OTHERS[last]}.")
-    if head.startswith((b"DMIG", b"$")) and b"DMIG" in path.read_bytes()[:20000]:
-        return "dmig"
+        head = file.read(HEAD).lower()
+    for form in FORMATS:
+        if form.begins(head):
+            return form
+    for form in FORMATS:
+        if ends(path, form.suffixes):
+            return form
+    for form in FORMATS:
+        if ends(path, form.mesh):
+            raise FlexplantError(
+                f"{path.name!r} holds no matrices but a mesh or results: give it to "
+                f"{form.read.__name__}(..., {form.mesh_option}=...)."
+            )
+    for other in ELSEWHERE:
+        if ends(path, other.suffixes):
+            raise FlexplantError(f"{path.name!r} holds no matrices but {other.reader}.")
     raise FlexplantError(
-        f"the format of {path.name!r} is not known, neither by its suffix {last!r} nor by what it "
-        f"begins with. Known suffixes: .mtx, {', '.join(_BY_SUFFIX)}. Readers of one format are in "
-        "flexplant.io."
+        f"the format of {path.name!r} is not known, neither by its suffix {path.suffix!r} nor by "
+        f"what it begins with. Known suffixes: {', '.join(s for f in FORMATS for s in f.suffixes)}."
+        " Readers of one format are in flexplant.io."
     )

@@ -15,6 +15,7 @@ from ..errors import FlexplantError, ModelError, unknown_label
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices
 from ..values import name_list
+from .formats import Format
 from .op4_text import text_matrices
 from .paths import file_path
 
@@ -397,3 +398,6 @@ def _broken(path: str, at: int, name: str) -> FlexplantError:
         f"{path!r}, byte {at}: a string of {name} has an impossible length: the file is damaged. "
         "Write it again (above 65535 rows with BIGMAT=YES)."
     )
+
+
+OUTPUT4 = Format((".op4",), read_op4)

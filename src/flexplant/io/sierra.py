@@ -14,6 +14,7 @@ from ..structure.matrices import FEMatrices
 from ..values import FloatArray
 from .abaqus import symmetric
 from .exodus import opened
+from .formats import Format
 from .numbers import printed_digits, spaced_numbers
 from .paths import file_path
 
@@ -162,3 +163,6 @@ def _named(path: str | Path, exodus: str | Path | None, n: int) -> DofSet:
         )
     at = entry // _PER_NODE
     return DofSet(ids[at], tuple(DIRECTIONS[i] for i in kind.tolist()), xyz[at])
+
+
+SIERRA = Format((".m",), read_sierra)

@@ -15,6 +15,7 @@ from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import Frf
 from ..values import FloatArray, positive, short
+from .formats import Elsewhere
 from .paths import file_path
 from .uff_units import KINDS, ORDERS, record_scale
 
@@ -440,3 +441,9 @@ def _pole(part: dict[str, Any]) -> complex:
     viscous, hysteretic = float(part["modal_damp_vis"]), float(part["modal_damp_his"])
     zeta = viscous or hysteretic / 2
     return complex(omega * (-zeta + 1j * np.sqrt(max(0.0, 1 - zeta**2))))
+
+
+UNIVERSAL = Elsewhere(
+    (".unv", ".uff"),
+    "measured data: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io",
+)

@@ -15,6 +15,7 @@ from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
+from .formats import Format
 from .paths import file_path
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -201,3 +202,7 @@ def _hdf5(item: Any) -> Any:
         (np.asarray(item["data"][()]), np.asarray(item["ir"][()], dtype=np.int64), columns),
         shape=shape,
     )
+
+
+MATLAB = Format((".mat",), read_matlab, lambda head: head.startswith(b"matlab "))
+NUMPY = Format((".npz", ".npy"), read_npz)
