@@ -18,9 +18,9 @@ from .estimation import KalmanEstimator as KalmanEstimator
 from .estimation import StaticEstimator as StaticEstimator
 from .estimation import design_kalman as design_kalman
 from .estimation import design_static as design_static
-from .identification import H1 as H1
-from .identification import H2 as H2
-from .identification import Hv as Hv
+from .identification import H1Estimator as H1Estimator
+from .identification import H2Estimator as H2Estimator
+from .identification import HvEstimator as HvEstimator
 from .identification import IdentifiedModes as IdentifiedModes
 from .identification import MeasuredModes as MeasuredModes
 from .identification import Periodic as Periodic

@@ -5,7 +5,15 @@ import pytest
 import scipy.signal as ss
 
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.identification import H1, H2, Hv, Periodic, average_frfs, estimate_frf, multisine
+from flexplant.identification import (
+    H1Estimator,
+    H2Estimator,
+    HvEstimator,
+    Periodic,
+    average_frfs,
+    estimate_frf,
+    multisine,
+)
 from flexplant.lti import Frf
 from oracles_identification import Loop
 
@@ -88,19 +96,22 @@ def test_h1_h2_hv_have_the_bias_of_their_textbook():
     u, y = records(np.random.default_rng(2), noise_u=0.5, noise_y=0.6)
     gains = {
         method: np.mean(estimate_frf(u, y, RATE, method=method(segment=0.25)).data).real
-        for method in (H1, H2, Hv)
+        for method in (H1Estimator, H2Estimator, HvEstimator)
     }
-    assert gains[H1] == pytest.approx(1.5 / 1.25, rel=0.01)
-    assert gains[H2] == pytest.approx(1.5 * (1 + 0.36 / 2.25), rel=0.01)
-    assert gains[H1] < gains[Hv] < gains[H2]
-    frf = {m: estimate_frf(u, y, RATE, method=m(segment=0.25)) for m in (H1, H2, Hv)}
-    mean = np.sqrt(np.abs(frf[H1].data * frf[H2].data))
-    assert np.allclose(np.abs(frf[Hv].data), mean, rtol=1e-10)
+    assert gains[H1Estimator] == pytest.approx(1.5 / 1.25, rel=0.01)
+    assert gains[H2Estimator] == pytest.approx(1.5 * (1 + 0.36 / 2.25), rel=0.01)
+    assert gains[H1Estimator] < gains[HvEstimator] < gains[H2Estimator]
+    frf = {
+        m: estimate_frf(u, y, RATE, method=m(segment=0.25))
+        for m in (H1Estimator, H2Estimator, HvEstimator)
+    }
+    mean = np.sqrt(np.abs(frf[H1Estimator].data * frf[H2Estimator].data))
+    assert np.allclose(np.abs(frf[HvEstimator].data), mean, rtol=1e-10)
 
 
 def test_coherence_is_the_share_of_the_signal():
     u, y = records(np.random.default_rng(3), noise_y=1.5)
-    frf = estimate_frf(u, y, RATE, method=H1(segment=0.25))
+    frf = estimate_frf(u, y, RATE, method=H1Estimator(segment=0.25))
     assert np.mean(frf.coherence) == pytest.approx(0.5, abs=0.01)
 
 
@@ -112,7 +123,7 @@ def test_h1_variance_is_that_of_its_errors_for_two_inputs(overlap):
         u = rng.normal(size=(3, 2, 6000))
         u[:, 1] += 0.5 * u[:, 0]
         y = np.array([[2.0, -1.0]]) @ u + rng.normal(size=(3, 1, 6000))
-        frf = estimate_frf(u, y, RATE, method=H1(segment=0.2, overlap=overlap))
+        frf = estimate_frf(u, y, RATE, method=H1Estimator(segment=0.2, overlap=overlap))
         error = frf.data - np.array([2.0, -1.0])[None, :, None]
         ratios.append(np.mean(np.abs(error) ** 2 / frf.variance))
     assert np.mean(ratios) == pytest.approx(1.0, abs=0.08)
@@ -129,7 +140,7 @@ def floating():
 
 def test_h1_is_biased_under_feedback_and_joint_input_output_is_not(floating):
     loop, r, u, y = floating
-    method = H1(segment=0.5)
+    method = H1Estimator(segment=0.5)
     naive = estimate_frf(u, y, RATE, method=method)
     joint = estimate_frf(u, y, RATE, method=method, reference=r)
     G = loop.plant(joint.freq, RATE)
@@ -206,10 +217,10 @@ U = np.random.default_rng(0).normal(size=(1, 1, 800))
         ({"rate": 0.0}, ModelError, "rate"),
         ({"quantity": "position"}, LabelError, "quantity"),
         ({"method": "H1"}, ModelError, "method"),
-        ({"method": H2(), "reference": U}, ModelError, "joint"),
+        ({"method": H2Estimator(), "reference": U}, ModelError, "joint"),
         ({"reference": np.repeat(U, 2, axis=1)}, ShapeError, "one reference per input"),
-        ({"method": H1(segment=2.0)}, ModelError, "segment"),
-        ({"method": H1(segment=0.8)}, ModelError, "averages"),
+        ({"method": H1Estimator(segment=2.0)}, ModelError, "segment"),
+        ({"method": H1Estimator(segment=0.8)}, ModelError, "averages"),
         ({"method": Periodic(period=0.01234)}, ModelError, "whole number"),
         ({"method": Periodic(period=0.5)}, ModelError, "periods"),
         ({"method": Periodic(period=0.1, band=(1.0, 2.0))}, ModelError, "no line"),
@@ -224,9 +235,9 @@ def test_bad_records_are_refused(changes, error, text):
 @pytest.mark.parametrize(
     "make",
     [
-        lambda: H1(overlap=1.0),
-        lambda: H1(segment=-1.0),
-        lambda: H1(window="nonsense"),
+        lambda: H1Estimator(overlap=1.0),
+        lambda: H1Estimator(segment=-1.0),
+        lambda: H1Estimator(window="nonsense"),
         lambda: Periodic(period=0.0),
         lambda: Periodic(period=1.0, discard=-1),
         lambda: Periodic(period=1.0, band=(3.0, 2.0)),
@@ -251,9 +262,9 @@ def test_h2_needs_as_many_outputs_as_inputs():
     rng = np.random.default_rng(1)
     u = rng.normal(size=(2, 8000))
     with pytest.raises(ShapeError, match="H2"):
-        estimate_frf(u, u[:1], RATE, method=H2(segment=0.1))
+        estimate_frf(u, u[:1], RATE, method=H2Estimator(segment=0.1))
     mix = np.array([[1.0, 0.5], [0.0, 2.0]])
-    for method in (H1, H2, Hv):
+    for method in (H1Estimator, H2Estimator, HvEstimator):
         frf = estimate_frf(u, mix @ u, RATE, method=method(segment=0.1))
         assert np.abs(frf.data - mix[:, :, None]).max() < 1e-6
 

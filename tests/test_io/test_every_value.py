@@ -152,7 +152,7 @@ def of_updates(rom, unknowns, residual, fit):
     yield fx.update(rom, bounded, [residual], method=fx.TrustRegion(), starts=2)
     yield fx.sample_posterior(rom, unknowns, [residual], fit, steps=20)
     yield fx.validate(rom, unknowns[:1], [residual.select([6])], [residual.select([7])])
-    yield from (fx.H1(), fx.H2(), fx.Hv(), fx.Periodic(period=1.0))
+    yield from (fx.H1Estimator(), fx.H2Estimator(), fx.HvEstimator(), fx.Periodic(period=1.0))
     # modes far away leave more than nothing where there is no noise at all
     noise = np.random.default_rng(5).normal(size=(2, *frf.data.shape)) * np.abs(frf.data).max()
     frf = frf.replace(data=frf.data + 1e-4 * (noise[0] + 1j * noise[1]))

@@ -11,6 +11,6 @@ from .measured import MeasuredModes as MeasuredModes
 from .numbering import numbered as numbered
 from .periodic import Periodic as Periodic
 from .periodic import multisine as multisine
-from .spectra import H1 as H1
-from .spectra import H2 as H2
-from .spectra import Hv as Hv
+from .spectra import H1Estimator as H1Estimator
+from .spectra import H2Estimator as H2Estimator
+from .spectra import HvEstimator as HvEstimator

@@ -10,7 +10,7 @@ from ..lti.frequency import Frf
 from ..values import FloatArray, positive
 from .periodic import Periodic, periodic_frf
 from .records import records
-from .spectra import H1, SpectralMethod, spectral_frf
+from .spectra import H1Estimator, SpectralMethod, spectral_frf
 
 Signals = FloatArray | Mapping[str, Any]
 
@@ -26,13 +26,13 @@ def estimate_frf(
 ) -> Frf:
     r"""Return the FRFs from inputs to outputs, with coherence and variance per line.
 
-    ======================  ==========================================================
-    ``H1(...)``             S_yu S_uu^-1: noise on the outputs, open loop
-    ``H2(...)``             S_yy S_uy^-1: noise on the inputs
-    ``Hv(...)``             total least squares: noise on both
-    ``Periodic(...)``       Y U^-1 of mean periods: no leakage, noise on both
-    with ``reference=r``    S_yr S_ur^-1: under feedback (joint input-output)
-    ======================  ==========================================================
+    ====================  ==========================================================
+    ``H1Estimator(...)``  S_yu S_uu^-1: noise on the outputs, open loop
+    ``H2Estimator(...)``  S_yy S_uy^-1: noise on the inputs
+    ``HvEstimator(...)``  total least squares: noise on both
+    ``Periodic(...)``     Y U^-1 of mean periods: no leakage, noise on both
+    with ``reference=r``  S_yr S_ur^-1: under feedback (joint input-output)
+    ====================  ==========================================================
 
     A machine that floats is measured under feedback, where noise finds its way back to the
     inputs and H1 is biased towards ``-1/K``. References r that are not correlated with the noise
@@ -49,8 +49,8 @@ def estimate_frf(
         Sampling rate.
     reference : array or mapping, optional
         The excitation added inside the loop, one signal per input.
-    method : H1, H2, Hv or Periodic
-        How to average; ``H1()`` by default.
+    method : H1Estimator, H2Estimator, HvEstimator or Periodic
+        How to average; ``H1Estimator()`` by default.
     quantity : {"displacement", "velocity", "acceleration"}, optional
         What the outputs are; `Frf.converted` changes it.
 
@@ -83,11 +83,12 @@ def estimate_frf(
     data = records(inputs, outputs, reference, positive(rate, "rate"))
     if quantity not in (None, "displacement", "velocity", "acceleration"):
         raise unknown_label("quantity", quantity, ["displacement", "velocity", "acceleration"])
-    method = H1() if method is None else method
+    method = H1Estimator() if method is None else method
     if isinstance(method, Periodic):
         return periodic_frf(data, method, quantity)
     if isinstance(method, SpectralMethod):
         return spectral_frf(data, method, quantity)
     raise ModelError(
-        f"method is H1(...), H2(...), Hv(...) or Periodic(...), got {type(method).__name__}."
+        "method is H1Estimator(...), H2Estimator(...), HvEstimator(...) or Periodic(...), got "
+        f"{type(method).__name__}."
     )

@@ -15,7 +15,7 @@ from .records import Records
 
 @dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class SpectralMethod(Value):
-    """Averages of windowed, overlapping segments (Welch); the base of `H1`, `H2` and `Hv`.
+    """Averages of windowed, overlapping segments (Welch); the base of H1, H2 and Hv.
 
     Parameters
     ----------
@@ -51,7 +51,7 @@ class SpectralMethod(Value):
         return f"{type(self).__name__}(segments of {length}, window {self.window!r})"
 
 
-class H1(SpectralMethod):
+class H1Estimator(SpectralMethod):
     """``G = S_yu S_uu^-1``: unbiased with noise on outputs, in open loop.
 
     Parameters
@@ -70,7 +70,7 @@ class H1(SpectralMethod):
     """
 
 
-class H2(SpectralMethod):
+class H2Estimator(SpectralMethod):
     """``G = S_yy S_uy^-1``: unbiased with noise on inputs; for one input, or n_out = n_in.
 
     Parameters
@@ -89,7 +89,7 @@ class H2(SpectralMethod):
     """
 
 
-class Hv(SpectralMethod):
+class HvEstimator(SpectralMethod):
     """Total least squares of every output and all inputs, each scaled to unit power per line.
 
     For one input its size is the geometric mean of those of H1 and H2.
@@ -173,10 +173,10 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         inverse = _inverse(found.block("u", "u"))
         coherent = np.einsum("fyu,fuy->fy", found.block("y", "u"), explained).real
     else:
-        if type(method) is not H1:
+        if type(method) is not H1Estimator:
             raise ModelError(
                 "with a reference the estimate is joint input-output, G = S_yr S_ur^-1: pass "
-                "method=H1(...) or Periodic(...)."
+                "method=H1Estimator(...) or Periodic(...)."
             )
         back = found.block("u", "r")
         G = _right_divided(found.block("y", "r"), back)
@@ -229,17 +229,17 @@ def _left_over(found: Averages, G: ComplexArray, *, with_reference: bool) -> Com
 
 def _open_loop(found: Averages, method: SpectralMethod) -> ComplexArray:
     yu, uu, yy = found.block("y", "u"), found.block("u", "u"), found.block("y", "y")
-    if isinstance(method, H2):
+    if isinstance(method, H2Estimator):
         if found.n_in == 1:
             power = np.einsum("foo->fo", yy)[:, :, None]
             return np.asarray(power / yu.conj())
         if found.n_in != found.n_out:
             raise ShapeError(
                 f"H2 inverts the cross spectra of outputs and inputs, got {found.n_out} and "
-                f"{found.n_in}: take as many outputs as inputs, or H1 or Hv."
+                f"{found.n_in}: take as many outputs as inputs, or H1Estimator or HvEstimator."
             )
         return _right_divided(yy, yu.conj().transpose(0, 2, 1))
-    if isinstance(method, Hv):
+    if isinstance(method, HvEstimator):
         rows = [_total(found, o) for o in range(found.n_out)]
         return np.stack(rows, axis=1)
     return _right_divided(yu, uu)
