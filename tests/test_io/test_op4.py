@@ -81,6 +81,11 @@ def test_words_and_markers_of_any_length(tmp_path, order, marker, integer):
     path = tmp_path / "x.op4"
     path.write_bytes(content)
     found = read_op4_matrices(path)
+    # words of 8 bytes hold type 1 in double precision
+    path_of_K = tmp_path / "k.op4"
+    square = record(whole(2, 2, 2, 1), name) + record(whole(1, 1, 2), real(2.0, -1.0))
+    path_of_K.write_bytes(square + record(whole(3, 1, 1), real(1.0)))
+    assert read_op4(path_of_K).digits == (7 if integer == 4 else None)
     expected = np.zeros((4, 3))
     expected[1:3, 0], expected[0, 2] = (1.5, -2.5), 0.25
     assert np.array_equal(found["KAA"], expected)

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.io
 import scipy.linalg as la
 import scipy.sparse as sp
 
@@ -155,3 +156,66 @@ def test_the_aircraft_with_its_coordinates_becomes_a_free_model(tmp_path):
     # ten printed digits lose the softest mode, as the warning says
     assert -0.0075 < ours[0] < -0.006
     assert np.abs(ours[1:]).max() < 3e-4
+
+
+def test_single_precision_has_seven_digits():
+    """Rounding of float32 holds a free plate: the same as a text of seven digits."""
+    exact = plate()
+    K, M = exact.K.toarray().astype(np.float32), exact.M.toarray().astype(np.float32)
+    for given in (K, sp.csc_array(K), [list(row) for row in K]):
+        single = FEMatrices(given, M, dofs=exact.dofs)
+        assert single.digits == 7
+    assert FEMatrices(np.eye(2, dtype=np.float16)).digits == 3
+    for double in (K.astype(np.float64), K.astype(np.int64), exact.K):
+        assert FEMatrices(double).digits is None
+    report = fx.check(single)
+    assert report.ok
+    assert (report.rigid, report.n_rigid, report.n_zero) == (("z", "rx", "ry"), 3, 3)
+    assert "7 digits are enough" in str(report)
+    assert report.first_freq == pytest.approx(elastic(exact)[0], rel=1e-5)
+    with pytest.raises(ModelError, match=r"3 of its rigid-body motions.*7 digits.*free=True"):
+        single.model()
+    with pytest.raises(ModelError, match=r"3 of its rigid-body motions.*7 digits.*free=True"):
+        FEModel(M, K, dofs=exact.dofs)
+    modes = fx.solve_modes(single.model(free=True), count=9)
+    assert modes.freq[:3].tolist() == [0, 0, 0]
+    assert modes.freq[3:] == pytest.approx(elastic(exact), rel=2e-5)
+
+
+def test_single_precision_that_happens_to_be_definite_warns():
+    """Rounding that stiffens holds the plate at about 1 Hz, which no factorisation refuses."""
+    exact = plate()
+    K = exact.K.toarray()
+    up = np.diag(np.spacing(np.diag(K).astype(np.float32)) * 0.5)
+    K = (K + up).astype(np.float32)
+    with pytest.warns(FlexplantWarning, match=r"held by nothing but the rounding.*free=True"):
+        model = FEModel(exact.M, K, dofs=exact.dofs)
+    assert 0.1 < fx.solve_modes(model, count=3).freq[0] < 10
+    exact_in_single = FEModel(
+        np.eye(2, dtype="f4"),
+        np.array([[5, -5], [-5, 5]], "f4"),
+        dofs=fx.DofSet([1, 2], ["z", "z"], np.zeros((2, 3))),
+    )
+    assert exact_in_single.rigid_body.shape[1] == 1
+
+
+@pytest.mark.parametrize("kind", ["npz", "sparse npz", "npy", "mat v5", "mat v7.3"])
+def test_single_precision_in_files(tmp_path, kind):
+    K = np.array([[2, -1.1], [-1.1, 3]], np.float32)
+    path = tmp_path / {"n": "K.npz", "s": "K.npz", "m": "K.mat"}[kind[0]]
+    path = path.with_suffix(".npy") if kind == "npy" else path
+    if kind == "npz":
+        np.savez(path, K=K, M=np.eye(2))
+    elif kind == "sparse npz":
+        sp.save_npz(path, sp.csc_array(K))
+    elif kind == "npy":
+        np.save(path, K)
+    elif kind == "mat v5":
+        scipy.io.savemat(path, {"K": K, "M": np.eye(2)})
+    else:
+        h5py = pytest.importorskip("h5py")
+        with h5py.File(path, "w", userblock_size=512) as file:
+            file["K"] = K
+        with path.open("r+b") as file:
+            file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
+    assert fx.read_matrices(path).digits == 7

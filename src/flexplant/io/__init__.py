@@ -30,11 +30,11 @@ from .frf_arrays import read_frf_mat as read_frf_mat
 from .frf_arrays import read_frf_npz as read_frf_npz
 from .frf_csv import read_frf_csv as read_frf_csv
 from .frf_csv import write_frf_csv as write_frf_csv
+from .harwell_boeing import read_harwell_boeing as read_harwell_boeing
 from .mat_matrices import read_matlab as read_matlab
 from .mat_matrices import read_npz as read_npz
 from .mat_systems import read_mat as read_mat
 from .mat_systems import write_mat as write_mat
-from .matrix_market import read_harwell_boeing as read_harwell_boeing
 from .matrix_market import read_matrix_market as read_matrix_market
 from .models import read_matrices as read_matrices
 from .models import read_model as read_model

@@ -15,7 +15,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .formats import Format
-from .numbers import printed_digits, spaced_numbers
+from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
 from .paths import file_path
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
@@ -162,16 +162,16 @@ def _triplets(path: str | Path) -> _Triplets:
     for line in lines:
         match = re.search(rb"SCALE\s*FACTOR\s*=\s*([^,\s]+)", line.upper())
         if match and line[:1] == b"*" and line[:2] != b"**":
-            scale = float(match[1])
+            scale = _scale(match[1], path)
     if not data:
         raise FlexplantError(f"{str(path)!r} holds no matrix. Write it again.")
     width = len(_WORD.findall(data[0]))
     if width not in (3, 5) or (width == 3 and b"," in data[0]):
         raise _wrong(path, lines, data[0], 5)
-    numbers = spaced_numbers(b"\n".join(data).replace(b",", b" "), width * len(data))
-    if numbers is None:
-        raise next(_wrong(path, lines, line, width) for line in data if not _fits(line, width))
-    table = numbers.reshape(-1, width)
+    table = rows_of_numbers(b"\n".join(data).replace(b",", b" "), width)
+    if table is None:
+        at = wrong_line((line.replace(b",", b" ") for line in data), width)
+        raise _wrong(path, lines, data[at or 0], width)
     labels = table[:, :-1]
     if not np.all(np.isfinite(table)) or np.any(labels != np.round(labels)):
         bad = np.argmax(~np.isfinite(table).all(axis=1) | (labels != np.round(labels)).any(axis=1))
@@ -208,9 +208,11 @@ def _triplets(path: str | Path) -> _Triplets:
     )
 
 
-def _fits(line: bytes, width: int) -> bool:
-    numbers = spaced_numbers(line.replace(b",", b" "), width)
-    return numbers is not None
+def _scale(word: bytes, path: str | Path) -> float:
+    try:
+        return decimal(word.decode("latin-1"))
+    except ValueError as error:
+        raise FlexplantError(f"{str(path)!r}: SCALE FACTOR={error}. Write it again.") from None
 
 
 def _wrong(path: str | Path, lines: list[bytes], line: bytes, width: int) -> FlexplantError:
@@ -278,7 +280,7 @@ def _nodes(path: str | Path) -> dict[int, list[float]]:
         elif inside:
             try:
                 node, *xyz = [part.strip() for part in line.rstrip(",").split(",")]
-                places[int(node)] = ([float(part or 0) for part in xyz[:3]] + [0.0] * 3)[:3]
+                places[int(node)] = ([decimal(part or "0") for part in xyz[:3]] + [0.0] * 3)[:3]
             except ValueError:
                 raise FlexplantError(
                     f"{str(path)!r}, line {number}: a node and its coordinates are due, got "

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,9 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
+from ..structure.precision import digits_of
 from .numbers import printed_digits
+from .paths import file_path
 from .tables import read_dofs
 
 #: the names under which K, M and D are looked for, in any case
@@ -56,12 +58,37 @@ def assembled(
         done["M"],
         done["D"],
         dofs=named,
-        digits=digits,
+        digits=digits_of(parts["K"]) if digits is None else digits,
         source=source,
         located=located,
         notes=tuple(said),
     )
     return whole.trimmed()
+
+
+def one_matrix_each(
+    paths: Mapping[str, str | Path | None],
+    read: Callable[[Path], tuple[Any, int | None]],
+    dofs: DofSet | str | Path | None,
+) -> FEMatrices:
+    """Return the FEMatrices of files that hold one matrix each.
+
+    Parameters
+    ----------
+    paths : mapping {"K", "M", "D": path or None}
+        The files.
+    read : callable
+        Returns the matrix of a file, and the digits it was printed with.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for.
+    """
+    parts: dict[str, Any] = {}
+    digits: int | None = None
+    for name, path in paths.items():
+        if path is not None:
+            parts[name], printed = read(file_path(path, name))
+            digits = printed if name == "K" else digits
+    return assembled(parts, dofs=dofs, source=Path(str(paths["K"])).name, digits=digits)
 
 
 def chosen(

@@ -244,14 +244,17 @@ def _block(
         stop += 1
     part = lines[first:stop]
     if all(line[:5] == b"DMIG*" or line[:1] == b"*" for line in part) and part:
-        columns, rows, values, words = _large(part, first, path)
+        columns, rows, values, words = _large(part, first, head[2] < 3, path)
     else:
-        columns, rows, values, words = _any(part, first, head[0], path)
+        columns, rows, values, words = _any(part, first, head[0], head[2] < 3, path)
     return _Block(*head, rows, columns, values, printed_digits(words))
 
 
-def _large(part: list[bytes], first: int, path: str) -> Any:
-    """Return columns, rows, values of cards in large fields, all at once."""
+def _large(part: list[bytes], first: int, real: bool, path: str) -> Any:
+    """Return columns, rows, values of cards in large fields, all at once.
+
+    Of a real matrix the last field, the imaginary part, must be empty or 0.
+    """
     table = np.frombuffer(b"".join(line[:72].ljust(72) for line in part), np.uint8)
     table = table.reshape(-1, 72)
     heads = table[:, 0] == ord("D")
@@ -269,6 +272,12 @@ def _large(part: list[bytes], first: int, path: str) -> Any:
     values = _field(table[~heads, 40:56])
     if values is None:
         raise _named(part, np.flatnonzero(~heads), 40, first, path, "a number")
+    if real:
+        beyond = _field(table[~heads, 56:72])
+        if beyond is None or np.any(beyond):
+            wrong = 0 if beyond is None else int(np.argmax(beyond != 0))
+            at = int(np.flatnonzero(~heads)[wrong])
+            raise _wrong(path, first + at, part[at], "no imaginary part (the matrix is real)")
     places = np.flatnonzero(~heads)
     words = [part[i][40:56] for i in places[:: max(1, places.size // 1000)]]
     return columns[np.cumsum(heads)[~heads] - 1], rows, values, words
@@ -296,7 +305,7 @@ def _named(
     return _wrong(path, first, part[0], "numbers in every field")
 
 
-def _any(part: list[bytes], first: int, name: str, path: str) -> Any:
+def _any(part: list[bytes], first: int, name: str, real: bool, path: str) -> Any:
     """Return columns, rows, values of cards in small or free fields, line by line."""
     columns, rows, values, words = list[int](), list[int](), list[float](), list[bytes]()
     column, started = 0, False
@@ -315,10 +324,13 @@ def _any(part: list[bytes], first: int, name: str, path: str) -> Any:
             if not started:
                 raise ValueError
             for i in range(0, len(fields), 4):
-                entry = [*fields[i : i + 4], b"", b"", b""]
+                entry = [*fields[i : i + 4], b"", b"", b"", b""]
                 if entry[0]:
                     rows.append(_code(entry[0], entry[1]))
                     values.append(nastran_float(entry[2].decode("latin-1")))
+                    # a decimal comma would leave its digits in the field of the imaginary part
+                    if real and nastran_float(entry[3].removesuffix(b"+").decode("latin-1")):
+                        raise ValueError
                     columns.append(column)
                     words.append(entry[2])
         except (ValueError, IndexError, OverflowError):

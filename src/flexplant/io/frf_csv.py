@@ -14,6 +14,7 @@ from ..errors import FlexplantError, LabelError, ModelError
 from ..lti.frequency import Frf
 from ..store import written
 from ..values import FloatArray
+from .numbers import decimal
 from .paths import file_path
 
 _FREQ = "frequency [Hz]"
@@ -95,9 +96,9 @@ def read_frf_csv(path: str | Path) -> Frf:
     Raises
     ------
     FlexplantError
-        When the header or a line has another form; the line is named.
+        When the header or a line has another form, or a cell is no number; the line is named.
     ModelError
-        When numbers are not finite or frequencies do not increase.
+        When frequencies do not increase.
     FileNotFoundError
         When there is no such file.
     """
@@ -108,14 +109,14 @@ def read_frf_csv(path: str | Path) -> Frf:
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     keys = _header(rows[0] if rows else [], str(path))
     values = []
-    for number, row in enumerate(rows[1:], first + 1):
+    for line, row in enumerate(rows[1:], first + 1):
         try:
-            values.append([float(cell) for cell in row])
+            values.append([decimal(cell) for cell in row])
         except ValueError as error:
-            raise FlexplantError(f"{str(path)!r}, line {number}: {error}.") from None
+            raise FlexplantError(f"{str(path)!r}, line {line}: {error}.") from None
         if len(row) != len(keys) + 1:
             raise FlexplantError(
-                f"{str(path)!r}, line {number}: {len(row)} numbers, {len(keys) + 1} columns."
+                f"{str(path)!r}, line {line}: {len(row)} numbers, {len(keys) + 1} columns."
             )
     table = np.array(values, dtype=np.float64).reshape(len(values), len(keys) + 1)
     outputs = list(dict.fromkeys(key[0] for key in keys))

@@ -1,29 +1,25 @@
-"""Matrices as text: Matrix Market and Harwell-Boeing."""
+"""Matrix Market files: a matrix as text, a line an entry."""
 
 from __future__ import annotations
 
 import gzip
-import re
-from collections.abc import Callable, Mapping
-from itertools import islice
+import zlib
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.io
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, ModelError
+from ..errors import FlexplantError, ModelError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices
-from .assembled import assembled, text_digits
+from ..values import FloatArray
+from .assembled import one_matrix_each, text_digits
 from .formats import Format
-from .numbers import fixed_numbers, spaced_numbers
-from .paths import file_path
+from .numbers import rows_of_numbers, wrong_line
 
-#: entries whose digits are counted
+#: lines whose digits are counted
 _SAMPLE = 4000
-_FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)
 
 
 def read_matrix_market(
@@ -52,46 +48,10 @@ def read_matrix_market(
     Raises
     ------
     FlexplantError
-        When a file is no Matrix Market file.
+        When a file is no Matrix Market file, is cut short, or a line holds what is no number; the
+        line is named.
     ModelError
         When a matrix is complex, skew-symmetric or a pattern without numbers.
-    ShapeError
-        When sizes differ.
-    FileNotFoundError
-        When there is no such file.
-    """
-    return _read({"K": stiffness, "M": mass, "D": damping}, _matrix_market, dofs)
-
-
-def read_harwell_boeing(
-    stiffness: str | Path,
-    mass: str | Path | None = None,
-    *,
-    damping: str | Path | None = None,
-    dofs: DofSet | str | Path | None = None,
-) -> FEMatrices:
-    """Return the matrices of Harwell-Boeing (or Rutherford-Boeing) files.
-
-    Assembled real or integer matrices, symmetric (RSA, of which the file holds the lower triangle)
-    or not (RUA). The rest is as in `read_matrix_market`.
-
-    Parameters
-    ----------
-    stiffness, mass, damping : str or Path
-        Files (.rsa, .rua, .hb, .rb) of K, M and D.
-    dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for: the files do not say.
-
-    Returns
-    -------
-    FEMatrices
-
-    Raises
-    ------
-    FlexplantError
-        When a file is no Harwell-Boeing file, or cut short.
-    ModelError
-        When a matrix is complex, skew-symmetric, a pattern, or not assembled.
     ShapeError
         When sizes differ.
     FileNotFoundError
@@ -99,121 +59,126 @@ def read_harwell_boeing(
 
     Notes
     -----
-    Format: I. S. Duff, R. G. Grimes, J. G. Lewis, "Users' Guide for the Harwell-Boeing Sparse
-    Matrix Collection", 1992, section 2.
+    Format: R. F. Boisvert, R. Pozo, K. A. Remington, "The Matrix Market Exchange Formats: Initial
+    Design", NISTIR 5935, 1996. Exponents of Fortran (7.5D+03, 7.5+03) are read as such.
     """
-    return _read({"K": stiffness, "M": mass, "D": damping}, _harwell_boeing, dofs)
-
-
-def _read(
-    paths: Mapping[str, str | Path | None],
-    reader: Callable[[Path], tuple[Any, int | None]],
-    dofs: DofSet | str | Path | None,
-) -> FEMatrices:
-    parts: dict[str, Any] = {}
-    digits: list[int] = []
-    for name, path in paths.items():
-        if path is None:
-            continue
-        parts[name], printed = reader(file_path(path, name))
-        if printed is not None and name == "K":
-            digits.append(printed)
-    source = Path(str(paths["K"])).name
-    return assembled(parts, dofs=dofs, source=source, digits=min(digits, default=None))
+    return one_matrix_each({"K": stiffness, "M": mass, "D": damping}, _matrix_market, dofs)
 
 
 def _matrix_market(path: Path) -> tuple[Any, int | None]:
-    file: Any
-    with gzip.open(path, "rb") if path.suffix == ".gz" else path.open("rb") as file:
-        lines: list[bytes] = list(islice(file, _SAMPLE + 200))
-    head = lines[0].decode("latin-1").lower().split() if lines else []
-    if len(head) < 5 or head[0] != "%%matrixmarket":
+    try:
+        content = path.read_bytes()
+        content = gzip.decompress(content) if path.suffix == ".gz" else content
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise FlexplantError(f"{str(path)!r} cannot be unpacked ({error}): cut short?") from None
+    head = _header(content, path)
+    body = content[head.start :]
+    if b"%" in body:
+        body = b"\n".join(b"" if line[:1] == b"%" else line for line in body.split(b"\n"))
+    width = 3 if head.listed else 1
+    table = rows_of_numbers(body, width)
+    if table is None or not np.all(np.isfinite(table)):
+        lines = body.split(b"\n")
+        at = wrong_line(lines, width) or 0
+        due = "row, column and value" if head.listed else "one number"
         raise FlexplantError(
-            f"{str(path)!r} is no Matrix Market file: it begins with "
-            f"{lines[0][:40] if lines else b''!r}. Abaqus writes .mtx files of another kind: "
-            "read_abaqus."
+            f"{str(path)!r}, line {head.lines + at + 1}: expected {due}, got "
+            f"{lines[at].strip()[:72].decode('latin-1')!r}. A number has a decimal point and may "
+            "end in E, D or no letter and its exponent. Is the file cut short?"
         )
-    kind, symmetry = head[3], head[4]
+    if len(table) != head.entries:
+        raise FlexplantError(
+            f"{str(path)!r} announces {head.entries} entries and holds {len(table)}. Is it cut "
+            "short?"
+        )
+    matrix = _listed(table, head, path) if head.listed else _columns(table[:, 0], head)
+    if head.whole:
+        return matrix, None
+    lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
+    return matrix, text_digits(line.split()[-1] for line in lines if line.strip())
+
+
+class _Header(NamedTuple):
+    """What the first lines say, and where the entries begin."""
+
+    listed: bool  # coordinate form; else all entries column by column
+    whole: bool  # integers
+    symmetric: bool
+    shape: tuple[int, int]
+    entries: int
+    start: int  # bytes
+    lines: int
+
+
+def _header(content: bytes, path: Path) -> _Header:
+    start = content.find(b"\n") + 1 or len(content)
+    words = content[:start].decode("latin-1").lower().split()
+    if len(words) < 5 or words[0] != "%%matrixmarket":
+        raise FlexplantError(
+            f"{str(path)!r} is no Matrix Market file: it begins with {content[:40]!r}. Abaqus "
+            "writes .mtx files of another kind: read_abaqus."
+        )
+    form, kind, symmetry = words[2:5]
     if kind in ("complex", "pattern") or symmetry in ("skew-symmetric", "hermitian"):
         raise ModelError(
             f"{str(path)!r} is {kind} {symmetry}: a stiffness, mass or damping matrix is real and "
             "symmetric. Gyroscopic and structural (complex) terms have no place here."
         )
-    try:
-        matrix = scipy.io.mmread(str(path))
-    except (ValueError, TypeError, OverflowError, EOFError) as error:
+    lines = 1
+    line = b"%"
+    while start < len(content) and (not line.strip() or line[:1] == b"%"):
+        stop = content.find(b"\n", start) + 1 or len(content)
+        line, start, lines = content[start:stop], stop, lines + 1
+    sizes = [int(word) if word.isdigit() else -1 for word in line.split()]
+    known = form in ("coordinate", "array") and symmetry in ("general", "symmetric")
+    if not known or len(sizes) != (3 if form == "coordinate" else 2) or min(sizes) < 0:
         raise FlexplantError(
-            f"{str(path)!r} cannot be read as Matrix Market ({error}). Is it cut short?"
-        ) from None
-    if kind == "integer":
-        return matrix, None
-    rows = [line.split() for line in lines if not line.startswith(b"%") and line.strip()][1:]
-    return matrix, text_digits(row[-1] for row in rows)
-
-
-def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
-    lines = path.read_bytes().splitlines()
-    try:
-        counts = [int(lines[1][i : i + 14] or 0) for i in range(0, 56, 14)]
-        kind = lines[2][:3].decode("ascii").upper()
-        n_rows, n_columns, n_entries = (int(lines[2][i : i + 14]) for i in (14, 28, 42))
-        formats = lines[3].decode("ascii")
-        forms = [_form(formats[a:b]) for a, b in ((0, 16), (16, 32), (32, 52))]
-    except (IndexError, ValueError, UnicodeDecodeError) as error:
-        raise FlexplantError(
-            f"{str(path)!r} is no Harwell-Boeing file: its header cannot be read ({error})."
-        ) from None
-    if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
-        raise ModelError(
-            f"{str(path)!r} is of kind {kind!r}: only real or integer (R, I), symmetric or "
-            "unsymmetric (S, U), assembled (A) matrices are a stiffness or mass. A skew-symmetric "
-            "one is gyroscopic, an elemental one must be assembled first."
+            f"{str(path)!r}, line {lines}: the size of a matrix of {form} {symmetry} form cannot "
+            f"be read from {line[:72]!r}. Is it cut short?"
         )
-    right_hand = 1 if len(lines[1]) >= 70 and lines[1][56:70].strip() not in (b"", b"0") else 0
-    first = 4 + right_hand
-    blocks = []
-    needed = (n_columns + 1, n_entries, n_entries)
-    for count, (per_line, width), size in zip(counts[1:4], forms, needed, strict=True):
-        blocks.append(_block(lines[first : first + count], per_line, width, size, path))
-        first += count
-    pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
-    matrix: Any = sp.csc_array((blocks[2], index, pointer), shape=(n_rows, n_columns))
-    matrix.sum_duplicates()
-    if kind[1] == "S":
-        matrix = sp.csc_array(matrix + sp.tril(matrix, -1).T + sp.triu(matrix, 1).T)
-    if kind[0] == "I":
-        return matrix, None
-    per_line, width = forms[2]
-    start = 4 + right_hand + counts[1] + counts[2]
-    sample = lines[start : start + _SAMPLE // max(per_line, 1) + 1]
-    words = [line[i : i + width] for line in sample for i in range(0, len(line.rstrip()), width)]
-    return matrix, text_digits(words)
+    n, m = sizes[:2]
+    if symmetry == "symmetric" and n != m:
+        raise ShapeError(f"{str(path)!r} is called symmetric and is not square: {n} x {m}.")
+    full = n * (n + 1) // 2 if symmetry == "symmetric" else n * m
+    return _Header(
+        form == "coordinate",
+        kind in ("integer", "unsigned-integer"),
+        symmetry == "symmetric",
+        (n, m),
+        sizes[2] if form == "coordinate" else full,
+        start,
+        lines,
+    )
 
 
-def _form(text: str) -> tuple[int, int]:
-    """Return numbers a line and the width of one from a Fortran format such as (1P,4E20.12)."""
-    match = _FORMAT.search(text)
-    if match is None:
-        raise ValueError(f"format {text.strip()!r}")
-    return int(match[1] or 1), int(match[3])
-
-
-def _block(lines: list[bytes], per_line: int, width: int, size: int, path: Path) -> Any:
-    full = per_line * width
-    text = b"".join(line[:full].ljust(full) for line in lines)
-    numbers = fixed_numbers(text[: size * width], width) if len(text) >= size * width else None
-    if numbers is None:
-        # not in the fields that the header names, as some programs write; blanks still separate
-        numbers = spaced_numbers(b" ".join(lines), size)
-    if numbers is None:
+def _listed(table: FloatArray, head: _Header, path: Path) -> Any:
+    """Return the matrix of lines `row column value`; of a symmetric one both triangles."""
+    at = table[:, :2].astype(np.int64)
+    wrong = np.any((table[:, :2] != at) | (at < 1) | (at > head.shape), axis=1)
+    if wrong.any():
+        i, j = table[int(np.argmax(wrong)), :2]
         raise FlexplantError(
-            f"{str(path)!r} holds fewer than {size} numbers in fields of {width} characters, or "
-            "something else among them. Is it cut short, or were its blanks lost?"
+            f"{str(path)!r}, entry {int(np.argmax(wrong)) + 1}: row {i:g}, column {j:g} of a "
+            f"matrix of {head.shape[0]} x {head.shape[1]}, counted from 1. Write it again."
         )
-    return numbers
+    i, j, values = at[:, 0] - 1, at[:, 1] - 1, table[:, 2]
+    if head.symmetric:
+        off = i != j
+        i, j = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])
+        values = np.concatenate([values, values[off]])
+    return sp.coo_array((values, (i, j)), shape=head.shape)
+
+
+def _columns(values: FloatArray, head: _Header) -> FloatArray:
+    """Return the matrix of all entries, column by column (of a symmetric one the lower half)."""
+    if not head.symmetric:
+        return np.asarray(values.reshape(head.shape[::-1]).T)
+    n = head.shape[0]
+    matrix = np.zeros((n, n))
+    matrix.T[np.triu_indices(n)] = values
+    return np.asarray(matrix + np.tril(matrix, -1).T)
 
 
 MATRIX_MARKET = Format(
     (".mtx.gz",), read_matrix_market, lambda head: head.startswith(b"%%matrixmarket")
 )
-HARWELL_BOEING = Format((".rsa", ".rua", ".hb", ".rb"), read_harwell_boeing)

@@ -12,14 +12,25 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices, FEModel
 from ..values import short
-from . import abaqus, ansys, dmig, exodus, mat_matrices, matrix_market, op4, sierra, uff
+from . import (
+    abaqus,
+    ansys,
+    dmig,
+    exodus,
+    harwell_boeing,
+    mat_matrices,
+    matrix_market,
+    op4,
+    sierra,
+    uff,
+)
 from .formats import HEAD, Elsewhere, Format, ends
 from .paths import file_path
 from .tables import at_nodes, read_dofs, read_nodes_table
 
 FORMATS: tuple[Format, ...] = (
     matrix_market.MATRIX_MARKET,
-    matrix_market.HARWELL_BOEING,
+    harwell_boeing.HARWELL_BOEING,
     mat_matrices.MATLAB,
     mat_matrices.NUMPY,
     ansys.FULL,

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,9 +10,9 @@ import numpy as np
 
 from ..errors import FlexplantError, LabelError, ModelError
 from ..values import FloatArray
+from .numbers import decimal
 from .paths import file_path
 
-_BARE = re.compile(r"(?<=[\d.])([+-]\d)")
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S", "SPOINT")
 
 
@@ -101,8 +100,7 @@ def nastran_float(text: str) -> float:
     >>> nastran_float("-2.5-3")
     -0.0025
     """
-    word = text.strip().upper().replace("D", "E")
-    return float(_BARE.sub(r"E\1", word) if "E" not in word else word) if word else 0.0
+    return decimal(text) if text.strip() else 0.0
 
 
 def cards(lines: Iterable[str], kinds: tuple[str, ...]) -> Iterator[tuple[int, str, list[str]]]:

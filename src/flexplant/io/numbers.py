@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,32 @@ from ..values import FloatArray
 
 #: an exponent without its letter: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
+_DECIMAL = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:[eEdDqQ]([+-]?[0-9]+)|([+-][0-9]+))?")
 _DIGITS = re.compile(rb"[+-]?0*(\d*)\.?(\d*)")
+
+
+def decimal(text: str) -> float:
+    """Return a decimal number as Fortran or C writes it: 7.5, 7.5e3, 7.5D+03, 7.5+03.
+
+    Parameters
+    ----------
+    text : str
+        One number; blanks around it do not matter.
+
+    Raises
+    ------
+    ValueError
+        When it is anything else: a decimal comma, hexadecimal digits, underscores, nan.
+
+    Examples
+    --------
+    >>> decimal(" 7.5D+03"), decimal("-2.5-3")
+    (7500.0, -0.0025)
+    """
+    match = _DECIMAL.fullmatch(text.strip())
+    if match is None:
+        raise ValueError(f"{text.strip()!r:.40} is no decimal number")
+    return float(f"{match[1]}e{match[2] or match[3] or 0}")
 
 
 def fixed_numbers(text: bytes, width: int) -> FloatArray | None:
@@ -31,6 +57,11 @@ def fixed_numbers(text: bytes, width: int) -> FloatArray | None:
     array([ 1.5, -2.5])
     """
     fields = np.frombuffer(text, np.uint8).reshape(-1, width)
+    shown = np.zeros((fields.shape[0], width + 1), dtype=bool)
+    shown[:, 1:] = fields != ord(" ")
+    # one number in each: a blank within a field beside an empty field would shift all that follow
+    if np.any(np.count_nonzero(shown[:, 1:] & ~shown[:, :-1], axis=1) != 1):
+        return None
     return spaced_numbers(_separated(fields).tobytes(), len(fields))
 
 
@@ -53,10 +84,60 @@ def spaced_numbers(text: bytes, count: int | None = None) -> FloatArray | None:
         How many there must be.
     """
     clean = text.translate(_LETTERS)
+    seen = np.frombuffer(clean, np.uint8)
+    signs = np.flatnonzero((seen[1:] == ord("+")) | (seen[1:] == ord("-")))
+    before = seen[signs]
+    if np.any((before >= ord("0")) & (before <= ord("9")) | (before == ord("."))):
+        clean = _BARE.sub(rb"\1e\2", clean)
     numbers = _parsed(clean)
-    if numbers is None or (count is not None and numbers.size != count):
-        numbers = _parsed(_BARE.sub(rb"\1e\2", clean))
     return None if numbers is None or (count is not None and numbers.size != count) else numbers
+
+
+def rows_of_numbers(text: bytes, width: int) -> FloatArray | None:
+    r"""Return the numbers (m, width) of m lines, None when a line does not hold `width` numbers.
+
+    Parameters
+    ----------
+    text : bytes
+        Numbers as in `spaced_numbers`; empty lines are passed over.
+    width : int
+        How many a line must hold.
+
+    Examples
+    --------
+    >>> rows_of_numbers(b"1 2.5D0\n\n2 -1+1\n", 2).tolist()
+    [[1.0, 2.5], [2.0, -10.0]]
+    """
+    seen = np.frombuffer(text, np.uint8)
+    shown = np.zeros(seen.size + 1, dtype=bool)
+    shown[1:] = (seen > ord(" ")) & (seen != 127)
+    starts = np.flatnonzero(shown[1:] & ~shown[:-1])
+    ends = np.append(np.flatnonzero(seen == ord("\n")), seen.size)
+    held = np.diff(np.searchsorted(starts, ends), prepend=0)
+    if np.any((held != width) & (held != 0)):
+        return None
+    numbers = spaced_numbers(text, starts.size)
+    return None if numbers is None else numbers.reshape(-1, width)
+
+
+def wrong_line(lines: Iterable[bytes], width: int) -> int | None:
+    """Return the place (from 0) of the first line that does not hold `width` finite numbers.
+
+    Parameters
+    ----------
+    lines : iterable of bytes
+        Empty ones are passed over.
+    width : int
+        How many each must hold.
+    """
+    for place, line in enumerate(lines):
+        words = line.decode("latin-1").split()
+        try:
+            if words and len([decimal(word) for word in words]) != width:
+                return place
+        except ValueError:
+            return place
+    return None
 
 
 _LETTERS = bytes.maketrans(b"DdEQ", b"eeee")

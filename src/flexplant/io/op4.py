@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from ..errors import FlexplantError, ModelError, unknown_label
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices
+from ..structure.precision import digits_of
 from ..values import name_list
 from .formats import Format
 from .op4_text import text_matrices
@@ -51,7 +52,7 @@ def read_op4(
     Returns
     -------
     FEMatrices
-        With `digits` as printed, for a text file.
+        With the `digits` of K as printed in a text file, 7 in single precision (type 1).
 
     Raises
     ------
@@ -69,7 +70,7 @@ def read_op4(
     Format: MSC Nastran Quick Reference Guide and DMAP manual, OUTPUT4; matrices of form 6
     (symmetric) with one triangle only are completed.
     """
-    found, digits = _read(path, None)
+    found = _read(path, None)
     chosen = {
         "stiffness": _chosen(stiffness, _STIFFNESS, "stiffness", found, path),
         "mass": _chosen(mass, _MASS, "mass", found, path),
@@ -82,6 +83,7 @@ def read_op4(
         )
     K, M, D = (_real(found, name, path) for name in chosen.values())
     assert K is not None  # noqa: S101 - its name is known
+    digits = found[chosen["stiffness"]][2]
     return FEMatrices(K, M, D, dofs=dofs, digits=digits, source=str(path))
 
 
@@ -111,8 +113,8 @@ def read_op4_matrices(
     FileNotFoundError
         When there is no such file.
     """
-    found, _ = _read(path, None if names is None else name_list(names, "matrices"))
-    return {name: matrix for name, (matrix, _) in found.items()}
+    found = _read(path, None if names is None else name_list(names, "matrices"))
+    return {name: matrix for name, (matrix, _, _) in found.items()}
 
 
 def _chosen(
@@ -134,7 +136,7 @@ def _chosen(
 def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
     if name is None:
         return None
-    matrix, form = found[name]
+    matrix, form, _ = found[name]
     if np.iscomplexobj(matrix):
         raise ModelError(
             f"matrix {name} of {str(path)!r} is complex: a structure's M, D and K are real. "
@@ -150,27 +152,24 @@ def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_a
 
 def _read(
     path: str | Path, names: tuple[str, ...] | None
-) -> tuple[dict[str, tuple[Op4Matrix, int]], int | None]:
-    """Return {name: (matrix, form)}, and the digits of a text file."""
+) -> dict[str, tuple[Op4Matrix, int, int | None]]:
+    """Return {name: (matrix, form, decimal digits of its entries)}; None is double precision."""
     content = file_path(path).read_bytes()
-    digits: int | None = None
     if len(content) < 16:
         raise FlexplantError(
             f"{str(path)!r} has {len(content)} bytes, too few for an OUTPUT4 file. Write it again."
         )
     try:
-        if content[:4].count(0):
-            parts = list(_binary(content, str(path)))
-        else:
-            parts, digits = text_matrices(content, str(path))
+        form_of_file = _binary if content[:4].count(0) else text_matrices
+        parts = list(form_of_file(content, str(path)))
     except MemoryError:
         raise FlexplantError(
             f"{str(path)!r} names a size that does not fit into memory: the header is damaged, or "
             "a large matrix is held dense. Write it again, sparse."
         ) from None
-    found: dict[str, tuple[Op4Matrix, int]] = {}
+    found: dict[str, tuple[Op4Matrix, int, int | None]] = {}
     matrix: Any
-    for name, matrix, form in parts:
+    for name, matrix, form, digits in parts:
         entries = matrix.data if hasattr(matrix, "indptr") else matrix
         if not np.all(np.isfinite(entries)):
             raise FlexplantError(
@@ -181,13 +180,13 @@ def _read(
         while key in found:
             count += 1
             key = f"{name}_{count}"
-        found[key] = (matrix, form)
+        found[key] = (matrix, form, digits)
     if names is None:
-        return found, digits
+        return found
     for name in names:
         if name not in found:
             raise unknown_label("matrix", name, found, repr(str(path)))
-    return {name: found[name] for name in names}, digits
+    return {name: found[name] for name in names}
 
 
 @dataclass(frozen=True)
@@ -246,7 +245,7 @@ class _Words:
         return list(struct.unpack_from(form, self.content, at))
 
 
-def _binary(content: bytes, path: str) -> Iterable[tuple[str, Op4Matrix, int]]:
+def _binary(content: bytes, path: str) -> Iterable[tuple[str, Op4Matrix, int, int | None]]:
     words = _Words(content, path)
     size, marker = words.layout.integer, words.layout.marker
     at = 0
@@ -285,7 +284,8 @@ def _binary(content: bytes, path: str) -> Iterable[tuple[str, Op4Matrix, int]]:
                 )
             starts.append(start)
             stops.append(stop)
-        yield name, _matrix(words, name, (abs(rows), columns), rows < 0, kind, starts, stops), form
+        matrix = _matrix(words, name, (abs(rows), columns), rows < 0, kind, starts, stops)
+        yield name, matrix, form, digits_of(np.zeros(0, dtype=words.real[kind % 2 == 0]))
 
 
 def _matrix(

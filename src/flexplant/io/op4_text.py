@@ -12,11 +12,13 @@ import scipy.sparse as sp
 from ..errors import FlexplantError
 from .numbers import fixed_numbers
 
+#: digits of single precision (types 1 and 3), however many are printed
+_SINGLE = 7
 _FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
 
 
-def text_matrices(content: bytes, path: str) -> tuple[list[tuple[str, Any, int]], int]:
-    """Return (name, matrix, form) of each matrix, and the fewest significant digits printed.
+def text_matrices(content: bytes, path: str) -> list[tuple[str, Any, int, int]]:
+    """Return (name, matrix, form, significant digits) of each matrix.
 
     Parameters
     ----------
@@ -31,13 +33,12 @@ def text_matrices(content: bytes, path: str) -> tuple[list[tuple[str, Any, int]]
         When it is no text of OUTPUT4, or cut off; the line is named.
     """
     reader = _Reader(content.splitlines(), path)
-    matrices, digits = [], 99
+    matrices = []
     while reader.more():
         matrices.append(reader.matrix())
-        digits = min(digits, reader.digits)
     if not matrices:
         raise reader.wrong("no matrix in the file")
-    return matrices, digits
+    return matrices
 
 
 @dataclass
@@ -47,7 +48,6 @@ class _Reader:
     lines: list[bytes]
     path: str
     at: int = 0
-    digits: int = 0
     width: int = 0
     per_line: int = 1
     chunks: list[bytes] = field(default_factory=list)
@@ -83,7 +83,7 @@ class _Reader:
             start += width
         return numbers
 
-    def matrix(self) -> tuple[str, Any, int]:
+    def matrix(self) -> tuple[str, Any, int, int]:
         line = self.line()
         head = (16, 16, 8, 8) if b"I16" in line else (8, 8, 8, 8)
         columns, rows, form, kind = self.integers(line, head)
@@ -98,7 +98,8 @@ class _Reader:
             )
         self.per_line, self.width = int(match[2]), int(match[3])
         # Fortran's scale factor 1P puts one digit before the point
-        self.digits = int(match[4]) + (int(match[1]) if match[1] else 0)
+        digits = int(match[4]) + (int(match[1]) if match[1] else 0)
+        digits = min(digits, _SINGLE) if kind in (1, 3) else digits
         self.chunks, self.strings = [], []
         sparse = rows < 0
         per = 2 if kind > 2 else 1
@@ -120,7 +121,8 @@ class _Reader:
             else:
                 sparse = True
                 self._sparse(column, count, words, per, rows < 0)
-        return name, self._assembled((abs(rows), columns), kind > 2, sparse, name), form
+        matrix = self._assembled((abs(rows), columns), kind > 2, sparse, name)
+        return name, matrix, form, digits
 
     def _peek(self) -> bytes:
         return self.lines[self.at].rstrip() if self.at < len(self.lines) else b""

@@ -15,7 +15,7 @@ from ..values import FloatArray
 from .abaqus import symmetric
 from .exodus import opened
 from .formats import Format
-from .numbers import printed_digits, spaced_numbers
+from .numbers import printed_digits, rows_of_numbers, wrong_line
 from .paths import file_path
 
 _WORD = re.compile(rb"[^\s,;]+")
@@ -115,17 +115,15 @@ def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
     lines = [line.replace(b"...", b" ") for line in lines]
     words = [_WORD.findall(line) for line in lines]
     kept = [line for line in lines if line]
-    numbers = spaced_numbers(re.sub(rb"[,;]", b" ", b"\n".join(kept)), width * len(kept))
-    if numbers is None or not kept or not np.all(np.isfinite(numbers)):
-        for at, row in enumerate(words):
-            values = spaced_numbers(b" ".join(row), width)
-            if row and (values is None or not np.all(np.isfinite(values))):
-                raise FlexplantError(
-                    f"{str(path)!r}, line {first + at}: {width} number{'s' * (width > 1)} are due, "
-                    f"got {lines[at][:72].decode('latin-1')!r}. Write it again with 'mfile'."
-                )
+    table = rows_of_numbers(re.sub(rb"[,;]", b" ", b"\n".join(kept)), width)
+    if table is None or not kept or not np.all(np.isfinite(table)):
+        at = wrong_line((b" ".join(row) for row in words), width)
+        if at is not None:
+            raise FlexplantError(
+                f"{str(path)!r}, line {first + at}: {width} number{'s' * (width > 1)} are due, "
+                f"got {lines[at][:72].decode('latin-1')!r}. Write it again with 'mfile'."
+            )
         raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
-    table = numbers.reshape(-1, width)
     whole = table[:, : width - 1] if width > 1 else table
     wrong = (whole != np.round(whole)) | ((whole < 1) & (width > 1))
     if np.any(wrong):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
 from ..values import FloatArray, IntArray
+from .numbers import decimal
 from .paths import file_path
 
 #: what other programs call the six directions
@@ -79,10 +80,11 @@ def read_dofs(
     FileNotFoundError
         When there is no such file.
     """
-    columns = _table(path)
+    table = _table(path)
+    columns = table.columns
     scale = units(length).length
     if directions is not None:
-        numbers, xyz = _nodes(columns, path)
+        numbers, xyz = _nodes(table)
         each = [_direction(name, path) for name in directions]
         return DofSet(
             np.repeat(numbers, len(each)),
@@ -96,16 +98,16 @@ def read_dofs(
             f"{str(path)!r} has no column {missing}, got {list(columns)}. One line a DOF: node, "
             "direction, x, y, z; or give nodes=table of coordinates, or directions=(...)."
         )
-    numbers = _whole(columns["node"], "node", path)
+    numbers = table.whole("node")
     kinds = [_direction(name, path) for name in columns["direction"]]
     if nodes is None:
-        xyz = np.column_stack([_numbers(columns[c], c, path) for c in "xyz"])
+        xyz = np.column_stack([table.numbers(c) for c in "xyz"])
     else:
         known, places = read_nodes_table(nodes)
         xyz = at_nodes(numbers, known, places, str(nodes))
     order = np.arange(numbers.size)
     if "row" in columns:
-        rows = _whole(columns["row"], "row", path)
+        rows = table.whole("row")
         if not np.array_equal(np.sort(rows), np.arange(1, rows.size + 1)):
             raise LabelError(
                 f"column 'row' of {str(path)!r} must count the {rows.size} rows of the matrices "
@@ -128,7 +130,7 @@ def read_nodes_table(path: str | Path) -> tuple[IntArray, FloatArray]:
     FlexplantError
         When it has another form.
     """
-    return _nodes(_table(path, plain=("node", "x", "y", "z")), path)
+    return _nodes(_table(path, plain=("node", "x", "y", "z")))
 
 
 def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:
@@ -149,64 +151,83 @@ def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) ->
     return np.asarray(xyz[order[np.searchsorted(known[order], wanted)]], dtype=np.float64)
 
 
-def _nodes(columns: Mapping[str, list[str]], path: str | Path) -> tuple[IntArray, FloatArray]:
-    missing = [name for name in ("node", "x", "y", "z") if name not in columns]
+def _nodes(table: _Table) -> tuple[IntArray, FloatArray]:
+    missing = [name for name in ("node", "x", "y", "z") if name not in table.columns]
     if missing:
         raise LabelError(
-            f"{str(path)!r} has no column {missing}, got {list(columns)}: a table of nodes has "
-            "node, x, y, z."
+            f"{table.path!r} has no column {missing}, got {list(table.columns)}: a table of nodes "
+            "has node, x, y, z."
         )
-    xyz = np.column_stack([_numbers(columns[c], c, path) for c in "xyz"])
-    return _whole(columns["node"], "node", path), xyz
+    return table.whole("node"), np.column_stack([table.numbers(c) for c in "xyz"])
 
 
-def _table(path: str | Path, plain: Sequence[str] = ()) -> dict[str, list[str]]:
+@dataclass(frozen=True)
+class _Table:
+    """The cells of a text table by the names of its columns, and the line of the file of each."""
+
+    path: str
+    columns: dict[str, list[str]]
+    lines: list[int]
+
+    def numbers(self, column: str) -> FloatArray:
+        """Return a column of numbers (n,)."""
+        found = []
+        for line, cell in zip(self.lines, self.columns[column], strict=True):
+            try:
+                found.append(decimal(cell))
+            except ValueError as error:
+                raise FlexplantError(
+                    f"{self.path!r}, line {line}: column {column!r} holds something that is no "
+                    f"number ({error}). Write it with a decimal point and no unit."
+                ) from None
+        return np.array(found)
+
+    def whole(self, column: str) -> IntArray:
+        """Return a column of whole numbers (n,)."""
+        numbers = self.numbers(column)
+        if np.any(numbers != np.round(numbers)):
+            raise FlexplantError(f"{self.path!r}: column {column!r} must hold whole numbers.")
+        return numbers.astype(np.int64)
+
+
+def _table(path: str | Path, plain: Sequence[str] = ()) -> _Table:
     text = file_path(path).read_text(encoding="utf-8-sig")
-    lines = [line for line in text.splitlines() if line.strip() and line.lstrip()[0] not in "#%!$"]
-    if not lines:
+    numbered = [
+        (number, line)
+        for number, line in enumerate(text.splitlines(), 1)
+        if line.strip() and line.lstrip()[0] not in "#%!$"
+    ]
+    if not numbered:
         raise FlexplantError(f"{str(path)!r} is empty: a table was expected.")
-    mark = next((m for m in ";\t," if m in lines[0]), None)
+    mark = next((m for m in ";\t," if m in numbered[0][1]), None)
     rows = [
         [cell.strip() for cell in cells]
         for cells in (
-            csv.reader(lines, delimiter=mark)
+            csv.reader((line for _, line in numbered), delimiter=mark)
             if mark
-            else (re.split(r"\s+", line.strip()) for line in lines)
+            else (re.split(r"\s+", line.strip()) for _, line in numbered)
         )
     ]
     first = [_NAMES.get(cell.lower().split("[")[0].strip(), cell) for cell in rows[0]]
     if "node" in first:
-        names, rows, start = first, rows[1:], 2
+        names, rows, numbered = first, rows[1:], numbered[1:]
     elif plain and len(rows[0]) == len(plain):
-        names, start = list(plain), 1
+        names = list(plain)
     else:
         raise LabelError(
             f"{str(path)!r} does not begin with the names of its columns, got {rows[0][:6]}. Write "
             "node, direction, x, y, z in its first line."
         )
-    wrong = next((i for i, row in enumerate(rows) if len(row) != len(names)), None)
-    if wrong is not None:
-        raise FlexplantError(
-            f"{str(path)!r}, line {wrong + start} (comments not counted): {len(rows[wrong])} "
-            f"columns, {len(names)} names. Complete it."
-        )
-    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
-
-
-def _numbers(cells: list[str], column: str, path: str | Path) -> FloatArray:
-    try:
-        return np.array(cells, dtype=np.float64)
-    except ValueError as error:
-        raise FlexplantError(
-            f"{str(path)!r}: column {column!r} holds something that is no number ({error})."
-        ) from None
-
-
-def _whole(cells: list[str], column: str, path: str | Path) -> IntArray:
-    numbers: Any = _numbers(cells, column, path)
-    if not np.all(np.isfinite(numbers)) or np.any(numbers != np.round(numbers)):
-        raise FlexplantError(f"{str(path)!r}: column {column!r} must hold whole numbers.")
-    return np.asarray(numbers, dtype=np.int64)
+    lines = [number for number, _ in numbered]
+    if len(lines) != len(rows):
+        raise FlexplantError(f"{str(path)!r} has a cell of several lines. Close its quotes.")
+    for line, row in zip(lines, rows, strict=True):
+        if len(row) != len(names):
+            raise FlexplantError(
+                f"{str(path)!r}, line {line}: {len(row)} columns, {len(names)} names. Complete it."
+            )
+    columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
+    return _Table(str(path), columns, lines)
 
 
 def _direction(name: str, path: str | Path) -> str:

@@ -105,7 +105,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     Symmetry and definiteness (by factorisation), rigid-body motions found in K against those of the
     geometry, mechanisms and which DOFs move in them, total mass, centre of gravity and inertia,
     DOFs without mass or stiffness, parts that are not joined, penalties, odd units, damping to
-    ground, and digits lost in a text file. Nothing is changed or repaired.
+    ground, and digits lost in a text or in single precision. Nothing is changed or repaired.
 
     Parameters
     ----------
@@ -197,6 +197,6 @@ def _digits(found: Facts) -> list[Line]:
         return []
     said: Any = verdict(found.loss, digits)
     if said is None:
-        return [("ok", "digits", f"{digits} digits in the text are enough", "")]
+        return [("ok", "digits", f"{digits} digits are enough", "")]
     text, _, following = said.partition(" Export")
     return [("note", "digits", text, f"export{following}")]

@@ -20,11 +20,10 @@ from .condense import condensed, no_mass
 from .factor import is_positive_definite
 from .local_axes import cosines
 from .model import FEModel
-from .precision import endangered
-from .rigid import force_free
+from .precision import digits_of, endangered, held_by_rounding
 from .singular_mass import left_out, null_motions, projected
 from .units import units
-from .zero_energy import freed, nearly_free
+from .zero_energy import freed
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -43,7 +42,8 @@ class FEMatrices(Value):
     dofs : DofSet, optional
         What the rows stand for. None: not known yet, `with_dofs` gives it.
     digits : int, optional
-        Significant decimal digits of a text file. None: binary, nothing was lost.
+        Significant decimal digits of the entries of K: as printed in a text, 7 when K is given in
+        single precision. None: double precision, nothing was lost.
     source : str, optional
         Where it came from, for display.
     constrained : sequence of str
@@ -101,11 +101,11 @@ class FEMatrices(Value):
                 f"K has {n} rows, but the DofSet {len(self.dofs)} DOFs. Are constrained "
                 "DOFs in one of them only?"
             )
-        if self.digits is not None:
-            object.__setattr__(self, "digits", whole(self.digits, "digits"))
+        digits = digits_of(self.K) if self.digits is None else whole(self.digits, "digits")
         self._set(
             K=K,
             **others,
+            digits=digits,
             constrained=name_list(self.constrained, "constrained DOFs"),
             notes=name_list(self.notes, "notes"),
         )
@@ -337,8 +337,8 @@ class FEMatrices(Value):
             What to do with DOFs without mass. "condense" removes them statically,
             ``K = K_mm - K_ms K_ss^-1 K_sm``: exact, since they follow without inertia.
         free : bool
-            Free the rigid-body motions that only lost digits of a text hold, as `freed` does, where
-            there are such.
+            Free the rigid-body motions that only lost digits hold (a text, or single precision), as
+            `freed` does, where there are such.
         name : str, optional
             For display.
 
@@ -352,7 +352,8 @@ class FEMatrices(Value):
         Warns
         -----
         FlexplantWarning
-            When the digits of a text file endanger the first elastic eigenvalue.
+            When few digits (a text, or single precision) endanger the first elastic eigenvalue, or
+            hold rigid-body motions.
         """
         if massless not in ("refuse", "condense"):
             raise ModelError(f"massless must be 'refuse' or 'condense', got {short(massless)}.")
@@ -375,7 +376,7 @@ class FEMatrices(Value):
         motions = null_motions(ready.M, self.digits)
         if motions.shape[1]:
             ready = ready._projected(motions, massless)
-        # of a text, the last digit decides whether K is singular
+        # of few digits, the last one decides whether K is singular
         rounding = 1e-14 if self.digits is None else 10.0**-self.digits
         if not self.located and not is_positive_definite(ready.K, -rounding):
             raise ModelError(
@@ -387,20 +388,20 @@ class FEMatrices(Value):
         try:
             model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=label)
         except ModelError as error:
-            held = None if free else _stuck(ready, None)
+            held = None if free else ready._held_by_rounding(None)
             raise ModelError(f"{error} {held[0].upper()}{held[1:]}") if held else error from None
         if self.digits is not None:
-            stuck = None if free else _stuck(ready, model)
-            for said in (endangered(ready.K, ready.M, self.digits), stuck):
+            held = None if free else ready._held_by_rounding(model)
+            for said in (endangered(ready.K, ready.M, self.digits), held):
                 if said:
-                    warnings.warn(f"{self.source or 'text file'}: {said}", FlexplantWarning, 2)
+                    warnings.warn(f"{self.source or 'K'}: {said}", FlexplantWarning, 2)
         return model
 
     def freed(self) -> FEMatrices:
         """Return the same with rigid-body motions free that only lost digits of K hold.
 
         ``K' = P^T K P`` with ``P = I - R R^T M``: elastic modes, M-orthogonal to the rigid-body
-        motions R, stay as they are. For text files; K becomes a full matrix.
+        motions R, stay as they are. For texts and single precision; K becomes a full matrix.
 
         Raises
         ------
@@ -414,6 +415,13 @@ class FEMatrices(Value):
             )
         K = freed(self.K, self.M, self.dofs, self.digits)
         return self.replace(K=K, notes=(*self.notes, "K freed of rounding in rigid-body motions"))
+
+    def _held_by_rounding(self, model: FEModel | None) -> str | None:
+        """Return what to say when rounding alone holds rigid-body motions."""
+        if self.digits is None or self.dofs is None or not self.located:
+            return None
+        known = None if model is None else model.rigid_body
+        return held_by_rounding(self.K, self.M, self.dofs, self.digits, known)
 
     def _condensed(self, without: Any, massless: str) -> FEMatrices:
         if massless == "refuse":
@@ -440,22 +448,6 @@ class FEMatrices(Value):
         note = f"{motions.shape[1]} motions without inertia condensed"
         dofs = taken(self.dofs, kept)
         return self.replace(K=K, M=M, D=D, dofs=dofs, notes=(*self.notes, note))
-
-
-def _stuck(given: FEMatrices, model: FEModel | None) -> str | None:
-    """Return what to say when rounding alone holds rigid-body motions."""
-    if given.digits is None or given.dofs is None or not given.located:
-        return None
-    nearly = nearly_free(given.K, given.dofs, given.digits).shape[1]
-    if model is not None:
-        found = model.rigid_body
-        nearly -= found.shape[1] if force_free(model.M, model.K, found) else 0
-    if nearly <= 0:
-        return None
-    return (
-        f"{nearly} of its rigid-body motions are held by nothing but the rounding of the text, and "
-        "modes at or below 0 would follow. Export in binary, or free them: model(free=True)."
-    )
 
 
 def taken(dofs: DofSet | None, rows: IntArray) -> DofSet | None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -10,13 +11,14 @@ from typing import Any, Self, cast
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, ShapeError
+from ..errors import FlexplantWarning, ModelError, ShapeError
 from ..labels import DofSet
 from ..values import FloatArray, Matrix, Value, frozen, real_array
 from .damping import Damping, ModalDamping, Rayleigh
 from .eigen import elastic_modes
 from .factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
 from .parts import HeldShape, Part, added_matrices, sum_of
+from .precision import digits_of, endangered, held_by_rounding
 from .rigid import rigid_body_basis
 from .units import units
 
@@ -37,7 +39,9 @@ class FEModel(Value):
     M : (n, n) array or sparse matrix [kg, kg m, kg m^2]
         Mass: symmetric, positive definite.
     K : (n, n) array or sparse matrix [N/m, N, N m]
-        Stiffness: symmetric, positive semi-definite; singular for a free structure.
+        Stiffness: symmetric, positive semi-definite; singular for a free structure. Double
+        precision: what single precision loses is refused or warned of, and
+        ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees what only its rounding holds.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
     dofs : DofSet
@@ -51,6 +55,12 @@ class FEModel(Value):
         When the sizes of the matrices and of `dofs` differ.
     ModelError
         When a matrix is not finite, not symmetric, or M, K, D are not (semi-)definite.
+
+    Warns
+    -----
+    FlexplantWarning
+        When K comes in single precision and its rounding holds rigid-body motions, or endangers
+        the first elastic eigenvalue.
 
     Examples
     --------
@@ -74,6 +84,7 @@ class FEModel(Value):
         n = len(self.dofs)
         if not n:
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
+        digits = digits_of(self.K)
         M, K = _symmetric(self.M, "M", n), _symmetric(self.K, "K", n)
         D = None if self.D is None else _symmetric(self.D, "D", n)
         if not is_positive_definite(M):
@@ -81,10 +92,23 @@ class FEModel(Value):
                 f"M is not positive definite: {_lowest(M)}. Some motion would have no inertia, or "
                 "a negative one. Condense massless DOFs out, or look for a sign."
             )
-        _check_semidefinite(K, "K")
+        try:
+            _check_semidefinite(K, "K")
+        except ModelError as error:
+            held = None if digits is None else held_by_rounding(K, M, self.dofs, digits)
+            raise ModelError(
+                f"{error} {held[0].upper()}{held[1:]}" if held else str(error)
+            ) from None
         if D is not None:
             _check_semidefinite(D, "D")
         self._set(M=M, K=K, D=D)
+        if digits is not None:
+            for said in (
+                endangered(K, M, digits),
+                held_by_rounding(K, M, self.dofs, digits, self.rigid_body),
+            ):
+                if said:
+                    warnings.warn(f"{self.name or 'K'}: {said}", FlexplantWarning, 3)
 
     def __repr__(self) -> str:
         named = f" {self.name!r}" if self.name else ""

@@ -1,16 +1,45 @@
-"""What the digits of a text file do to the soft modes of a model."""
+"""What few digits of K, printed or of single precision, do to the soft modes of a model."""
 
 from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from ..errors import SolverError
+from ..labels import DofSet
+from ..values import FloatArray
 from .lowest import Lowest, lowest_modes
+from .rigid import force_free
+from .zero_energy import nearly_free
 
 #: relative error of the first elastic eigenvalue from which on it is worth a warning
 _WORTH = 1e-4
 #: a text of this many digits loses nothing of a double
 _ALL_DIGITS = 16
+
+
+def digits_of(given: Any) -> int | None:
+    """Return the decimal digits that entries of this type hold, None for double precision.
+
+    Rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
+    digits, in single precision.
+
+    Parameters
+    ----------
+    given : array, sparse matrix or sequence
+        As it was read, before it is made double.
+
+    Examples
+    --------
+    >>> digits_of(np.eye(2, dtype=np.float32)), digits_of(np.eye(2))
+    (7, None)
+    """
+    kind = np.dtype(given.dtype if hasattr(given, "dtype") else np.asarray(given).dtype)
+    if kind.kind not in "fc":
+        return None
+    digits = int(-np.log10(np.finfo(kind).eps / 2))
+    return digits if digits < np.finfo(np.float64).precision else None
 
 
 def loss(found: Lowest, digits: int) -> float | None:
@@ -25,7 +54,7 @@ def loss(found: Lowest, digits: int) -> float | None:
 
 
 def endangered(K: Any, M: Any, digits: int) -> str | None:
-    """Return what to say when the digits of a text endanger the first elastic eigenvalue."""
+    """Return what to say when the digits of K endanger the first elastic eigenvalue."""
     if digits >= _ALL_DIGITS:
         return None
     try:
@@ -42,6 +71,34 @@ def verdict(error: float | None, digits: int) -> str | None:
     percent = f"up to {100 * error:.2g} %" if error < 1 else "wholly"
     return (
         f"K was written with {digits} digits, which may change the first elastic eigenvalue "
-        f"{percent}: digits times the norm of K drown its softness. Export in binary (OP4, HDF5, "
-        "npz), or with 16 digits."
+        f"{percent}: their rounding times the norm of K exceeds its softness. Export in double "
+        "precision: in binary (OP4, HDF5, npz), or with 16 digits."
+    )
+
+
+def held_by_rounding(
+    K: Any, M: Any, dofs: DofSet, digits: int, found: FloatArray | None = None
+) -> str | None:
+    """Return what to say when only rounding of the entries of K holds rigid-body motions.
+
+    Parameters
+    ----------
+    K, M : (n, n) arrays or sparse matrices
+        Stiffness and mass.
+    dofs : DofSet
+        With coordinates.
+    digits : int
+        Of the entries of K.
+    found : (n, r) array, optional
+        Rigid-body motions that the model knows already.
+    """
+    nearly = nearly_free(K, dofs, digits).shape[1]
+    if found is not None and force_free(M, K, found):
+        nearly -= found.shape[1]
+    if nearly <= 0:
+        return None
+    return (
+        f"{nearly} of its rigid-body motions are held by nothing but the rounding of K's entries "
+        f"to {digits} digits, and modes at or below 0 would follow. Export in double precision, or "
+        "free them: FEMatrices(K, M, dofs=dofs).model(free=True), read_model(..., free=True)."
     )

@@ -1,0 +1,141 @@
+"""Harwell-Boeing and Rutherford-Boeing files: a matrix in fixed fields, as Fortran writes it."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantError, ModelError
+from ..labels import DofSet
+from ..structure import FEMatrices
+from .assembled import one_matrix_each, text_digits
+from .formats import Format
+from .numbers import fixed_numbers, spaced_numbers
+
+#: lines whose digits are counted
+_SAMPLE = 4000
+_FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)
+
+
+def read_harwell_boeing(
+    stiffness: str | Path,
+    mass: str | Path | None = None,
+    *,
+    damping: str | Path | None = None,
+    dofs: DofSet | str | Path | None = None,
+) -> FEMatrices:
+    """Return the matrices of Harwell-Boeing (or Rutherford-Boeing) files.
+
+    Assembled real or integer matrices, symmetric (RSA, of which the file holds the lower triangle)
+    or not (RUA). The rest is as in `read_matrix_market`.
+
+    Parameters
+    ----------
+    stiffness, mass, damping : str or Path
+        Files (.rsa, .rua, .hb, .rb) of K, M and D.
+    dofs : DofSet, or path of a table for `read_dofs`, optional
+        What the rows stand for: the files do not say.
+
+    Returns
+    -------
+    FEMatrices
+
+    Raises
+    ------
+    FlexplantError
+        When a file is no Harwell-Boeing file, or cut short.
+    ModelError
+        When a matrix is complex, skew-symmetric, a pattern, or not assembled.
+    ShapeError
+        When sizes differ.
+    FileNotFoundError
+        When there is no such file.
+
+    Notes
+    -----
+    Format: I. S. Duff, R. G. Grimes, J. G. Lewis, "Users' Guide for the Harwell-Boeing Sparse
+    Matrix Collection", 1992, section 2.
+    """
+    return one_matrix_each({"K": stiffness, "M": mass, "D": damping}, _harwell_boeing, dofs)
+
+
+def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
+    lines = path.read_bytes().splitlines()
+    try:
+        counts = [int(lines[1][i : i + 14] or 0) for i in range(0, 56, 14)]
+        kind = lines[2][:3].decode("ascii").upper()
+        n_rows, n_columns, n_entries = (int(lines[2][i : i + 14]) for i in (14, 28, 42))
+        formats = lines[3].decode("ascii")
+        forms = [_form(formats[a:b]) for a, b in ((0, 16), (16, 32), (32, 52))]
+    except (IndexError, ValueError, UnicodeDecodeError) as error:
+        raise FlexplantError(
+            f"{str(path)!r} is no Harwell-Boeing file: its header cannot be read ({error})."
+        ) from None
+    if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
+        raise ModelError(
+            f"{str(path)!r} is of kind {kind!r}: only real or integer (R, I), symmetric or "
+            "unsymmetric (S, U), assembled (A) matrices are a stiffness or mass. A skew-symmetric "
+            "one is gyroscopic, an elemental one must be assembled first."
+        )
+    right_hand = 1 if len(lines[1]) >= 70 and lines[1][56:70].strip() not in (b"", b"0") else 0
+    first = 4 + right_hand
+    blocks = []
+    needed = (n_columns + 1, n_entries, n_entries)
+    for count, form, size in zip(counts[1:4], forms, needed, strict=True):
+        blocks.append(_block(lines[first : first + count], form, size, f"{str(path)!r}", first))
+        first += count
+    pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
+    matrix: Any = sp.csc_array((blocks[2], index, pointer), shape=(n_rows, n_columns))
+    matrix.sum_duplicates()
+    if kind[1] == "S":
+        matrix = sp.csc_array(matrix + sp.tril(matrix, -1).T + sp.triu(matrix, 1).T)
+    if kind[0] == "I":
+        return matrix, None
+    per_line, width = forms[2]
+    start = 4 + right_hand + counts[1] + counts[2]
+    sample = lines[start : start + _SAMPLE // max(per_line, 1) + 1]
+    words = [line[i : i + width] for line in sample for i in range(0, len(line.rstrip()), width)]
+    return matrix, text_digits(words)
+
+
+def _form(text: str) -> tuple[int, int]:
+    """Return numbers a line and the width of one from a Fortran format such as (1P,4E20.12)."""
+    match = _FORMAT.search(text)
+    if match is None:
+        raise ValueError(f"format {text.strip()!r}")
+    return int(match[1] or 1), int(match[3])
+
+
+def _block(lines: list[bytes], form: tuple[int, int], size: int, source: str, before: int) -> Any:
+    """Return the `size` numbers of a block that follows `before` lines."""
+    per_line, width = form
+    full = per_line * width
+    text = b"".join(line[:full].ljust(full) for line in lines)
+    numbers = fixed_numbers(text[: size * width], width) if len(text) >= size * width else None
+    if numbers is None:
+        # not in the fields that the header names, as some programs write; blanks still separate
+        numbers = spaced_numbers(b" ".join(lines), size)
+    if numbers is None:
+        raise FlexplantError(
+            f"{source} holds fewer than {size} numbers in fields of {width} characters"
+            f"{_damage(lines, form, size, before)}. Is it cut short, or were its blanks lost?"
+        )
+    return numbers
+
+
+def _damage(lines: list[bytes], form: tuple[int, int], size: int, before: int) -> str:
+    """Return which line holds something else than numbers, in words; empty when none does."""
+    per_line, width = form
+    for place, line in enumerate(lines):
+        due = min(per_line, size - place * per_line)
+        fields = line[: due * width].ljust(due * width)
+        if fixed_numbers(fields, width) is None and spaced_numbers(line, due) is None:
+            return f", line {before + place + 1} is {line[:72].decode('latin-1')!r}"
+    return ""
+
+
+HARWELL_BOEING = Format((".rsa", ".rua", ".hb", ".rb"), read_harwell_boeing)
