@@ -10,7 +10,7 @@ import oracles_updating as oracle
 from bridges import FILE, Bridge, ends, noisy_fits
 from flexplant.identification import MeasuredModes
 from flexplant.updating import AddedMass, Eigenvalues
-from flexplant.updating.objective import Objective
+from flexplant.updating.search import Objective
 from noisy_plate import Campaign, judged
 from stages import fitted, reduced
 

@@ -9,7 +9,7 @@ from flexplant.labels import DofSet
 from flexplant.lti import Frf
 from flexplant.structure import FEModel
 from flexplant.updating import AddedMass, ModeShapes
-from flexplant.updating.objective import Objective
+from flexplant.updating.search import Objective
 
 M = np.diag([1.0, 2.0, 1.5, 1.2])
 K = np.array([[200.0, -110, 0, 0], [-110, 180, -70, 0], [0, -70, 200, -130], [0, 0, -130, 190]])

@@ -21,9 +21,9 @@ from flexplant.updating import (
     ShapeCorrelation,
     StaticCompliance,
 )
-from flexplant.updating.objective import Objective
 from flexplant.updating.pencil import Family
 from flexplant.updating.point import first_point
+from flexplant.updating.search import Objective
 
 BASE = np.array([0.3, 5.0, 1e5, 0.002])
 STEPS = np.array([3e-3, 0.3, 3e3, 3e-4])

@@ -16,7 +16,7 @@ from flexplant.updating import (
     correlate,
     update,
 )
-from flexplant.updating.objective import Objective
+from flexplant.updating.search import Objective
 
 RATE = 20.0  # Hz; the modes of the chains lie between 0.5 and 3.4 Hz
 FREQ = np.array([0.3, 0.9, 1.7, 2.4, 6.0, 9.9])

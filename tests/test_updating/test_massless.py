@@ -17,7 +17,7 @@ from flexplant.updating import (
     eigenvalue_sensitivities,
     update,
 )
-from flexplant.updating.objective import Objective
+from flexplant.updating.search import Objective
 
 LINKS = [(i, i + 1, 900.0 + 40 * i) for i in range(7)]
 

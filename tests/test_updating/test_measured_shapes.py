@@ -7,7 +7,7 @@ from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.store import load
 from flexplant.updating import AddedMass, AddedStiffness, ModeShapes, ShapeCorrelation, update
-from flexplant.updating.objective import Objective
+from flexplant.updating.search import Objective
 
 LINKS = [(0, None, 90), (0, 1, 110), (1, 2, 70), (2, 3, 130), (3, None, 60)]
 PLACES = ["1:z", "2:z", "3:z", "4:z"]

@@ -13,7 +13,7 @@ from matplotlib.ticker import MaxNLocator
 from ..errors import ModelError
 from ..lti.frequency import Frf
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
-from ..updating.objective import Objective
+from ..updating.search import Objective
 from ..values import FloatArray
 from ._axes import MEASURED, REDUCED, UPDATED, finish
 

@@ -12,11 +12,6 @@ from .localisation import Localisation as Localisation
 from .localisation import localise as localise
 from .matrix_parameters import MatrixParameter as MatrixParameter
 from .matrix_parameters import ModeDamping as ModeDamping
-from .methods import GaussNewton as GaussNewton
-from .methods import Lasso as Lasso
-from .methods import Method as Method
-from .methods import Tikhonov as Tikhonov
-from .methods import TrustRegion as TrustRegion
 from .parameters import AddedDamping as AddedDamping
 from .parameters import AddedMass as AddedMass
 from .parameters import AddedStiffness as AddedStiffness
@@ -30,6 +25,11 @@ from .residuals_base import Residual as Residual
 from .result import History as History
 from .result import Starts as Starts
 from .result import UpdateResult as UpdateResult
+from .search import GaussNewton as GaussNewton
+from .search import Lasso as Lasso
+from .search import Method as Method
+from .search import Tikhonov as Tikhonov
+from .search import TrustRegion as TrustRegion
 from .sensitivity import Sensitivities as Sensitivities
 from .sensitivity import eigenvalue_sensitivities as eigenvalue_sensitivities
 from .shapes import ModeShapes as ModeShapes

@@ -12,8 +12,8 @@ from ..errors import ModelError, ShapeError
 from ..identification import MeasuredModes
 from ..values import ComplexArray, FloatArray, Value, short
 from .frf_residual import FrfResidual
-from .objective import Objective, checked_residuals
 from .pairing import mac as _mac
+from .search import Objective, checked_residuals
 from .shapes import ModeShapes
 
 

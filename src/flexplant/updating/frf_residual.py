@@ -159,8 +159,20 @@ class _BoundFrf(Bound):
         if self.magnitude:
             sigma = sigma / np.abs(self.data)
         self.sigma = sigma
+        whole = 1 / sigma
+        if not self.magnitude:
+            whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma
+        self.size = np.tile(np.where(whole > 0, whole, 1.0).ravel(), 1 if self.magnitude else 2)
+        self._freq, self._pairs = (
+            frf.freq[lines],
+            [f"{o} / {i}" for o in frf.outputs for i in frf.inputs],
+        )
         self.name = f"{lines.size} lines of FRFs"
         self._last: tuple[Point, ComplexArray, Any] | None = None
+
+    def row_name(self, row: int) -> str:
+        line, channel = divmod(row % self.data.size, len(self._pairs))
+        return f"{self._pairs[channel]} at {self._freq[line]:.4g} Hz"
 
     def responses(self, point: Point) -> ComplexArray:
         """Return H (l, o, i)."""

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..values import FloatArray, Value
-from .objective import Objective, checked_residuals
 from .parameters import Parameter
+from .search import Objective, checked_residuals
 from .sensitivity import checked_parameters, checked_values
 
 #: correlations beyond this are told

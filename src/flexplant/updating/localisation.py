@@ -12,12 +12,10 @@ import numpy as np
 from ..errors import ModelError, SolverError, unknown_label
 from ..values import FloatArray, Value
 from ..values import whole as counted
-from .methods import TrustRegion
-from .objective import Objective, checked_residuals
 from .parameters import Parameter
-from .search import Found, trust_region
+from .search import Found, Objective, TrustRegion, checked_residuals
+from .search.lasso import bic
 from .sensitivity import checked_parameters
-from .sparse_search import bic
 
 #: pairs of the best so many candidates are all tried
 PAIRS = 4
@@ -340,4 +338,4 @@ class _Fits:
         family = self.whole.family.of(picked)
         parameters = [self.whole.parameters[i] for i in picked]
         objective = Objective(family.model, parameters, self.residuals, prior=False, family=family)
-        return trust_region(objective, self.start[picked], TrustRegion(), most=50, tolerance=1e-8)
+        return TrustRegion().search(objective, self.start[picked], most=50, tolerance=1e-8)

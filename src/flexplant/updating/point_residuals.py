@@ -93,8 +93,13 @@ class _BoundZeros(Bound):
         std = np.ones(self.target.size) if residual.std is None else residual.std / np.sqrt(2)
         self.std = std
         self.hold = residual.hold
+        self.size = np.tile(np.abs(self.target) / std, 2)
         self.name = f"{self.target.size} antiresonances"
         self._last: tuple[Point, ComplexArray, ComplexArray] | None = None
+
+    def row_name(self, row: int) -> str:
+        zero = self.target[row % self.target.size]
+        return f"the antiresonance at {abs(zero) / (2 * np.pi):.4g} Hz"
 
     def _sampled(self, point: Point) -> tuple[ComplexArray, ComplexArray]:
         """Return the sampled zeros nearest to the measured ones and their slopes (m, q)."""
@@ -211,6 +216,7 @@ class _BoundStatic(Bound):
         self.value = residual.value
         self.noisy = residual.std is not None
         self.std = abs(residual.value) if residual.std is None else residual.std
+        self.size = np.array([abs(residual.value) / self.std])
         self.name = "a static compliance"
 
     def _solved(self, point: Point) -> tuple[Any, FloatArray, FloatArray]:

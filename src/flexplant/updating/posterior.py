@@ -10,9 +10,9 @@ import numpy as np
 
 from ..errors import ModelError
 from ..values import FloatArray, Value, generator
-from .objective import Objective, checked_residuals
 from .parameters import Parameter
 from .result import UpdateResult
+from .search import Objective, checked_residuals
 from .sensitivity import checked_parameters
 
 #: stretch of the moves

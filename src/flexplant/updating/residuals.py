@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -111,10 +110,10 @@ class Eigenvalues(Residual):
 
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""
-        return _BoundEigenvalues(self)
+        return BoundEigenvalues(self)
 
 
-class _BoundEigenvalues(Bound):
+class BoundEigenvalues(Bound):
     """Poles (or means of clusters) whitened by the factor of their covariance, or by W^(1/2)."""
 
     def __init__(self, residual: Eigenvalues) -> None:
@@ -134,65 +133,31 @@ class _BoundEigenvalues(Bound):
             covariance = measured.covariance
         factor = la.cholesky(both @ covariance @ both.T, lower=True)
         self.white = la.solve_triangular(factor, both, lower=True)
-        self.name = f"poles of modes {', '.join(map(str, self.numbers))}"
+        if measured.covariance is not None and not self.noisy:
+            self.noise = self.white @ measured.covariance @ self.white.T
+        self.size = np.abs(self.white) @ np.tile(np.abs(self.target), 2)
+        self.name = f"modes {', '.join(map(str, self.numbers))}"
+        self._members = [*alone, *self.clusters]
+
+    def row_name(self, row: int) -> str:
+        """Return the mode or modes of a row."""
+        members = self._members[row % len(self._members)]
+        return f"mode{'s' * (len(members) > 1)} {', '.join(str(self.numbers[i]) for i in members)}"
+
+    def whitened(self, rows: ComplexArray) -> FloatArray:
+        """Return weighted [Re; Im] of complex rows, one for each pole."""
+        return np.asarray(self.white @ split_parts(rows), dtype=np.float64)
 
     def values(self, point: Point) -> FloatArray:
+        """Return measured minus model, weighted."""
         gap = self.target - point.eigen.poles[point.columns(self.numbers)]
-        return np.asarray(self.white @ split_parts(gap), dtype=np.float64)
+        return self.whitened(gap)
 
     def slopes(self, point: Point) -> FloatArray:
+        """Return their derivatives."""
         S = point.sensitivity(self.numbers)
         for group in self.clusters:
             # the trace does not depend on the vectors chosen in the subspace
             _, change = point.subspace([self.numbers[i] for i in group])
             S[group] = np.trace(change, axis1=1, axis2=2) / len(group)
-        return np.asarray(-(self.white @ split_parts(S)), dtype=np.float64)
-
-
-@dataclass(frozen=True)
-class Data:
-    """All residuals, stacked."""
-
-    target: ComplexArray
-    modes: tuple[int, ...]
-    W: FloatArray
-    covariance: FloatArray | None
-
-    def error(self, poles: ComplexArray) -> float:
-        """Return e of (12)."""
-        return float(np.sum(self.W * np.abs(self.target - poles) ** 2))
-
-    def stacked(self, rows: ComplexArray) -> FloatArray:
-        """Return W^(1/2) [Re; Im] of complex rows."""
-        root = np.sqrt(self.W).reshape(-1, *[1] * (rows.ndim - 1))
-        return np.concatenate([root * rows.real, root * rows.imag])
-
-
-def checked_data(residuals: Any) -> Data:
-    """Return all residuals stacked, checked."""
-    listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
-    for residual in listed:
-        if not isinstance(residual, Eigenvalues):
-            raise ModelError(
-                f"residuals must be a list of Eigenvalues, got {type(residual).__name__}: wrap "
-                "the measurement, [Eigenvalues(measured)]."
-            )
-    if not listed:
-        raise ModelError("residuals is empty: nothing was measured to update from.")
-    parts = [residual.measured.covariance for residual in listed]
-    known = [part for part in parts if part is not None]
-    m = [len(residual.measured) for residual in listed]
-    covariance = None
-    if len(known) == len(parts):
-        covariance = np.zeros((2 * sum(m), 2 * sum(m)))
-        first = 0
-        for part, size in zip(known, m, strict=True):
-            at = np.r_[first : first + size, sum(m) + first : sum(m) + first + size]
-            covariance[np.ix_(at, at)] = part
-            first += size
-    return Data(
-        target=np.concatenate([residual.measured.poles for residual in listed]),
-        modes=tuple(n for residual in listed for n in residual.measured.modes or ()),
-        W=np.concatenate([residual.W for residual in listed]),
-        covariance=covariance,
-    )
+        return -self.whitened(S)

@@ -29,6 +29,10 @@ class Bound:
     numbers: tuple[int, ...] = ()
     #: whether the covariance of the measurement is known
     noisy: bool = False
+    #: the covariance of the rows where it is known but not the unit matrix
+    noise: FloatArray | None = None
+    #: what the whole of a measured value is in each row: a part of it is a relative change
+    size: FloatArray | float = 1.0
     name: str = ""
 
     def values(self, point: Point) -> FloatArray:
@@ -38,6 +42,10 @@ class Bound:
     def slopes(self, point: Point) -> FloatArray:
         """Return their derivatives (m, q)."""
         raise NotImplementedError
+
+    def row_name(self, row: int) -> str:
+        """Return what is measured in a row, for messages."""
+        return self.name
 
     def assigned(self, point: Point) -> Point:
         """Return the point with modes relabelled by the measurement, where it can tell."""

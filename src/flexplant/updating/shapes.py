@@ -187,7 +187,15 @@ class _BoundShapes(Bound):
         self.psi = np.asarray(residual.shapes)
         self.white = _whitening(self.psi, residual)
         self.assign = residual.assign
+        order = [i for group in self.sets for i in group]
+        lengths = [float(np.linalg.norm(self.white[i] @ self.psi[:, i])) for i in order]
+        parts = 2 if np.iscomplexobj(self.psi) else 1
+        self._order, self._rows_each = order, self.psi.shape[0] * parts
+        self.size = np.repeat(lengths, self._rows_each)
         self.name = f"shapes of modes {', '.join(map(str, own))}"
+
+    def row_name(self, row: int) -> str:
+        return f"the shape of mode {self.own[self._order[row // self._rows_each]]}"
 
     def assigned(self, point: Point) -> Point:
         if not self.assign:
@@ -250,7 +258,7 @@ class _BoundMac(_BoundShapes):
 
     def __init__(self, residual: ModeShapes, family: Family) -> None:
         super().__init__(residual, family)
-        self.noisy = False
+        self.noisy, self.size, self._rows_each = False, 1.0, 1
 
     def values(self, point: Point) -> FloatArray:
         found = []

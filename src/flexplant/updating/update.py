@@ -8,19 +8,20 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError
-from ..values import ComplexArray, FloatArray, flag, positive, seed_sequence
-from .general import general_update
-from .methods import GaussNewton, Method, TrustRegion
-from .objective import checked_residuals
+from ..errors import FlexplantError, FlexplantWarning, ModelError, SolverError
+from ..values import FloatArray, flag, positive, seed_sequence
+from .estimate import covariance
 from .parameters import Parameter
-from .pencil import Family
-from .residuals import Data, Eigenvalues, checked_data
+from .residuals import Eigenvalues
 from .residuals_base import Residual
 from .result import History, UpdateResult
-from .sensitivity import checked_parameters, checked_values, mode_columns
-from .steps import Iterate, advance, slopes, solve
+from .search import Found, GaussNewton, Method, Objective, TrustRegion, checked_residuals
+from .sensitivity import checked_parameters
+from .starts import all_starts, summary
 from .updated_model import changed_model
+
+#: a parameter this close to its bound, relative to their distance, is at it
+AT_BOUND = 1e-6
 
 
 def update(
@@ -115,109 +116,88 @@ def update(
     takes_part = flag(prior, "prior")
     bounded = any(getattr(q, "bounds", None) is not None for q in listed)
     known = any(getattr(q, "prior", None) is not None for q in listed)
-    plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given)
-    newton = isinstance(method, GaussNewton)
-    if isinstance(method, GaussNewton) and bounded:
-        raise ModelError("GaussNewton knows no bounds: use TrustRegion(), or drop bounds=.")
-    direct = not (isinstance(method, GaussNewton) and method.truncate)
-    direct = direct and (method is None or newton)
-    if plain and direct and not bounded and not known and starts is None:
-        return _paper(model, listed, given, start, max_iterations or 20, enough)
-    return general_update(
-        model,
-        listed,
-        given,
-        method=method or TrustRegion(),
-        start=start,
-        starts=starts,
-        seed=seed,
-        prior=takes_part,
-        most=max_iterations or (20 if newton else 200),
-        tolerance=enough,
-    )
-
-
-def _paper(
-    model: Any,
-    listed: tuple[Parameter, ...],
-    residuals: Sequence[Any],
-    start: Any,
-    most: int,
-    enough: float,
-) -> UpdateResult:
-    """Return the answer of the paper's iteration."""
-    data = checked_data(residuals)
-    family = Family(model, listed)
-    p = checked_values(start, listed, "start")
-    eigen = family.at(p)
-    columns = mode_columns(data.modes, eigen)
-    labels = np.arange(eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size + 1)
-    now = Iterate(p, eigen, labels, columns)
-    trail = [(now.p, now.poles, data.error(now.poles), 0.0)]
-    S, now = slopes(family, data, now)
-    step = solve(family, data, S, data.target - now.poles)
-    converged, reason = _met(data, now, enough), "residual below the tolerance"
-    while not converged:
-        reason = "max_iterations reached"
-        if len(trail) > most:
-            break
-        size = float(np.max(np.abs(S @ step) / np.abs(now.poles)))
-        accepted = advance(family, data, now, step)
-        if accepted is None:
-            converged = size < enough
-            reason = "step below the tolerance" if converged else "no part of a step helps"
-            break
-        now, fraction = accepted
-        trail.append((now.p, now.poles, data.error(now.poles), fraction))
-        S, now = slopes(family, data, now)
-        step = solve(family, data, S, data.target - now.poles)
-        if _met(data, now, enough):
-            converged, reason = True, "residual below the tolerance"
-        elif size < enough and fraction == 1.0:
-            converged, reason = True, "step below the tolerance"
-    if not converged:
-        warnings.warn(
-            f"the update did not converge in {len(trail) - 1} steps: {reason}, error "
-            f"{trail[-1][2]:.3g} from {trail[0][2]:.3g}. Look at .history; try other mode "
-            "numbers, start= or more iterations.",
-            FlexplantWarning,
-            stacklevel=3,
+    # the paper's problem: eigenvalues alone, nothing known beforehand
+    plain = all(isinstance(r, Eigenvalues) and not r.clusters for r in given) and not known
+    if method is None:
+        method = GaussNewton() if plain and not bounded and starts is None else TrustRegion()
+    if bounded and not method.keeps_bounds:
+        raise ModelError(
+            f"{type(method).__name__} knows no bounds: use TrustRegion(), or drop bounds=."
         )
-    covariance, correlation = _doubt(data, S, now)
+    if plain and method.weighs_poles:
+        given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))
+    objective = Objective(model, listed, given, prior=takes_part)
+    begins = all_starts(objective, start, starts, seed)
+    best, ends = _searched(objective, begins, method, max_iterations, enough)
+    point = objective.at(best.p)
+    if not best.converged:
+        error = best.trail.error
+        warnings.warn(
+            f"the update did not converge in {len(best.trail.p) - 1} steps: {best.reason}, error "
+            f"{error[-1]:.3g} from {error[0]:.3g}. Look at .history; try other mode numbers, "
+            "start=, starts= or more iterations.",
+            FlexplantWarning,
+            stacklevel=2,
+        )
+    spread, correlation = covariance(objective, point)
     return UpdateResult(
         parameters=tuple(q.name for q in listed),
         units=tuple(q.unit for q in listed),
-        values=now.p,
-        covariance=covariance,
+        values=best.p,
+        covariance=None if method.penalised else spread,
         correlation=correlation,
-        model=changed_model(model, family, now.p),
-        history=History(*(np.array(part) for part in zip(*trail, strict=True))),
-        converged=converged,
-        reason=reason,
+        model=changed_model(model, objective.family, best.p),
+        history=History(
+            np.array(best.trail.p),
+            np.array(best.trail.poles),
+            np.array(best.trail.error),
+            np.array(best.trail.fraction),
+        ),
+        converged=best.converged,
+        reason=best.reason,
+        at_bound=_at_bound(objective, best.p),
+        starts=summary(begins, ends),
         unknowns=tuple(listed),
     )
 
 
-def _met(data: Data, now: Iterate, tolerance: float) -> bool:
-    return bool(np.max(np.abs(data.target - now.poles) / np.abs(data.target)) < tolerance)
+def _searched(
+    objective: Objective,
+    begins: list[FloatArray],
+    method: Method,
+    most: int | None,
+    tolerance: float,
+) -> tuple[Found, list[Found | None]]:
+    """Return the best end, the objective being there, and what every start led to."""
+    ends: list[Found | None] = []
+    trouble: FlexplantError | None = None
+    for begin in begins:
+        try:
+            ends.append(method.search(objective, begin, most=most, tolerance=tolerance))
+        except (ModelError, SolverError) as error:
+            if len(begins) == 1:
+                raise
+            trouble = error
+            ends.append(None)
+    reached = [found for found in ends if found is not None]
+    if not reached:
+        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {trouble}")
+    best = min(reached, key=lambda found: found.cost)
+    # the modes of the best end are numbered from its own start
+    if len(begins) > 1:
+        objective.begin(begins[[f is best for f in ends].index(True)])
+        for p in best.trail.p[1:]:
+            objective.at(p, refer=True)
+    return best, ends
 
 
-def _doubt(data: Data, S: ComplexArray, now: Iterate) -> tuple[FloatArray | None, FloatArray]:
-    """Return covariance (or None) and correlation of the estimate."""
-    J = data.stacked(S)
-    length = np.linalg.norm(J, axis=0)
-    pinv = np.linalg.pinv(J / length) / length[:, None]
-    spare = J.shape[0] - J.shape[1]
-    unit = pinv @ pinv.T
-    covariance = None
-    if data.covariance is not None:
-        root = np.sqrt(np.concatenate([data.W, data.W]))
-        G = pinv * root
-        covariance = unit = G @ data.covariance @ G.T
-    elif spare > 0:
-        covariance = unit * data.error(now.poles) / spare
-    std = np.sqrt(np.diag(unit))
-    return covariance, unit / np.outer(std, std)
+def _at_bound(objective: Objective, p: FloatArray) -> tuple[str, ...]:
+    """Return the names of the parameters at one of their bounds."""
+    low, high = objective.lower, objective.upper
+    width = high - low
+    near = AT_BOUND * np.where(np.isfinite(width), width, np.maximum(np.abs(p), 1e-12))
+    at = (p - low <= near) | (high - p <= near)
+    return tuple(q.name for q, there in zip(objective.parameters, at, strict=True) if there)
 
 
 def _checked_count(value: Any) -> int:

@@ -11,11 +11,11 @@ import numpy as np
 from ..errors import ModelError
 from ..values import FloatArray, Value, generator, positive
 from .correlation import Correlation, correlate
-from .methods import Method
-from .objective import Objective, checked_residuals
 from .parameters import Parameter
 from .residuals_base import Residual
 from .result import UpdateResult
+from .search import Objective, checked_residuals
+from .search.method import Method
 from .sensitivity import checked_parameters
 from .update import update
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, SolverError
-from ..values import FloatArray
-from .methods import TrustRegion
+from ...errors import ModelError, SolverError
+from ...values import FloatArray, positive
+from .method import Found, Method, Trail, units
 from .objective import Objective
-from .search import Found, Trail, trust_region, units
+from .trust_region import TrustRegion
 
 #: weights on the path
 PATH = 13
@@ -20,7 +21,53 @@ PATH_STEPS = 5
 NOTHING = 1e-9
 
 
-def lasso(
+@dataclass(frozen=True, eq=False)
+class Lasso(Method):
+    """Sparse change: penalty ``weight |(p - start) / unit|_1`` on a sequence of linear problems.
+
+    Most parameters end at exactly their start: those are the ones without a change. The convex
+    problems go to Clarabel through cvxpy.
+
+    Parameters
+    ----------
+    weight : float, optional
+        None: of a path of weights the one with the least BIC (Bayesian information criterion), its
+        parameters fitted once more without the penalty.
+
+    References
+    ----------
+    Tibshirani: Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B 58, 1996.
+    """
+
+    weight: float | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.weight is not None:
+            self._set(weight=positive(self.weight, "weight"))
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the answer is drawn towards the start."""
+        return True
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether the answer is fitted once more without the penalty."""
+        return self.weight is None
+
+    def search(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        *,
+        most: int | None = None,
+        tolerance: float = 1e-10,
+    ) -> Found:
+        """Return where the search from `start` ends; see `Method.search`."""
+        return _lasso(objective, start, self.weight, most=most or self.steps, tolerance=tolerance)
+
+
+def _lasso(
     objective: Objective, start: FloatArray, weight: float | None, *, most: int, tolerance: float
 ) -> Found:
     """Minimise with an l1 penalty on the change; None: the weight of least BIC, refitted."""
@@ -82,7 +129,7 @@ def refitted(
         objective.lower = np.where(active, lower, start - held)
         objective.upper = np.where(active, upper, start + held)
         p = np.where(active, begin, start)
-        found = trust_region(objective, p, TrustRegion(), most=most, tolerance=tolerance)
+        found = TrustRegion().search(objective, p, most=most, tolerance=tolerance)
     finally:
         objective.lower, objective.upper = lower, upper
     found.p = np.where(active, found.p, start)

@@ -7,15 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import ComplexArray, FloatArray
-from .parameters import Parameter
-from .pencil import Family, repeated_groups
-from .point import Point, first_point
-from .residuals import Data, Eigenvalues, checked_data
-from .residuals_base import Residual
-from .sensitivity import mode_columns
-from .steps import Iterate, slopes
+from ...errors import ModelError
+from ...values import ComplexArray, FloatArray
+from ..parameters import Parameter
+from ..pencil import Family
+from ..point import Point, first_point
+from ..residuals import BoundEigenvalues
+from ..residuals_base import Bound, Residual
+from ..sensitivity import mode_columns
+from ..splitting import PoleRows, turned
 
 
 class Objective:
@@ -66,7 +66,8 @@ class Objective:
         limits = [getattr(q, "bounds", None) or (-np.inf, np.inf) for q in parameters]
         self.lower = np.array([low for low, _ in limits], dtype=np.float64)
         self.upper = np.array([high for _, high in limits], dtype=np.float64)
-        self.data = _pole_data(self.residuals)
+        poles = [bound for bound in self.bounds if isinstance(bound, BoundEigenvalues)]
+        self.poles_measured = PoleRows(poles) if poles else None
         self.reference: Point | None = None
         self._point: Point | None = None
 
@@ -120,17 +121,7 @@ class Objective:
 
     def _turned(self, point: Point) -> Point:
         """Return the point with exactly repeated modes turned to the split of the next step."""
-        if self.data is None or not repeated_groups(point.eigen.poles):
-            return point
-        try:
-            columns = point.columns(self.data.modes)
-        except ModelError:
-            return point
-        now = Iterate(point.p, point.eigen, point.labels, columns)
-        S, now = slopes(self.family, self.data, now)
-        turned = Point(self.family, point.p, now.eigen, point.labels)
-        turned.turned = dict(zip(self.data.modes, S, strict=True))
-        return turned
+        return point if self.poles_measured is None else turned(point, self.poles_measured)
 
     def values(self, point: Point, *, prior: bool = True) -> FloatArray:
         """Return the residuals, then those of the priors."""
@@ -146,6 +137,37 @@ class Objective:
         if prior and self.uses_prior:
             rows.append(-np.diag(1 / self.prior_std)[self.has_prior])
         return np.vstack(rows)
+
+    def size(self, point: Point) -> FloatArray:
+        """Return what the whole of a measured value is in each row of `values`."""
+        rows = [np.broadcast_to(b.size, b.values(point).shape) for b in self.bounds]
+        if self.uses_prior:
+            rows.append(np.ones(int(self.has_prior.sum())))
+        return np.concatenate(rows)
+
+    @property
+    def noise_known(self) -> bool:
+        """Whether the covariance of all residuals is known, whatever their weights."""
+        return all(bound.noisy or bound.noise is not None for bound in self.bounds)
+
+    def rows(self, point: Point) -> list[tuple[Bound, slice]]:
+        """Return which rows of `values` belong to each residual; those of the priors follow."""
+        found, first = [], 0
+        for bound in self.bounds:
+            last = first + bound.values(point).size
+            found.append((bound, slice(first, last)))
+            first = last
+        return found
+
+    @property
+    def text(self) -> str:
+        """What is fitted, in words."""
+        return " and ".join(bound.name for bound in self.bounds)
+
+    def omega(self, point: Point) -> float:
+        """Return a typical |lambda| of the modes that are followed, of all where none is."""
+        poles = self.poles(point) if self.numbers else point.eigen.poles
+        return float(np.median(np.abs(poles))) if poles.size else 1.0
 
     def poles(self, point: Point) -> ComplexArray:
         """Return the eigenvalues of the modes that are followed."""
@@ -178,8 +200,3 @@ def _from_bounds(parameter: Parameter) -> tuple[float, float] | None:
 def _numbers(residual: Residual) -> tuple[int, ...]:
     measured = getattr(residual, "measured", None)
     return tuple(getattr(measured, "modes", None) or ())
-
-
-def _pole_data(residuals: Sequence[Residual]) -> Data | None:
-    poles = [r for r in residuals if isinstance(r, Eigenvalues)]
-    return checked_data(poles) if poles else None

@@ -1,0 +1,154 @@
+"""Gauss-Newton: the paper's (13) and (14), for any residuals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...errors import ModelError, SolverError
+from ...values import FloatArray, positive
+from ..point import Point
+from .method import Found, Method, Trail
+from .objective import Objective
+
+#: what rounding leaves of an eigenvalue, relatively; the error may rise by as much
+ROUNDING = 1e-11
+#: a parameter's effect below this share of what it could have is none
+UNSEEN = 1e-9
+#: singular values of S, its columns of length one, below which parameters cannot be told apart
+SINGULAR = 1e-7
+#: how often a step that harms is halved
+HALVINGS = 30
+EXACT, STEP = "residual below the tolerance", "step below the tolerance"
+
+
+@dataclass(frozen=True, eq=False)
+class GaussNewton(Method):
+    """The paper's weighted Gauss-Newton iteration, (13) and (14), steps halved where they harm.
+
+    Eigenvalues alone are weighted by W of (12). It ends where a full step would change nothing
+    that is fitted by more than the tolerance, relatively.
+
+    Parameters
+    ----------
+    truncate : float
+        Singular values of the (column-scaled) sensitivities below this part of the largest are
+        left out of a step: truncated SVD. Zero: all are used, and a singular S raises.
+    """
+
+    truncate: float = field(default=0.0, kw_only=True)
+
+    steps = 20
+    keeps_bounds = False
+    weighs_poles = True
+
+    def __post_init__(self) -> None:
+        value = positive(self.truncate, "truncate", zero=True)
+        if value >= 1:
+            raise ModelError(f"truncate must be below 1, got {value:g}. Choose 1e-3, say.")
+        self._set(truncate=value)
+
+    @property
+    def penalised(self) -> bool:
+        """Whether directions are left out, in which the answer stays at the start."""
+        return self.truncate > 0
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether all directions are searched."""
+        return not self.truncate
+
+    def search(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        *,
+        most: int | None = None,
+        tolerance: float = 1e-10,
+    ) -> Found:
+        """Return where Gauss-Newton steps from `start` end; see `Method.search`."""
+        trail = Trail()
+        p, point = start, objective.begin(start)
+        r, size = objective.values(point), objective.size(point)
+        trail.add(objective, p, 0.0)
+        step, change = _step(objective, point, r, self.truncate)
+        converged = _is_small(r, size, tolerance)
+        reason = EXACT if converged else "max_iterations reached"
+        for _ in range(most or self.steps):
+            if converged:
+                break
+            small = _is_small(change, size, tolerance)
+            advanced = _advanced(objective, p, step, r, size)
+            if advanced is None:
+                converged, reason = small, STEP if small else "no part of a step helps"
+                break
+            fraction, r = advanced
+            p = p + fraction * step
+            point = objective.at(p, refer=True)
+            trail.add(objective, p, fraction)
+            step, change = _step(objective, point, r, self.truncate)
+            exact = _is_small(r, size, tolerance)
+            if exact or small:
+                converged, reason = True, EXACT if exact else STEP
+        return Found(p, float(r @ r) / 2, trail, converged, reason)
+
+
+def _is_small(rows: FloatArray, size: FloatArray, tolerance: float) -> bool:
+    return bool(np.max(np.abs(rows) / size) < tolerance)
+
+
+def _step(
+    objective: Objective, point: Point, r: FloatArray, truncate: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return the step of (13) and the change of the residuals to first order.
+
+    As the real least-squares problem that (13) comes from.
+    """
+    J = objective.slopes(point)
+    length = np.linalg.norm(J, axis=0)
+    names = [parameter.name for parameter in objective.parameters]
+    reach = objective.family.strength(objective.omega(point)) / objective.omega(point)
+    unseen = length <= UNSEEN * reach * float(np.max(objective.size(point)))
+    if unseen.any():
+        missed = [name for name, none in zip(names, unseen, strict=True) if none]
+        raise ModelError(
+            f"{', '.join(missed)} cannot be found from {objective.text}: what is fitted does not "
+            "depend on it (it sits on the nodal lines of these modes, say). Measure a mode that "
+            "moves there, or drop the parameter."
+        )
+    U, s, Vt = np.linalg.svd(J / length, full_matrices=False)
+    keep = s > max(truncate, SINGULAR) * s[0]
+    if not truncate and not (keep.all() and s.size == len(names)):
+        mixed = np.abs(np.linalg.svd(J / length)[2][-1])
+        together = [name for name, part in zip(names, mixed, strict=True) if part > 0.1]
+        raise ModelError(
+            f"{', '.join(together)} cannot be told apart by {objective.text} ({r.size} real "
+            f"equations, {len(names)} unknowns, S is singular): some combination of them changes "
+            "nothing. Measure more modes, drop one of them, give priors, begin elsewhere (start=) "
+            "or cut it off, GaussNewton(truncate=1e-3). identifiability(...) shows which."
+        )
+    step = -(Vt[keep].T @ ((U[:, keep].T @ r) / s[keep])) / length
+    return step, J @ step
+
+
+def _advanced(
+    objective: Objective, p: FloatArray, step: FloatArray, r: FloatArray, size: FloatArray
+) -> tuple[float, FloatArray] | None:
+    """Return the part of a step taken and the residuals there, None when no part lowers (12)."""
+    rounding = ROUNDING * float(np.linalg.norm(size))
+    limit = float(np.linalg.norm(r)) * (1 + ROUNDING) + rounding
+    fraction, trouble = 1.0, ""
+    for _ in range(HALVINGS):
+        try:
+            found = objective.values(objective.at(p + fraction * step))
+        except ModelError as error:
+            trouble = str(error)
+        else:
+            trouble = ""
+            if float(np.linalg.norm(found)) <= limit:
+                return fraction, found
+        fraction /= 2
+    if trouble:
+        raise SolverError(f"no part of a Gauss-Newton step keeps the model physical: {trouble}")
+    return None

@@ -1,0 +1,103 @@
+"""A penalty on the distance from the start, its weight given or by the L-curve."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ...values import FloatArray, positive
+from .method import Found, Method, units
+from .objective import Objective
+from .trust_region import TrustRegion, minimised
+
+#: weights tried for an L-curve
+PATH = 13
+
+
+@dataclass(frozen=True, eq=False)
+class Tikhonov(Method):
+    """Trust region with a penalty ``weight^2 |(p - start) / unit|^2``.
+
+    The unit of each parameter is its prior standard deviation, half the width of finite bounds, or
+    the change that moves the residuals by one.
+
+    Parameters
+    ----------
+    weight : float, optional
+        None: the corner of the L-curve, where the curve of penalty over misfit (both
+        logarithmic) turns most.
+
+    References
+    ----------
+    Hansen: Analysis of discrete ill-posed problems by means of the L-curve, SIAM Review 34, 1992.
+    """
+
+    weight: float | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.weight is not None:
+            self._set(weight=positive(self.weight, "weight"))
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the answer is drawn towards the start."""
+        return True
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether there is no penalty."""
+        return False
+
+    def search(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        *,
+        most: int | None = None,
+        tolerance: float = 1e-10,
+    ) -> Found:
+        """Return where the search from `start` ends; see `Method.search`."""
+        J = objective.slopes(objective.begin(start), prior=False)
+        unit = units(objective, J)
+
+        def solved(size: float, begin: FloatArray) -> Found:
+            def extra(p: FloatArray) -> tuple[FloatArray, FloatArray]:
+                return size * (p - start) / unit, np.diag(size / unit)
+
+            return minimised(
+                objective,
+                begin,
+                TrustRegion(),
+                most=most or self.steps,
+                tolerance=tolerance,
+                extra=extra,
+            )
+
+        if self.weight is not None:
+            return solved(self.weight, start)
+        largest = float(np.linalg.norm(J * unit, 2))
+        sizes = np.geomspace(largest, 1e-6 * largest, PATH)
+        curve, found, begin = [], [], start
+        for size in sizes.tolist():
+            one = solved(size, begin)
+            begin = one.p
+            change = float(np.linalg.norm((one.p - start) / unit))
+            curve.append(
+                (np.log(max(one.trail.error[-1], 1e-300)) / 2, np.log(max(change, 1e-300)))
+            )
+            found.append(one)
+        return found[corner(np.array(curve))]
+
+
+def corner(curve: FloatArray) -> int:
+    """Return the point of an L-curve (m, 2) with the largest curvature, of three points each."""
+    best, at = -np.inf, len(curve) // 2
+    for i in range(1, len(curve) - 1):
+        a, b = curve[i] - curve[i - 1], curve[i + 1] - curve[i]
+        c = curve[i + 1] - curve[i - 1]
+        area = -(a[0] * b[1] - a[1] * b[0])
+        sides = float(np.prod([np.linalg.norm(side) for side in (a, b, c)]))
+        if sides > 0 and 2 * area / sides > best:
+            best, at = 2 * area / sides, i
+    return at

@@ -1,0 +1,186 @@
+"""Levenberg-Marquardt steps in a trust region, within bounds, with robust losses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from ...errors import ModelError
+from ...values import FloatArray, positive
+from .method import Found, Method, Trail, units
+from .objective import Objective
+
+Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
+LOSSES = ("linear", "huber", "soft_l1", "cauchy")
+
+#: rows (r, J) added to those of the objective
+Extra = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
+
+@dataclass(frozen=True, eq=False)
+class TrustRegion(Method):
+    """Levenberg-Marquardt steps in a trust region that keeps to the bounds of the parameters.
+
+    `scipy.optimize.least_squares` (method trf) with exact gradients.
+
+    Parameters
+    ----------
+    loss : {"linear", "huber", "soft_l1", "cauchy"}
+        Robust losses take outliers down: rho(r^2) of each whitened residual.
+    scale : float
+        Residuals above this many (standard deviations) count as outliers.
+
+    References
+    ----------
+    Branch, Coleman, Li: A subspace, interior, and conjugate gradient method for large-scale
+    bound-constrained minimization problems, SIAM J. Sci. Comput. 21, 1999.
+    """
+
+    loss: Loss = field(default="linear", kw_only=True)
+    scale: float = field(default=1.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.loss not in LOSSES:
+            raise ModelError(
+                f"loss must be one of {', '.join(LOSSES)}, got {self.loss!r}. Choose one."
+            )
+        self._set(scale=positive(self.scale, "scale"))
+
+    @property
+    def least_squares(self) -> bool:
+        """Whether the loss is that of least squares."""
+        return self.loss == "linear"
+
+    def search(
+        self,
+        objective: Objective,
+        start: FloatArray,
+        *,
+        most: int | None = None,
+        tolerance: float = 1e-10,
+    ) -> Found:
+        """Return where the search from `start` ends; see `Method.search`."""
+        return minimised(objective, start, self, most=most or self.steps, tolerance=tolerance)
+
+
+def minimised(
+    objective: Objective,
+    start: FloatArray,
+    method: TrustRegion,
+    *,
+    most: int,
+    tolerance: float,
+    extra: Extra | None = None,
+) -> Found:
+    """Minimise by least_squares, first as if there were no bounds, again within them if needed.
+
+    Steps that keep away from bounds cost half as much again where none of them is active. Only
+    points that the search moves to become references for the pairing of modes.
+    """
+    free = np.full(start.size, np.inf)
+    if np.any(np.isfinite(objective.lower)) or np.any(np.isfinite(objective.upper)):
+        try:
+            found = _within(objective, start, method, (-free, free), most, tolerance, extra)
+        except (ModelError, np.linalg.LinAlgError):
+            found = None
+        if (
+            found is not None
+            and found.converged
+            and np.all(found.p >= objective.lower)
+            and np.all(found.p <= objective.upper)
+        ):
+            return found
+    limits = (objective.lower, objective.upper)
+    return _within(objective, start, method, limits, most, tolerance, extra)
+
+
+def _within(
+    objective: Objective,
+    start: FloatArray,
+    method: TrustRegion,
+    limits: tuple[FloatArray, FloatArray],
+    most: int,
+    tolerance: float,
+    extra: Extra | None,
+) -> Found:
+    trail = Trail()
+    point = objective.begin(start)
+    rows = objective.values(point, prior=False).size
+
+    def values(p: FloatArray) -> FloatArray:
+        try:
+            r = objective.values(objective.at(p))
+        except ModelError:
+            r = np.full(count, np.inf)
+        return r if extra is None else np.concatenate([r, extra(p)[0]])
+
+    def slopes(p: FloatArray) -> FloatArray:
+        point = objective.at(p, refer=True)
+        trail.add(objective, p, 1.0 if trail.p else 0.0)
+        J = objective.slopes(point)
+        return J if extra is None else np.vstack([J, extra(p)[1]])
+
+    count = objective.values(point).size
+    low, high = limits
+    # a start on its bound has nowhere to go
+    room = np.where(np.isfinite(high - low), high - low, np.maximum(np.abs(start), 1.0)) * 1e-8
+    inside = np.clip(start, low + room, high - room)
+    if not np.array_equal(inside, start):
+        point = objective.begin(inside)
+    loss: Any = method.loss
+    if method.loss != "linear":
+        loss = _data_loss(method.loss, rows)
+    answer = least_squares(
+        values,
+        inside,
+        slopes,
+        bounds=(low, high),
+        method="trf",
+        x_scale=units(objective, objective.slopes(point, prior=False)),
+        # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
+        ftol=max(1e-2 * tolerance, 2.3e-16),
+        xtol=max(tolerance, 2.3e-16),
+        gtol=1e-15,
+        loss=loss,
+        f_scale=method.scale,
+        max_nfev=most,
+    )
+    p = np.asarray(answer.x, dtype=np.float64)
+    objective.at(p, refer=True)
+    if not np.array_equal(trail.p[-1], p):
+        trail.add(objective, p, 1.0)
+    reason = {0: "max_iterations reached", 1: "gradient is zero", 2: "error no longer falls"}.get(
+        answer.status, "step below the tolerance"
+    )
+    return Found(p, float(answer.cost), trail, answer.status > 0, reason)
+
+
+def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:
+    """Return rho, rho', rho'' with the named loss on the first rows and squares on the others.
+
+    A prior is no outlier, however far the data pull.
+    """
+
+    def rho(z: FloatArray) -> FloatArray:
+        out = np.vstack([z, np.ones_like(z), np.zeros_like(z)])
+        t = 1 + z[:rows]
+        if name == "cauchy":
+            parts = np.log(t), 1 / t, -1 / t**2
+        elif name == "soft_l1":
+            parts = 2 * (np.sqrt(t) - 1), t**-0.5, -0.5 * t**-1.5
+        else:
+            root = np.sqrt(np.maximum(z[:rows], 1.0))
+            far = z[:rows] > 1
+            parts = (
+                np.where(far, 2 * root - 1, z[:rows]),
+                1 / root,
+                np.where(far, -0.5 / root**3, 0),
+            )
+        out[:, :rows] = parts
+        return out
+
+    return rho

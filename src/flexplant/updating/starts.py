@@ -1,0 +1,74 @@
+"""Where the searches of an update begin."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.stats import qmc
+
+from ..errors import ModelError, ShapeError
+from ..values import FloatArray, generator, real_array, short
+from .result import Starts
+from .search import Found, Objective
+from .sensitivity import checked_values
+
+
+def all_starts(objective: Objective, start: Any, starts: Any, seed: int) -> list[FloatArray]:
+    """Return the start and the others: those given, or a Latin hypercube in bounds or priors."""
+    first = objective.default_start
+    if start is not None:
+        first = checked_values(start, objective.parameters, "start")
+        _check_inside(objective, first)
+    if starts is None:
+        return [first]
+    if np.ndim(starts) == 0:
+        if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
+            raise ModelError(f"starts must be whole or values, got {short(starts)}. Pass 20, say.")
+        return [first, *_drawn(objective, int(starts) - 1, seed)]
+    values = real_array(starts, "starts")
+    if values.ndim != 2 or values.shape[1] != first.size or not values.shape[0]:
+        raise ShapeError(f"starts must have shape (any, {first.size}), got {values.shape}.")
+    for value in values:
+        _check_inside(objective, value)
+    return list(values)
+
+
+def summary(begins: list[FloatArray], ends: list[Found | None]) -> Starts | None:
+    """Return what several starts led to, None for one."""
+    if len(begins) == 1:
+        return None
+    nan = np.full(begins[0].size, np.nan)
+    return Starts(
+        np.array(begins),
+        np.array([nan if found is None else found.p for found in ends]),
+        np.array([np.inf if found is None else found.cost for found in ends]),
+    )
+
+
+def _drawn(objective: Objective, count: int, seed: int) -> FloatArray:
+    low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)
+    high = np.where(objective.has_prior, objective.prior_mean + 2 * objective.prior_std, np.inf)
+    low, high = np.maximum(low, objective.lower), np.minimum(high, objective.upper)
+    open_ = [
+        p.name
+        for p, width in zip(objective.parameters, high - low, strict=True)
+        if not np.isfinite(width)
+    ]
+    if open_:
+        raise ModelError(
+            f"starts of {', '.join(open_)} cannot be drawn: give them bounds= or prior=, or "
+            "give starts as values."
+        )
+    drawn = qmc.LatinHypercube(low.size, rng=generator(seed, "seed")).random(count)
+    return np.asarray(low + (high - low) * drawn, dtype=np.float64)
+
+
+def _check_inside(objective: Objective, start: FloatArray) -> None:
+    for q, value, low, high in zip(
+        objective.parameters, start, objective.lower, objective.upper, strict=True
+    ):
+        if not low <= value <= high:
+            raise ModelError(
+                f"start of {q.name} is {value:g}, outside its bounds ({low:g}, {high:g})."
+            )
