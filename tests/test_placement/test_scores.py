@@ -16,7 +16,8 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.placement import PoiLqr, PoiVariance, score_actuators, score_sensors
-from flexplant.placement.candidates import confirmed, scorer_of
+from flexplant.placement.layouts import layouts_of
+from flexplant.placement.quadratic import Quadratic
 from flexplant.plant import Sensor, StandardPlant, lowpass
 from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
@@ -125,9 +126,8 @@ def test_ports_with_filters_take_the_slow_way(make):
     if "dynamics" not in {field.name for field in fields(Sensor)}:
         pytest.skip("sensors have no dynamics yet")
     slow = [s.replace(dynamics=lowpass(300.0)) for s in sensors[:3]]
-    scorer = scorer_of(plant, "y", slow, PoiVariance())
-    assert scorer.problem is None
-    assert scorer_of(plant, "y", sensors[:3], PoiVariance()).problem is not None
+    assert not isinstance(layouts_of(plant, "y", slow, PoiVariance()).scorer, Quadratic)
+    assert isinstance(layouts_of(plant, "y", sensors[:3], PoiVariance()).scorer, Quadratic)
     value = score_sensors(plant, [slow]).values[0]
     direct = PoiVariance()(plant.with_ports(plant.ports.replace(y=slow)))
     assert value == direct
@@ -188,11 +188,11 @@ def test_scores_are_saved(make, tmp_path):
 
 def test_the_best_score_is_confirmed_by_the_filter(make):
     plant, sensors, _ = make(4)
-    scorer = scorer_of(plant, "y", sensors, PoiVariance("die"))
-    value = scorer((0, 1, 2))[0]
-    confirmed(scorer, (0, 1, 2), value)
+    layouts = layouts_of(plant, "y", sensors, PoiVariance("die"))
+    value = layouts.score([(0, 1, 2)])[0]
+    layouts.confirm((0, 1, 2), value)
     with pytest.raises(CertificateError, match="fast score"):
-        confirmed(scorer, (0, 1, 2), value * (1 + 1e-5))
+        layouts.confirm((0, 1, 2), value * (1 + 1e-5))
 
 
 def test_bad_input(make):

@@ -16,7 +16,7 @@ from flexplant.placement import (
     place_actuators,
     place_sensors,
 )
-from flexplant.placement.candidates import scorer_of
+from flexplant.placement.layouts import layouts_of
 from flexplant.plant import Sensor
 from flexplant.store import load
 from oracles_placement import best_subset
@@ -28,16 +28,16 @@ CASES = [(seed, n, k) for seed, n, k in ((11, 9, 3), (12, 9, 5), (13, 10, 4), (1
 def test_sensors_equal_every_subset_and_the_bound_bounds(make, seed, total, count):
     plant, sensors, _ = make(seed, count=total)
     criterion = PoiVariance("die")
-    scorer = scorer_of(plant, "y", sensors, criterion)
-    best, values = best_subset(count, total, lambda chosen: scorer(chosen)[0])
+    layouts = layouts_of(plant, "y", sensors, criterion)
+    best, values = best_subset(count, total, lambda chosen: layouts.score([chosen])[0])
     assert len(values) == comb(total, count) <= 1500
     found = place_sensors(plant, sensors, count, criterion, method=Exchange(), rng=seed)
     assert found.chosen == tuple(f"s{i}" for i in best)
     assert found.value == values[best]
     assert found.bound <= values[best]
-    assert scorer.problem.bound(count, ()) <= values[best]
+    assert layouts.scorer.bound(count, ()) <= values[best]
     # sharper than all candidates at once, which bounds as well
-    everything = scorer(range(total))[0]
+    everything = layouts.score([range(total)])[0]
     assert everything < found.bound
     assert found.bound > 0.5 * found.value
     assert found.evaluations < 5 * len(values)
@@ -49,20 +49,20 @@ def test_sensors_equal_every_subset_and_the_bound_bounds(make, seed, total, coun
 def test_actuators_equal_every_subset_and_the_bound_bounds(make, seed, total, count, delay):
     plant, _, actuators = make(seed, count=total, delay=delay)
     criterion = PoiLqr("die", effort=1e-8)
-    scorer = scorer_of(plant, "u", actuators, criterion)
-    best, values = best_subset(count, total, lambda chosen: scorer(chosen)[0])
+    layouts = layouts_of(plant, "u", actuators, criterion)
+    best, values = best_subset(count, total, lambda chosen: layouts.score([chosen])[0])
     found = place_actuators(plant, actuators, count, criterion, method=Exchange(), rng=seed)
     assert found.value == values[best]
     assert found.chosen == tuple(f"a{i}" for i in best)
-    assert scorer(range(total))[0] <= scorer.problem.bound(count, ()) <= values[best]
+    assert layouts.score([range(total)])[0] <= layouts.scorer.bound(count, ()) <= values[best]
     assert 0.3 * found.value < found.bound <= found.value
     assert found.value == pytest.approx(criterion(found.on(plant)), rel=1e-6, abs=0.0)
 
 
 def test_exhaustive_is_every_subset(make):
     plant, sensors, _ = make(11, count=9)
-    scorer = scorer_of(plant, "y", sensors, PoiVariance())
-    best, values = best_subset(4, 9, lambda chosen: scorer(chosen)[0], required=(2, 5))
+    layouts = layouts_of(plant, "y", sensors, PoiVariance())
+    best, values = best_subset(4, 9, lambda chosen: layouts.score([chosen])[0], required=(2, 5))
     found = place_sensors(plant, sensors, 4, method=Exhaustive(), required=["s2", "s5"])
     assert found.chosen == tuple(f"s{i}" for i in best)
     assert (found.value, found.bound) == (values[best], values[best])
@@ -92,7 +92,7 @@ def test_required_candidates_stay(make):
 
 def test_the_slope_of_the_relaxation_is_its_derivative(make):
     plant, sensors, _ = make(12)
-    problem = scorer_of(plant, "y", sensors, PoiVariance("die", ("z", "rx"))).problem
+    problem = layouts_of(plant, "y", sensors, PoiVariance("die", ("z", "rx"))).scorer
     weights = np.random.default_rng(0).uniform(0.2, 1.0, len(sensors))
     _, gradient = problem.relaxed(weights)
     for i in range(len(sensors)):

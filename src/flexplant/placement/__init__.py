@@ -1,12 +1,17 @@
 """Where sensors and actuators go: criteria, scores, search and bounds."""
 
-from .criteria import PoiLqr as PoiLqr
-from .criteria import PoiVariance as PoiVariance
+from .criterion import Criterion as Criterion
+from .criterion import Scorer as Scorer
+from .exchange import Exchange as Exchange
+from .exhaustive import Exhaustive as Exhaustive
+from .poi_lqr import PoiLqr as PoiLqr
+from .poi_variance import PoiVariance as PoiVariance
+from .problem import Found as Found
+from .problem import Problem as Problem
+from .problem import Search as Search
 from .scores import Scores as Scores
 from .scores import score_actuators as score_actuators
 from .scores import score_sensors as score_sensors
-from .search import Exchange as Exchange
-from .search import Exhaustive as Exhaustive
 from .search import Placement as Placement
 from .search import place_actuators as place_actuators
 from .search import place_sensors as place_sensors

@@ -12,6 +12,7 @@ from ..errors import SolverError
 from ..lti.lyapunov import doubled
 from ..lti.riccati import control_dare
 from ..values import FloatArray, IntArray, Value
+from .criterion import Scorer
 
 #: a doubling has converged when every diagonal entry grows by less than this: the next one would
 #: add the square of it
@@ -24,7 +25,7 @@ STEPS, GAP = 60, 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Quadratic(Value):
+class Quadratic(Value, Scorer):
     """``J(w) = tr(S X+ S') + constant`` with weights w of the candidates.
 
     ::

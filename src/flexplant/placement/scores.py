@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import Any
@@ -13,17 +13,9 @@ from ..errors import LabelError, ModelError
 from ..parallel import mapped
 from ..plant import StandardPlant
 from ..values import FloatArray, IntArray, Value, short, whole
-from .candidates import (
-    Criterion,
-    Port,
-    Reasoned,
-    Side,
-    checked_plant,
-    confirmed,
-    known_candidates,
-    scorer_of,
-    with_side,
-)
+from .candidates import Port, Side, checked_plant, known_candidates, with_side
+from .criterion import Criterion
+from .layouts import layouts_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -107,7 +99,7 @@ class Scores(Value):
 def score_sensors(
     plant: StandardPlant,
     layouts: Sequence[Sequence[Any]],
-    criterion: Criterion | None = None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     candidates: Sequence[Any] = (),
     executor: Executor | None = None,
@@ -158,7 +150,7 @@ def score_sensors(
 def score_actuators(
     plant: StandardPlant,
     layouts: Sequence[Sequence[Any]],
-    criterion: Criterion | None = None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     candidates: Sequence[Any] = (),
     executor: Executor | None = None,
@@ -205,7 +197,7 @@ def _scored(
     plant: StandardPlant,
     side: Side,
     layouts: Sequence[Sequence[Any]],
-    criterion: Criterion | None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None,
     candidates: Sequence[Any],
     executor: Executor | None,
     progress: bool | None,
@@ -227,20 +219,20 @@ def _scored(
     used = {name for layout in names for name in layout}
     ports = tuple(port for name, port in known.items() if name in used)
     position = {port.name: i for i, port in enumerate(ports)}
-    scorer = scorer_of(plant, side, ports, criterion)
+    judged = layouts_of(plant, side, ports, criterion)
     chosen = [tuple(position[name] for name in layout) for layout in names]
-    found = mapped(
-        Reasoned(scorer), chosen, executor=executor, progress=progress, description="layouts"
-    )
-    values = np.array([value for value, _ in found])
+    values = judged.scores(chosen, executor=executor, progress=progress)
+    lost = np.flatnonzero(~np.isfinite(values)).tolist()
+    why = mapped(judged.reason, [chosen[i] for i in lost], executor=executor, progress=progress)
+    reasons = dict(zip(lost, why, strict=True))
     order = np.argsort(values, kind="stable")
-    confirmed(scorer, chosen[order[0]], float(values[order[0]]))
+    judged.confirm(chosen[order[0]], float(values[order[0]]))
     return Scores(
         tuple(names[i] for i in order),
         values[order],
-        tuple(found[i][1] for i in order),
+        tuple(reasons.get(i, "") for i in order.tolist()),
         order,
-        repr(scorer.criterion),
+        repr(judged.criterion),
         ports,
         side,
     )

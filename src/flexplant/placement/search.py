@@ -1,83 +1,26 @@
-"""Choose sensors or actuators from candidates: exchange or exhaustive search, with a bound."""
+"""Choose sensors or actuators from candidates by a search, with a bound of how good it can be."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from itertools import combinations
-from math import comb
 from typing import Any
 
 import numpy as np
 
 from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
-from ..parallel import mapped
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, name_list, seed_sequence, whole
-from .candidates import (
-    WEAK,
-    Criterion,
-    Port,
-    Scorer,
-    Side,
-    checked_plant,
-    confirmed,
-    known_candidates,
-    require_any,
-    scorer_of,
-    with_side,
-)
+from ..values import Value, name_list, whole
+from .candidates import Port, Side, checked_plant, known_candidates, with_side
+from .criterion import Criterion
+from .exchange import Exchange
+from .exhaustive import Exhaustive
+from .layouts import layouts_of
+from .problem import Problem, Search
 
-#: an exchange must gain this, relative, to be made: rounding must not make it go round in circles
-_GAIN = 1e-12
-
-#: up to here every subset is scored unless told otherwise: it takes seconds, and leaves no doubt
+#: up to here every subset is scored when no method is given: it takes seconds, and proves it
 _FEW = 1500
-
-
-@dataclass(frozen=True, eq=False)
-class Exchange(Value):
-    """Greedy choice, then exchanges of one candidate at a time; again from random starts.
-
-    Each start ends where no single exchange helps.
-
-    Parameters
-    ----------
-    starts : int
-        Starts in all: the greedy one and `starts - 1` random ones.
-
-    Raises
-    ------
-    ModelError
-        When starts is not at least 1.
-    """
-
-    starts: int = 10
-
-    def __post_init__(self) -> None:
-        self._set(starts=whole(self.starts, "starts"))
-
-
-@dataclass(frozen=True, eq=False)
-class Exhaustive(Value):
-    """Every subset: the optimum, proven.
-
-    Parameters
-    ----------
-    limit : int
-        More subsets than this are refused.
-
-    Raises
-    ------
-    ModelError
-        When limit is no whole number of at least 1.
-    """
-
-    limit: int = 200_000
-
-    def __post_init__(self) -> None:
-        self._set(limit=whole(self.limit, "limit"))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -145,10 +88,10 @@ def place_sensors(
     plant: StandardPlant,
     candidates: Sequence[Any],
     count: int,
-    criterion: Criterion | None = None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     required: Sequence[str] = (),
-    method: Exchange | Exhaustive | None = None,
+    method: Search | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
     rng: int | np.random.SeedSequence | np.random.Generator | None = None,
@@ -207,10 +150,10 @@ def place_actuators(
     plant: StandardPlant,
     candidates: Sequence[Any],
     count: int,
-    criterion: Criterion | None = None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     required: Sequence[str] = (),
-    method: Exchange | Exhaustive | None = None,
+    method: Search | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
     rng: int | np.random.SeedSequence | np.random.Generator | None = None,
@@ -267,9 +210,9 @@ def _placed(
     side: Side,
     candidates: Sequence[Any],
     count: int,
-    criterion: Criterion | None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None,
     required: Sequence[str],
-    method: Exchange | Exhaustive | None,
+    method: Search | None,
     executor: Executor | None,
     progress: bool | None,
     rng: int | np.random.SeedSequence | np.random.Generator | None,
@@ -282,45 +225,37 @@ def _placed(
     count = whole(count, "count", maximum=max(len(ports), 1))
     if len(kept) > count:
         raise ModelError(f"{len(kept)} candidates are required, but only {count} are chosen.")
-    scorer = scorer_of(plant, side, ports, criterion)
-    require_any(scorer)
-    spanning = _spanning(scorer, kept, int(count), np.ones(len(ports)))
-    if scorer.missing(spanning):
+    layouts = layouts_of(plant, side, ports, criterion)
+    layouts.require_any()
+    problem = Problem(layouts, count, kept)
+    spanning = problem.spanning()
+    if layouts.missing(spanning):
         raise InfeasibleError(
             f"no choice of {count} of the {len(ports)} candidates will do; of the nearest one: "
-            f"{scorer.reason(spanning)} Choose more, or require others."
+            f"{layouts.reason(spanning)} Choose more, or require others."
         )
     if method is None:
-        few = comb(len(ports) - len(kept), int(count) - len(kept)) <= _FEW
-        method = Exhaustive() if few else Exchange()
-    if isinstance(method, Exhaustive):
-        found = _all(scorer, int(count), kept, method, executor, progress)
-    elif isinstance(method, Exchange):
-        found = _exchanged(scorer, int(count), kept, method, executor, progress, rng)
-    else:
+        method = Exhaustive() if problem.subsets <= _FEW else Exchange()
+    if not isinstance(method, Search):
         raise ModelError(
-            f"method must be Exchange(...) or Exhaustive(), got {type(method).__name__}. Pass one."
+            "method must be a search such as Exchange(...) or Exhaustive(), got "
+            f"{type(method).__name__}. Pass one."
         )
-    chosen, value, evaluations, history = found
-    if not np.isfinite(value):
+    found = method.search(problem, rng=rng, executor=executor, progress=progress)
+    if not np.isfinite(found.value):
         raise InfeasibleError(
             f"no choice of {count} of the {len(ports)} candidates has a finite score; the last "
-            f"reason: {_why(scorer, chosen)} Give more candidates or a larger count."
+            f"reason: {layouts.reason(found.chosen)} Give more candidates or a larger count."
         )
-    confirmed(scorer, chosen, value)
-    bound = -np.inf
-    if isinstance(method, Exhaustive):
-        bound = value
-    elif scorer.problem is not None:
-        bound = min(scorer.problem.bound(int(count), kept), value)
+    layouts.confirm(found.chosen, found.value)
     return Placement(
-        tuple(ports[i].name for i in chosen),
-        value,
-        bound,
-        evaluations,
-        history,
-        repr(scorer.criterion),
-        tuple(ports[i] for i in chosen),
+        tuple(ports[i].name for i in found.chosen),
+        found.value,
+        found.bound,
+        found.evaluations,
+        found.history,
+        repr(layouts.criterion),
+        tuple(ports[i] for i in found.chosen),
         side,
     )
 
@@ -331,145 +266,3 @@ def _required(names: Sequence[str], required: Sequence[str]) -> tuple[int, ...]:
         if name not in names:
             raise unknown_label("required candidate", name, names)
     return tuple(sorted({names.index(name) for name in listed}))
-
-
-def _why(scorer: Scorer, chosen: Sequence[int]) -> str:
-    reason = scorer(chosen)[1]
-    return scorer.reason(chosen) if reason == "rigid" else reason
-
-
-#: chosen, value, evaluations, history
-_Found = tuple[tuple[int, ...], float, int, tuple[tuple[float, ...], ...]]
-
-
-def _all(
-    scorer: Scorer,
-    count: int,
-    kept: tuple[int, ...],
-    method: Exhaustive,
-    executor: Executor | None,
-    progress: bool | None,
-) -> _Found:
-    free = [i for i in range(len(scorer.candidates)) if i not in kept]
-    total = comb(len(free), count - len(kept))
-    if total > method.limit:
-        raise ModelError(
-            f"there are {total} subsets, more than Exhaustive(limit={method.limit}) allows. Use "
-            "Exchange(), whose bound tells how far from the optimum it can be, or a higher limit."
-        )
-    subsets = [tuple(sorted((*kept, *rest))) for rest in combinations(free, count - len(kept))]
-    scores = mapped(
-        scorer, subsets, executor=executor, progress=progress, description="every subset"
-    )
-    values = np.array([value for value, _ in scores])
-    best = int(np.argmin(values))
-    return subsets[best], float(values[best]), total, ((float(values[best]),),)
-
-
-def _exchanged(
-    scorer: Scorer,
-    count: int,
-    kept: tuple[int, ...],
-    method: Exchange,
-    executor: Executor | None,
-    progress: bool | None,
-    rng: int | np.random.SeedSequence | np.random.Generator | None,
-) -> _Found:
-    search = _Search(scorer, count, kept)
-    seed = seed_sequence(rng)
-    runs = mapped(
-        search,
-        range(method.starts),
-        executor=executor,
-        progress=progress,
-        rng=seed,
-        description="starts",
-    )
-    chosen, history, _ = min(runs, key=lambda run: run[1][-1])
-    return (
-        chosen,
-        history[-1],
-        sum(run[2] for run in runs),
-        tuple(run[1] for run in runs),
-    )
-
-
-class _Search:
-    """One start and its exchanges; start 0 is greedy."""
-
-    def __init__(self, scorer: Scorer, count: int, kept: tuple[int, ...]) -> None:
-        self.scorer, self.count, self.kept = scorer, count, kept
-
-    def __call__(
-        self, start: int, rng: np.random.Generator
-    ) -> tuple[tuple[int, ...], tuple[float, ...], int]:
-        """Return the choice, the values on the way to it and the number of evaluations."""
-        seen: dict[tuple[int, ...], float] = {}
-
-        def value(chosen: Sequence[int]) -> float:
-            key = tuple(sorted(chosen))
-            if key not in seen:
-                seen[key] = self.scorer(key)[0]
-            return seen[key]
-
-        total = len(self.scorer.candidates)
-        chosen = self._start(start, rng, value)
-        values = [value(chosen)]
-        idle = 0
-        movable = [i for i in range(self.count) if chosen[i] not in self.kept]
-        while movable and idle < len(movable):
-            slot = movable.pop(0)
-            movable.append(slot)
-            rest = [i for i in range(total) if i not in chosen]
-            trials = [[*chosen[:slot], i, *chosen[slot + 1 :]] for i in rest]
-            best = min(trials, key=value, default=chosen)
-            if value(best) < values[-1] - _GAIN * abs(values[-1]) or (
-                np.isinf(values[-1]) and np.isfinite(value(best))
-            ):
-                chosen, idle = best, 0
-                values.append(value(best))
-            else:
-                idle += 1
-        return tuple(sorted(chosen)), tuple(values), len(seen)
-
-    def _start(self, start: int, rng: np.random.Generator, value: Any) -> list[int]:
-        total = len(self.scorer.candidates)
-        weights = np.ones(total) if start == 0 else rng.uniform(0.1, 1.0, total)
-        chosen = _spanning(self.scorer, self.kept, self.count, weights)
-        rest = [i for i in range(total) if i not in chosen]
-        if start:
-            return chosen + list(rng.permutation(rest)[: self.count - len(chosen)])
-        while len(chosen) < self.count:
-            best = min(
-                (i for i in range(total) if i not in chosen), key=lambda i: value([*chosen, i])
-            )
-            chosen.append(best)
-        return chosen
-
-
-def _spanning(scorer: Scorer, kept: tuple[int, ...], count: int, weights: FloatArray) -> list[int]:
-    """Return `kept` and candidates that add most to the rigid-body modes seen, one by one.
-
-    Orthogonalisation with pivoting: it reaches the highest rank that any choice of the size has.
-    """
-    chosen = list(kept)
-    left = scorer.rigid.copy()
-    for i in kept:
-        left = _without(left, left[i])
-    while len(chosen) < count:
-        sizes = np.linalg.norm(left, axis=1) * weights
-        sizes[chosen] = 0.0
-        pick = int(np.argmax(sizes))
-        if np.linalg.norm(left[pick]) < WEAK:
-            break
-        chosen.append(pick)
-        left = _without(left, left[pick])
-    return chosen
-
-
-def _without(rows: FloatArray, row: FloatArray) -> FloatArray:
-    size = float(np.linalg.norm(row))
-    if size < WEAK:
-        return rows
-    unit = row / size
-    return rows - np.outer(rows @ unit, unit)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
 
@@ -10,12 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ModelError
-from ..parallel import mapped
 from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
 from ..values import FloatArray, Value, positive, real_array, short
-from .candidates import Criterion, checked_plant, confirmed, require_any, scorer_of
+from .candidates import checked_plant
+from .criterion import Criterion
+from .layouts import layouts_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -68,7 +69,7 @@ class SensorMap(Value):
 def sensor_map(
     plant: StandardPlant,
     points: npt.ArrayLike,
-    criterion: Criterion | None = None,
+    criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     asd: float,
     direction: str = "z",
@@ -138,15 +139,14 @@ def sensor_map(
         Sensor(f"{prefix}{i}", at=place, direction=direction, quantity=quantity, asd=noise)
         for i, place in enumerate(places, 1)
     ]
-    scorer = scorer_of(plant, "y", (*own, *tried), criterion)
-    require_any(scorer)
+    layouts = layouts_of(plant, "y", (*own, *tried), criterion)
+    layouts.require_any()
     base = tuple(range(len(own)))
     sets = [base, *((*base, len(own) + i) for i in range(len(tried)))]
-    found = mapped(scorer, sets, executor=executor, progress=progress, description="points")
-    values = np.array([value for value, _ in found])
+    values = layouts.scores(sets, executor=executor, progress=progress, description="points")
     best = 1 + int(np.argmin(values[1:]))
-    confirmed(scorer, sets[best], float(values[best]))
-    return SensorMap(places, values[1:], float(values[0]), repr(scorer.criterion), zones)
+    layouts.confirm(sets[best], float(values[best]))
+    return SensorMap(places, values[1:], float(values[0]), repr(layouts.criterion), zones)
 
 
 def _zones(exclude: Sequence[Rectangle | Disc]) -> tuple[Rectangle | Disc, ...]:

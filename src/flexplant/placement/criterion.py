@@ -1,0 +1,140 @@
+"""What a layout is judged by: any function from plant to float, some with a fast form."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..errors import FlexplantError, ModelError
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, short
+from .candidates import KIND, Port, Side, with_side
+
+
+class Scorer:
+    """The scores of choices among fixed candidates; choices are rows of indices, ascending."""
+
+    def value(self, chosen: Sequence[int]) -> Any:
+        """Return the score of one choice, smaller is better.
+
+        Raises
+        ------
+        FlexplantError
+            When the choice has none.
+        """
+        raise NotImplementedError
+
+    def outcome(self, chosen: Sequence[int]) -> tuple[float, str]:
+        """Return the score of one choice, infinite with the reason when it has none.
+
+        Raises
+        ------
+        ModelError
+            When `value` gives no number.
+        """
+        try:
+            found = self.value(chosen)
+        except FlexplantError as error:
+            return np.inf, str(error)
+        try:
+            number = float(found)
+        except (TypeError, ValueError) as error:
+            raise ModelError(
+                f"the criterion {self!r} must return a float, got {type(found).__name__}."
+            ) from error
+        if np.isnan(number):
+            raise ModelError(f"the criterion {self!r} returned NaN: it cannot be compared.")
+        return number, "" if np.isfinite(number) else "the criterion is infinite."
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return the scores (n,) of several choices, at once where the criterion allows it."""
+        return np.array([self.outcome(chosen)[0] for chosen in sets])
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return a number below the score of every choice of `count`; -inf when none is known."""
+        return -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class OnPlant(Scorer):
+    """The scores of a function from plant to float: for each choice the plant is made anew."""
+
+    plant: StandardPlant
+    side: Side
+    candidates: tuple[Port, ...]
+    function: Callable[[StandardPlant], Any]
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def value(self, chosen: Sequence[int]) -> Any:
+        """Return what the function gives on the plant with this choice."""
+        return self.function(with_side(self.plant, self.side, [self.candidates[i] for i in chosen]))
+
+
+class Criterion(Value):
+    """A function from plant to float, smaller is better; the base of those with more to say.
+
+    A new criterion defines `__call__`, and where it can `check` and a `scorer` that is faster.
+    """
+
+    #: what it depends on: sensors "y", actuators "u"
+    sides: ClassVar[str] = "yu"
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return the criterion on a plant."""
+        raise NotImplementedError
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Raise AssumptionError for what no choice among the candidates can repair."""
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the scores of choices among candidates; what they share is computed once.
+
+        Parameters
+        ----------
+        plant : StandardPlant
+            Sampled, assembled from a structure.
+        candidates : sequence of Sensor or Actuator
+            All that may be chosen, of one kind.
+        """
+        side: Side = "y" if all(isinstance(port, KIND["y"]) for port in candidates) else "u"
+        return OnPlant(plant, side, tuple(candidates), self)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Function(Criterion):
+    """A callable of the user's."""
+
+    function: Callable[[StandardPlant], Any]
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def __call__(self, plant: StandardPlant) -> Any:
+        return self.function(plant)
+
+
+def as_criterion(given: Any, side: Side) -> Criterion:
+    """Return a criterion of one side, made of any callable from plant to float.
+
+    Raises
+    ------
+    ModelError
+        When it is not callable, or of the other side.
+    """
+    if not callable(given):
+        raise ModelError(
+            "a criterion is a value such as PoiVariance(...) or PoiLqr(...), or a callable from "
+            f"plant to float, got {short(given)}. Pass one, or none for the usual."
+        )
+    criterion = given if isinstance(given, Criterion) else _Function(given)
+    if side not in criterion.sides:
+        raise ModelError(
+            f"{criterion!r} does not depend on {'sensors' if side == 'y' else 'actuators'}: use "
+            "a criterion that does, or any callable from plant to float."
+        )
+    return criterion

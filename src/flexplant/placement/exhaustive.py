@@ -1,0 +1,64 @@
+"""Every subset is scored: the optimum, proven."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import whole
+from .problem import Found, Problem, Search
+
+
+@dataclass(frozen=True, eq=False)
+class Exhaustive(Search):
+    """Every subset: the optimum, proven.
+
+    Parameters
+    ----------
+    limit : int
+        More subsets than this are refused.
+
+    Raises
+    ------
+    ModelError
+        When limit is no whole number of at least 1.
+    """
+
+    limit: int = 200_000
+
+    def __post_init__(self) -> None:
+        self._set(limit=whole(self.limit, "limit"))
+
+    def search(
+        self,
+        problem: Problem,
+        *,
+        rng: int | np.random.SeedSequence | np.random.Generator | None = None,
+        executor: Executor | None = None,
+        progress: bool | None = None,
+    ) -> Found:
+        """Return the best of all subsets; see `Search.search`. Nothing is random.
+
+        Raises
+        ------
+        ModelError
+            When there are more subsets than `limit`.
+        """
+        if problem.subsets > self.limit:
+            raise ModelError(
+                f"there are {problem.subsets} subsets, more than Exhaustive(limit={self.limit}) "
+                "allows. Use Exchange(), whose bound tells how far from the optimum it can be, or "
+                "a higher limit."
+            )
+        kept, more = problem.required, problem.count - len(problem.required)
+        sets = [tuple(sorted((*kept, *rest))) for rest in combinations(problem.free, more)]
+        values = problem.layouts.scores(
+            sets, executor=executor, progress=progress, description="every subset"
+        )
+        best = int(np.argmin(values))
+        value = float(values[best])
+        return Found(sets[best], value, value, len(sets), ((value,),))

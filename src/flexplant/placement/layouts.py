@@ -1,0 +1,167 @@
+"""Layouts on one plant: their rigid-body modes before any score, and their scores."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssumptionError, CertificateError
+from ..parallel import mapped
+from ..plant import Sensor, StandardPlant, assemble_plant
+from ..plant.check import Assumption
+from ..plant.ports import QUANTITIES
+from ..values import FloatArray
+from .candidates import Port, Side, checked_plant, structure_of, with_side
+from .criterion import Criterion, OnPlant, Scorer, as_criterion
+from .poi_lqr import PoiLqr
+from .poi_variance import PoiVariance
+
+ASSUMPTION = {"y": "detectable", "u": "stabilisable"}
+#: a rigid-body motion weaker than this beside the strongest counts as absent (as in plant.check)
+WEAK = 1e-8
+#: choices that are scored at once: always as many, so that rounding does not depend on the executor
+_BLOCK = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Layouts:
+    """Candidates on a plant, and the scores of choices among them.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, assembled from a structure.
+    side : {"y", "u"}
+        Whether sensors or actuators are chosen.
+    candidates : sequence of Sensor or Actuator
+        All of them.
+    criterion : Criterion
+        Plant to float.
+    rigid : (N, r) array
+        Part of each candidate in each rigid-body mode, rows of unit size or zero.
+    scorer : Scorer
+        The criterion over these candidates.
+    """
+
+    plant: StandardPlant
+    side: Side
+    candidates: tuple[Port, ...]
+    criterion: Criterion
+    rigid: FloatArray
+    scorer: Scorer
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return the scores (n,) of choices, infinite where there is none."""
+        ordered = [sorted(chosen) for chosen in sets]
+        scored = [i for i, chosen in enumerate(ordered) if not self.missing(chosen)]
+        values = np.full(len(ordered), np.inf)
+        values[scored] = self.scorer.score([ordered[i] for i in scored])
+        return values
+
+    def scores(
+        self,
+        sets: Sequence[Sequence[int]],
+        *,
+        executor: Executor | None = None,
+        progress: bool | None = None,
+        description: str = "layouts",
+    ) -> FloatArray:
+        """Return the scores (n,) of many choices, computed on an executor."""
+        blocks = [sets[i : i + _BLOCK] for i in range(0, len(sets), _BLOCK)]
+        found = mapped(
+            self.score, blocks, executor=executor, progress=progress, description=description
+        )
+        return np.concatenate(found) if found else np.zeros(0)
+
+    def missing(self, chosen: Sequence[int]) -> int:
+        """Return how many rigid-body modes a choice has no part in: ranks decide."""
+        rows = self.rigid[list(chosen)]
+        wanted = int(rows.shape[1])
+        if not wanted or not np.any(rows):
+            return wanted
+        sizes = np.linalg.svd(rows, compute_uv=False)
+        return wanted - int(np.count_nonzero(sizes > WEAK * sizes[0]))
+
+    def reason(self, chosen: Sequence[int]) -> str:
+        """Return in words why a choice has no score; empty when it has one."""
+        lost = self.missing(chosen)
+        if not lost:
+            return self.scorer.outcome(sorted(chosen))[1]
+        found = self._finding(chosen)
+        return f"{lost} rigid-body modes are missed." if found.holds else found.finding
+
+    def require_any(self) -> None:
+        """Raise AssumptionError when even all candidates together miss a rigid-body mode."""
+        everything = range(len(self.candidates))
+        if self.missing(everything):
+            raise AssumptionError(
+                f"no choice of these candidates will do: {self.reason(everything)} "
+                f"{self._finding(everything).remedy}".strip()
+            )
+
+    def confirm(self, chosen: Sequence[int], value: float) -> None:
+        """Raise CertificateError unless the criterion itself, on the plant, gives a fast value."""
+        if isinstance(self.scorer, OnPlant) or not np.isfinite(value):
+            return
+        ports = [self.candidates[i] for i in sorted(chosen)]
+        direct = float(self.criterion(with_side(self.plant, self.side, ports)))
+        if not abs(direct - value) <= 1e-6 * abs(direct):
+            raise CertificateError(
+                f"the fast score {value:.9g} of the best choice differs from {self.criterion!r} on "
+                f"its plant, {direct:.9g}. No score can be trusted: the problem is too badly "
+                "conditioned."
+            )
+
+    def _finding(self, chosen: Sequence[int]) -> Assumption:
+        ports, realisation = structure_of(self.plant)
+        only = ports.replace(**{self.side: [self.candidates[i] for i in chosen]})
+        return assemble_plant(realisation, only).check()[ASSUMPTION[self.side]]
+
+
+def layouts_of(
+    plant: StandardPlant, side: Side, candidates: Sequence[Port], criterion: Any
+) -> Layouts:
+    """Return the layouts of candidates on a plant, with everything checked.
+
+    Raises
+    ------
+    ModelError
+        When the plant is not a sampled one of a structure, or the criterion is not callable or is
+        of the other side.
+    AssumptionError
+        When the criterion has no meaning on this plant, whatever is chosen.
+    LabelError
+        When a candidate is off the structure, or a name is used twice.
+    """
+    checked_plant(plant)
+    if criterion is None:
+        criterion = PoiVariance() if side == "y" else PoiLqr()
+    criterion = as_criterion(criterion, side)
+    candidates = tuple(candidates)
+    with_side(plant, side, candidates)  # names and places, all at once
+    plainly = OnPlant(plant, side, candidates, criterion)
+    layouts = Layouts(plant, side, candidates, criterion, _rigid(plant, candidates), plainly)
+    criterion.check(plant, candidates)
+    # without a single feasible choice there is nothing that choices could share
+    if layouts.missing(range(len(candidates))):
+        return layouts
+    return replace(layouts, scorer=criterion.scorer(plant, candidates))
+
+
+def _rigid(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
+    """Return unit rows (N, r): a sensor sees positions, an actuator moves velocities."""
+    realisation = structure_of(plant)[1]
+    rows = np.zeros((len(candidates), realisation.n_rigid))
+    for i, port in enumerate(candidates):
+        row = realisation.row(port.at, port.direction)
+        if isinstance(port, Sensor):
+            motion = realisation.motion(row, QUANTITIES.index(port.quantity))
+            rows[i] = motion[0 : 2 * realisation.n_rigid : 2]
+        else:
+            rows[i] = realisation.force(row)[1 : 2 * realisation.n_rigid : 2]
+    sizes = np.linalg.norm(rows, axis=1, keepdims=True)
+    return np.asarray(rows / np.where(sizes > 0, sizes, 1.0))

@@ -1,0 +1,109 @@
+"""The variance of a POI's estimate: where sensors go."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssumptionError
+from ..estimation import design_kalman
+from ..plant import Disturbance, StandardPlant
+from ..plant.ports import QUANTITIES
+from .candidates import structure_of
+from .criterion import Criterion, Scorer
+from .poi_axes import Axes, bare, checked_axes, factors_of, plain, shown, structure_part
+from .quadratic import quadratic
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PoiVariance(Criterion):
+    """Variance of the stationary Kalman estimate's error at a POI: for sensors, smaller is better.
+
+    ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, P after the measurement, at sample instants: the
+    square of `design_kalman(plant).rms(...)`. More sensors never make it larger.
+
+    Parameters
+    ----------
+    poi : str, optional
+        The POI's name; not needed when the plant has one only.
+    axes : str, sequence of str or mapping {axis: factor}, optional
+        The POI's axes to sum over; its first when not given. A rotation is turned into a
+        displacement by a factor [m], such as half the width of the die.
+
+    Raises
+    ------
+    LabelError
+        When an axis appears twice; when called, for a POI or an axis that the plant lacks.
+    ModelError
+        When a factor is not positive.
+
+    Examples
+    --------
+    >>> PoiVariance("die", {"z": 1.0, "rx": 0.013})
+    PoiVariance('die', axes={'z': 1.0, 'rx': 0.013})
+    """
+
+    sides = "y"
+    poi: str | None = None
+    axes: Axes = field(default=None)
+
+    def __post_init__(self) -> None:
+        self._set(axes=checked_axes(self.axes))
+
+    def __repr__(self) -> str:
+        return f"PoiVariance({shown(self.poi, self.axes)})"
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return the variance [m^2] on a sampled plant, by its certified Kalman filter.
+
+        Raises
+        ------
+        AssumptionError
+            When no stationary filter exists: the message names what the sensors miss.
+        """
+        estimator = design_kalman(plant)
+        factors = factors_of(plant, self.poi, self.axes, every=False)
+        return float(sum((f * estimator.rms(name)) ** 2 for name, f in factors.items()))
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Raise AssumptionError when w misses a rigid-body mode or a candidate fits no filter."""
+        factors_of(plant, self.poi, self.axes, every=False)
+        plant.check().require(("excited",), "a stationary Kalman filter")
+        ports, realisation = structure_of(plant)
+        silent = [sensor.name for sensor in candidates if sensor.asd <= 0]
+        if silent:
+            raise AssumptionError(
+                f"sensors {', '.join(silent[:6])} have no noise (asd 0): the filter would trust "
+                "them without limit. Give Sensor(..., asd=) what the data sheet says."
+            )
+        # noise that is shaped first does not arrive at once
+        loud = [d for d in ports.w if isinstance(d, Disturbance) and d.asd > 0 and bare(d)]
+        B = [realisation.force(realisation.row(d.at, d.direction)) for d in loud]
+        for sensor in candidates:
+            row = realisation.row(sensor.at, sensor.direction)
+            if sensor.quantity == "acceleration" and np.any(np.dot(B, realisation.motion(row, 1))):
+                raise AssumptionError(
+                    f"white noise of a disturbance reaches {sensor.name!r} (an acceleration) at "
+                    "once, so a sample of it would have infinite variance. Measure displacement "
+                    "or velocity, or shape the disturbance."
+                )
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the variance as a function of the sensors alone; all else is computed once.
+
+        Delay lines of u are left out: the filter knows their states exactly. Where ports have
+        filters or delays every choice has states of its own, and the plant is made anew.
+        """
+        if not plain(plant, candidates):
+            return super().scorer(plant, candidates)
+        A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=False))
+        realisation = structure_of(plant)[1]
+        items = np.zeros((len(candidates), A.shape[0]))
+        for i, sensor in enumerate(candidates):
+            row = realisation.row(sensor.at, sensor.direction)
+            seen = realisation.motion(row, QUANTITIES.index(sensor.quantity))
+            items[i] = seen / np.sqrt(0.5 * sensor.asd**2 / plant.dt)
+        return quadratic(A.T, noise @ noise.T, rows, items)

@@ -1,0 +1,101 @@
+"""The problem of a search: which `count` of the candidates, some of them required."""
+
+from __future__ import annotations
+
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from math import comb
+
+import numpy as np
+
+from ..values import FloatArray, Value
+from .layouts import WEAK, Layouts
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The best choice of `count` candidates, `required` (indices) among them."""
+
+    layouts: Layouts
+    count: int
+    required: tuple[int, ...]
+
+    @property
+    def free(self) -> list[int]:
+        """Candidates that may be left out."""
+        return [i for i in range(len(self.layouts.candidates)) if i not in self.required]
+
+    @property
+    def subsets(self) -> int:
+        """How many choices there are."""
+        return comb(len(self.free), self.count - len(self.required))
+
+    def bound(self) -> float:
+        """Return a number below the score of every choice; minus infinity when none is known."""
+        return self.layouts.scorer.bound(self.count, self.required)
+
+    def spanning(self, weights: FloatArray | None = None) -> list[int]:
+        """Return the required and those that add most to the rigid-body modes seen, one by one.
+
+        Orthogonalisation with pivoting: it reaches the highest rank that any choice of the size
+        has. Weights (N,) favour some candidates.
+        """
+        chosen = list(self.required)
+        left = self.layouts.rigid.copy()
+        for i in self.required:
+            left = _without(left, left[i])
+        while len(chosen) < self.count:
+            sizes = np.linalg.norm(left, axis=1) * (1.0 if weights is None else weights)
+            sizes[chosen] = 0.0
+            pick = int(np.argmax(sizes))
+            if np.linalg.norm(left[pick]) < WEAK:
+                break
+            chosen.append(pick)
+            left = _without(left, left[pick])
+        return chosen
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """What a search found: a choice, its value, a bound, and the way there."""
+
+    chosen: tuple[int, ...]
+    value: float
+    bound: float
+    evaluations: int
+    history: tuple[tuple[float, ...], ...]
+
+
+class Search(Value):
+    """A way to search; the base of all of them."""
+
+    def search(
+        self,
+        problem: Problem,
+        *,
+        rng: int | np.random.SeedSequence | np.random.Generator | None = None,
+        executor: Executor | None = None,
+        progress: bool | None = None,
+    ) -> Found:
+        """Return the best choice that was found.
+
+        Parameters
+        ----------
+        problem : Problem
+            With `layouts.score(sets)`, `bound()`, and choices that see every rigid-body mode.
+        rng : int, SeedSequence or Generator, optional
+            For what is random.
+        executor : concurrent.futures.Executor, optional
+            The result is the same to the bit.
+        progress : bool, optional
+            A bar: None shows one on a terminal for work of more than two seconds.
+        """
+        raise NotImplementedError
+
+
+def _without(rows: FloatArray, row: FloatArray) -> FloatArray:
+    size = float(np.linalg.norm(row))
+    if size < WEAK:
+        return rows
+    unit = row / size
+    return rows - np.outer(rows @ unit, unit)
