@@ -1,5 +1,6 @@
 """The Kalman filter of the POI on the paper's plate: prediction, closed form, a run, refusals."""
 
+import pickle
 from functools import cache
 
 import numpy as np
@@ -164,20 +165,38 @@ def test_without_noise_the_estimate_is_exact_also_with_feedthrough_of_u():
         design_kalman(plant).to_filterpy()
 
 
-def test_filterpy_in_its_stationary_state_gives_the_same_estimates():
-    plant = stage()
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1)])
+@pytest.mark.parametrize("make", [stage, plate_plant])
+def test_filterpy_in_its_stationary_state_gives_the_same_estimates(make, shape):
+    plant = make()
     estimator = design_kalman(plant)
-    twin = estimator.to_filterpy()
+    twin = pickle.loads(pickle.dumps(estimator.to_filterpy()))
     truth, observer = dictionaries(plant, estimator)
     rng = np.random.default_rng(1)
     x = np.zeros(plant.system.n_states)
+    theirs, ours = [], []
     for _ in range(50):
-        y, u = rng.standard_normal(2) * 1e-9, rng.standard_normal(2)
-        twin.update(y)
-        hat = observer["C"] @ x + observer["Dy"] @ y
-        np.testing.assert_allclose(truth["C1"] @ twin.x[:, 0], hat, rtol=1e-6, atol=1e-16)
+        y, u = rng.standard_normal(twin.dim_z) * 1e-9, rng.standard_normal(twin.dim_u)
+        twin.update(y.reshape(shape))
+        assert twin.x.shape == (x.size, 1)
+        theirs.append(truth["C1"] @ twin.x[:, 0])
+        ours.append(observer["C"] @ x + observer["Dy"] @ y)
         x = observer["A"] @ x + observer["By"] @ y + observer["Bu"] @ u
-        twin.predict(u[:, None])
+        np.testing.assert_array_equal(twin.get_prediction(u.reshape(shape))[0].shape, (x.size, 1))
+        twin.predict(u.reshape(shape))
+    size = np.abs(ours).max(axis=0)
+    np.testing.assert_allclose(np.array(theirs) / size, np.array(ours) / size, rtol=0, atol=1e-12)
+
+
+def test_filterpy_runs_without_commands_and_refuses_too_many():
+    twin = design_kalman(stage()).to_filterpy()
+    still = twin.batch_filter([np.zeros(2)] * 3)[0]
+    assert still.shape == (3, twin.dim_x, 1)
+    assert not still.any()
+    with pytest.raises(ShapeError, match="u must have 2 entries"):
+        twin.predict(np.zeros(3))
+    with pytest.raises(ShapeError, match="y must have 2 entries"):
+        twin.update(np.zeros((2, 2)))
 
 
 def test_delays_of_u_cost_nothing():

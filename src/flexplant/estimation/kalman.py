@@ -112,9 +112,10 @@ class KalmanEstimator(Value):
     def to_filterpy(self) -> Any:
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
 
-        Call `update(y)` and then `predict(u)`; y without references, u all actuators.
+        Call `update(y)` and then `predict(u)`; y without references, u all actuators, as 1-D
+        arrays or as columns.
         """
-        from filterpy.kalman import KalmanFilter
+        from .filterpy_twin import twin_class
 
         g, noise = _model(self.plant), _noises(self.plant)
         if np.any(g.D):
@@ -123,7 +124,7 @@ class KalmanEstimator(Value):
                 "with a delay: plant.continuous.discretized(rate, delay=1)."
             )
         n, m = g.B.shape
-        twin = KalmanFilter(dim_x=n, dim_z=g.C.shape[0], dim_u=m)
+        twin = twin_class()(dim_x=n, dim_z=g.C.shape[0], dim_u=m)
         twin.F, twin.B, twin.H = g.A.copy(), g.B.copy(), g.C.copy()
         twin.Q, twin.R = noise.process.copy(), noise.sensors.copy()
         twin.P = g.A @ self.covariance @ g.A.T + noise.process

@@ -1,0 +1,64 @@
+"""A filter of filterpy that takes measurements and commands as 1-D arrays or as columns."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+
+from ..errors import ShapeError
+from ..values import FloatArray, real_array
+
+
+@cache
+def twin_class() -> Any:
+    """Return a subclass of `filterpy.kalman.KalmanFilter` whose y and u are 1-D or columns.
+
+    filterpy adds ``B u`` to the column x as it comes: a 1-D u would make x an (n, n) array.
+    """
+    from filterpy.kalman import KalmanFilter
+
+    class Twin(KalmanFilter):  # type: ignore[misc]
+        def update(self, z: Any, R: Any = None, H: Any = None) -> None:
+            super().update(None if z is None else _column(z, self.dim_z, "y"), R, H)
+
+        def predict(self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None) -> None:
+            super().predict(_command(u, self.dim_u), B, F, Q)
+
+        def predict_steadystate(self, u: Any = None, B: Any = None) -> None:
+            super().predict_steadystate(_command(u, self.dim_u), B)
+
+        def get_prediction(
+            self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None
+        ) -> tuple[FloatArray, FloatArray]:
+            x, P = super().get_prediction(_command(u, self.dim_u), B, F, Q)
+            return x, P
+
+        def __reduce__(self) -> tuple[Any, ...]:
+            return _restored, (self.__dict__,)
+
+    return Twin
+
+
+def _command(u: Any, count: int) -> FloatArray:
+    # None and 0 are filterpy's own defaults for no command
+    return np.zeros((count, 1)) if u is None or np.array_equal(u, 0) else _column(u, count, "u")
+
+
+def _column(value: Any, count: int, name: str) -> FloatArray:
+    found = real_array(value, name)
+    if found.shape not in ((count,), (count, 1)) and not (count == 1 and found.size == 1):
+        raise ShapeError(
+            f"{name} must have {count} entries, as a 1-D array or a column, got shape "
+            f"{found.shape}. Pass all of them, in the order of the plant."
+        )
+    return found.reshape(count, 1)
+
+
+def _restored(fields: dict[str, Any]) -> Any:
+    """Return an unpickled filter: pickle finds no class that is made inside a function."""
+    kind = twin_class()
+    twin = kind.__new__(kind)
+    twin.__dict__.update(fields)
+    return twin
