@@ -3,10 +3,12 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 import scipy.io
+import scipy.linalg
 
-from flexplant import solid_block
+from flexplant import h2_norm, solid_block
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -64,3 +66,7 @@ def test_the_code_runs(tmp_path, monkeypatch):
     names = {"__name__": "readme"}
     for i, code in enumerate(BLOCKS, 1):
         exec(compile(code, f"README block {i}", "exec"), names)
+    g = names["loop"].system
+    P = scipy.linalg.solve_discrete_lyapunov(g.A, g.B @ g.B.T)
+    by_scipy = np.sqrt(np.trace(g.C @ P @ g.C.T) + np.sum(g.D**2))
+    assert h2_norm(g) == pytest.approx(by_scipy, rel=1e-8)
