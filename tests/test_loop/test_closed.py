@@ -1,5 +1,7 @@
 """close_loop against python-control's interconnect, dense formulas, and wrong connections."""
 
+import re
+
 import control as ct
 import numpy as np
 import pytest
@@ -7,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import oracles_loop as oracle
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_static
-from flexplant.loop import ClosedLoop, close_loop
+from flexplant.loop import ClosedLoop, bandwidth, close_loop
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
 from flexplant.store import load
@@ -97,7 +99,15 @@ def test_idle_actuator_rests(loop):
 
 
 def test_unstable_loop_is_reported_not_refused():
-    bad = close_loop(stage(), observer(), servo(sign=-1.0))
+    with pytest.warns(FlexplantWarning, match=r"is unstable: a pole at .* \(spectral radius 1\."):
+        bad = close_loop(stage(), observer(), servo(sign=-1.0))
+    assert re.search(
+        rf"\n  unstable: a pole .*; spectral radius {bad.spectral_radius:.9g}\n", repr(bad)
+    )
+    with pytest.raises(AssumptionError, match="not stable"):
+        bandwidth(bad)
+    with pytest.raises(AssumptionError, match="not stable"):
+        bandwidth((bad.plant, bad))
     assert not bad.is_stable
     assert bad.spectral_radius > 1
     assert bad.modulus_margin == 0.0
@@ -113,7 +123,8 @@ def test_same_blocks_on_another_machine(loop):
 def test_stiff_servos_are_not_taken_for_algebraic_loops(loop):
     """A gain of 1e10 N/m is a unit, not an ill-posed loop."""
     stiff = servo(sign=1e6)
-    joined = close_loop(loop.plant, observer(), stiff).controller
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        joined = close_loop(loop.plant, observer(), stiff).controller
     np.testing.assert_allclose(
         joined.select(["u1", "u2"]).C / 1e6, loop.controller.select(["u1", "u2"]).C, rtol=1e-12
     )
@@ -126,7 +137,8 @@ def test_a_block_may_pass_the_command_on_directly(loop):
     """A meter of the applied force is exact, whatever the size of that force."""
     meter = StateSpace([], [], [], [[3.0, 0.5]], inputs=["u1", "u2"], outputs=["meter"])
     stiff = servo(sign=1e6)
-    g = close_loop(loop.plant, observer(), stiff, meter).controller
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        g = close_loop(loop.plant, observer(), stiff, meter).controller
     z = np.exp(2j * np.pi * 30.0 * DT)
     gain = g.evaluated(z)
     assert g.outputs == ("u1", "u2", "die:hat", "meter")
@@ -197,6 +209,7 @@ def test_saved_and_loaded(loop, tmp_path):
 def test_repr_is_short(loop):
     assert repr(loop).splitlines() == [
         "<ClosedLoop: plant 10 states, controller 2 states, dt 0.0005 s>",
+        f"  stable: spectral radius {loop.spectral_radius:.9g}, modulus margin 0.586",
         "  driven: u1 u2",
         "  monitored: die:hat",
     ]
@@ -304,3 +317,12 @@ def test_a_plant_of_python_control_with_our_names_closes_the_same_loop():
         StandardPlant.from_statespace(twin, u=plant.u)
     with pytest.raises(ModelError, match="need a StandardPlant, got 3"):
         close_loop(3, *blocks)
+
+
+def test_a_command_without_feedback_keeps_the_whole_margin():
+    plant = stage(delay=1.0)
+    plant = plant.replace(system=plant.system.replace(A=0.9 * plant.system.A))
+    ahead = StateSpace([], [], [], [[2.0], [2.0]], inputs=["die:ref"], outputs=["u1", "u2"])
+    loop = close_loop(plant, ahead)
+    assert loop.modulus_margin == pytest.approx(1.0, rel=1e-12)
+    assert "modulus margin 1\n" in repr(loop)

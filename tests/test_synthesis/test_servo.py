@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError, SolverError
+from flexplant.errors import (
+    AssumptionError,
+    FlexplantWarning,
+    LabelError,
+    ModelError,
+    ShapeError,
+    SolverError,
+)
 from flexplant.estimation import design_kalman, design_static
 from flexplant.loop import close_loop
 from flexplant.plant import Actuator, Poi, Ports, assemble_plant
@@ -154,7 +161,8 @@ def test_the_loop_on_the_plate_is_stable_and_turns_unstable_with_the_sign():
     assert -20 * np.log10(loop.modulus_margin) < 6.0
     g = servo.system
     wrong = g.replace(C=-g.C, D=-g.D)
-    assert close_loop(plant, observer, wrong).spectral_radius > 1
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        assert close_loop(plant, observer, wrong).spectral_radius > 1
 
 
 def test_the_loop_follows_a_constant_reference():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,9 +11,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
 from ..lti.frequency import Frf, frequency_response
 from ..lti.interconnection import connect, lft
+from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, standard_plant
 from ..values import Value, name_list, real_array
@@ -47,6 +49,10 @@ class ClosedLoop(Value):
         kind = f"dt {self.plant.dt:g} s" if self.plant.dt else "continuous"
         plant, controller = self.plant.system.n_states, self.controller.n_states
         lines = [f"<ClosedLoop: plant {plant} states, controller {controller} states, {kind}>"]
+        if self.obstacle is None:
+            lines.append(f"  stable: {self._decay}, modulus margin {self.modulus_margin:.3g}")
+        else:
+            lines.append(f"  {self.obstacle.reason}; {self._decay}")
         lines.append(f"  driven: {' '.join(self.driven)}")
         if self.watched:
             shown = " ".join(self.watched[:8]) + (" ..." if len(self.watched) > 8 else "")
@@ -168,9 +174,20 @@ class ClosedLoop(Value):
         return float(np.max(self.monitored.poles().real, initial=-np.inf))
 
     @property
+    def _decay(self) -> str:
+        if self.plant.dt:
+            return f"spectral radius {self.spectral_radius:.9g}"
+        return f"spectral abscissa {self.spectral_abscissa:.6g} rad/s"
+
+    @property
     def is_stable(self) -> bool:
         """Whether all eigenvalues of the closed loop are strictly inside the stability region."""
         return self.monitored.is_stable
+
+    @cached_property
+    def obstacle(self) -> Obstacle | None:
+        """The pole that makes the loop unstable or marginal (to within rounding), or None."""
+        return obstacle(self.monitored)
 
     @cached_property
     def modulus_margin(self) -> float:
@@ -205,7 +222,13 @@ def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] 
     Returns
     -------
     ClosedLoop
-        Stable or not: see `is_stable`, `spectral_radius`, `modulus_margin`.
+        Its repr says whether it is stable, with spectral radius and modulus margin.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the closed loop is unstable; it is returned all the same, to be looked at. Marginal
+        poles (a rigid-body mode that nothing holds) are named by its repr alone.
 
     Raises
     ------
@@ -243,7 +266,16 @@ def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] 
     driven, watched = _drives(plant, systems, resting)
     _check_inputs(plant, systems)
     controller = _joined(plant, systems, driven, watched)
-    return ClosedLoop(plant, systems, controller, resting)
+    loop = ClosedLoop(plant, systems, controller, resting)
+    if not loop.is_stable and loop.obstacle and loop.obstacle.reason.startswith("unstable"):
+        warnings.warn(
+            f"the closed loop is {loop.obstacle.reason} ({loop._decay}): its signals grow, and it "
+            "has no margin, bandwidth or norm. Check the sign (u = K y), lower the bandwidth, or "
+            "notch the mode at that frequency.",
+            FlexplantWarning,
+            stacklevel=2,
+        )
+    return loop
 
 
 def _joined(

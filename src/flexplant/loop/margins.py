@@ -62,11 +62,16 @@ def bandwidth(loop: Loop) -> float:
     Raises
     ------
     AssumptionError
-        When |S| is nowhere below 0 dB.
+        When the closed loop is not stable, or |S| is nowhere below 0 dB.
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
     """
     parts = taken_apart(loop)
+    if parts.measured is None and not _stable(parts):
+        raise AssumptionError(
+            "the closed loop is not stable, so |S| is the size of no response of it and gives no "
+            "bandwidth. Stabilise it first: see loop.spectral_radius and loop.modulus_margin."
+        )
     grid = checked_grid(parts, None)
     loop_low = open_gain(parts, grid[:1], "u")[0]
     vectors, gains, _ = np.linalg.svd(loop_low)

@@ -13,7 +13,6 @@ from threadpoolctl import threadpool_limits
 
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
-from ..lti.stability import obstacle
 from ..plant import StandardPlant
 from ..values import (
     FloatArray,
@@ -234,7 +233,7 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> None:
     radius = loop.spectral_radius
     if radius <= 1:
         return
-    found = obstacle(loop.monitored)
+    found = loop.obstacle
     if found is None or not found.reason.startswith("unstable"):
         return
     with np.errstate(over="ignore"):
