@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import oracles_loop as oracle
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.loop import close_loop, compare_loops
 from flexplant.lti import StateSpace
 from flexplant.plant import StandardPlant
@@ -64,7 +64,8 @@ def test_it_reads_as_a_table_and_survives_a_file(found, tmp_path):
 
 def test_an_unstable_loop_has_no_figures(loops):
     law = servo()
-    wrong = close_loop(stage(), observer(), law.replace(C=-law.C, D=-law.D))
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        wrong = close_loop(stage(), observer(), law.replace(C=-law.C, D=-law.D))
     found = compare_loops({"right": loops["servo"], "wrong sign": wrong})
     row = found["wrong sign"]
     assert not row.stable
