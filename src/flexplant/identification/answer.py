@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
@@ -49,7 +50,7 @@ def answer(
         large = np.argmax(np.abs(raw), axis=0)
         columns = np.arange(fit.poles.size)
         factor = np.abs(shapes[large, columns] / raw[large, columns]) ** 2
-        doubt = _shape_covariance(fit, ready.correlation) * factor[:, None, None] * max(1.0, misfit)
+        doubt = _shape_covariance(fit, ready) * factor[:, None, None] * max(1.0, misfit)
         doubt = doubt[inside]
     return IdentifiedModes(
         fit.poles[inside],
@@ -77,27 +78,18 @@ def _covariance(fit: Fit, ready: Prepared) -> FloatArray:
     # participation of repeated poles is known up to a rotation only: no doubt is asked of it
     inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
     both = 2 * fit.poles.size
-    if ready.correlation is None or ready.data.shape[0] == 1:
+    if ready.independent:
         chosen = inverse[:both, :both]
     else:
-        gain = inverse[:both]
-        meat = np.zeros((both, both))
-        slopes = [np.einsum("ifp,qp->ifq", J, gain) for J in fit.jacobian]
-        if ready.swapped:
-            for J in slopes:
-                mixed = np.einsum("abf,bfq->afq", ready.correlation, J)
-                meat += np.einsum("afp,afq->pq", J.conj(), mixed).real
-        else:
-            for a, J in enumerate(slopes):
-                for b, other in enumerate(slopes):
-                    line = ready.correlation[a, b][None, :, None] * other
-                    flat = J.reshape(-1, both)
-                    meat += (flat.conj().T @ line.reshape(-1, both)).real
-        chosen = meat
+        slopes = [np.einsum("ifp,qp->ifq", J, inverse[:both]) for J in fit.jacobian]
+        chosen = np.zeros((both, both))
+        for a, J in enumerate(slopes):
+            for b, other in enumerate(slopes):
+                chosen += _inner(J, ready.spread(a, b, other))
     return np.asarray((chosen + chosen.T) / 2)
 
 
-def _shape_covariance(fit: Fit, correlation: ComplexArray | None) -> ComplexArray:
+def _shape_covariance(fit: Fit, ready: Prepared) -> ComplexArray:
     r"""Return E[n n^H] (m, n_out, n_out) of the errors n of each shape.
 
     With poles and participation theta, the error of the shape at output a is
@@ -109,23 +101,21 @@ def _shape_covariance(fit: Fit, correlation: ComplexArray | None) -> ComplexArra
     size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
     inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
     slopes = np.array([slope for slope, _ in fit.shape_maps]).reshape(n_out, 2, m, -1)
-    direct = [own.reshape(-1, 2 * m) for _, own in fit.shape_maps]
+    direct = [own for _, own in fit.shape_maps]
     common, mixed = inverse, np.zeros((n_out, inverse.shape[0], 2 * m))
     held = np.zeros((n_out, n_out, 2 * m, 2 * m))
-    if correlation is None:
+    if ready.independent:
         for a, own in enumerate(direct):
-            held[a, a] = (own.conj().T @ own).real
+            held[a, a] = _inner(own, own)
     else:
-        gains = [J.reshape(-1, inverse.shape[0]) @ inverse for J in fit.jacobian]
+        gains = [np.einsum("ifp,qp->ifq", J, inverse) for J in fit.jacobian]
         common = np.zeros_like(inverse)
-        repeats = fit.model.shape[1]
         for a in range(n_out):
             for b in range(n_out):
-                shared = np.tile(correlation[a, b], repeats)[:, None]
-                other = shared * direct[b]
-                common = common + (gains[a].conj().T @ (shared * gains[b])).real
-                mixed[b] += (gains[a].conj().T @ other).real
-                held[a, b] = (direct[a].conj().T @ other).real
+                other = ready.spread(a, b, direct[b])
+                common = common + _inner(gains[a], ready.spread(a, b, gains[b]))
+                mixed[b] += _inner(gains[a], other)
+                held[a, b] = _inner(direct[a], other)
     mixed = mixed.reshape(n_out, -1, 2, m)
     held = held.reshape(n_out, n_out, 2, m, 2, m)
     found = np.zeros((m, n_out, n_out), dtype=np.complex128)
@@ -137,6 +127,13 @@ def _shape_covariance(fit: Fit, correlation: ComplexArray | None) -> ComplexArra
         S += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
     return np.asarray((found + found.conj().transpose(0, 2, 1)) / 2)
+
+
+def _inner(left: ComplexArray, right: ComplexArray | None) -> Any:
+    """Return Re(left^H right), summed over inputs and lines; zero where right is None."""
+    if right is None:
+        return 0.0
+    return (left.reshape(-1, left.shape[2]).conj().T @ right.reshape(-1, right.shape[2])).real
 
 
 def _scaled(

@@ -56,6 +56,12 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
             raise ModelError(
                 f"quantities differ: {first.quantity!r} and {frf.quantity!r}. Convert first."
             )
+        if (frf.window, frf.resolution) != (first.window, first.resolution):
+            raise ModelError(
+                f"segments differ: window {first.window!r} at a resolution of {first.resolution} "
+                f"Hz, and {frf.window!r} at {frf.resolution} Hz. They leak differently, and their "
+                "mean has no window: estimate all with the same method."
+            )
     data = np.array([frf.data for frf in frfs])
     mean: ComplexArray = data.mean(axis=0)
     error = data - mean
@@ -78,4 +84,7 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
         quantity=first.quantity,
         variance=variance,
         correlation=correlation,
+        resolution=first.resolution,
+        window=first.window,
+        overlap=first.overlap,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from ..values import positive, real_array, short, whole
 from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
+from .leakage import leakage_warned
 from .refine import Lines, refined
 from .separate import backed, reseated, separated
 from .support import freedom, supported
@@ -117,8 +119,8 @@ def identify_modes(
     ----------
     frf : Frf
         Measured. With a variance, errors are weighted by it and the covariance follows from it
-        (and from the correlation between outputs where known); without, both come from what
-        the fit leaves, averaged over 41 lines.
+        (and from the correlation between outputs, and between lines by the window, where known);
+        without, both come from what the fit leaves, averaged over 41 lines.
     band : (low, high) [Hz], optional
         What to fit and report; all by default.
     orders : iterable of int, optional
@@ -149,7 +151,8 @@ def identify_modes(
     Warns
     -----
     FlexplantWarning
-        When the residual of a stretch of lines is more than noise: a missed or merged mode.
+        When the residual of a stretch of lines is more than noise: a missed or merged mode; or
+        when a resonance is narrower than about four lines of windowed segments.
 
     Raises
     ------
@@ -210,6 +213,7 @@ def _identified(
     for _ in range(1 if ready.known else 2):
         # with all residual terms, so that no pole is kept or moved to stand in for one
         lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
+        lines = replace(lines, inflation=ready.inflation)
         if start is None:
             poles, part = supported(lines, poles, part)
         # poles that turn out to be none may keep it from settling: judged at the end
@@ -237,7 +241,9 @@ def _identified(
     if not fit.settled:
         fit = refined(lines, fit.poles, fit.participation, steps=max_iterations)
     warned(left)
-    return answer(frf, ready, lines, fit, (low, high), labels, diagram)
+    found = answer(frf, ready, lines, fit, (low, high), labels, diagram)
+    leakage_warned(frf, found.poles)
+    return found
 
 
 def _affordable(orders: list[int], ready: Prepared) -> list[int]:

@@ -94,6 +94,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
         inputs=data.inputs,
         outputs=data.outputs,
         quantity=quantity,
+        resolution=1.0 / method.period,
     )
 
 
@@ -107,6 +108,7 @@ def frf_of_periods(
     inputs: tuple[str, ...],
     outputs: tuple[str, ...],
     quantity: str | None,
+    resolution: float,
 ) -> Frf:
     """Return ``Y X^H (U X^H)^-1`` of `line_spectra` with its variance, correlation, coherence."""
     n_in = U.shape[1]
@@ -134,6 +136,7 @@ def frf_of_periods(
         coherence=_coherence(y, left, periods, n_in) if variance is not None else None,
         variance=variance,
         correlation=correlation,
+        resolution=resolution,
     )
 
 

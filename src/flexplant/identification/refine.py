@@ -29,6 +29,8 @@ class Lines:
     upper: int
     hold: float | None
     known: bool = True  # whether the weights are those of a known variance
+    #: variance of a mean over many lines, relative to independent ones
+    inflation: float = 1.0
 
 
 @dataclass(frozen=True, eq=False)

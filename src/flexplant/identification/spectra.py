@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..lti.frequency import Frf
+from ..lti.line_correlation import checked_overlap, checked_window
 from ..values import ComplexArray, FloatArray, Value, positive
 from .records import Records
 
@@ -32,19 +33,10 @@ class SpectralMethod(Value):
     window: str | tuple[Any, ...] = "hann"
 
     def __post_init__(self) -> None:
-        overlap = positive(self.overlap, "overlap", zero=True)
-        if overlap >= 0.95:
-            raise ModelError(f"overlap must be below 0.95, got {overlap:g}: it brings nothing new.")
+        overlap, window = checked_overlap(self.overlap), checked_window(self.window)
         if self.segment is not None:
             positive(self.segment, "segment")
-        from scipy.signal import get_window  # costs a third of a second that few need
-
-        try:
-            get_window(self.window, 16)
-        except (ValueError, TypeError) as error:
-            raise ModelError(
-                f"window {self.window!r} is not one of scipy.signal: {error}"
-            ) from error
+        self._set(overlap=overlap, window=window)
 
     def __repr__(self) -> str:
         length = "an eighth of the record" if self.segment is None else f"{self.segment:g} s"
@@ -119,6 +111,7 @@ class Averages:
     count: float
     n_out: int
     n_in: int
+    resolution: float
 
     def block(self, a: str, b: str) -> ComplexArray:
         """Return the cross spectra of two of "y", "u", "r"."""
@@ -155,7 +148,8 @@ def averages(data: Records, method: SpectralMethod) -> Averages:
     freq: FloatArray = np.asarray(np.fft.rfftfreq(length, 1.0 / data.rate), dtype=np.float64)
     # at zero and at half the rate a spectrum is real, and the mean was taken off
     keep = slice(1, (length + 1) // 2)
-    return Averages(freq[keep], S[keep] / total, count, data.y.shape[1], data.u.shape[1])
+    sizes = data.y.shape[1], data.u.shape[1]
+    return Averages(freq[keep], S[keep] / total, count, *sizes, data.rate / length)
 
 
 def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) -> Frf:
@@ -197,6 +191,9 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
         coherence=np.repeat(coherence.T[:, None, :], found.n_in, axis=1),
         variance=variance,
         correlation=correlation,
+        resolution=found.resolution,
+        window=method.window,
+        overlap=method.overlap,
     )
 
 

@@ -33,11 +33,13 @@ def price(lines: Lines) -> float:
     """Return by how much a pole must lower the cost.
 
     Its pole, shape and participation are 2 (n_out + n_in) numbers, so noise lowers the cost by a
-    chi-square of that many degrees; it has as many places to do so as there are lines. A pole kept
-    in vain costs little; one left out biases its neighbours by up to the root of this price.
+    chi-square of that many degrees; it has as many places to do so as there are lines. Where
+    errors of neighbouring lines are correlated, noise that changes little over a few lines has
+    `inflation` times the power of independent errors. A pole kept in vain costs little; one left
+    out biases its neighbours by up to the root of this price.
     """
     n_out, n_in, n_freq = lines.data.shape
-    return float(chi2.isf(CHANCE / n_freq, 2 * (n_out + n_in)))
+    return lines.inflation * float(chi2.isf(CHANCE / n_freq, 2 * (n_out + n_in)))
 
 
 class _Costs:
@@ -62,7 +64,10 @@ class _Costs:
 
 
 def freedom(lines: Lines, m: int) -> float:
-    """Return real data less real parameters of a fit with m poles."""
+    """Return the expected cost of a fit with m poles: real data less real parameters.
+
+    Where errors of lines are correlated each parameter fits `inflation` times as much of them.
+    """
     n_out, n_in, _ = lines.data.shape
     used = n_out * n_in * (lines.lower + lines.upper) + 2 * m * (n_out + n_in)
-    return float(max(1, 2 * lines.data.size - used))
+    return float(max(1.0, 2 * lines.data.size - lines.inflation * used))

@@ -69,7 +69,7 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
         middle = float(np.median(total))
         spread = 1.4826 * float(np.median(np.abs(total - middle)))
         freedom = 2.0 * channels * length * (1.0 - used)
-        spread = max(spread, middle / freedom * np.sqrt(2.0 * freedom))
+        spread = max(spread, middle / freedom * np.sqrt(2.0 * freedom * lines.inflation))
         # chi-square leans to the right, its cube root does not (Wilson and Hilferty, 1931)
         height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
         if noiseless:
@@ -136,7 +136,7 @@ def lessened(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tup
         less = replace(lines, upper=upper)
         lost = projected_cost(less, fit.poles, fit.participation) - fit.cost
         # a term too many costs next to nothing; one too few a bias: so noise may pass 1 in 10
-        if lost < unit * chi2.isf(0.1, channels * (lines.upper - upper)):
+        if lost < unit * lines.inflation * chi2.isf(0.1, channels * (lines.upper - upper)):
             return less, refined(less, fit.poles, fit.participation, steps=steps, strict=False)
     return lines, fit
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import scipy.ndimage as ndi
+import scipy.sparse as sp
 
 from ..errors import ModelError
 from ..lti.frequency import Frf
@@ -26,6 +27,37 @@ class Prepared:
     correlation: ComplexArray | None
     known: bool  # whether the weights come from a variance
     swapped: bool
+    line_correlation: sp.csr_array | None = None  # of errors of different lines
+
+    @property
+    def independent(self) -> bool:
+        """Whether errors of different entries are independent."""
+        return self.line_correlation is None and (
+            self.correlation is None or self.data.shape[0] == 1
+        )
+
+    @property
+    def inflation(self) -> float:
+        """By how much the variance of a mean over many lines exceeds that of independent ones."""
+        if self.line_correlation is None:
+            return 1.0
+        return float(np.median(self.line_correlation.sum(axis=1)))
+
+    def spread(self, a: int, b: int, rows: ComplexArray) -> ComplexArray | None:
+        """Return the correlation of the errors of rows a and b times `rows` (n_in, n_freq, k).
+
+        None where the two are independent.
+        """
+        C, R = self.correlation, self.line_correlation
+        if a != b and (C is None or self.swapped):
+            return None
+        if R is not None:
+            flat = np.moveaxis(rows, 1, 0)
+            spread: Any = (R @ flat.reshape(flat.shape[0], -1)).reshape(flat.shape)
+            rows = np.moveaxis(spread, 0, 1)
+        if C is not None and self.swapped:
+            return np.asarray(np.einsum("abf,bfq->afq", C, rows))
+        return rows if C is None else np.asarray(C[a, b][None, :, None] * rows)
 
     @property
     def line_weight(self) -> FloatArray:
@@ -84,10 +116,13 @@ def prepared(frf: Any, band: Any) -> Prepared:
     weight = np.sqrt(2.0 / variance) / np.abs(factor)
     data = data * factor
     correlation = None if frf.correlation is None else frf.correlation[:, :, inside]
+    lines = frf.line_correlation()
+    if lines is not None:
+        lines = lines[inside][:, inside]
     swapped = data.shape[0] < data.shape[1]
     if swapped:
         data, weight = data.transpose(1, 0, 2), weight.transpose(1, 0, 2)
-    return Prepared(freq, data, weight, correlation, known, swapped)
+    return Prepared(freq, data, weight, correlation, known, swapped, lines)
 
 
 def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:

@@ -29,7 +29,9 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     A line `# quantity: displacement`, a header `frequency [Hz], y1 <- u1 real [m/N],
     y1 <- u1 imag [m/N], ...` (and `... coherence`, `... variance` where
     known), then one line a frequency, with
-    all digits. The correlation between outputs stays behind: `.save` keeps it.
+    all digits. Where known, lines `# resolution: 0.5` [Hz], `# window: hann` and `# overlap: 0.5`
+    follow the first. The correlation between outputs and a window with parameters stay behind:
+    `.save` keeps them.
 
     Parameters
     ----------
@@ -74,6 +76,10 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
                 columns.append(frf.variance[i, j])
     text = io.StringIO()
     text.write(f"# quantity: {frf.quantity or 'unknown'}\n")
+    if frf.resolution is not None:
+        text.write(f"# resolution: {frf.resolution!r}\n")
+        if isinstance(frf.window, str):
+            text.write(f"# window: {frf.window}\n# overlap: {frf.overlap!r}\n")
     table = csv.writer(text, lineterminator="\n")
     table.writerow(header)
     table.writerows([repr(number) for number in row] for row in np.column_stack(columns).tolist())
@@ -104,7 +110,15 @@ def read_frf_csv(path: str | Path) -> Frf:
     """
     lines = file_path(path).read_text(encoding="utf-8").splitlines()
     comments = [line for line in lines if line.startswith("#")]
-    quantity = next((c.split(":", 1)[1].strip() for c in comments if "quantity:" in c), "unknown")
+    said = dict(re.findall(r"^#\s*(\w+):\s*(.*?)\s*$", "\n".join(comments), re.MULTILINE))
+    quantity = said.get("quantity", "unknown")
+    try:
+        resolution = float(said["resolution"]) if "resolution" in said else None
+        overlap = float(said.get("overlap", 0.0))
+    except ValueError as error:
+        raise FlexplantError(
+            f"{str(path)!r}: resolution and overlap are numbers: {error}."
+        ) from None
     first = len(comments) + 1
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     keys = _header(rows[0] if rows else [], str(path))
@@ -147,6 +161,9 @@ def read_frf_csv(path: str | Path) -> Frf:
         quantity=None if quantity == "unknown" else quantity,
         coherence=known("coherence"),
         variance=known("variance"),
+        resolution=resolution,
+        window=said.get("window") if resolution is not None else None,
+        overlap=overlap,
     )
 
 

@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError, unknown_label
 from ..values import ComplexArray, FloatArray, Value, positive, real_array, rebuild, signal_names
 from .grid import default_freq as default_freq
+from .line_correlation import checked_overlap, checked_window, line_correlation
 from .responses import responses
 from .statespace import System, as_statespace
 
@@ -36,6 +38,14 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     correlation : (n_out, n_out, n_freq) complex array, optional
         Of a measurement: of the errors of different outputs under the same input (a disturbance
         reaches all of them), with ones on the diagonal.
+    resolution : float [Hz], optional
+        Of a measurement: inverse of the length of a segment or period that was transformed.
+    window : str or tuple, optional
+        Of a measurement averaged over windowed segments: their window, as
+        `scipy.signal.get_window` knows; needs `resolution`. Such lines leak, and their errors are
+        correlated (`line_correlation`). None where nothing leaks: computed, or whole periods.
+    overlap : float
+        Share of a segment that the next one sees again, 0 to below 0.95.
 
     Raises
     ------
@@ -60,6 +70,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     coherence: FloatArray | None = None
     variance: FloatArray | None = None
     correlation: ComplexArray | None = None
+    resolution: float | None = None
+    window: str | tuple[Any, ...] | None = None
+    overlap: float = 0.0
 
     def __post_init__(self) -> None:
         freq = checked_freq(self.freq)
@@ -85,6 +98,14 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         correlation = self.correlation
         if correlation is not None:
             correlation = _checked_correlation(correlation, data.shape)
+        window, resolution = self.window, self.resolution
+        if resolution is not None:
+            resolution = positive(resolution, "resolution")
+        elif window is not None:
+            raise ModelError(
+                f"window={window!r} says little without the length of its segments: give "
+                "resolution= too, the inverse of that length [Hz]."
+            )
         self._set(
             freq=freq,
             data=data,
@@ -93,6 +114,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             coherence=coherence,
             variance=variance,
             correlation=correlation,
+            resolution=resolution,
+            window=None if window is None else checked_window(window),
+            overlap=checked_overlap(self.overlap),
         )
 
     def __repr__(self) -> str:
@@ -133,6 +157,20 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             coherence=None if self.coherence is None else self.coherence[picked],
             variance=None if self.variance is None else self.variance[picked],
             correlation=None if self.correlation is None else self.correlation[np.ix_(rows, rows)],
+        )
+
+    def line_correlation(self) -> sp.csr_array | None:
+        r"""Return the correlation (n_freq, n_freq) of errors of different lines, or None.
+
+        Lines averaged over windowed segments share data with their neighbours: under a Hann
+        window errors of neighbours are correlated by 4/9, of lines two apart by 1/36, so that a
+        mean over many lines has 1 + 2 (4/9 + 1/36) = 1.94 times the variance that independent
+        ones would give. None where lines are independent: computed, or of whole periods.
+        """
+        if self.window is None or self.resolution is None:
+            return None
+        return line_correlation(
+            self.freq, window=self.window, resolution=self.resolution, overlap=self.overlap
         )
 
     def converted(self, quantity: str) -> Frf:
@@ -262,8 +300,8 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
     for array in (freq, data):
         array.flags.writeable = False
     fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}
-    unmeasured = dict.fromkeys(("quantity", "coherence", "variance", "correlation"))
-    frf = rebuild(Frf, fields | unmeasured)
+    known = ("quantity", "coherence", "variance", "correlation", "resolution", "window")
+    frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0})
     assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
     return frf
 

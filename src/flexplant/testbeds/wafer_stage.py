@@ -294,6 +294,7 @@ class WaferStage(Value):
             inputs=tuple(port.name for port in ports.u),
             outputs=tuple(port.name for port in ports.y),
             quantity=kinds.pop() if len(kinds) == 1 else None,
+            resolution=1.0 / period,
         )
 
 
