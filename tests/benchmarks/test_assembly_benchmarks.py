@@ -13,8 +13,8 @@ import scipy.sparse.linalg as spla
 
 from flexplant.labels import DofSet
 from flexplant.structure import FEModel, Rib, Spring, kirchhoff_plate, solid_block
-from flexplant.structure.assembly import Grid
-from flexplant.structure.elements import plate_mass, plate_stiffness
+from flexplant.structure.mesh.assembly import Grid
+from flexplant.structure.mesh.elements import plate_mass, plate_stiffness
 from plates import PLATE, make_plate
 
 pytestmark = pytest.mark.benchmark

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import positive, short
+from ...errors import ModelError
+from ...values import positive, short
+from ..model import FEModel
 from .assembly import Grid
 from .elements import beam_mass, beam_stiffness
-from .fields import Field, counts_of, dofs_of, field_of
-from .model import FEModel
+from .grid_fields import Field, counts_of, dofs_of, field_of
 from .shapes import BeamShape
 
 #: which motions an end does not have

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from ..values import FloatArray, real_array
+from ...values import FloatArray, real_array
+from ..model import FEModel
 from .assembly import Grid
 from .elements import brick_mass, brick_stiffness
-from .fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of
-from .model import FEModel
+from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of
 from .shapes import BlockShape
 
 

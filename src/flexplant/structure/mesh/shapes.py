@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError
-from ..labels import Interpolation
-from ..values import FloatArray, real_array
+from ...errors import LabelError
+from ...labels import Interpolation
+from ...values import FloatArray, real_array
 from .assembly import Grid
 from .elements import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
 

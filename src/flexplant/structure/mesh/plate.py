@@ -7,14 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import FloatArray, short
+from ...errors import ModelError
+from ...values import FloatArray, short
+from ..model import FEModel
 from .assembly import Grid
 from .elements import plate_mass, plate_stiffness
-from .fields import Field, Hole, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of
-from .model import FEModel
+from .grid_fields import (
+    Field,
+    Hole,
+    counts_of,
+    dofs_of,
+    field_of,
+    lengths_of,
+    poisson_of,
+    present_of,
+)
+from .ribs import Rib, Skin, rib_matrices
 from .shapes import PlateShape as PlateShape
-from .stiffeners import Rib, Skin, rib_matrices
 
 
 def kirchhoff_plate(

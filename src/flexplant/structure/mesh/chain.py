@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, ShapeError
-from ..labels import DofSet
-from ..values import FloatArray, frozen, positive, real_array
-from .model import FEModel
+from ...errors import ModelError, ShapeError
+from ...labels import DofSet
+from ...values import FloatArray, frozen, positive, real_array
+from ..model import FEModel
 
 
 def chain(

@@ -11,9 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.ndimage
 
-from ..errors import ModelError, ShapeError
-from ..labels import DofSet, Interpolation
-from ..values import FloatArray, Value, positive, real_array, short, whole
+from ...errors import ModelError, ShapeError
+from ...labels import DofSet, Interpolation
+from ...values import FloatArray, Value, positive, real_array, short, whole
 from .assembly import Grid
 
 #: one number, an array (nx, ny, ...) with one per element, or a function of an element's centre

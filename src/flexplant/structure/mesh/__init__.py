@@ -1,0 +1,1 @@
+"""Meshes that the library makes itself: plates, beams, chains, blocks, and their ribs."""
