@@ -15,6 +15,7 @@ from flexplant.reduction import (
     reduce,
     solve_modes,
 )
+from flexplant.reduction.mode_pairs import paired
 from flexplant.structure import ModalDamping
 from plates import make_plate
 
@@ -70,6 +71,73 @@ def test_repeated_modes_are_compared_as_a_subspace(plate):
     pair = np.flatnonzero(np.diff(f) < 1e-6 * f[1:])
     assert pair[pair >= 3].size  # the square plate has one there
     assert found.mac.min() > 0.999
+
+
+@pytest.mark.parametrize("missing", [7, 8])
+def test_a_missing_mode_of_a_repeated_pair_is_not_paired_with_a_stranger(plate, missing):
+    """Modes 7 and 8 are one pair at 639 Hz, the next mode is at 1156 Hz: 81 % off."""
+    modes = solve_modes(plate, count=14)
+    kept = [n for n in range(1, 10) if n != missing]
+    model = reduce(modes, ModalTruncation(modes=kept))
+    found = model.quality(modes, band=BAND)  # the same basis of the pair: which one is known
+    assert found.modes[np.isnan(found.freq)].tolist() == [missing]
+    assert found.mac[missing - 1] < 1e-12
+    assert np.nanmax(np.abs(found.freq_error)) < 1e-9
+    assert np.delete(found.mac, missing - 1).min() == pytest.approx(1.0, abs=1e-9)
+    # solved anew the pair has another basis: one is missing, which is not known, and it is said
+    again = model.quality(plate, band=BAND)
+    assert np.count_nonzero(np.isnan(again.freq)) == 1
+    assert sorted(again.mac[6:8]) == pytest.approx([0.0, 1.0], abs=1e-9)
+    assert np.nanmax(np.abs(again.freq_error)) < 1e-9
+    assert again.alike == ((7, 8),)
+    assert "cannot be told apart: modes 7, 8" in repr(again)
+    assert [line.endswith("alike: 8") for line in again.table().splitlines()].index(True) == 7
+
+
+def shapes(n, m, seed=3):
+    return la.qr(np.random.default_rng(seed).normal(size=(n, m)), mode="economic")[0]
+
+
+def pairs_of(freq, other_freq, phi, psi, n_rigid=0):
+    return paired(freq, other_freq, phi.T @ phi, phi.T @ psi, psi.T @ psi, n_rigid=n_rigid)
+
+
+def test_pairs_follow_shapes_and_alike_shapes_follow_frequency():
+    phi = shapes(40, 5)
+    f = np.array([100.0, 130.0, 170.0, 220.0, 300.0])
+    found = pairs_of(f, np.array([101.0, 160.0, 165.0, 230.0, 290.0]), phi, phi[:, [0, 2, 1, 4, 3]])
+    assert found.partner.tolist() == [0, 2, 1, 4, 3]  # two crossings
+    assert found.group.tolist() == [0, 1, 2, 3, 4]
+    # four sensors see modes 2 and 5 alike, and the noise of the shapes prefers the wrong one
+    few = shapes(4, 4)[:, [0, 1, 2, 3, 1]]
+    noisy = few + 0.01 * np.random.default_rng(1).normal(size=few.shape)
+    noisy[:, [1, 4]] = few[:, [4, 1]] + 0.01 * noisy[:, [4, 1]]
+    found = pairs_of(f, 1.007 * f, few, noisy)
+    assert found.partner.tolist() == [0, 1, 2, 3, 4]
+    assert found.group.tolist() == [0, 1, 2, 3, 1]
+
+
+@pytest.mark.parametrize("angle", [0.0, 0.2, np.pi / 4, 1.4])
+def test_pairs_of_a_cluster_hold_for_every_basis(angle):
+    turn = np.eye(4)
+    turn[1:3, 1:3] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    basis = shapes(20, 5)
+    phi, foreign = basis[:, :4], basis[:, 4]
+    f, g = np.array([100.0, 200.0, 200.001, 300.0]), np.array([100.0, 201.0, 201.0, 300.0])
+    found = pairs_of(f, g, phi, phi @ turn)
+    assert found.partner.tolist() == [0, 1, 2, 3]
+    assert found.mac == pytest.approx(1.0, abs=1e-12)
+    assert found.group.tolist() == [0, 1, 1, 3]
+    fewer = pairs_of(f, g[[0, 1, 3]], phi, (phi @ turn)[:, [0, 1, 3]])
+    assert sorted(fewer.partner.tolist()) == [-1, 0, 1, 2]
+    assert sorted(fewer.mac) == pytest.approx([0, 1, 1, 1], abs=1e-12)
+    partly = (phi @ turn)[:, [0, 1, 3]]
+    partly[:, 1] = 0.8 * partly[:, 1] + 0.6 * foreign
+    found = pairs_of(f, g[[0, 1, 3]], phi, partly)
+    assert sorted(found.mac) == pytest.approx([0, 0.64, 1, 1], abs=1e-12)
+    # alike at one sensor: the cluster has no two dimensions there
+    one = pairs_of(f[1:3], g[1:3], np.array([[1.0, 2.0]]), np.array([[1.0, 3.0]]))
+    assert one.mac.tolist() == pytest.approx([1.0, 0.0], abs=1e-12)
 
 
 def test_the_report_can_fail(plate):

@@ -1,4 +1,4 @@
-"""How well a reduced model stands for the full one, by a route of its own."""
+"""How well a reduced model stands for the full one, checked by another computation."""
 
 from __future__ import annotations
 
@@ -6,42 +6,25 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
-import scipy.sparse as sp
-from scipy.optimize import linear_sum_assignment
 
 from ..errors import ModelError
 from ..labels import Place
 from ..structure import FEModel
-from ..structure.factor import dense
-from ..values import (
-    ComplexArray,
-    FloatArray,
-    IntArray,
-    Matrix,
-    Value,
-    name_list,
-    positive,
-    real_array,
-    whole,
-)
-from .attachment import labels_of, places, static_response
+from ..values import FloatArray, IntArray, Value, name_list, positive, real_array, whole
+from .attachment import labels_of, places
 from .bounds import ErrorBound
+from .check_responses import (
+    SMALL,
+    check_frequencies,
+    full_response,
+    reduced_response,
+    static_error,
+)
+from .mode_pairs import paired
 from .modes import Modes
-from .projection import lu_of, undamped
+from .projection import undamped
 from .reduced import ReducedModel
 from .solve import solve_modes
-
-#: up to this many DOFs responses are solved densely, at many frequencies
-_SMALL = 600
-#: check frequencies beside the resonances, of small and of large models
-_GRID = (60, 6)
-#: resonances looked at, of small and of large models
-_RESONANCES = (200, 6)
-#: modes closer than this, relatively, are compared as one subspace
-_CLUSTER = 1e-3
-#: MAC from which a reduced mode is a full one's partner
-_PARTNER = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,13 +36,17 @@ class ReductionQuality(Value):
     modes : (m,) array of int
         Numbers of the full model's modes that are compared.
     full_freq, freq : (m,) arrays [Hz]
-        Their frequencies, and those of the reduced modes paired with them; NaN when the best one
-        has a MAC below 0.5.
+        Their frequencies, and those of the reduced modes paired with them, one to one, by shape and
+        frequency; NaN where none has a MAC of 0.5.
     freq_error : (m,) array
         Relative; 0 for rigid-body modes, NaN without a partner.
     mac : (m,) array
-        Of each full mode with the reduced one (with the span of those of a cluster): mass-weighted
-        for an FEModel.
+        Of each full mode with the reduced one: mass-weighted for an FEModel. Of repeated modes,
+        whose shapes are any basis of a subspace, the squared cosines of the angles between the two
+        subspaces.
+    group : (m,) array of int
+        Number of the first mode whose shape cannot be told from that of each: of repeated modes
+        that lack a partner it is not known which one is missing.
     check_freq : (f,) array [Hz]
         Where responses were compared.
     frf_error : (p, q) array
@@ -88,6 +75,7 @@ class ReductionQuality(Value):
     freq: FloatArray
     freq_error: FloatArray
     mac: FloatArray
+    group: IntArray
     check_freq: FloatArray
     frf_error: FloatArray
     resonance_error: FloatArray
@@ -103,6 +91,7 @@ class ReductionQuality(Value):
     def __post_init__(self) -> None:
         self._set(
             modes=np.asarray(self.modes, dtype=np.int64),
+            group=np.asarray(self.group, dtype=np.int64),
             inputs=name_list(self.inputs, "inputs"),
             outputs=name_list(self.outputs, "outputs"),
             **{
@@ -113,6 +102,14 @@ class ReductionQuality(Value):
                 )
             },
         )  # fmt: skip
+
+    @property
+    def alike(self) -> tuple[tuple[int, ...], ...]:
+        """Numbers of the elastic modes whose shapes cannot be told apart, group by group."""
+        elastic = self.full_freq > 0
+        firsts = np.unique(self.group[elastic])
+        groups = [self.modes[elastic & (self.group == first)].tolist() for first in firsts]
+        return tuple(tuple(members) for members in groups if len(members) > 1)
 
     @property
     def band_bound(self) -> float | None:
@@ -136,6 +133,10 @@ class ReductionQuality(Value):
             f"{self.mac[~np.isnan(self.freq)].min(initial=1.0):.4f}"
             + (f", {lost} without a partner" if lost else "")
         ]
+        if self.alike:
+            listed = "; ".join(", ".join(map(str, members)) for members in self.alike[:4])
+            more = ", ..." if len(self.alike) > 4 else ""
+            lines.append(f"shapes that cannot be told apart: modes {listed}{more}")
         if self.frf_error.size:
             i, j = np.unravel_index(int(np.argmax(self.frf_error)), self.frf_error.shape)
             lines.append(
@@ -156,10 +157,15 @@ class ReductionQuality(Value):
         return "\n  ".join(lines) + ">"
 
     def table(self) -> str:
-        """Return mode by mode: both frequencies, error and MAC."""
+        """Return mode by mode: both frequencies, error, MAC and of which shape it may also be."""
+        other = {
+            n: f"  alike: {', '.join(str(k) for k in members if k != n)}"
+            for members in self.alike
+            for n in members
+        }
         lines = [f"mode{'full [Hz]':>12s}{'reduced [Hz]':>14s}{'error [%]':>12s}{'MAC':>9s}"]
         lines += [
-            f"{n:4d}{f:12.4f}{g:14.4f}{100 * e:12.3g}{m:9.5f}"
+            f"{n:4d}{f:12.4f}{g:14.4f}{100 * e:12.3g}{m:9.5f}{other.get(n, '')}"
             for n, f, g, e, m in zip(
                 self.modes, self.full_freq, self.freq, self.freq_error, self.mac, strict=True
             )
@@ -191,15 +197,19 @@ def quality_of(
     resonances = elastic[(elastic >= low) & (elastic <= high)]
     B, C = _rows(full, pushed).T, _rows(full, watched)
     Br, Cr = reduced.T.T @ B, C @ reduced.T
-    small = len(full.dofs) <= _SMALL or isinstance(full, Modes)
-    grid = _grid(low, high, resonances, small) if freq is None else real_array(freq, "freq")
+    small = len(full.dofs) <= SMALL or isinstance(full, Modes)
+    grid = (
+        check_frequencies(low, high, resonances, small)
+        if freq is None
+        else real_array(freq, "freq")
+    )
     grid = np.unique(np.concatenate([np.atleast_1d(grid), []]))
     if not grid.size or grid[0] < 0:
         raise ModelError("freq needs at least one frequency [Hz], none below 0.")
     factor = _loss(reduced, loss)
-    whole_response, route = _full_response(full, modes, grid, B, C, factor)
+    whole_response, route = full_response(full, modes, grid, B, C, factor)
     structural = isinstance(full, FEModel) and full.D is None
-    found = _reduced_response(reduced, grid, Br, Cr, factor if structural else None)
+    found = reduced_response(reduced, grid, Br, Cr, factor if structural else None)
     gap = np.abs(found - whole_response)
     size = np.abs(whole_response)
     at = np.isin(grid, resonances)
@@ -219,7 +229,7 @@ def quality_of(
         check_freq=grid,
         frf_error=frf,
         resonance_error=resonance,
-        static_error=_static_error(full, modes, reduced, B, C, Br, Cr),
+        static_error=static_error(full, modes, reduced, B, C, Br, Cr),
         true_error=float(np.linalg.norm(found - whole_response, 2, axis=(1, 2)).max(initial=0.0))
         if gap.size
         else 0.0,
@@ -281,48 +291,34 @@ def _full_modes(
 def _compared(
     full: FEModel | Modes, modes: Modes, reduced: ReducedModel, count: int | None, high: float
 ) -> dict[str, Any]:
-    """Return the pairing of full and reduced modes by MAC, and how alike they are."""
+    """Return the pairs of full and reduced modes, and how alike they are."""
     wanted = whole(count, "count") if count is not None else int(np.sum(modes.freq <= high))
     phi: Any = np.asarray(modes.phi)[:, :wanted]
     f = modes.freq[:wanted]
-    r = modes.n_rigid
     found = _undamped_modes(reduced)
     own = found.freq
     shapes = np.real(found.phi)
     if isinstance(full, FEModel):
         loaded = np.asarray(full.M @ shapes)
-        weighted, size = loaded, np.sum(shapes * loaded, axis=0)
-        full_size = np.sum(np.conj(phi) * np.asarray(full.M @ phi), axis=0).real
+        weighted, full_gram = loaded, phi.conj().T @ np.asarray(full.M @ phi)
         orthogonality = float(np.abs(shapes.T @ loaded - np.eye(own.size)).max())
     else:
         straight = np.array([":r" not in label for label in full.dofs.labels])
-        weighted = shapes * (straight if straight.any() else True)[:, None]  # type: ignore[index]
-        size = np.sum(shapes * weighted, axis=0)
-        full_size = np.sum(np.abs(phi[straight] if straight.any() else phi) ** 2, axis=0)
+        seen = straight if straight.any() else np.ones_like(straight)
+        weighted, full_gram = shapes * seen[:, None], phi[seen].conj().T @ phi[seen]
         orthogonality = float("nan")
-    alike = np.abs(phi.conj().T @ weighted) ** 2 / np.outer(full_size, size)
-    k = min(f.size, own.size)
-    partner = np.full(f.size, -1)
-    partner[: min(r, k)] = np.arange(min(r, k))
-    rows, columns = linear_sum_assignment(-alike[r:, r:]) if k > r else ([], [])
-    partner[np.asarray(rows, dtype=np.int64) + r] = np.asarray(columns, dtype=np.int64) + r
-    partner = _in_order(partner, f)
-    mac = np.where(partner >= 0, 0.0, np.nan)
-    for members in _clusters(f, r):
-        mine = partner[members]
-        mine = mine[mine >= 0]
-        for i in members:
-            mac[i] = _inside(alike[i], mine, shapes, weighted, phi[:, i], size, full_size[i])
-    mac = np.where(np.isnan(mac), 0.0, mac)
-    paired = np.where((partner >= 0) & (mac >= _PARTNER), own[partner], np.nan)
+    gram = shapes.T @ weighted
+    pairs = paired(f, own, full_gram, phi.conj().T @ weighted, gram, n_rigid=modes.n_rigid)
+    found_freq = np.where(pairs.partner >= 0, own[pairs.partner], np.nan)
     with np.errstate(invalid="ignore", divide="ignore"):
-        error = np.where(f > 0, paired / f - 1.0, 0.0)
+        error = np.where(f > 0, found_freq / f - 1.0, 0.0)
     return {
         "modes": np.arange(1, f.size + 1),
         "full_freq": f,
-        "freq": paired,
+        "freq": found_freq,
         "freq_error": error,
-        "mac": mac,
+        "mac": pairs.mac,
+        "group": pairs.group + 1,
         "orthogonality": orthogonality,
     }
 
@@ -333,147 +329,3 @@ def _undamped_modes(reduced: ReducedModel) -> Modes:
     if not reduced.is_physical:
         return found
     return found.replace(phi=reduced.T @ found.phi, dofs=reduced.full_dofs)
-
-
-def _clusters(f: FloatArray, r: int) -> list[IntArray]:
-    """Return the modes that are compared together: rigid-body modes, then close ones."""
-    cuts = [0] if not f.size else [0, *(i for i in range(1, f.size) if _apart(f, i, r))]
-    return [np.arange(a, b) for a, b in zip(cuts, [*cuts[1:], f.size], strict=True) if b > a]
-
-
-def _apart(f: FloatArray, i: int, r: int) -> bool:
-    return i == r or (i > r and f[i] - f[i - 1] > _CLUSTER * f[i])
-
-
-def _in_order(partner: IntArray, f: FloatArray) -> IntArray:
-    """Return partners with those of a cluster in rising order."""
-    for members in _clusters(f, 0):
-        mine = partner[members]
-        if np.all(mine >= 0):
-            partner[members] = np.sort(mine)
-    return partner
-
-
-def _inside(
-    alike: FloatArray,
-    mine: IntArray,
-    shapes: FloatArray,
-    weighted: FloatArray,
-    phi: Any,
-    size: FloatArray,
-    full_size: float,
-) -> float:
-    """Return how much of a full mode lies in the span of its reduced partners."""
-    if not mine.size:
-        return 0.0
-    if mine.size == 1:
-        return float(alike[mine[0]])
-    gram = shapes[:, mine].T @ weighted[:, mine]
-    part = weighted[:, mine].T @ phi
-    share = la.solve(gram, part, assume_a="sym")
-    return float(np.real(np.conj(part) @ share)) / full_size
-
-
-def _grid(low: float, high: float, resonances: FloatArray, small: bool) -> FloatArray:
-    which = 0 if small else 1
-    start = low if low > 0 else high / 1000
-    grid = np.geomspace(start, high, _GRID[which])
-    few = resonances
-    if few.size > _RESONANCES[which]:
-        few = few[np.linspace(0, few.size - 1, _RESONANCES[which]).astype(int)]
-    return np.concatenate([grid, few])
-
-
-def _full_response(
-    full: FEModel | Modes, modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float
-) -> tuple[ComplexArray, str]:
-    """Return responses (f, p, q) of the full structure, and how they were found."""
-    found = np.zeros((freq.size, C.shape[0], B.shape[1]), dtype=np.complex128)
-    if not B.shape[1]:
-        return found, "no response: no inputs were named"
-    if isinstance(full, Modes):
-        return _modal_response(full, freq, B, C), "the sum over the given modes"
-    M, K, D = full.M, full.K, full.D
-    many = len(full.dofs) > _SMALL and sp.issparse(K) and sp.issparse(M)
-    for i, f in enumerate(freq):
-        omega = 2 * np.pi * float(f)
-        stiffness: Any = K * (1 + 1j * loss) if D is None else K + 1j * omega * _as_like(D, K)
-        found[i] = C @ _solved(stiffness - omega**2 * M, B, many)
-    kind = "sparse" if many else "dense"
-    how = "its D" if D is not None else f"loss factor {loss:.3g} in both"
-    return found, f"{kind} solutions at {freq.size} frequencies, {how}"
-
-
-def _as_like(D: Matrix, K: Matrix) -> Any:
-    return D if sp.issparse(K) == sp.issparse(D) else (dense(D) if not sp.issparse(K) else D)
-
-
-def _solved(matrix: Any, B: FloatArray, many: bool) -> ComplexArray:
-    is_sparse = sp.issparse(matrix)
-    if many and is_sparse:
-        lu = lu_of(matrix)
-        loads = B.astype(np.complex128)
-        solved = lu.solve(loads)
-        return np.asarray(solved + lu.solve(loads - matrix @ solved))
-    full = matrix.toarray() if is_sparse else np.asarray(matrix)
-    size = 1.0 / np.sqrt(np.abs(np.diag(full)))
-    scaled = full * size[:, None] * size
-    return np.asarray(la.solve(scaled, B * size[:, None]) * size[:, None], dtype=np.complex128)
-
-
-def _modal_response(modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
-    s = 2j * np.pi * freq[:, None]
-    if np.iscomplexobj(modes.phi):
-        r = modes.n_rigid
-        poles = np.asarray(modes.poles)
-        phi = np.asarray(modes.phi)
-        swing = np.where(poles.imag > 0, poles.imag, 1.0)
-        one = np.where(np.arange(poles.size) < r, 1 / s**2, 1 / (2j * swing * (s - poles)))
-        two = np.where(np.arange(poles.size) < r, 0.0, 1 / (-2j * swing * (s - poles.conj())))
-        total = np.einsum("pk,fk,kq->fpq", C @ phi, one, phi.T @ B)
-        total = total + np.einsum("pk,fk,kq->fpq", C @ phi.conj(), two, phi.conj().T @ B)
-        return np.asarray(total, dtype=np.complex128)
-    omega, zeta = modes.basis_omega, modes.basis_zeta
-    gain = 1.0 / (omega**2 + 2 * zeta * omega * s + s**2)
-    basis = np.real(modes.basis)
-    return np.asarray(np.einsum("pk,fk,kq->fpq", C @ basis, gain, basis.T @ B))
-
-
-def _reduced_response(
-    reduced: ReducedModel, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float | None
-) -> ComplexArray:
-    omega = 2 * np.pi * freq[:, None, None]
-    if not B.shape[1]:
-        return np.zeros((freq.size, C.shape[0], 0), dtype=np.complex128)
-    stiffness: Any = reduced.K * (1 + 1j * loss) if loss is not None else reduced.K
-    damping = 0.0 if loss is not None else 1j * omega * reduced.D
-    size = 1.0 / np.sqrt(np.abs(np.diag(reduced.K)) + np.abs(np.diag(reduced.M)))
-    matrix = (stiffness + damping - omega**2 * reduced.M) * size[:, None] * size
-    return np.asarray((C * size) @ np.linalg.solve(matrix, (B * size[:, None])[None]))
-
-
-def _static_error(
-    full: FEModel | Modes,
-    modes: Modes,
-    reduced: ReducedModel,
-    B: FloatArray,
-    C: FloatArray,
-    Br: FloatArray,
-    Cr: FloatArray,
-) -> FloatArray:
-    """Return errors (p, q) of the elastic compliance, of the size of its channels."""
-    p, q = C.shape[0], B.shape[1]
-    if not q:
-        return np.zeros((p, q))
-    loads, watched = np.hstack([B, C.T]), np.hstack([Br, Cr.T])
-    if isinstance(full, FEModel):
-        whole_set = loads.T @ static_response(full.M, full.K, full.rigid_body, loads)
-    else:
-        if np.iscomplexobj(full.phi):
-            return np.full((p, q), np.nan)
-        r = modes.n_rigid
-        motion = (loads.T @ np.real(full.basis))[:, r:] / full.basis_omega[r:]
-        whole_set = motion @ motion.T
-    found = watched.T @ static_response(reduced.M, reduced.K, reduced.rigid_body, watched)
-    size = np.sqrt(np.abs(np.diag(whole_set)))
-    return np.asarray(np.abs(found - whole_set)[q:, :q] / np.outer(size[q:], size[:q]))

@@ -1,0 +1,161 @@
+"""Which mode of one model is which of another: one to one, by shape and frequency."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+from scipy.optimize import linear_sum_assignment
+
+from ..values import FloatArray, IntArray
+
+#: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
+CLUSTER = 1e-3
+#: MAC from which on two modes are the same one
+PARTNER = 0.5
+#: MAC beyond which two modes of one model have the same shape as far as it is known
+ALIKE = 0.9
+#: eigenvalues of inner products below this part of the largest are none
+_RANK = 1e-12
+#: part of the MAC that a frequency ratio of e counts for: it decides where shapes do not
+_FREQUENCY = 0.1
+
+
+class ModePairs(NamedTuple):
+    """The pairs of m modes with those of another model.
+
+    Attributes
+    ----------
+    partner : (m,) array of int
+        Column of the other model's mode (from 0), -1 for none.
+    mac : (m,) array
+        Modal assurance criterion with it; of a cluster the squared cosines of the angles between
+        the two subspaces, which hold for every basis of a repeated mode; 0 without a partner there.
+    group : (m,) array of int
+        First (from 0) of the modes whose shapes cannot be told from that of each: a cluster, or
+        shapes that are alike as far as they are known.
+    """
+
+    partner: IntArray
+    mac: FloatArray
+    group: IntArray
+
+
+def paired(
+    freq: FloatArray,
+    other_freq: FloatArray,
+    gram: Any,
+    cross: Any,
+    other_gram: Any,
+    *,
+    n_rigid: int = 0,
+) -> ModePairs:
+    """Return the one-to-one assignment of largest MAC, decided by frequency where shapes are alike.
+
+    Minimises the sum of ``1 - MAC + 0.1 |ln(f_j / f_i)|`` over the pairs. Modes of a cluster share
+    the part of the other mode that lies in their span; a pair with less than half is none.
+
+    Parameters
+    ----------
+    freq, other_freq : (m,), (k,) arrays [Hz]
+        Rising, rigid-body modes first.
+    gram, other_gram : (m, m), (k, k) arrays
+        Inner products ``phi^H W phi`` of each model's shapes, W the mass matrix or, where only
+        sensors are known, one.
+    cross : (m, k) array
+        ``phi^H W psi``.
+    n_rigid : int
+        Rigid-body modes, the first ones of both: paired in order.
+    """
+    size, other_size = np.real(np.diag(gram)), np.real(np.diag(other_gram))
+    alike = np.abs(cross) ** 2 / np.outer(size, other_size)
+    clusters = _clusters(freq, n_rigid)
+    score = alike.copy()
+    for members in clusters:
+        if members.size > 1:
+            score[members] = _share(gram[np.ix_(members, members)], cross[members], other_size)
+    partner = _assigned(freq, other_freq, score, n_rigid)
+    mac = np.array([alike[i, j] if j >= 0 else 0.0 for i, j in enumerate(partner.tolist())])
+    chosen = np.array([score[i, j] if j >= 0 else 0.0 for i, j in enumerate(partner.tolist())])
+    partner[chosen < PARTNER] = -1
+    for members in clusters:
+        if members.size > 1:
+            found = np.sort(partner[members][partner[members] >= 0])
+            holders = _holders(alike[np.ix_(members, found)])
+            partner[members], mac[members] = -1, 0.0
+            partner[members[holders]] = found
+            mac[members[holders]] = _cosines(
+                gram[np.ix_(members, members)],
+                cross[np.ix_(members, found)],
+                other_gram[np.ix_(found, found)],
+            )
+    return ModePairs(partner, mac, _groups(clusters, np.abs(gram) ** 2 / np.outer(size, size)))
+
+
+def _assigned(
+    freq: FloatArray, other_freq: FloatArray, score: FloatArray, n_rigid: int
+) -> IntArray:
+    partner = np.full(freq.size, -1, dtype=np.int64)
+    k = min(freq.size, other_freq.size)
+    rigid = np.arange(min(n_rigid, k))
+    partner[rigid] = rigid
+    if k > n_rigid:
+        r = n_rigid
+        ratio = np.maximum(other_freq[None, r:], 1e-300) / np.maximum(freq[r:, None], 1e-300)
+        far = np.minimum(np.abs(np.log(ratio)), 1.0)
+        rows, columns = linear_sum_assignment(_FREQUENCY * far - score[r:, r:])
+        partner[rows + r] = columns + r
+    return partner
+
+
+def _clusters(freq: FloatArray, n_rigid: int) -> list[IntArray]:
+    """Return the modes that are compared together: rigid-body modes, then close ones."""
+    first = [
+        i
+        for i in range(freq.size)
+        if i in (0, n_rigid) or (i > n_rigid and freq[i] - freq[i - 1] > CLUSTER * freq[i])
+    ]
+    return [np.arange(a, b) for a, b in zip(first, [*first[1:], freq.size], strict=True)]
+
+
+def _share(gram: Any, cross: Any, other_size: FloatArray) -> FloatArray:
+    """Return how much of each of the other model's shapes lies in the span of a cluster (k,)."""
+    inside = _orthonormal(gram).conj().T @ cross
+    return np.asarray(np.sum(np.abs(inside) ** 2, axis=0) / other_size)
+
+
+def _orthonormal(gram: Any) -> Any:
+    """Return T with ``T^H G T = I`` on the span of shapes with inner products G, of its rank."""
+    values, vectors = la.eigh(gram)
+    kept = values > _RANK * values[-1]
+    return vectors[:, kept] / np.sqrt(values[kept])
+
+
+def _holders(alike: FloatArray) -> IntArray:
+    """Return which members of a cluster hold its partners: all by rising frequency, else by MAC."""
+    if alike.shape[0] == alike.shape[1]:
+        return np.arange(alike.shape[0])
+    rows, columns = linear_sum_assignment(-alike)
+    return np.asarray(rows[np.argsort(columns)], dtype=np.int64)
+
+
+def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
+    """Return the squared cosines of the principal angles between two subspaces, largest first."""
+    if not cross.shape[1]:
+        return np.zeros(0)
+    both = _orthonormal(gram).conj().T @ cross @ _orthonormal(other_gram)
+    cosines = np.zeros(cross.shape[1])
+    found = la.svdvals(both)
+    cosines[: found.size] = found**2
+    return cosines
+
+
+def _groups(clusters: list[IntArray], alike: FloatArray) -> IntArray:
+    """Return for each mode the first one whose shape cannot be told from its own."""
+    group = np.zeros(len(alike), dtype=np.int64)
+    for members in clusters:
+        group[members] = members[0]
+    for i, j in np.argwhere(np.triu(alike > ALIKE, 1)).tolist():
+        group[group == group[j]] = group[i]
+    return group
