@@ -59,13 +59,16 @@ def test_weights_are_what_their_formulas_say(rate):
     force = (2 * np.pi * crossing) ** 2 / (2.0 / MASS)
     assert weights.z["die:z"] is None
     error = weights.z["die:error"]
-    assert size(error, crossing)[0] == pytest.approx(1.0, rel=1e-3)
-    assert size(error, 1e-4)[0] == pytest.approx(100.0, rel=1e-3)
-    assert size(error, 4.9e3)[0] == pytest.approx(1 / 3, rel=1e-3)
+    unit = 1 / (3.0 * 0.2 * 0.4)  # gamma 1 is |T| < peak: W_u W_d = 1 / peak
+    assert size(error, crossing)[0] == pytest.approx(unit, rel=1e-3)
+    assert size(error, 1e-4)[0] == pytest.approx(100.0 * unit, rel=1e-3)
+    assert size(error, 4.9e3)[0] == pytest.approx(unit / 3, rel=1e-3)
     effort = weights.z["u2:effort"]
-    assert size(effort, 1e-3)[0] == pytest.approx(0.4 / force, rel=1e-4)
-    assert size(effort, 6 * crossing)[0] == pytest.approx(0.4 / force * np.sqrt(2), rel=2e-2)
+    assert size(effort, 1e-3)[0] == pytest.approx(unit * 0.4 / force, rel=1e-4)
+    corner = unit * 0.4 / force * np.sqrt(2)
+    assert size(effort, 6 * crossing)[0] == pytest.approx(corner, rel=2e-2)
     assert weights.w["amp1"] == pytest.approx(0.2 * force)
+    assert weights.w["amp1"] * size(effort, 1e-3)[0] == pytest.approx(1 / 3.0, rel=1e-4)
     assert weights.w["y3:noise"] == 0.01
     # the arm of the rotations: the corners are L / 2 from the axis through the centre
     arm = size(weights.z["die:rx"], 10.0)[0] / size(error, 10.0)[0]
@@ -145,7 +148,7 @@ def test_several_references_must_be_named():
 
 
 def test_other_points_of_the_body_move_with_the_reference_and_are_left_out():
-    """Held at rest beside a reference they would cost gamma 100, the weight's floor."""
+    """Held at rest beside a reference they would cost a hundredfold, the weight's floor."""
     left, right = (Poi(n, at=(x, 0.3, 0.0), axes=AXES) for n, x in (("left", 0.15), ("right", 0.4)))
     model = some_modes(count=6, attached=False)
     channels = ports(z=[left, right], references=[Reference("left")])

@@ -5,6 +5,7 @@ from .closed import close_loop as close_loop
 from .comparison import LoopComparison as LoopComparison
 from .comparison import LoopFigures as LoopFigures
 from .comparison import compare_loops as compare_loops
+from .left_out import LeftOut as LeftOut
 from .margins import bandwidth as bandwidth
 from .margins import modulus_margin as modulus_margin
 from .sensitivity import complementary_sensitivity as complementary_sensitivity

@@ -16,8 +16,9 @@ from ..lti.frequency import Frf, frequency_response
 from ..lti.interconnection import connect, lft
 from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant, standard_plant
+from ..plant import StandardPlant, larger_plant, standard_plant
 from ..values import Value, name_list, real_array
+from .left_out import LeftOut, growing_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -38,12 +39,16 @@ class ClosedLoop(Value):
         blocks (an observer's estimates, say), which are monitored.
     idle : sequence of str
         Actuators that nothing drives.
+    larger : StandardPlant, optional
+        The plant with the modes that it left out, where they are known; `left_out` is how the same
+        controller stands there.
     """
 
     plant: StandardPlant
     blocks: tuple[StateSpace, ...]
     controller: StateSpace
     idle: tuple[str, ...] = ()
+    larger: StandardPlant | None = None
 
     def __repr__(self) -> str:
         kind = f"dt {self.plant.dt:g} s" if self.plant.dt else "continuous"
@@ -57,6 +62,8 @@ class ClosedLoop(Value):
         if self.watched:
             shown = " ".join(self.watched[:8]) + (" ..." if len(self.watched) > 8 else "")
             lines.append(f"  monitored: {shown}")
+        if self.left_out is not None:
+            lines.append(f"  with the modes left out: {self.left_out.summary}")
         return "\n".join(lines)
 
     @property
@@ -190,6 +197,27 @@ class ClosedLoop(Value):
         return obstacle(self.monitored)
 
     @cached_property
+    def left_out(self) -> LeftOut | None:
+        """How the same controller stands on the plant with the modes left out; None: not known."""
+        if self.larger is None:
+            return None
+        whole = ClosedLoop(self.larger, self.blocks, self.controller, self.idle)
+        stability = whole.spectral_radius if self.plant.dt else whole.spectral_abscissa
+        modes, freq = (
+            ((), ())
+            if whole.is_stable
+            else growing_modes(whole.monitored, self.larger.system.states)
+        )
+        return LeftOut(
+            stability,
+            bool(self.plant.dt),
+            whole.modulus_margin,
+            self.larger.system.n_states,
+            modes,
+            freq,
+        )
+
+    @cached_property
     def modulus_margin(self) -> float:
         """Smallest distance of the loop gain to the critical point, broken at u.
 
@@ -201,7 +229,9 @@ class ClosedLoop(Value):
         return modulus_margin(self)
 
 
-def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] = ()) -> ClosedLoop:
+def close_loop(
+    plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] = (), larger: Any = None
+) -> ClosedLoop:
     """Return the closed loop of a plant with controller blocks, connected by name.
 
     An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
@@ -218,6 +248,10 @@ def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] 
         The controller in any number of parts. Sampled at the plant's rate, or static gains.
     idle : iterable of str
         Actuators that stay without a drive on purpose.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`. The loop is then
+        checked there too (`ClosedLoop.left_out`); unless given, with those that the plant's
+        reduced model still knows.
 
     Returns
     -------
@@ -227,8 +261,9 @@ def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] 
     Warns
     -----
     FlexplantWarning
-        When the closed loop is unstable; it is returned all the same, to be looked at. Marginal
-        poles (a rigid-body mode that nothing holds) are named by its repr alone.
+        When the closed loop is unstable, or is with the modes that the plant left out; it is
+        returned all the same, to be looked at. Marginal poles (a rigid-body mode that nothing
+        holds) are named by its repr alone.
 
     Raises
     ------
@@ -238,7 +273,7 @@ def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] 
         a name other than an actuator's is driven twice.
     ModelError
         When there is no block, a block is no system, sampling times differ, or the algebraic loop
-        is ill-posed.
+        is ill-posed, or `larger` does not go with the plant.
 
     Examples
     --------
@@ -266,16 +301,44 @@ def close_loop(plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] 
     driven, watched = _drives(plant, systems, resting)
     _check_inputs(plant, systems)
     controller = _joined(plant, systems, driven, watched)
-    loop = ClosedLoop(plant, systems, controller, resting)
-    if not loop.is_stable and loop.obstacle and loop.obstacle.reason.startswith("unstable"):
+    loop = ClosedLoop(plant, systems, controller, resting, _completed(plant, larger))
+    found = loop.left_out
+    if not loop.is_stable:
+        if loop.obstacle and loop.obstacle.reason.startswith("unstable"):
+            warnings.warn(
+                f"the closed loop is {loop.obstacle.reason} ({loop._decay}): its signals grow, and "
+                "it has no margin, bandwidth or norm. Check the sign (u = K y), lower the "
+                "bandwidth, or notch the mode at that frequency.",
+                FlexplantWarning,
+                stacklevel=2,
+            )
+    elif found is not None and not found.is_stable:
         warnings.warn(
-            f"the closed loop is {loop.obstacle.reason} ({loop._decay}): its signals grow, and it "
-            "has no margin, bandwidth or norm. Check the sign (u = K y), lower the bandwidth, or "
-            "notch the mode at that frequency.",
+            f"the loop is stable on its plant, but with the modes left out it is {found.summary}. "
+            "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "
+            "controller roll off (or notch) before them.",
             FlexplantWarning,
             stacklevel=2,
         )
     return loop
+
+
+def _completed(plant: StandardPlant, larger: Any) -> StandardPlant | None:
+    """Return the plant with the modes left out, None where they are not known.
+
+    Raises
+    ------
+    ModelError
+        When the plant is seen through a block, which the larger one is not.
+    """
+    if plant.unweighted is None:
+        return larger_plant(plant, larger)
+    if larger is not None:
+        raise ModelError(
+            "the plant is weighted, or seen through a block, and the larger one is not: close the "
+            "loop on plant.unweighted (with that block first) to check it with the modes left out."
+        )
+    return None
 
 
 def _joined(

@@ -60,7 +60,9 @@ class StandardPlant(Partition, Value):
     noise_factor : (n, r) array, optional
         G with G G' the covariance of x that disturbances add in one sample.
     unweighted : StandardPlant, optional
-        The plant before `weighted`.
+        The plant before `weighted` and `through`.
+    reading : StateSpace, optional
+        The block of `through`: from `unweighted.y` to y.
 
     Raises
     ------
@@ -83,6 +85,7 @@ class StandardPlant(Partition, Value):
     delay: float = 0.0
     noise_factor: FloatArray | None = None
     unweighted: StandardPlant | None = None
+    reading: StateSpace | None = None
 
     def __post_init__(self) -> None:
         for side in "wuzy":

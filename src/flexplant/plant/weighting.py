@@ -44,6 +44,7 @@ def weighted(plant: StandardPlant, z: Any, w: Any) -> StandardPlant:
         realisation=plant.realisation,
         delay=plant.delay,
         unweighted=plant.unweighted or plant,
+        reading=plant.reading,
     )
 
 
@@ -62,7 +63,10 @@ def measured_through(plant: StandardPlant, block: System) -> StandardPlant:
     """Return the plant with y read through a block."""
     g = as_statespace(block)
     inner = plant.system.select([*plant.z, *(plant.y[i] for i in _columns(plant, g))])
-    after = append(_through(plant, plant.z), g if g.n_states else g.replace(dt=plant.dt))
+    block = g if g.n_states else g.replace(dt=plant.dt)
+    after = append(_through(plant, plant.z), block)
+    if plant.reading is not None:
+        block = series(plant.reading.select(outputs=block.inputs), block)
     return StandardPlant(
         series(inner, after).replace(name=plant.system.name),
         plant.w,
@@ -74,6 +78,7 @@ def measured_through(plant: StandardPlant, block: System) -> StandardPlant:
         realisation=plant.realisation,
         delay=plant.delay,
         unweighted=plant.unweighted or plant,
+        reading=block,
     )
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
 from ..errors import CertificateError
@@ -9,6 +11,7 @@ from ..lti.frequency import frequency_response
 from ..lti.interconnection import lft
 from ..lti.norms import peak_gain
 from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
 from ..values import FloatArray
 
 #: the two norms agree to this part, and the claim holds to it
@@ -63,13 +66,57 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
     return {"norm": norm, "swept norm": swept, "stability": stability, "claim": claim}
 
 
+def reached_norms(P: StandardPlant, K: StateSpace) -> dict[str, float]:
+    """Return the largest gain of lft(P, K) from each group of w to each group of z, by a sweep.
+
+    The groups are told by the names that `assemble_plant` gives: of w `references` (die:ref),
+    `noises` (y1:noise) and `disturbances`, of z `efforts` (u1:effort) and `motions`. Empty for a
+    plant that was not assembled from a structure.
+    """
+    if P.ports is None:
+        return {}
+    loop = lft(P.system, K)
+    gain = frequency_response(loop, _sweep(loop)).data
+    w = {"references": ":ref", "noises": ":noise"}
+    sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
+    return {
+        f"{to} from {source}": float(
+            np.linalg.norm(np.moveaxis(gain[rows][:, columns], 2, 0), 2, axis=(1, 2)).max()
+        )
+        for to, rows in sides[0].items()
+        for source, columns in sides[1].items()
+    }
+
+
+def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dict[str, list[int]]:
+    """Return the places of names by group, told by their endings; empty groups left out."""
+    groups: dict[str, list[int]] = {rest: [], **{group: [] for group in endings}}
+    for i, name in enumerate(names):
+        own = next((group for group, end in endings.items() if name.endswith(end)), rest)
+        groups[own].append(i)
+    return {group: places for group, places in groups.items() if places}
+
+
 def swept_norm(loop: StateSpace) -> float:
     """Return the largest gain over a grid that is refined at resonances and at its own peak."""
     if not loop.D.size:
         return 0.0
-    poles = loop.poles()
-    if not poles.size:
+    if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
+    freq = _sweep(loop)
+    best = float(np.linalg.norm(loop.D, 2)) if not loop.dt else 0.0
+    for _ in range(3):
+        gains = _largest(loop, freq)
+        peak = int(np.argmax(gains))
+        best = max(best, float(gains[peak]))
+        bracket = freq[max(peak - 1, 0)], freq[min(peak + 1, freq.size - 1)]
+        freq = np.linspace(*bracket, 40)
+    return best
+
+
+def _sweep(loop: StateSpace) -> FloatArray:
+    """Return frequencies [Hz] from 0 up, dense around the resonances of a loop with states."""
+    poles = loop.poles()
     if loop.dt:
         poles = np.asarray(np.log(np.where(np.abs(poles) > 0, poles, 1e-300)) / loop.dt)
     nyquist = 0.5 / loop.dt if loop.dt else np.inf
@@ -84,15 +131,7 @@ def swept_norm(loop: StateSpace) -> float:
     offsets = np.concatenate([[0.0], np.geomspace(0.05, 20.0, 24)])
     near = (speeds[:, None] + width[:, None] * np.concatenate([-offsets, offsets])).ravel()
     freq = np.concatenate([[0.0], np.geomspace(min(low, 0.5 * high), high, 600), near])
-    freq = np.unique(freq[(freq >= 0) & (freq <= nyquist)])
-    best = float(np.linalg.norm(loop.D, 2)) if not loop.dt and loop.D.size else 0.0
-    for _ in range(3):
-        gains = _largest(loop, freq)
-        peak = int(np.argmax(gains))
-        best = max(best, float(gains[peak]))
-        bracket = freq[max(peak - 1, 0)], freq[min(peak + 1, freq.size - 1)]
-        freq = np.linspace(*bracket, 40)
-    return best
+    return np.asarray(np.unique(freq[(freq >= 0) & (freq <= nyquist)]))
 
 
 def _largest(loop: StateSpace, freq: FloatArray) -> FloatArray:

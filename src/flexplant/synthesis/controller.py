@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from ..loop import LeftOut
 from ..lti.statespace import StateSpace
 from ..values import Value
 
@@ -25,6 +26,13 @@ class Controller(Value):
         A bound from below on what controllers reach; see the method for its conditions.
     certificate : mapping {str: float}
         Numbers computed after the design by another route.
+    reached : mapping {str: float}
+        Of a weighted design: the norm from each group of w to each group of z, beside 1, which is
+        what the weights ask for. The largest is close to gamma.
+    left_out : LeftOut, optional
+        How the loop stands on the plant with the modes left out, where these are known.
+    notes : sequence of str
+        What the certificate does not cover, and what else is worth knowing.
     """
 
     system: StateSpace
@@ -32,14 +40,28 @@ class Controller(Value):
     gamma: float | None = None
     lower: float | None = None
     certificate: Mapping[str, float] | None = None
+    reached: Mapping[str, float] | None = None
+    left_out: LeftOut | None = None
+    notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        self._set(certificate=dict(self.certificate or {}))
+        self._set(
+            certificate=dict(self.certificate or {}),
+            reached=dict(self.reached or {}),
+            notes=tuple(self.notes),
+        )
 
     def __repr__(self) -> str:
         gamma = "" if self.gamma is None else f", gamma {self.gamma:.4g}"
         lines = [f"<Controller {self.method}: {self.system.n_states} states{gamma}>"]
+        if self.reached:
+            shown = ", ".join(f"{key} {value:.3g}" for key, value in self.reached.items())
+            lines.append(f"  reached, of 1 that the weights ask: {shown}")
         if self.certificate:
-            shown = ", ".join(f"{key} {value:.4g}" for key, value in self.certificate.items())
+            own = self.certificate.items()
+            shown = ", ".join(f"{k} {v:.4g}" for k, v in own if "left out" not in k)
             lines.append(f"  verified: {shown}")
+        if self.left_out is not None:
+            lines.append(f"  with the modes left out: {self.left_out.summary}")
+        lines += [f"  {note}" for note in self.notes]
         return "\n".join(lines)

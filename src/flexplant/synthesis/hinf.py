@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +12,11 @@ from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant, standard_plant
 from ..values import short
-from .certificate import certified_norm
+from .certificate import certified_norm, reached_norms
 from .controller import Controller
 from .method import Method
 from .riccati import Riccati
+from .spill_over import spill_over, unchecked
 
 
 def design_hinf(
@@ -23,6 +25,7 @@ def design_hinf(
     *,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
+    larger: Any = None,
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
@@ -39,13 +42,18 @@ def design_hinf(
         `Riccati()` unless given. `Lmi()` needs no full-rank D12 and D21, but suits small plants.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
+        there too, sampled and delayed alike. Unless given, with those that the plant's reduced
+        model still knows.
 
     Returns
     -------
     Controller
         `gamma` is the verified norm, `lower` a bound from below on what any controller reaches (by
         `Lmi` for controllers whose X and Y are no larger than its own), `certificate` what
-        was checked.
+        was checked, `reached` what is reached of each block of the weights, `left_out` the check
+        with the modes left out.
 
     Raises
     ------
@@ -56,7 +64,13 @@ def design_hinf(
     CertificateError
         When the closed loop does not keep the promise.
     ModelError
-        When the plant or the method is of another type, or a sampled plant has a pole at z = -1.
+        When the plant or the method is of another type, a sampled plant has a pole at z = -1, or
+        `larger` does not go with the plant.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the modes left out make the loop unstable; it names them.
 
     References
     ----------
@@ -83,12 +97,17 @@ def design_hinf(
     found = method.solve(problem)
     controller = problem.restored(found.A, found.B, found.C, found.D).replace(name="hinf")
     certificate = certified_norm(plant.system, controller, found.gamma)
+    reached = reached_norms(plant, controller)
+    left_out = spill_over(plant, [controller], larger)
     return Controller(
         controller,
         f"H-infinity by {type(method).__name__}",
         gamma=certificate["norm"],
         lower=found.lower,
-        certificate=certificate,
+        certificate=certificate | (left_out.certificate if left_out is not None else {}),
+        reached=reached,
+        left_out=left_out,
+        notes=() if left_out is not None else unchecked(plant),
     )
 
 

@@ -1,0 +1,147 @@
+"""How a loop stands on the plant with the modes that its design left out: spill-over."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, IntArray, Value
+
+#: a mode with less than this part of the one that takes part most is not named
+_TAKES_PART = 0.3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LeftOut(Value):
+    """The check of a loop on the plant with the modes left out, sampled and delayed alike.
+
+    Parameters
+    ----------
+    stability : float
+        Spectral radius of the sampled closed loop there, below 1 when stable; of a continuous one
+        the largest real part [rad/s], below 0.
+    sampled : bool
+        Which of both it is.
+    modulus_margin : float
+        There, broken at u; 0 when unstable.
+    states : int
+        Of the plant with the modes left out.
+    modes : sequence of int
+        Numbers (from 1, rigid-body modes included) of the modes of that plant which take part most
+        in what grows; empty when stable.
+    freq : sequence of float [Hz]
+        At which it grows, one for each of these modes.
+    """
+
+    stability: float
+    sampled: bool
+    modulus_margin: float
+    states: int
+    modes: tuple[int, ...] = ()
+    freq: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._set(modes=tuple(self.modes), freq=tuple(self.freq))
+
+    @property
+    def is_stable(self) -> bool:
+        """Whether the loop is stable there."""
+        return self.stability < (1.0 if self.sampled else 0.0)
+
+    @property
+    def spectral_radius(self) -> float:
+        """Largest magnitude of the closed loop's eigenvalues there; of a sampled loop.
+
+        Raises
+        ------
+        ModelError
+            In continuous time, where `stability` is the largest real part.
+        """
+        if not self.sampled:
+            raise ModelError("the spectral radius belongs to sampled loops: use stability.")
+        return self.stability
+
+    @property
+    def certificate(self) -> dict[str, float]:
+        """The numbers, named for a certificate."""
+        return {
+            f"{self._measure} with modes left out": self.stability,
+            "modulus margin with modes left out": self.modulus_margin,
+        }
+
+    @property
+    def _measure(self) -> str:
+        return "spectral radius" if self.sampled else "largest real part"
+
+    @property
+    def culprits(self) -> str:
+        """The modes that take part in what grows, in words."""
+        listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(self.modes, self.freq, strict=True)]
+        return ", ".join(listed)
+
+    def __repr__(self) -> str:
+        return f"<LeftOut: {self.summary}>"
+
+    @property
+    def summary(self) -> str:
+        """The finding in one line."""
+        found = f"{self._measure} {self.stability:.6f}"
+        if not self.is_stable:
+            return f"unstable ({self.states} states), {found}: {self.culprits or 'no mode named'}"
+        peak = -20.0 * np.log10(self.modulus_margin)
+        return f"stable ({self.states} states), {found}, |S| at u up to {peak:.3g} dB"
+
+
+def growing_modes(
+    loop: StateSpace, states: Sequence[str]
+) -> tuple[tuple[int, ...], tuple[float, ...]]:
+    """Return the numbers of the modes that take part in what grows, and its frequencies [Hz].
+
+    The part of state k in an eigenvalue is ``|left_k right_k|``, of its own left and right
+    eigenvectors (participation factors, Perez-Arriaga et al., IEEE Trans. Power Apparatus and
+    Systems 101, 1982); they do not depend on the units of the states.
+
+    Parameters
+    ----------
+    loop : StateSpace
+        The closed loop: states of the plant, then of the controller.
+    states : sequence of str
+        Names of the plant's states; `mode7:q` and `mode7:v` are those of mode 7.
+    """
+    numbers = _numbers(states, loop.n_states)
+    if not np.any(numbers):
+        return (), ()
+    eigen: Any = la.eig(loop.A, left=True, right=True)
+    values, left, right = eigen
+    edge = np.abs(values) - 1.0 if loop.dt else values.real
+    grows = np.flatnonzero((edge >= 0) & (values.imag >= 0))
+    found: dict[int, float] = {}
+    for i in grows[np.argsort(-edge[grows], kind="stable")]:
+        part = np.abs(left[:, i] * right[:, i])
+        share = _summed(part, numbers)
+        pole = np.log(values[i]) / loop.dt if loop.dt else values[i]
+        for number in np.flatnonzero(share >= max(_TAKES_PART * share.max(), 1e-300)).tolist():
+            found.setdefault(number, float(abs(pole.imag) / (2.0 * np.pi)))
+    return tuple(found), tuple(found.values())
+
+
+def _numbers(states: Sequence[str], size: int) -> IntArray:
+    """Return the mode that each state belongs to, 0 for other states."""
+    numbers = np.zeros(size, dtype=np.int64)
+    for i, name in enumerate(states):
+        head, _, part = name.partition(":")
+        if part in ("q", "v") and head.startswith("mode") and head[4:].isdigit():
+            numbers[i] = int(head[4:])
+    return numbers
+
+
+def _summed(part: FloatArray, numbers: IntArray) -> FloatArray:
+    share = np.bincount(numbers, weights=part)
+    share[0] = 0.0
+    return np.asarray(share)

@@ -1,0 +1,55 @@
+"""Every design on the plant with the modes that it left out, before the machine has them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from typing import Any
+
+from ..errors import FlexplantWarning
+from ..loop import LeftOut, close_loop
+from ..plant import StandardPlant, larger_plant
+from ..structure import FEModel
+
+
+def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> LeftOut | None:
+    """Return how a design's loop stands on the plant with the modes left out; None: not known.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        What was designed on; weights do not matter, a block that it is seen through does.
+    blocks : sequence
+        The controller, from that plant's y to its u.
+    larger : Modes, FEModel, ReducedModel, StandardPlant or None
+        As for `larger_plant`.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the loop is unstable there, with the numbers of the modes.
+    """
+    whole = larger_plant(plant, larger)
+    if whole is None:
+        return None
+    plain = plant.unweighted or plant
+    before = [] if plant.reading is None else [plant.reading]
+    with warnings.catch_warnings():  # one warning is enough, where the user called from
+        warnings.simplefilter("ignore", FlexplantWarning)
+        found = close_loop(plain, *before, *blocks, larger=whole).left_out
+    if found is not None and not found.is_stable:
+        warnings.warn(
+            f"with the modes that the plant left out the loop is {found.summary}. The machine has "
+            "these modes: ask for less bandwidth, keep them in the plant, or weight the efforts "
+            "(or roll the controller off) before them.",
+            FlexplantWarning,
+            stacklevel=3,
+        )
+    return found
+
+
+def unchecked(plant: StandardPlant) -> tuple[str, ...]:
+    """Return a note that no modes left out are known, for a plant that may have left out some."""
+    if plant.realisation is None or isinstance(plant.model, FEModel):
+        return ()
+    return ("modes left out of the plant: none known, none checked; larger= gives them",)

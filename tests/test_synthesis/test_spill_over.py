@@ -1,0 +1,249 @@
+"""Designs on truncated plants, checked with the modes left out: oracle by dense matrices."""
+
+import warnings
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
+from flexplant.labels import DofSet
+from flexplant.loop import LeftOut, close_loop
+from flexplant.loop.left_out import growing_modes
+from flexplant.plant import (
+    Actuator,
+    Disturbance,
+    Poi,
+    Ports,
+    Sensor,
+    assemble_plant,
+    larger_plant,
+    reference_errors,
+    stage_weights,
+)
+from flexplant.reduction import DesiredDofs, reduce, solve_modes
+from flexplant.store import load
+from flexplant.structure import FEModel, ModalDamping
+from flexplant.synthesis import Lmi, design_hinf
+from flexplant.synthesis.spill_over import spill_over
+from oracles_ports import chain
+from oracles_synthesis import closed_loop, split, stability
+from plates import make_plate
+from stages import L, ports, sampled
+
+#: weights that ask for S alone
+OLD = (("disturbance", 0.3), ("effort", 0.3), ("noise", 0.005))
+
+
+@cache
+def many(count=60):
+    """The plate without a secret: 60 modes at 0.1 % damping."""
+    return solve_modes(make_plate(), count=count, damping=ModalDamping(0.001))
+
+
+@cache
+def small(count=24):
+    """24 of these modes in physical DOFs."""
+    spots = [(x, y, 0.0) for y in np.linspace(0, L, 5) for x in np.linspace(0, L, 5)]
+    labels = [many().dofs.nearest(p, "z") for p in spots if p[:2] != (L / 2, L / 2)]
+    return reduce(many(count), DesiredDofs(labels[:count]))
+
+
+def weighted(plant, bandwidth, **knobs):
+    errors, weights = reference_errors(plant), stage_weights(plant, bandwidth, **knobs)
+    return errors, plant.through(errors).weighted(z=weights.z, w=weights.w)
+
+
+@cache
+def design(bandwidth=100.0, knobs=OLD, larger=True):
+    errors, problem = weighted(sampled(small()), bandwidth, **dict(knobs))
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        found = design_hinf(problem, larger=many() if larger else None)
+    return errors, problem, found, [str(w.message) for w in seen]
+
+
+def dense(plant, errors, K, kept=None):
+    """The plant's loop by dense matrices; modes of `kept` only are reached by u."""
+    g = plant.system
+    B, C, D = g.B.copy(), g.C, g.D
+    if kept is not None:
+        for i, name in enumerate(g.states):
+            number = name.partition(":")[0]
+            if number.startswith("mode") and int(number[4:]) not in kept:
+                B[i] = 0.0
+        # the delayed u act on the modes through A: silence those rows too
+        A = g.A.copy()
+        delays = [i for i, name in enumerate(g.states) if "delay" in name]
+        silent = [i for i in range(g.n_states) if i not in delays and not np.any(B[i])
+                  and int(g.states[i].partition(":")[0][4:]) not in kept]  # fmt: skip
+        A[np.ix_(silent, delays)] = 0.0
+    else:
+        A = g.A
+    rows = [*range(len(plant.z)), *(len(plant.z) + plant.y.index(n) for n in errors.inputs)]
+    nz = len(plant.z)
+    mix = np.zeros((nz + len(errors.outputs), len(rows)))
+    mix[:nz, :nz], mix[nz:, nz:] = np.eye(nz), errors.D
+    P = split(A, B, mix @ C[rows], mix @ D[rows], len(errors.outputs), len(plant.u))
+    return closed_loop(P, K.A, K.B, K.C, K.D)
+
+
+def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
+    errors, _, found, messages = design()
+    assert found.certificate["stability"] < 1
+    radius = found.certificate["spectral radius with modes left out"]
+    assert radius > 1.001
+    assert found.certificate["modulus margin with modes left out"] == 0.0
+    whole = sampled(many())
+    # oracle: stability() is the radius' logarithm or the like: only its sign counts
+    loop = dense(whole, errors, found.system)
+    assert np.abs(np.linalg.eigvals(loop[0])).max() == pytest.approx(radius, abs=1e-9)
+    assert len(messages) == 1 and f"mode {found.left_out.modes[0]} (" in messages[0]
+    assert "unstable" in repr(found) and "modes left out" in repr(found)
+
+
+def test_the_named_modes_are_the_cause():
+    """Without them, and with all others, the loop is stable."""
+    errors, _, found, _ = design()
+    whole, named = sampled(many()), found.left_out.modes
+    assert named and min(named) > 24
+    rest = set(range(1, 61)) - set(named)
+    assert stability(dense(whole, errors, found.system, rest)[0], whole.dt) < 0
+    only = set(range(1, 25)) | set(named)
+    assert stability(dense(whole, errors, found.system, only)[0], whole.dt) > 0
+    for number, freq in zip(named, found.left_out.freq, strict=True):
+        assert freq == pytest.approx(many().freq[number - 1], rel=0.02)
+
+
+def test_the_default_weights_are_stable_with_the_modes_left_out():
+    errors, _, found, messages = design(80.0, ())
+    assert not messages and found.left_out.is_stable and not found.left_out.modes
+    whole = sampled(many())
+    loop = dense(whole, errors, found.system)
+    radius = np.abs(np.linalg.eigvals(loop[0])).max()
+    assert found.certificate["spectral radius with modes left out"] == pytest.approx(radius)
+    margin = found.certificate["modulus margin with modes left out"]
+    assert 0.4 < margin < found.left_out.states
+    g, K = whole.system, found.system
+    peaks = []
+    for freq in np.unique(np.append(np.geomspace(5, 4900, 800), many().freq[3:24])):
+        z = np.exp(2j * np.pi * freq * whole.dt)
+        P = g.C[-5:-1] @ np.linalg.solve(z * np.eye(g.n_states) - g.A, g.B[:, -4:])
+        back = K.C @ np.linalg.solve(z * np.eye(K.n_states) - K.A, K.B) + K.D
+        peaks.append(np.linalg.norm(np.linalg.inv(np.eye(4) + back @ P), 2))
+    assert 1 / max(peaks) == pytest.approx(margin, rel=0.02)
+
+
+def test_one_flipped_sign_fails_the_check():
+    _, problem, found, _ = design(80.0, ())
+    K = found.system
+    for side in ("u", "y"):
+        signs = np.array([1.0, 1, -1, 1])
+        wrong = (
+            K.replace(C=signs[:, None] * K.C, D=signs[:, None] * K.D)
+            if side == "u"
+            else K.replace(B=K.B * signs, D=K.D * signs)
+        )
+        with pytest.warns(FlexplantWarning, match=r"unstable .*spectral radius 1\.\d+: mode \d"):
+            checked = spill_over(problem, [wrong], many())
+        assert not checked.is_stable and checked.modulus_margin == 0.0
+
+
+def test_the_reduced_model_knows_its_modes_by_itself():
+    """`solve_modes` found 60 modes, the reduction kept 21: nothing need be given."""
+    spots = [(x, y, 0.0) for y in np.linspace(0, L, 5) for x in np.linspace(0, L, 5)]
+    labels = [many().dofs.nearest(p, "z") for p in spots if p[:2] != (L / 2, L / 2)]
+    model = reduce(many(), DesiredDofs(labels))
+    assert model.truncated is not None
+    errors, problem = weighted(sampled(model), 80.0)
+    found = design_hinf(problem)
+    assert found.left_out is not None
+    assert found.left_out.states == larger_plant(sampled(model)).system.n_states
+    other = design_hinf(problem, larger=many())
+    assert other.left_out.modulus_margin == pytest.approx(found.left_out.modulus_margin, rel=1e-6)
+    loop = close_loop(sampled(model), errors, found)
+    assert loop.left_out.modulus_margin == pytest.approx(found.left_out.modulus_margin, rel=1e-9)
+    assert "with the modes left out: stable" in repr(loop)
+
+
+def test_where_none_are_known_the_answer_says_so():
+    errors, problem, _, _ = design()
+    found = design_hinf(problem)
+    assert found.left_out is None
+    assert "none known, none checked; larger=" in repr(found)
+    assert not [key for key in found.certificate if "left out" in key]
+    loop = close_loop(sampled(small()), errors, found)
+    assert loop.left_out is None
+
+
+def test_a_closed_loop_carries_the_check(tmp_path):
+    errors, _, found, _ = design()
+    plant = sampled(small())
+    with pytest.warns(FlexplantWarning, match=r"stable on its plant, .* unstable .*mode \d+ \("):
+        loop = close_loop(plant, errors, found, larger=many())
+    assert loop.is_stable and not loop.left_out.is_stable
+    assert loop.left_out.modes == found.left_out.modes
+    assert isinstance(loop.left_out, LeftOut) and "unstable" in repr(loop)
+    found.save(tmp_path / "k.npz")
+    back = load(tmp_path / "k.npz")
+    assert back.left_out.modes == found.left_out.modes and back.notes == found.notes
+
+
+@pytest.mark.parametrize("crossing", [5.0, 100.0])
+def test_linear_matrix_inequalities_are_checked_too(crossing):
+    """Five masses in a row as one rigid body, pushed at one end and seen at the other."""
+    M, D, K = chain()
+    row = DofSet(range(1, 6), ["x"] * 5, [(0.1 * i, 0.0, 0.0) for i in range(5)])
+    body = FEModel(M, K, D, dofs=row)
+    channels = Ports(
+        w=[Disturbance("push", at="1:x")],
+        u=[Actuator("u1", at="1:x")],
+        z=[Poi("die", at="5:x", axes=("x",))],
+        y=[Sensor("y1", at="5:x", asd=1e-9)],
+    )
+    stiff = assemble_plant(solve_modes(body, count=1), channels).discretized(5e3, delay=1)
+    push = M.trace() * (2 * np.pi * crossing) ** 2
+    problem = stiff.weighted(z={"die:x": push}, w={"y1:noise": 0.1 / push, "push": 1.0})
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        found = design_hinf(problem, Lmi(), larger=body)
+    whole = assemble_plant(body, channels).discretized(5e3, delay=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FlexplantWarning)
+        radius = np.abs(np.linalg.eigvals(close_loop(whole, found).system.A)).max()
+    assert found.left_out.spectral_radius == pytest.approx(radius, abs=1e-9)
+    assert (radius < 1) == (crossing < 50)
+    assert (2 in found.left_out.modes) == (radius >= 1)
+    assert bool(seen) == (radius >= 1)
+
+
+def test_a_continuous_design_is_checked_in_continuous_time():
+    plant = assemble_plant(small(), ports())
+    _, problem = weighted(plant, 50.0)
+    found = design_hinf(problem, larger=many())
+    assert found.left_out.stability < 0
+    assert "largest real part with modes left out" in found.certificate
+    with pytest.raises(ModelError, match="sampled loops"):
+        _ = found.left_out.spectral_radius
+
+
+def test_what_does_not_go_with_the_plant_is_refused():
+    _, problem, found, _ = design()
+    with pytest.raises(LabelError, match="other channels"):
+        design_hinf(problem, larger=sampled(many(), ports(references=[])))
+    with pytest.raises(ModelError, match=r"close the loop on plant\.unweighted"):
+        close_loop(problem, found, larger=many())
+
+
+def test_modes_are_told_from_the_controllers_states():
+    """Participation does not depend on units; states of other names take no part."""
+    errors, _, found, _ = design()
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        loop = close_loop(sampled(many()), errors, found)
+    system, names = loop.monitored, loop.plant.system.states
+    first = growing_modes(system, names)
+    scale = 10.0 ** np.random.default_rng(3).integers(-6, 6, system.n_states)
+    turned = system.replace(A=system.A * scale / scale[:, None], B=system.B / scale[:, None],
+                            C=system.C * scale, blocks=None)  # fmt: skip
+    assert growing_modes(turned, names)[0] == first[0]
+    assert growing_modes(system, ["x"] * len(names)) == ((), ())
