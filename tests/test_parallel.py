@@ -1,6 +1,5 @@
 """Executors: the same to the bit, in order, seeded per item, in chunks of the right size."""
 
-import subprocess
 import sys
 import time
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, ThreadPoolExecutor
@@ -8,10 +7,12 @@ from multiprocessing import get_context
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 import flexplant
 from flexplant.errors import ModelError
+from flexplant.lti import doubling, norms, responses
+from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
 
 
@@ -190,12 +191,34 @@ def test_bad_input():
         mapped(square, [1], executor=map)
 
 
-def test_the_module_does_not_hide_the_parallel_connection():
-    """`import flexplant.parallel` binds the name in the package: the function must win."""
-    if not hasattr(flexplant, "place_sensors"):
-        pytest.skip("placement is not exported yet")
-    code = "import flexplant.placement, flexplant as fx; print(fx.parallel.__module__)"
-    answer = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60
-    )
-    assert answer.stdout.strip() == "flexplant.lti.interconnection"
+def test_the_name_is_the_module():
+    """The connection of two systems of this name is in `flexplant.lti` only."""
+    assert flexplant.parallel.mapped is mapped
+    assert "parallel" in vars(flexplant.lti)
+
+
+@pytest.mark.parametrize(
+    ("module", "inner", "call"),
+    [
+        (responses, "_points", lambda g: flexplant.frequency_response(g, [1.0])),
+        (responses, "_points", lambda g: flexplant.frequency_response(g.replace(blocks=None), [1])),
+        (norms, "_searched", flexplant.hinf_norm),
+        (norms, "controllability_gramian", flexplant.h2_norm),
+        (doubling, "_doubling", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
+    ],
+)
+def test_dense_loops_run_on_one_thread(monkeypatch, module, inner, call):
+    """More BLAS threads than one wait for each other; afterwards there are as many as before."""
+    g = flexplant.StateSpace([[0, 1], [-9, -0.1]], [[0], [1]], [[1, 0]], [[0]], blocks=[2])
+    used = []
+    original = getattr(module, inner)
+
+    def noted(*arguments, **options):
+        used.append(threads_used(None))
+        return original(*arguments, **options)
+
+    monkeypatch.setattr(module, inner, noted)
+    with threadpool_limits(2, user_api="blas"):
+        call(g)
+        assert threads_used(None) == 2
+    assert used and set(used) == {1}

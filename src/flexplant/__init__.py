@@ -10,7 +10,6 @@ from typing import Any
 
 from . import errors as errors
 from . import io as io
-from . import parallel as _parallel  # noqa: F401  # before lti's connection takes the name
 from . import testbeds as testbeds
 from .errors import FlexplantError as FlexplantError
 from .errors import FlexplantWarning as FlexplantWarning
@@ -66,7 +65,6 @@ from .lti import matched as matched
 from .lti import minimal as minimal
 from .lti import modal_form as modal_form
 from .lti import norm_report as norm_report
-from .lti import parallel as parallel
 from .lti import peak_gain as peak_gain
 from .lti import series as series
 from .lti import split_stable as split_stable

@@ -7,8 +7,10 @@ and linear algebra runs on one thread while items are computed (its rounding dep
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
+from contextlib import contextmanager
+from functools import cache
 from time import perf_counter
 from types import TracebackType
 from typing import Any, Self, TypeVar
@@ -26,6 +28,24 @@ CHUNK = 0.5
 PROBE = 0.05
 #: shorter work than this [s] shows no bar
 PATIENCE = 2.0
+
+
+@cache
+def _controller() -> Any:
+    from threadpoolctl import ThreadpoolController
+
+    return ThreadpoolController()
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Return a context, also a decorator, in which BLAS runs on one thread.
+
+    For loops over small matrices: more threads wait for each other, 3 to 30 times as long on a busy
+    machine.
+    """
+    with _controller().limit(limits=1, user_api="blas"):
+        yield
 
 
 class Progress:
@@ -122,7 +142,7 @@ def mapped(
     calls: list[tuple[Any, ...]] = [(item,) for item in listed]
     if rng is not None:
         calls = [(*call, seed) for call, seed in zip(calls, _seeds(rng, len(calls)), strict=True)]
-    with _one_thread(), Progress(len(calls), description, progress=progress) as bar:
+    with one_thread(), Progress(len(calls), description, progress=progress) as bar:
         results: list[Result] = []
         start = perf_counter()
         for call in calls:
@@ -160,19 +180,13 @@ def _sent(
 
 
 def _chunk(function: Callable[..., Result], calls: Sequence[tuple[Any, ...]]) -> list[Result]:
-    with _one_thread():
+    with one_thread():
         return [_call(function, call) for call in calls]
 
 
 def _call(function: Callable[..., Result], call: tuple[Any, ...]) -> Result:
     item, *seed = call
     return function(item, np.random.default_rng(seed[0])) if seed else function(item)
-
-
-def _one_thread() -> Any:
-    from threadpoolctl import threadpool_limits
-
-    return threadpool_limits(limits=1, user_api="blas")
 
 
 def _seeds(

@@ -1,11 +1,11 @@
 """Small random machines: a plate with random candidates, die, disturbances."""
 
-import sys
 from functools import cache
 
 import numpy as np
 import pytest
 
+import flexplant.parallel
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.reduction import solve_modes
 from flexplant.structure import ModalDamping, kirchhoff_plate
@@ -59,6 +59,5 @@ def make():
 @pytest.fixture
 def send_everything(monkeypatch):
     """All items but the first leave for the executor, in small chunks."""
-    module = sys.modules["flexplant.parallel"]
-    monkeypatch.setattr(module, "PROBE", 0.0)
-    monkeypatch.setattr(module, "CHUNK", 0.01)
+    monkeypatch.setattr(flexplant.parallel, "PROBE", 0.0)
+    monkeypatch.setattr(flexplant.parallel, "CHUNK", 0.01)

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import scipy.optimize as so
 
 from ..errors import ModelError, ShapeError, SolverError
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
@@ -157,6 +156,8 @@ class StabilisationDiagram(Value):
         ModelError
             When there are no frequencies, or no pole lies within 3 % of one.
         """
+        import scipy.optimize as so
+
         wanted = real_array(freq, "freq", (None,))
         if not wanted.size:
             raise ModelError("select needs at least one frequency.")
@@ -229,6 +230,8 @@ def _followed(
     old: OrderPoles, new: OrderPoles, tolerances: tuple[float, float, float]
 ) -> tuple[list[tuple[int, int]], IntArray]:
     """Return which new pole continues which old one, and the flags of the new ones."""
+    import scipy.optimize as so
+
     tol_freq, tol_damping, tol_mac = tolerances
     f_old, f_new = np.abs(old.poles), np.abs(new.poles)
     z_old, z_new = -old.poles.real / f_old, -new.poles.real / f_new

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
-from ..structure.threads import one_thread
+from ..parallel import one_thread
 from ..values import positive, real_array, short, whole
 from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-import scipy.optimize as so
 
 from ..errors import LabelError, ModelError
 from ..labels import Place
@@ -72,6 +71,8 @@ def numbered(
     Allemang, "The Modal Assurance Criterion - twenty years of use and abuse", Sound and Vibration
     37 (2003) 14-21.
     """
+    import scipy.optimize as so
+
     if not isinstance(measured, MeasuredModes):
         raise ModelError(f"numbered takes MeasuredModes, got {type(measured).__name__}.")
     modes = model.modes() if hasattr(model, "modes") and not isinstance(model, Modes) else model

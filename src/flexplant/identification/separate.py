@@ -6,7 +6,6 @@ from dataclasses import replace
 
 import numpy as np
 import scipy.linalg as la
-from scipy.stats import chi2
 
 from ..errors import SolverError
 from ..values import ComplexArray
@@ -43,6 +42,8 @@ def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
 
 def least_of(lines: Lines, places: int) -> float:
     """Return by how much a second pole must lower the cost at one of some places."""
+    from scipy.stats import chi2
+
     n_out, n_in, _ = lines.data.shape
     return float(chi2.isf(CHANCE / places, 2 * (n_out + n_in)))
 
@@ -127,6 +128,8 @@ def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
     leave is too little to be seen and enough to bias, and in a wide band they cost next to
     nothing: so as many as the lines afford.
     """
+    from scipy.stats import chi2
+
     channels = lines.data.shape[0] * lines.data.shape[1]
     unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
     for upper in MORE:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import scipy.linalg as la
-from scipy.stats import chi2
 
 from ..values import ComplexArray
 from .refine import Lines, projected_normal
@@ -38,6 +37,8 @@ def price(lines: Lines) -> float:
     `inflation` times the power of independent errors. A pole kept in vain costs little; one left
     out biases its neighbours by up to the root of this price.
     """
+    from scipy.stats import chi2
+
     n_out, n_in, n_freq = lines.data.shape
     return lines.inflation * float(chi2.isf(CHANCE / n_freq, 2 * (n_out + n_in)))
 

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
-from scipy.stats import chi2
 
 from ..errors import FlexplantWarning, SolverError
 from ..values import ComplexArray
@@ -130,6 +129,8 @@ def candidate(
 
 def lessened(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
     """Return the fit with the fewest residual terms of modes above that the data let pass."""
+    from scipy.stats import chi2
+
     unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
     channels = lines.data.shape[0] * lines.data.shape[1]
     for upper in fewer:

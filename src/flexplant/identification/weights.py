@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import scipy.ndimage as ndi
 import scipy.sparse as sp
 
 from ..errors import ModelError
@@ -68,11 +67,15 @@ class Prepared:
     def from_errors(self, power: FloatArray, fitted_share: float) -> Prepared:
         """Return the same with weights from the squared errors of a rough fit."""
         # at sharp peaks such a fit leaves more than noise; the median does not see them
+        import scipy.ndimage as ndi
+
         power = ndi.median_filter(power, (1, 1, WINDOW), mode="nearest") / np.log(2.0)
         return self._weighted(power, fitted_share)
 
     def from_residuals(self, error: ComplexArray, fitted_share: float) -> Prepared:
         """Return the same with weights from what a fit left, averaged over lines."""
+        import scipy.ndimage as ndi
+
         power = ndi.uniform_filter1d(np.abs(error) ** 2, WINDOW, axis=2, mode="nearest")
         return self._weighted(power, fitted_share)
 

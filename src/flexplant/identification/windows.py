@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
-import scipy.ndimage as ndi
 
 from ..values import ComplexArray, FloatArray
 from .diagram import StabilisationDiagram, built_diagram
@@ -30,6 +29,8 @@ class Window:
 
 def windows(ready: Prepared) -> list[Window]:
     """Return parts of about 400 lines, cut where the responses are weakest."""
+    import scipy.ndimage as ndi
+
     n_freq = ready.freq.size
     count = max(1, round(n_freq / LINES))
     power = np.sum(np.abs(ready.data * ready.weight) ** 2, axis=(0, 1))

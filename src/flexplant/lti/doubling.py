@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import SolverError
+from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray
 from .lyapunov import accumulated, doubled, scale_of, solve_continuous
 
@@ -176,6 +177,7 @@ class Solved(NamedTuple):
     iterations: int
 
 
+@one_thread()
 @np.errstate(over="ignore", invalid="ignore")
 def solved(problem: Problem, kind: Discrete | Continuous) -> Solved:
     """Return the stabilising solution, scaled back.

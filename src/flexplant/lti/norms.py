@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import CertificateError, SolverError
+from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray
 from .lyapunov import controllability_gramian, observability_gramian
 from .responses import continuous_poles, responder
@@ -24,6 +25,7 @@ LEVELS = 30
 ZOOMS = 6
 
 
+@one_thread()
 def h2_norm(sys: System) -> float:
     """Return the H2 norm: the rms of all outputs together for white inputs of unit intensity.
 
@@ -187,6 +189,7 @@ def axis_peak(g: StateSpace) -> tuple[float, float]:
     return (float("inf"), problem.freq) if problem else _peak(g)
 
 
+@one_thread()
 def _peak(g: StateSpace) -> tuple[float, float]:
     """Return gain and frequency of a system without poles on the axis."""
     if not g.D.size:

@@ -10,6 +10,7 @@ import numpy.typing as npt
 import scipy.linalg as la
 
 from ..errors import ModelError
+from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray, IntArray
 from .scaling import state_scale
 from .statespace import StateSpace
@@ -38,6 +39,7 @@ def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
     modal = _modal(g) or _fed_by_lines(g)
     if modal is not None:
 
+        @one_thread()
         def by_modes(freq: FloatArray) -> ComplexArray:
             data, tame = modal(_points(g, freq))
             return data if tame else _finite(data, freq)
@@ -46,6 +48,7 @@ def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
     solve = _solver(g)
     step = max(1, CHUNK // (g.n_states * (len(g.inputs) + 2)))
 
+    @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
         s = _points(g, freq)
         out = np.empty((*shape, freq.size), dtype=np.complex128)

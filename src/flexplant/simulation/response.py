@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-from scipy.special import stdtrit
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray, IntArray, Value, check_names, positive, real_array
@@ -162,6 +161,8 @@ class Response(Value, Mapping[str, FloatArray]):
         rms = np.asarray(self.rms(channel, start=start))
         unit = float(rms.max()) or 1.0
         power = (rms / unit) ** 2
+        from scipy.special import stdtrit
+
         quantile = float(stdtrit(power.size - 1, 0.5 + 0.5 * level))
         half = quantile * float(power.std(ddof=1)) / np.sqrt(power.size)
         ends = np.sqrt(np.maximum(power.mean() + np.array([0.0, -half, half]), 0.0))

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import sys
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from threadpoolctl import threadpool_limits
 
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
+from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..values import (
     FloatArray,
@@ -139,9 +138,8 @@ def simulate(
     groups = [slice(i, i + ABREAST) for i in range(0, len(numbers), ABREAST)]
     total = len(groups) * -(-steps // STRETCH)
     # products this small run slower on two threads than on one (5 times, on a busy machine)
-    one_thread = threadpool_limits(limits=1, user_api="blas")
     overflow = np.errstate(over="ignore", invalid="ignore")
-    with one_thread, overflow, _Bar(total, progress) as bar:
+    with one_thread(), overflow, Progress(total, "simulate", progress=progress) as bar:
         for group in groups:
             run = _Group(loop, parts, white, generators[group], state)
             for first in range(0, steps, STRETCH):
@@ -343,26 +341,3 @@ def _start(loop: ClosedLoop, start: npt.ArrayLike | None) -> FloatArray:
         size = plant if values.shape == (plant,) else total
         state[:size] = real_array(values, "start (plant, or plant and controller)", (size,))
     return state
-
-
-class _Bar:
-    """A tqdm bar, or nothing."""
-
-    def __init__(self, total: int, progress: bool | None) -> None:
-        self.bar: Any = None
-        if progress or (progress is None and sys.stderr.isatty()):
-            from tqdm import tqdm
-
-            self.bar = tqdm(total=total, desc="simulate", delay=0.0 if progress else 2.0)
-
-    def __enter__(self) -> _Bar:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-    def advance(self) -> None:
-        """Count one stretch."""
-        if self.bar is not None:
-            self.bar.update()

@@ -9,6 +9,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
+from ..parallel import one_thread
 from ..values import FloatArray
 from .eigen import check_stiffness
 from .factor import by_rows
@@ -16,7 +17,6 @@ from .lanczos import FOUND, BlockLanczos
 from .model import FEModel
 from .pardiso import Pardiso
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
-from .threads import one_thread
 
 #: modes beyond the last wanted one among which a gap is looked for
 _EXTRA = 4

@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.optimize import nnls
 
 from ..errors import ModelError, ShapeError
 from ..values import FloatArray, Value, positive, real_array, short, whole
@@ -241,6 +240,8 @@ class Rayleigh(Damping):
         >>> law, law.zeta([200 * np.pi, 2000 * np.pi])
         (<Rayleigh alpha 10.1546 1/s, beta 6.10898e-06 s>, array([0.01, 0.02]))
         """
+        from scipy.optimize import nnls
+
         hertz = real_array(freq, "freq", (None,))
         ratio = _ratios(real_array(zeta, "zeta", hertz.shape), "zeta")
         if np.any(hertz <= 0) or np.unique(hertz).size < 2:

@@ -11,9 +11,9 @@ import scipy.sparse as sp
 from scipy.linalg import blas, lapack
 
 from ..errors import SolverError
+from ..parallel import one_thread
 from ..values import FloatArray, IntArray
 from .ordering import Dissection, Front, dissect
-from .threads import one_thread
 
 #: blocks smaller than this (entries, on average) are added by index lists, larger ones as slices
 _SLICE = 600

@@ -7,8 +7,6 @@ from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
-from scipy.interpolate import RBFInterpolator
-from scipy.spatial import ConvexHull, KDTree
 
 from ..errors import LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet, Interpolation
@@ -142,6 +140,8 @@ class _Field:
     """One displacement (or rotation) between the nodes that have it."""
 
     def __init__(self, xyz: FloatArray, rows: IntArray, direction: str, margin: float) -> None:
+        from scipy.spatial import KDTree
+
         self.n, self.rows, self.direction, self.margin = xyz.shape[0], rows, direction, margin
         self.nodes = xyz[rows]
         self.centre = self.nodes.mean(axis=0)
@@ -194,7 +194,9 @@ class _Field:
             found[i, self.rows[chosen]] = self._exact(part, chosen, at, axis)[0]
         return found
 
-    def _interpolant(self, chosen: IntArray) -> RBFInterpolator:
+    def _interpolant(self, chosen: IntArray) -> Any:
+        from scipy.interpolate import RBFInterpolator
+
         try:
             return RBFInterpolator(self.flat[chosen], np.eye(chosen.size), kernel="cubic", degree=1)
         except (np.linalg.LinAlgError, ValueError) as error:
@@ -240,6 +242,8 @@ class _Field:
     @cached_property
     def _walls(self) -> FloatArray:
         """Half spaces (walls, d + 1) of the hull: a x + b <= 0 inside."""
+        from scipy.spatial import ConvexHull
+
         if self.flat.shape[1] == 1:
             return np.array([[1.0, -self.flat.max()], [-1.0, self.flat.min()]])
         return np.asarray(ConvexHull(self.flat).equations, dtype=np.float64)

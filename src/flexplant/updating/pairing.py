@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from ..values import ComplexArray, FloatArray, IntArray
 from .pencil import groups
@@ -36,6 +35,8 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
     old_X, X : (k, m), (k, m') complex arrays
         Shapes by rising frequency, in coordinates where the mass matrix is about the unit matrix.
     """
+    from scipy.optimize import linear_sum_assignment
+
     shapes = mac(old_X, X)
     score = shapes.copy()
     clusters = groups(old_poles, gap=CLUSTER)

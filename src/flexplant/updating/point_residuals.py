@@ -7,7 +7,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg as la
-from scipy.optimize import linear_sum_assignment
 
 from ..errors import ModelError, ShapeError
 from ..labels import Place
@@ -113,6 +112,8 @@ class _BoundZeros(Bound):
         return self._last[1:]
 
     def _nearest(self, s: Any) -> Any:
+        from scipy.optimize import linear_sum_assignment
+
         if s.size < self.target.size:
             raise ModelError(
                 f"the model has {s.size} antiresonances there, {self.target.size} were measured."

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.special import ndtri
 
 from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
@@ -184,6 +183,8 @@ class UpdateResult(Value):
         if share >= 1:
             raise ModelError(f"level must be below 1, got {share:g}. Choose 0.95, say.")
         std = self._known_std()
+        from scipy.special import ndtri
+
         half = float(ndtri((1 + share) / 2)) * std
         return np.column_stack([self.values - half, self.values + half])
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import scipy.linalg as la
-from scipy.optimize import linear_sum_assignment
 
 from ..errors import LabelError, ModelError, ShapeError
 from ..identification import MeasuredModes
@@ -198,6 +197,8 @@ class _BoundShapes(Bound):
         return f"the shape of mode {self.own[self._order[row // self._rows_each]]}"
 
     def assigned(self, point: Point) -> Point:
+        from scipy.optimize import linear_sum_assignment
+
         if not self.assign:
             return point
         score = mac(self.psi.astype(complex), self.rows @ point.eigen.X)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.stats import qmc
 
 from ..errors import ModelError, ShapeError
 from ..values import FloatArray, generator, real_array, short
@@ -47,6 +46,8 @@ def summary(begins: list[FloatArray], ends: list[Found | None]) -> Starts | None
 
 
 def _drawn(objective: Objective, count: int, seed: int) -> FloatArray:
+    from scipy.stats import qmc
+
     low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)
     high = np.where(objective.has_prior, objective.prior_mean + 2 * objective.prior_std, np.inf)
     low, high = np.maximum(low, objective.lower), np.minimum(high, objective.upper)

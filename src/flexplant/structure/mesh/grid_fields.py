@@ -9,7 +9,6 @@ from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
-import scipy.ndimage
 
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet, Interpolation
@@ -208,6 +207,8 @@ def present_of(
     ModelError
         When nothing is left, or it falls apart: `corners` tells whether a common corner holds.
     """
+    import scipy.ndimage
+
     if holes is None or (isinstance(holes, Sequence) and not len(holes)):
         return None
     missing = _missing(holes, lengths, counts)

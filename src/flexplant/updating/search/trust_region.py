@@ -7,7 +7,6 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
-from scipy.optimize import least_squares
 
 from ...errors import ModelError
 from ...values import FloatArray, positive
@@ -107,6 +106,8 @@ def _within(
     tolerance: float,
     extra: Extra | None,
 ) -> Found:
+    from scipy.optimize import least_squares
+
     trail = Trail()
     point = objective.begin(start)
     rows = objective.values(point, prior=False).size
