@@ -65,3 +65,43 @@ def mean_square_and_its_error(runs):
     weight = 1 - np.arange(lags) / n
     total = covariance[0] ** 2 + 2 * np.sum(weight[1:] * covariance[1:lags] ** 2)
     return np.mean(runs**2), np.sqrt(2 * total / n / count)
+
+
+def truncated_covariance(omega, zeta, see, push, asd):
+    """Stationary covariance of the motions `see` (p, m) of modes under white forces `push` (w, m).
+
+    Sig_ij = W_ij (d_i + d_j) / ((om_i^2 - om_j^2)^2 + (d_i + d_j)(d_i om_j^2 + d_j om_i^2)).
+    """
+    W = push.T @ push * asd**2 / 2
+    d, square = 2 * zeta * omega, omega**2
+    total = d[:, None] + d
+    gap = (square[:, None] - square) ** 2
+    return see @ (W * total / (gap + total * (d[:, None] * square + d * square[:, None]))) @ see.T
+
+
+def error_by_frequency(plant, observer):
+    """Variances of z - hat by the density of the error over the unit circle.
+
+    Rigid-body motion is in the plant's A; what the observer misses of it must vanish at rest.
+    """
+    poles = np.concatenate([np.linalg.eigvals(plant["A"]), np.linalg.eigvals(observer["A"])])
+    poles = poles[(np.abs(poles) > 0.1) & (np.abs(poles - 1) > 1e-5)]
+    angle, width = np.abs(np.angle(poles)), np.maximum(1 - np.abs(poles), 1e-6)
+    spread = np.sinh(np.linspace(-8, 8, 97))
+    grid = np.unique(np.concatenate([(angle[:, None] + width[:, None] * spread).ravel(),
+                                     np.linspace(0, np.pi, 4001)]))  # fmt: skip
+    grid = grid[(grid > 1e-4) & (grid <= np.pi)]
+    size = np.linalg.norm(plant["factor"], axis=1)
+    size = np.where(size > 0, size, size.max())
+    values, T = np.linalg.eig(observer["A"])
+    B, C = np.linalg.solve(T, observer["B"]), observer["C"] @ T
+    root = np.sqrt(np.diag(plant["R"]))
+    A, G = plant["A"] * size / size[:, None], plant["factor"] / size[:, None]
+    C1, C2 = plant["C1"] * size, plant["C2"] * size
+    density = np.empty((grid.size, C1.shape[0]))
+    for k, z in enumerate(np.exp(1j * grid)):
+        filtered = (C / (z - values)) @ B + observer["D"]
+        moved = np.linalg.solve(z * np.eye(A.shape[0]) - A, G)
+        density[k] = np.sum(np.abs((C1 - filtered @ C2) @ moved) ** 2, axis=1)
+        density[k] += np.sum(np.abs(filtered * root) ** 2, axis=1)
+    return np.trapezoid(density, grid, axis=0) / np.pi

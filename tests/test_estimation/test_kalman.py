@@ -237,7 +237,8 @@ def test_names():
             estimator.rms(name)
     text = repr(estimator)
     assert "4 sensors" in text
-    assert len(text.splitlines()) == 1
+    assert len(text.splitlines()) == 2
+    assert "truncation is not in these numbers" in text
 
 
 def test_saves_and_loads(tmp_path):

@@ -24,7 +24,8 @@ def test_static_gains_see_the_structure_not_the_filters(filtered):
     found = fx.design_static(filtered)
     np.testing.assert_allclose(found.system.D, plain.system.D, rtol=1e-9, atol=1e-9)
     assert np.abs(plain.system.D).max() > 0.1
-    with pytest.raises(AssumptionError, match="without dynamics"):
+    # a filtered sensor lags behind a drift, the more the faster it is
+    with pytest.raises(AssumptionError, match="grows without limit"):
         found.rms("die")
 
 

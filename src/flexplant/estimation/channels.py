@@ -45,6 +45,30 @@ def poi_channels(plant: StandardPlant) -> tuple[str, ...]:
     return tuple(name for name in plant.z if not name.endswith(DERIVED))
 
 
+def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant:
+    """Return another plant that has the sensors and POIs of the first.
+
+    Raises
+    ------
+    LabelError
+        When one is missing.
+    ModelError
+        When it is no plant, or has further POIs.
+    """
+    other = standard_plant(on)
+    other = other.unweighted or other
+    for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
+        for name in names:
+            if name not in getattr(other, side):
+                raise unknown_label(f"channel of {side} of the other plant", name, names)
+    if poi_channels(other) != poi_channels(plant):
+        raise ModelError(
+            f"the other plant has the POIs {', '.join(poi_channels(other))}, the filter's has "
+            f"{', '.join(poi_channels(plant))}. Assemble both with the same ports."
+        )
+    return other
+
+
 def estimates(channels: Sequence[str]) -> tuple[str, ...]:
     """Return the names of the estimates, such as `die:hat` and `die:rx:hat`."""
     return tuple(_derived(channels, "hat"))

@@ -3,18 +3,27 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import AssumptionError, CertificateError, ModelError, ShapeError, SolverError
+from ..errors import (
+    AssumptionError,
+    CertificateError,
+    ModelError,
+    ShapeError,
+    SolverError,
+)
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant
+from ..plant import StandardPlant, larger_plant
 from ..plant.door import TYPE_THIS
+from ..plant.realisation import Structure
 from ..values import FloatArray, Value, real_array
-from .channels import checked_plant, estimates, poi_channels, row_of, sensors
+from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
+from .error import error_variances
+from .left_out import LeftOut, left_out
 
 #: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this
 AGREEMENT = 1e-6
@@ -31,13 +40,18 @@ class KalmanCertificate(Value):
     residual : float
         Of the Riccati equation, relative, in states of unit variance.
     difference : float
-        Largest relative difference between the predicted POI variances and those of the gain by a
-        Stein equation of its own: at most 1e-6.
+        Largest relative difference between two ways to the POI variances, at most 1e-6: on the
+        filter's own model the Riccati equation and a Stein equation of the gain; on the plant with
+        the modes left out the joint Stein equation and its dual.
+    left_out : int, optional
+        How many modes left out are in the predicted error; None: none are known, truncation is not
+        in the number.
     """
 
     spectral_radius: float
     residual: float
     difference: float
+    left_out: int | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,8 +60,11 @@ class KalmanEstimator(Value):
 
     ::
 
-        x[k|k] = x[k|k-1] + L (y[k] - C2 x[k|k-1] - D22 u[k]),  hat[k] = C1 x[k|k]
+        x[k|k] = x[k|k-1] + L (y[k] - C2 x[k|k-1] - D22 u[k])
+        hat[k] = C1 x[k|k-1] + D12 u[k] + L_z (y[k] - C2 x[k|k-1] - D22 u[k])
         x[k+1|k] = A x[k|k] + B2 u[k]
+
+    L_z is C1 L where no modes left out are known.
 
     Parameters
     ----------
@@ -59,9 +76,14 @@ class KalmanEstimator(Value):
     gain : (n, ny) array
         L, per sensor.
     covariance : (n, n) array
-        Of the error of x[k|k], after the measurement.
+        Of the error of x[k|k], after the measurement, on the filter's own model.
     certificate : KalmanCertificate
         What was checked.
+    variances : (nz,) array [m^2 or rad^2]
+        Predicted, of the errors at the POIs: on the plant with the modes left out where these are
+        known.
+    left_out : LeftOut, optional
+        The modes left out, as noise and static compliance.
     """
 
     system: StateSpace
@@ -69,16 +91,25 @@ class KalmanEstimator(Value):
     gain: FloatArray
     covariance: FloatArray
     certificate: KalmanCertificate
+    variances: FloatArray
+    left_out: LeftOut | None = None
 
     def __post_init__(self) -> None:
-        self._set(gain=self.gain, covariance=self.covariance)
+        self._set(gain=self.gain, covariance=self.covariance, variances=self.variances)
 
     def __repr__(self) -> str:
         channels = poi_channels(self.plant)
         rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in channels[:4])
+        count = self.certificate.left_out
+        counted = (
+            "modes left out are not known: truncation is not in these numbers"
+            if count is None
+            else f"with {count} modes left out"
+        )
         return (
             f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
-            f"spectral radius {self.certificate.spectral_radius:.6f}; rms error {rms}>"
+            f"spectral radius {self.certificate.spectral_radius:.6f};\n"
+            f"  rms error {rms} ({counted})>"
         )
 
     @property
@@ -86,28 +117,35 @@ class KalmanEstimator(Value):
         """The sensors, in the order of the columns of `gain`."""
         return sensors(self.plant)
 
-    def rms(self, channel: str) -> float:
-        """Return the predicted rms of the estimation error at the sample instants.
+    def rms(self, channel: str, *, on: StandardPlant | System | None = None) -> float:
+        """Return the rms of the estimation error at the sample instants.
 
         Parameters
         ----------
         channel : str
             A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
+        on : StandardPlant, optional
+            A plant that the filter runs on, sampled, with other modes or noises; the error there is
+            exact (`error_variances`), u at rest. None: the predicted error.
 
         Returns
         -------
         float [m or rad]
-            Square root of ``C1 P C1'``, P the covariance after the measurement.
 
         Raises
         ------
         LabelError
-            When it is no motion of a POI.
+            When it is no motion of a POI, or the other plant lacks a channel.
+        ModelError
+            When the other plant is not sampled alike, or its noise is not known.
+        AssumptionError
+            When the error would contain a rigid-body motion of the other plant.
         """
-        channels = poi_channels(self.plant)
-        row = self.plant.system.C[self.plant.system.output_index(channels)]
-        row = row[row_of(channels, channel)]
-        return float(np.sqrt(max(row @ self.covariance @ row, 0.0)))
+        row = row_of(poi_channels(self.plant), channel)
+        variances = self.variances
+        if on is not None:
+            variances = error_variances(same_pois(self.plant, on), self.system).values
+        return float(np.sqrt(max(variances[row], 0.0)))
 
     def to_filterpy(self) -> Any:
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
@@ -117,7 +155,10 @@ class KalmanEstimator(Value):
         """
         from .filterpy_twin import twin_class
 
-        g, noise = _model(self.plant), _noises(self.plant)
+        own = self.plant if self.left_out is None else self.left_out.plant
+        g, noise = _model(own), _noises(own)
+        if self.left_out is not None:
+            noise = noise.replace(sensors=noise.sensors + self.left_out.sensors)
         if np.any(g.D):
             raise ModelError(
                 "filterpy's filter has no feedthrough from u to y, this plant has one. Sample it "
@@ -132,7 +173,9 @@ class KalmanEstimator(Value):
         return twin
 
 
-def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
+def design_kalman(
+    plant: StandardPlant | System, larger: StandardPlant | Structure | None = None
+) -> KalmanEstimator:
     """Return the stationary Kalman filter of the POIs on a sampled plant.
 
     The noise model is that of `simulate`: `plant.process_noise` per sample into x and
@@ -140,16 +183,29 @@ def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
     applied u; delays of u are known exactly. The Riccati equation is solved scaled inside, in any
     units (`flexplant.lti.solve_dare`).
 
+    Modes left out of the plant add no states. Their motion under the disturbances is noise with
+    covariances R_t at the sensors, V_t at the POIs and N_t between them (see `left_out`), and they
+    follow u by their static compliance::
+
+        S = C2 P C2' + R + R_t,   L = P C2' S^-1,   L_z = (C1 P C2' + N_t) S^-1
+
+    with P of the Riccati equation of (A, C2, Q, R + R_t). The predicted error is that of this
+    filter on the plant with the modes left out.
+
     Parameters
     ----------
     plant : StandardPlant
         Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`. A system with labels
-        lacks noise densities: it is told how to give them.
+        lacks noise densities: the error names what gives them.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        The structure with more modes, such as `solve_modes(fit.applied_to(model), count=100)`.
+        None: the modes that the plant's reduced model knows beyond those it kept; where it knows
+        none, truncation is not in the predicted error. The plant itself: no modes are left out.
 
     Returns
     -------
     KalmanEstimator
-        With a certificate: the gain's own error by a Stein equation agrees with the prediction.
+        With a certificate: the error by two routes.
 
     Raises
     ------
@@ -157,9 +213,9 @@ def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
         When the plant is continuous, a sensor has no noise, a disturbance reaches a sensor
         directly, w does not excite a rigid-body mode or y does not see it.
     ModelError
-        When the plant is weighted or its noise is not known.
+        When the plant is weighted or its noise is not known, or the larger model is not larger.
     LabelError
-        When the labels of a system do not tell w, u, z and y.
+        When the labels of a system do not tell w, u, z and y, or the larger plant has others.
     SolverError
         When no strictly stable filter exists for another reason.
     CertificateError
@@ -184,16 +240,63 @@ def design_kalman(plant: StandardPlant | System) -> KalmanEstimator:
         )
     _check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
-    g, noise = _model(plant), _noises(plant)
+    whole = None if larger is plant else larger_plant(plant, larger)
+    found = None if whole is None else left_out(plant, whole)
+    own = plant if found is None else found.plant
+    design = _designed(own, found)
+    system = _observer(own, design.gain, design.poi_gain)
+    if whole is None or found is None:
+        certificate = design.certificate
+        if larger is not None:
+            certificate = certificate.replace(left_out=0)
+        return KalmanEstimator(
+            system, plant, design.gain, design.covariance, certificate, design.variances
+        )
+    honest = error_variances(whole, system)
+    if not honest.difference <= AGREEMENT:
+        raise CertificateError(
+            f"the error on the plant with the modes left out and its dual differ by "
+            f"{honest.difference:.1e} (allowed {AGREEMENT:.0e}). The prediction cannot be trusted."
+        )
+    certificate = design.certificate.replace(
+        difference=max(design.certificate.difference, honest.difference),
+        left_out=int(found.modes.size),
+    )
+    return KalmanEstimator(
+        system, plant, design.gain, design.covariance, certificate, honest.values, found
+    )
+
+
+class _Design(NamedTuple):
+    gain: FloatArray
+    poi_gain: FloatArray
+    covariance: FloatArray
+    variances: FloatArray
+    certificate: KalmanCertificate
+
+
+def _designed(plant: StandardPlant, found: LeftOut | None) -> _Design:
+    """Return the gains of a plant whose sensors have noise of modes left out as well."""
+    g, noise, C1 = _model(plant), _noises(plant), _poi_rows(plant)
+    cross = np.zeros((C1.shape[0], g.C.shape[0]))
+    if found is not None:
+        noise = noise.replace(sensors=noise.sensors + found.sensors)
+        cross = found.cross
     solution = solve_dare(g.A, g.C, Q=noise.process, R=noise.sensors)
     innovation = g.C @ solution.P @ g.C.T + noise.sensors
     scale = np.sqrt(innovation.diagonal())
     unit = innovation / scale / scale[:, None]
-    gain = np.linalg.solve(unit, g.C @ solution.P / scale[:, None]).T / scale
+
+    def weighed(covariance: FloatArray) -> FloatArray:
+        return np.asarray(np.linalg.solve(unit, covariance.T / scale[:, None]).T / scale)
+
+    gain = weighed(solution.P @ g.C.T)
+    poi_gain = weighed(C1 @ solution.P @ g.C.T + cross)
     covariance = _updated(solution.P, gain, g.C, noise.sensors)
-    radius, difference = _error_of(plant, gain, covariance)
+    variances = np.einsum("ij,jk,ik->i", C1, covariance, C1)
+    radius, difference = _error_of(g, C1, noise, gain, covariance)
     certificate = KalmanCertificate(radius, solution.residual, difference)
-    return KalmanEstimator(_observer(plant, gain), plant, gain, covariance, certificate)
+    return _Design(gain, poi_gain, covariance, variances, certificate)
 
 
 def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -> float:
@@ -225,14 +328,14 @@ def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -
     """
     n, p = plant.system.n_states, len(sensors(plant))
     gain = real_array(gain, "gain", (n, p))
-    return _error_of(plant, gain, real_array(covariance, "covariance", (n, n)))[1]
+    covariance = real_array(covariance, "covariance", (n, n))
+    return _error_of(_model(plant), _poi_rows(plant), _noises(plant), gain, covariance)[1]
 
 
 def _error_of(
-    plant: StandardPlant, gain: FloatArray, covariance: FloatArray
+    g: StateSpace, C1: FloatArray, noise: _Noises, gain: FloatArray, covariance: FloatArray
 ) -> tuple[float, float]:
     """Return spectral radius and difference, refusing bad ones."""
-    g, noise = _model(plant), _noises(plant)
     moved = g.A @ gain
     closed = g.A - moved @ g.C
     radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
@@ -246,7 +349,6 @@ def _error_of(
     except SolverError as error:
         raise CertificateError(f"the estimation error could not be checked: {error}") from error
     found = _updated(P, gain, g.C, noise.sensors)
-    C1 = plant.system.C[plant.system.output_index(poi_channels(plant))]
     truth = np.einsum("ij,jk,ik->i", C1, found, C1)
     claim = np.einsum("ij,jk,ik->i", C1, covariance, C1)
     size = np.where(truth > 0, truth, 1.0)
@@ -266,24 +368,27 @@ def _updated(P: FloatArray, gain: FloatArray, C: FloatArray, R: FloatArray) -> F
     return np.asarray(0.5 * (updated + updated.T))
 
 
-def _observer(plant: StandardPlant, gain: FloatArray) -> StateSpace:
+def _observer(plant: StandardPlant, gain: FloatArray, poi_gain: FloatArray) -> StateSpace:
     g, inner = _model(plant), plant.system
     channels = poi_channels(plant)
-    rows = inner.output_index(channels)
-    C1, D12 = inner.C[rows], inner.D[np.ix_(rows, inner.input_index(plant.u))]
-    corrected = np.eye(inner.n_states) - gain @ g.C
-    through = -gain @ g.D  # from u to x[k|k]
+    C1 = _poi_rows(plant)
+    D12 = inner.D[np.ix_(inner.output_index(channels), inner.input_index(plant.u))]
+    moved = g.A @ gain
     return StateSpace(
-        g.A @ corrected,
-        np.hstack([g.A @ gain, g.B + g.A @ through]),
-        C1 @ corrected,
-        np.hstack([C1 @ gain, D12 + C1 @ through]),
+        g.A - moved @ g.C,
+        np.hstack([moved, g.B - moved @ g.D]),
+        C1 - poi_gain @ g.C,
+        np.hstack([poi_gain, D12 - poi_gain @ g.D]),
         plant.dt,
         inputs=[*sensors(plant), *plant.u],
         outputs=estimates(channels),
         states=inner.states,
         name="kalman",
     )
+
+
+def _poi_rows(plant: StandardPlant) -> FloatArray:
+    return plant.system.C[plant.system.output_index(poi_channels(plant))]
 
 
 def _model(plant: StandardPlant) -> StateSpace:

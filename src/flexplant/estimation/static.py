@@ -7,12 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import AssumptionError
-from ..lti.lyapunov import controllability_gramian
-from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
-from ..plant.carried import carried, carried_of, seen, structure_of
+from ..lti.statespace import StateSpace, System
+from ..plant import StandardPlant, larger_plant
+from ..plant.carried import carried_of, seen, structure_of
+from ..plant.realisation import Structure
 from ..values import FloatArray, Value
-from .channels import checked_plant, estimates, poi_channels, row_of, sensors
+from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
+from .error import error_variances
 
 #: a POI motion that the sensors miss by this relative part is not determined by them
 _MISSED = 1e-8
@@ -28,10 +29,13 @@ class StaticEstimator(Value):
         From the displacement sensors to `die:hat`, ...; no states.
     plant : StandardPlant
         Whose geometry it uses.
+    larger : StandardPlant, optional
+        The plant with the modes left out, where these are known.
     """
 
     system: StateSpace
     plant: StandardPlant
+    larger: StandardPlant | None = None
 
     def __repr__(self) -> str:
         g = self.system
@@ -42,66 +46,52 @@ class StaticEstimator(Value):
         """The gains (n_poi, n_sensors)."""
         return self.system.D
 
-    def rms(self, channel: str) -> float:
+    def rms(self, channel: str, *, on: StandardPlant | System | None = None) -> float:
         """Return the predicted rms of the error at sample instants, with u at rest.
 
-        What the disturbances bend, by the Gramian of the elastic modes, and the sensor noise; the
-        rigid-body motion has no error.
+        What the disturbances bend, the modes left out among it where they are known, and the
+        sensor noise; the rigid-body motion, free or on weak springs, has no error.
 
         Parameters
         ----------
         channel : str
             A POI's motion: `die`, `die:z`, `die:hat` or `die:error`.
+        on : StandardPlant, optional
+            Another plant that it runs on, sampled; None: its own, with the modes left out.
 
         Raises
         ------
         LabelError
-            When it is no motion of a POI.
+            When it is no motion of a POI, or the other plant lacks a channel.
         AssumptionError
-            When the plant is continuous (a sample of white sensor noise has no variance then), or
-            its ports have dynamics of their own.
+            When the plant is continuous (a sample of white sensor noise has no variance then), its
+            noise is not known, or the error grows with the rigid-body motion.
+        ModelError
+            When the other plant is not sampled alike, or its noise is not known.
         SolverError
             When an elastic mode is not damped.
         """
-        plant = self.plant
-        row = row_of(poi_channels(plant), channel)
-        if not plant.dt:
+        row = row_of(poi_channels(self.plant), channel)
+        if not self.plant.dt:
             raise AssumptionError(
                 "the rms needs a sampled plant: design_static(plant.discretized(rate))."
             )
-        if plant.ports is not None and plant.ports.has_dynamics:
-            raise AssumptionError(
-                "the static relation's rms is known for sensors and actuators without dynamics or "
-                "delay of their own. Simulate instead, or leave the dynamics out of the ports."
-            )
-        g = plant.system
-        weights = self.gain[row]
-        rows = [plant.y.index(name) for name in self.system.inputs]
-        noise = weights @ plant.sensor_noise[np.ix_(rows, rows)] @ weights
-        elastic = _elastic(plant)
-        missed = (
-            g.C[g.output_index(poi_channels(plant))[row]]
-            - weights @ (g.C[g.output_index(self.system.inputs)])
-        )
-        missed = missed[elastic]
-        if plant.noise_factor is None:
+        plant = self.larger or self.plant
+        if on is not None:
+            plant = same_pois(self.plant, on)
+        elif plant.noise_factor is None:
             raise AssumptionError(
                 "the rms needs the process noise of a plant that was assembled and sampled: "
                 "assemble_plant(model, ports).discretized(rate)."
             )
-        factor = plant.noise_factor[elastic]
-        bending = StateSpace(
-            g.A[np.ix_(elastic, elastic)],
-            factor,
-            missed[None],
-            np.zeros((1, factor.shape[1])),
-            plant.dt,
-            blocks=[2] * (len(elastic) // 2),
-        )
-        return float(np.sqrt(noise + missed @ controllability_gramian(bending) @ missed))
+        held = carried_of(plant) if plant.realisation is not None else None
+        found = error_variances(plant, self.system, None if held is None else held.modes)
+        return float(np.sqrt(found.values[row]))
 
 
-def design_static(plant: StandardPlant) -> StaticEstimator:
+def design_static(
+    plant: StandardPlant, larger: StandardPlant | Structure | None = None
+) -> StaticEstimator:
     """Return the static geometric relation between the displacement sensors and the POIs.
 
     ``hat = R_z R_y^+ y`` with R_y and R_z the rigid-body modes at the sensors and the POIs: the
@@ -112,6 +102,9 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
     ----------
     plant : StandardPlant
         Assembled from a structure that is free or on weak springs, continuous or sampled.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        The structure with more modes, for the predicted error. None: the modes that the plant's
+        reduced model knows beyond those it kept.
 
     Returns
     -------
@@ -124,7 +117,7 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
         When the structure has no rigid-body or suspension mode, or the displacement sensors do
         not determine the POI's rigid-body motion.
     ModelError
-        When the plant is weighted.
+        When the plant is weighted, or the larger one is not sampled alike.
 
     References
     ----------
@@ -159,11 +152,5 @@ def design_static(plant: StandardPlant) -> StaticEstimator:
             name="static",
         ),
         plant,
+        None if larger is plant else larger_plant(plant, larger),
     )
-
-
-def _elastic(plant: StandardPlant) -> list[int]:
-    """Return the states of elastic modes; delay lines of u come after all modes."""
-    modes = (plant.continuous or plant).system.n_states
-    rigid = carried(structure_of(plant)[0]).modes
-    return [i for i in range(modes) if i // 2 not in rigid]

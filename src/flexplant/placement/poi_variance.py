@@ -23,7 +23,8 @@ class PoiVariance(Criterion):
     """Variance of the stationary Kalman estimate's error at a POI: for sensors, smaller is better.
 
     ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, P after the measurement, at sample instants: the
-    square of `design_kalman(plant).rms(...)`. More sensors never make it larger.
+    square of `design_kalman(plant, larger=plant).rms(...)`, of the plant's own modes. More sensors
+    never make it larger.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ class PoiVariance(Criterion):
         AssumptionError
             When no stationary filter exists: the message names what the sensors miss.
         """
-        estimator = design_kalman(plant)
+        estimator = design_kalman(plant, larger=plant)
         factors = factors_of(plant, self.poi, self.axes, every=False)
         return float(sum((f * estimator.rms(name)) ** 2 for name, f in factors.items()))
 

@@ -226,6 +226,24 @@ def _with_own_delays(
     )
 
 
+def with_flexibility(plant: StandardPlant, flexibility: FloatArray) -> StandardPlant:
+    """Return a plant whose motions (p, m) also answer forces at once, sampled alike.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled, not weighted.
+    flexibility : (p, m) array
+        From `ports.forces` to the motions of POIs and sensors, between the filters of the ports.
+    """
+    if plant.realisation is None or plant.ports is None:
+        raise ModelError("the plant was not assembled from a structure.")
+    bare = structure_system(plant.realisation, plant.ports)
+    physical = with_filters(bare.replace(D=bare.D + flexibility), plant.ports)
+    fresh = _plant(physical, plant.ports, plant.realisation)
+    return sampled(fresh, 1.0 / plant.dt, plant.delay) if plant.dt else fresh
+
+
 def reassembled(plant: StandardPlant, ports: Ports) -> StandardPlant:
     """Return a plant with other ports, from the same modes, sampled like the old one."""
     _check_ports(ports)

@@ -107,6 +107,7 @@ class DesiredDofs(ReductionMethod):
             method=f"{modes.n_modes} modes and {modes.n_vectors} attachment vectors",
             condition=condition,
             truncated=truncated,
+            n_vectors=modes.n_vectors,
         )
 
 

@@ -59,6 +59,9 @@ class ReducedModel(Value):
         The modes over `full_dofs` that were known to `reduce` and left out, M-orthogonal to the
         kept ones. They stay as they were solved when M, D or K change (an update): the modes of
         the changed full structure are then nearer.
+    n_vectors : int
+        How many shapes are attachment vectors: as many of the model's modes are none of the
+        structure's, but hold the compliance of those left out.
 
     Raises
     ------
@@ -79,6 +82,7 @@ class ReducedModel(Value):
     condition_of: str = "phi_kk"
     bound: ErrorBound | None = None
     truncated: Modes | None = None
+    n_vectors: int = 0
 
     def __post_init__(self) -> None:
         names = tuple(str(name) for name in self.coordinates) or self.dofs.labels

@@ -368,4 +368,5 @@ def _diagonal(
         coordinates=[*names, *static],
         condition_of="M*",
         bound=bound if bound is None or np.isfinite(bound.value) else None,
+        n_vectors=modes.n_vectors,
     )

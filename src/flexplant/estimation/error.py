@@ -1,0 +1,262 @@
+"""The error of an observer on any sampled plant, in closed form: no model of the observer's own."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import AssumptionError, ModelError
+from ..lti.lyapunov import accumulated, doubled, scale_of, solve_stein
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray, IntArray
+from .channels import poi_channels
+
+#: a rigid-body motion may enter the error by this part of the motion itself
+_SEEN = 1e-7
+#: condition of a sampled mode's eigenvectors above which its block is not diagonalised
+_DEFECTIVE = 1e6
+#: modulus of a sampled pole from which a mode counts as undamped
+_ON_CIRCLE = 1.0 - 1e-12
+
+
+class Variances(NamedTuple):
+    """Variances (n_poi,) of the error, and their largest relative difference from the dual's."""
+
+    values: FloatArray
+    difference: float
+
+
+def error_variances(
+    plant: StandardPlant, observer: StateSpace, suspension: IntArray | None = None
+) -> Variances:
+    """Return the variances of ``z - hat`` at the sample instants, u at rest or known exactly.
+
+    ``x[k+1] = A x[k] + w[k]``, ``y = C2 x + v``; the observer reads y. A rigid-body motion x_r
+    has no variance, nor has an undamped mode (poles on the unit circle); the observer follows them
+    with the states V x_r,
+    ``A_o V - V A_rr = -B_y C2_r``, so that the rest ``x' = x - V x_r`` is stable and has a
+    Stein equation of its own. The elastic states are solved mode by mode, O(n^2) of them. The
+    dual equation, from the output back to the noises, gives the same variances by another way.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        The machine: sampled, with `noise_factor`; it may have other modes than the observer's.
+    observer : StateSpace
+        From sensors of the plant (and u) to the estimates of its POIs, in their order.
+    suspension : array of int, optional
+        Modes of the plant, from 0, whose motion counts as that of a rigid body without error.
+
+    Returns
+    -------
+    Variances
+
+    Raises
+    ------
+    ModelError
+        When sampling times differ, or the noise of the plant is not known.
+    AssumptionError
+        When the error contains a rigid-body motion or an undamped mode of the plant.
+    SolverError
+        When the error is not stable.
+    """
+    if plant.noise_factor is None or not np.isclose(plant.dt, observer.dt, rtol=1e-9, atol=0.0):
+        raise ModelError(
+            "the error of an observer needs a plant of its sampling time "
+            f"({observer.dt:g} s, got {plant.dt:g} s) that was assembled and sampled."
+        )
+    joint = _joint(plant, observer, suspension)
+    if joint.modal is None:
+        X = solve_stein(joint.A, joint.noise @ joint.noise.T)
+        primal = np.einsum("ij,jk,ik->i", joint.E, X, joint.E)
+        dual = np.array([_dual_dense(joint, row) for row in joint.E])
+    else:
+        primal, dual = _primal(joint), np.array([_dual(joint, row) for row in joint.E])
+    size = np.where(primal > 0, primal, 1.0)
+    return Variances(primal + joint.direct, float(np.max(np.abs(dual - primal) / size)))
+
+
+class _Joint(NamedTuple):
+    """``x' = A x + noise``, ``error = E x`` + white of variance `direct`; elastic states first."""
+
+    A: FloatArray
+    noise: FloatArray
+    E: FloatArray
+    direct: FloatArray
+    n_elastic: int
+    modal: tuple[ComplexArray, ComplexArray, ComplexArray] | None
+
+
+def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | None) -> _Joint:
+    g, factor = plant.system, plant.noise_factor
+    assert factor is not None  # noqa: S101  # error_variances has refused it
+    read = [name for name in observer.inputs if name in plant.y and name not in plant.w]
+    observer = observer.select(observer.outputs, read)
+    C1, C2 = g.C[g.output_index(poi_channels(plant))], g.C[g.output_index(read)]
+    noise = np.sqrt(plant.sensor_noise[np.ix_(*[[plant.y.index(name) for name in read]] * 2)])
+    rigid, rest = _parts(plant)
+    if suspension is not None:
+        rest = np.setdiff1d(rest, plant.modal_states.reshape(-1, 2)[suspension])
+    n, m, k = rest.size, observer.n_states, rigid.size
+    A = np.zeros((n + m, n + m))
+    A[:n, :n], A[n:, n:] = g.A[np.ix_(rest, rest)], observer.A
+    A[n:, :n] = observer.B @ C2[:, rest]
+    E = np.hstack([C1[:, rest] - observer.D @ C2[:, rest], -observer.C])
+    drive = np.zeros((n + m, factor.shape[1] + len(read)))
+    drive[:n, : factor.shape[1]], drive[n:, factor.shape[1] :] = factor[rest], observer.B @ noise
+    if k:
+        entering = np.vstack([g.A[np.ix_(rest, rigid)], observer.B @ C2[:, rigid]])
+        V = _followed(A, n, entering, g.A[np.ix_(rigid, rigid)])
+        back = np.zeros((k, n + m))
+        back[:, :n] = g.A[np.ix_(rigid, rest)]
+        seen = C1[:, rigid] - observer.D @ C2[:, rigid] + E @ V
+        _check_seen(plant, seen, C1[:, rigid])
+        A = A - V @ back
+        drive[:, : factor.shape[1]] -= V @ factor[rigid]
+    direct = np.sum((observer.D @ noise) ** 2, axis=1)
+    return _Joint(A, drive, E, direct, n, _eigen(A[:n, :n], A[:n, n:]))
+
+
+def _parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
+    """Return the states of modes on the unit circle, and all others that noise reaches."""
+    g, factor = plant.system, plant.noise_factor
+    assert factor is not None  # noqa: S101
+    kept = np.zeros(0, dtype=np.int64)
+    if plant.realisation is not None:
+        states = plant.modal_states.reshape(-1, 2)
+        blocks = g.A[states[:, :, None], states[:, None, :]]
+        undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= _ON_CIRCLE
+        undamped[: plant.n_rigid] = True
+        kept = states[undamped].reshape(-1)
+    reached = np.any(factor != 0, axis=1)
+    pattern = g.A != 0
+    while np.any(grown := ~reached & np.any(pattern[:, reached], axis=1)):
+        reached |= grown
+    reached[kept] = False
+    return kept, np.flatnonzero(reached)
+
+
+def _followed(A: FloatArray, n: int, entering: FloatArray, kept: FloatArray) -> FloatArray:
+    """Return V of ``A V - V A_rr = -entering``; n states stand before the observer's."""
+    V = np.zeros_like(entering)
+    start = 0 if np.any(entering[:n]) else n
+    V[start:] = la.solve_sylvester(A[start:, start:], -kept, -entering[start:])
+    return V
+
+
+def _check_seen(plant: StandardPlant, seen: FloatArray, motion: FloatArray) -> None:
+    worst = np.linalg.norm(seen, axis=1) / np.maximum(np.linalg.norm(motion, axis=1), 1e-300)
+    if np.max(worst) > _SEEN:
+        raise AssumptionError(
+            f"the estimate of {poi_channels(plant)[int(np.argmax(worst))]!r} misses "
+            f"{np.max(worst):.2g} of a rigid-body motion or undamped mode of the plant: its error "
+            "grows without limit. The two models differ in places, filters, delays or undamped "
+            "modes."
+        )
+
+
+def _eigen(
+    block: FloatArray, above: FloatArray
+) -> tuple[ComplexArray, ComplexArray, ComplexArray] | None:
+    """Return eigenvalues, T and T^-1 as pairs (b, 2), (b, 2, 2) of uncoupled modes, or None."""
+    n = block.shape[0]
+    if n % 2 or np.any(above):
+        return None
+    pairs = block.reshape(n // 2, 2, n // 2, 2)[np.arange(n // 2), :, np.arange(n // 2), :]
+    if np.count_nonzero(block) != np.count_nonzero(pairs):
+        return None
+    # states of one size: those of a mode are its omega q and dq/dt
+    values, vectors = np.linalg.eig(pairs.astype(np.complex128))
+    if n and np.max(np.linalg.cond(vectors)) > _DEFECTIVE:
+        return None
+    return values.reshape(-1), vectors, np.linalg.inv(vectors)
+
+
+def _modal_parts(
+    joint: _Joint,
+) -> tuple[ComplexArray, FloatArray, ComplexArray, ComplexArray, FloatArray]:
+    """Return lambda, A_o, the coupling B_y C2 T, and both parts of the noise (modal, observer)."""
+    assert joint.modal is not None  # noqa: S101
+    values, T, inverse = joint.modal
+    n = joint.n_elastic
+    coupling = _right(joint.A[n:, :n], T)
+    noise = np.einsum("bij,bjm->bim", inverse, joint.noise[:n].reshape(n // 2, 2, -1))
+    return values, joint.A[n:, n:], coupling, noise.reshape(n, -1), joint.noise[n:]
+
+
+def _right(rows: FloatArray, T: ComplexArray) -> ComplexArray:
+    """Return ``rows T``."""
+    b = T.shape[0]
+    return np.asarray(np.einsum("pbi,bij->pbj", rows.reshape(-1, b, 2), T).reshape(-1, 2 * b))
+
+
+def _columns(A: FloatArray, shifts: ComplexArray, right: ComplexArray) -> ComplexArray:
+    """Return X with ``(I - shifts_j A) X_j = right_j``, by one Schur form of A."""
+    if not A.size:
+        return right
+    schur, U = la.schur(A.astype(np.complex128), output="complex")
+    turned = U.conj().T @ right
+    X = np.empty_like(turned)
+    for i in range(A.shape[0] - 1, -1, -1):
+        rest = shifts * (schur[i, i + 1 :] @ X[i + 1 :])
+        X[i] = (turned[i] + rest) / (1 - shifts * schur[i, i])
+    return np.asarray(U @ X)
+
+
+def _primal(joint: _Joint) -> FloatArray:
+    """Return ``E X E'`` with ``X = A X A' + noise noise'``."""
+    values, A, coupling, driven, noise = _modal_parts(joint)
+    n = joint.n_elastic
+    inner = (driven @ driven.conj().T) / (1 - np.outer(values, values.conj()))
+    entering = coupling @ inner
+    cross = _columns(A, values.conj(), entering * values.conj() + noise @ driven.conj().T)
+    half = A @ cross @ coupling.conj().T
+    entered = np.real(entering @ coupling.conj().T) + noise @ noise.T
+    own = _own(A, entered + np.real(half + half.conj().T), _sizes(joint))
+    assert joint.modal is not None  # noqa: S101
+    see = _right(joint.E[:, :n], joint.modal[1])
+    keep = joint.E[:, n:]
+    total = np.einsum("pi,ij,pj->p", see, inner, see.conj()).real
+    total += 2 * np.einsum("pi,ij,pj->p", keep, cross, see.conj()).real
+    return np.asarray(total + np.einsum("pi,ij,pj->p", keep, own, keep))
+
+
+def _sizes(joint: _Joint) -> FloatArray:
+    """Return the sizes of the observer's states by the sensor noise alone, powers of two.
+
+    Of all states alike, also of those that the POIs do not see: the dual's are their inverses.
+    """
+    A, noise = joint.A[joint.n_elastic :, joint.n_elastic :], joint.noise[joint.n_elastic :]
+    return scale_of(accumulated(A, noise @ noise.T))
+
+
+def _own(A: FloatArray, load: FloatArray, d: FloatArray) -> FloatArray:
+    """Return X of ``X = A X A' + load`` in states of sizes d; the load may be indefinite."""
+    As, Qs = A * d / d[:, None], 0.5 * (load + load.T) / d / d[:, None]
+    X = doubled(As, Qs)
+    X = X + doubled(As, As @ X @ As.T + Qs - X)
+    return np.asarray(X * d * d[:, None])
+
+
+def _dual(joint: _Joint, row: FloatArray) -> float:
+    """Return ``trace(noise' Y noise)`` with ``Y = A' Y A + row' row``."""
+    values, A, coupling, driven, noise = _modal_parts(joint)
+    assert joint.modal is not None  # noqa: S101
+    n = joint.n_elastic
+    see, keep = _right(row[None, :n], joint.modal[1])[0], row[n:]
+    own = _own(A.T, np.outer(keep, keep), 1.0 / _sizes(joint))
+    cross = _columns(A.T, values, A.T @ own @ coupling + np.outer(keep, see))
+    back = coupling.conj().T @ cross * values
+    load = coupling.conj().T @ own @ coupling + back + back.conj().T + np.outer(see.conj(), see)
+    inner = load / (1 - np.outer(values.conj(), values))
+    total = np.einsum("im,ij,jm->", driven.conj(), inner, driven).real
+    total += 2 * np.einsum("im,ij,jm->", noise, cross, driven).real
+    return float(total + np.einsum("im,ij,jm->", noise, own, noise))
+
+
+def _dual_dense(joint: _Joint, row: FloatArray) -> float:
+    Y = solve_stein(joint.A.T, np.outer(row, row))
+    return float(np.einsum("im,ij,jm->", joint.noise, Y, joint.noise))

@@ -1,0 +1,238 @@
+"""Modes left out of a filter's model: noise on its sensors and POIs, and a static compliance."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from ..errors import ModelError
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..plant.assembly import with_flexibility
+from ..plant.dynamics import structure_system
+from ..plant.ports import Ports, filter_of
+from ..plant.realisation import ModalRealisation
+from ..reduction import ReducedModel
+from ..reduction.reduced import STATIC
+from ..values import ComplexArray, FloatArray, IntArray, Value
+
+#: a mode of the plant is one of the larger plant's within this part of its frequency
+_SAME = 0.15
+#: how much another shape weighs beside another frequency when modes are paired
+_SHAPE = 0.02
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LeftOut(Value):
+    """What the modes that a plant lacks do to its sensors y and POIs z.
+
+    Parameters
+    ----------
+    modes : (m,) array of int
+        Numbers of the modes left out, in the larger model, from 1.
+    sensors : (ny, ny) array
+        R_t, their stationary covariance at the sensors.
+    pois : (nz, nz) array
+        V_t, at the POIs.
+    cross : (nz, ny) array
+        N_t, between POIs and sensors.
+    plant : StandardPlant
+        The plant whose motions also follow u by the static compliance of the modes left out.
+        Shapes that stood for them (attachment vectors) are excited by u only.
+    """
+
+    modes: IntArray
+    sensors: FloatArray
+    pois: FloatArray
+    cross: FloatArray
+    plant: StandardPlant
+
+    def __post_init__(self) -> None:
+        self._set(modes=self.modes, sensors=self.sensors, pois=self.pois, cross=self.cross)
+
+    def __repr__(self) -> str:
+        return f"<LeftOut: {self.modes.size} modes as noise and static compliance>"
+
+
+def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
+    """Return what the modes of a larger plant do that the plant lacks; None when it lacks none.
+
+    With the poles lambda of the modes left out, b what white noise of unit intensity drives and c
+    what is seen, ``X_ij = - b_i b_j^* / (lambda_i + lambda_j^*)`` is the stationary covariance,
+    ``c X c*`` that of the motions. For modes damped each by itself this is::
+
+        Sig_ij = W_ij (d_i + d_j) / ((om_i^2 - om_j^2)^2 + (d_i + d_j)(d_i om_j^2 + d_j om_i^2))
+        R_t = P_y Sig P_y',  N_t = P_z Sig P_y',  V_t = P_z Sig P_z'
+
+    with d = 2 zeta omega and ``W_ij = sum_w phi_iw phi_jw asd_w^2 / 2``. A sample has the same
+    covariance. Disturbances with a shape drive a mode with their density at its frequency, and
+    their slow part moves it statically; filters and delays of sensors act at its pole.
+
+    Parameters
+    ----------
+    plant, larger : StandardPlant
+        Sampled alike, with the same ports, both assembled from structures.
+
+    Raises
+    ------
+    ModelError
+        When one is not assembled from a structure, the larger one has fewer modes, or a mode left
+        out has no damping.
+    """
+    small, big, ports = plant.realisation, larger.realisation, plant.ports
+    if small is None or big is None or ports is None or larger.ports is None:
+        raise ModelError(
+            "modes left out are counted between plants that were assembled from structures: use "
+            "assemble_plant(model, ports), and pass larger= as Modes or a model."
+        )
+    kept, all_modes = _blocks(small, ports), _blocks(big, larger.ports)
+    kept_omega, kept_static = kept.omega, kept.static
+    genuine = np.setdiff1d(np.arange(kept_omega.size), _of_vectors(small))
+    if genuine.size > all_modes.omega.size:
+        raise ModelError(
+            f"the larger model has {all_modes.omega.size} elastic modes, the plant "
+            f"{genuine.size}: it is not larger. Pass more modes of the full structure."
+        )
+    rows, columns = _paired(kept, all_modes, genuine)
+    others = np.setdiff1d(np.arange(all_modes.omega.size), columns)
+    if not others.size:
+        return None
+    stand_ins = np.setdiff1d(np.arange(kept_omega.size), rows)
+    flexibility = all_modes.static[others].sum(axis=0) - kept_static[stand_ins].sum(axis=0)
+    flexibility[:, np.logical_not(_may_follow(plant, ports))] = 0.0
+    # an acceleration has no static part: what modes answer at once they take back at rest
+    moving = [i for i, sensor in enumerate(ports.y) if sensor.quantity == "acceleration"]
+    flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
+    covariance = _covariance(all_modes, others, larger.ports)
+    nz = covariance.shape[0] - len(ports.y)
+    return LeftOut(
+        others + big.n_rigid + 1,
+        covariance[nz:, nz:],
+        covariance[:nz, :nz],
+        covariance[:nz, nz:],
+        _quiet(with_flexibility(plant, flexibility), plant, stand_ins),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class _Blocks:
+    """Elastic modes of a structure between its ports; two poles each."""
+
+    poles: ComplexArray  # (b, 2)
+    see: ComplexArray  # (p, b, 2)
+    push: ComplexArray  # (b, 2, m)
+    static: FloatArray  # (b, p, m)
+
+    @property
+    def omega(self) -> FloatArray:
+        return np.asarray(np.sqrt(np.abs(np.prod(self.poles, axis=1))))
+
+
+def _blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
+    g, r = structure_system(realisation, ports), realisation.n_rigid
+    n = g.n_states // 2 - r
+    A, B, C = g.A[2 * r :, 2 * r :], g.B[2 * r :], g.C[:, 2 * r :]
+    if realisation.coupling is None:
+        poles, T = np.linalg.eig(realisation.pairs[r:].astype(np.complex128))
+        see = np.einsum("pbi,bij->pbj", C.reshape(-1, n, 2), T)
+        push = np.einsum("bij,bjm->bim", np.linalg.inv(T), B.reshape(n, 2, -1))
+    else:
+        values, T = np.linalg.eig(A.astype(np.complex128))
+        order = np.lexsort((values.imag, np.round(np.abs(values), 9)))
+        poles = values[order].reshape(n, 2)
+        see = (C @ T[:, order]).reshape(-1, n, 2)
+        push = np.linalg.inv(T)[order].reshape(n, 2, -1) @ B
+    static = -np.real(np.einsum("pbi,bi,bim->bpm", see, 1 / poles, push))
+    return _Blocks(poles, see, push, static)
+
+
+def _of_vectors(realisation: ModalRealisation) -> IntArray:
+    """Return which elastic modes are attachment vectors: stand-ins for modes left out."""
+    r = realisation.n_rigid
+    names = realisation.names[2 * r :: 2]
+    model = realisation.model
+    if not isinstance(model, ReducedModel) or not model.n_vectors:
+        return np.array([i for i, n in enumerate(names) if n.startswith("residual")], np.int64)
+    shapes = realisation.outputs.reshape(model.n_dof, -1, 2)[:, r:]
+    size = np.sum(shapes**2, axis=(0, 2))
+    held = [i for i, name in enumerate(model.coordinates) if name.startswith(STATIC)]
+    if held:
+        part = np.sum(shapes[held] ** 2, axis=(0, 2)) / size
+    else:  # frequencies of vectors are means of those of modes left out
+        part = np.sqrt(np.abs(np.linalg.det(realisation.pairs[r:])))
+    return np.sort(np.argsort(part)[part.size - model.n_vectors :])
+
+
+def _paired(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray, IntArray]:
+    """Return the modes of both that are the same ones, by frequency and by compliance."""
+    one, two = kept.static[genuine], larger.static
+    size = np.maximum(np.abs(two).max(axis=0, initial=0.0), 1e-300)
+    one, two = ((part / size).reshape(part.shape[0], -1) for part in (one, two))
+    lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
+    alike = np.abs(one @ two.T) / np.where(lengths > 0, lengths, 1.0)
+    apart = np.abs(np.log(kept.omega[genuine][:, None] / larger.omega))
+    rows, columns = linear_sum_assignment(np.minimum(apart, 1.0) + _SHAPE * (1.0 - alike))
+    near = apart[rows, columns] < _SAME
+    return genuine[rows[near]], columns[near]
+
+
+def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
+    """Return which forces a static compliance may answer (m,).
+
+    A white disturbance has no value at an instant, and u must not reach y in the sample in which
+    it is computed from y.
+    """
+    late = {port.name: plant.delay + port.delay / plant.dt > 0 for port in ports.u}
+    parts = [(port.name, filter_of(port)) for port in ports.forces]
+    return np.array(
+        [late.get(name, False) or (f is not None and not np.any(f.D)) for name, f in parts]
+    )
+
+
+def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
+    """Return the stationary covariance of the motions of some modes."""
+    poles = blocks.poles[chosen].reshape(-1)
+    if np.any(poles.real >= 0):
+        raise ModelError(
+            "a mode left out has no damping: its motion under white noise has no variance. Give "
+            "solve_modes(damping=...)."
+        )
+    omega = np.asarray(1j * np.repeat(blocks.omega[chosen], 2), dtype=np.complex128)
+    drive = blocks.push[chosen].reshape(poles.size, -1)[:, : len(ports.w)]
+    drive = drive * np.array([_density(port, omega) for port in ports.w]).reshape(-1, poles.size).T
+    see = blocks.see[:, chosen].reshape(-1, poles.size).copy()
+    turn = np.where(poles.imag >= 0, omega, -omega)
+    first = see.shape[0] - len(ports.y)
+    for row, sensor in enumerate(ports.y, first):
+        see[row] *= np.exp(-turn * sensor.delay) * _gain(filter_of(sensor), turn)
+    X = -(drive @ drive.conj().T) / np.add.outer(poles, poles.conj())
+    return np.asarray(np.real(see @ X @ see.conj().T))
+
+
+def _density(port: Any, omega: ComplexArray) -> FloatArray:
+    """Return the root of a disturbance's two-sided density at frequencies."""
+    asd = float(getattr(port, "asd", 0.0))
+    shape = filter_of(port)
+    if shape is None:
+        return np.full(omega.size, asd / np.sqrt(2.0))
+    return np.asarray(asd / np.sqrt(2.0) * np.abs(_gain(shape, omega)))
+
+
+def _gain(part: StateSpace | None, at: ComplexArray) -> ComplexArray:
+    if part is None:
+        return np.ones(at.size, dtype=np.complex128)
+    return np.array([part.evaluated(s)[0, 0] for s in at])
+
+
+def _quiet(fresh: StandardPlant, plant: StandardPlant, stand_ins: IntArray) -> StandardPlant:
+    """Return the new plant with the old one's noise, less that on shapes that stand in for modes.
+
+    What the modes left out do is in the noise of the sensors already.
+    """
+    factor = np.array(plant.noise_factor)
+    elastic = plant.modal_states[2 * plant.n_rigid :].reshape(-1, 2)
+    factor[elastic[stand_ins].reshape(-1)] = 0.0
+    return fresh.replace(noise_factor=factor)

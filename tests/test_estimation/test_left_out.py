@@ -1,0 +1,178 @@
+"""Modes left out of the filter: noise by the closed form, an honest rms, other machines."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import AssumptionError, LabelError, ModelError
+from flexplant.estimation import design_kalman, design_static
+from flexplant.estimation.error import error_variances
+from flexplant.estimation.left_out import left_out
+from flexplant.plant import assemble_plant, larger_plant
+from flexplant.reduction import DesiredDofs, ModalTruncation, reduce, solve_modes
+from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
+from oracles_estimation import error_by_frequency, truncated_covariance
+from plates import make_plate
+from stages import CORNERS, INSET, fitted, ports, sampled
+from stages import reduced as stage_model
+
+LEVELS = (1e-4, 1e-3, 1e-2)
+DAMPINGS = (0.01, 0.001)
+AXES = ("die:z", "die:rx", "die:ry")
+#: the paper's plate, a thin wide one with its mass at a corner, a thick short one of steel
+PLATES = {
+    "paper": {"size": (0.6, 0.6), "thickness": 0.0272, "density": 2702, "youngs_modulus": 70e9},
+    "thin": {"size": (0.6, 0.9), "thickness": 0.018, "density": 2702, "youngs_modulus": 70e9},
+    "steel": {"size": (0.8, 0.6), "thickness": 0.03, "density": 7800, "youngs_modulus": 205e9},
+}
+ELEMENTS, OTHER = (8, 8), (10, 10)
+
+
+def channels(kind, level):
+    """The example's ports on a plate of another size; the die beside the centre."""
+    scale = np.array([*PLATES[kind]["size"], 1.0]) / np.array([0.6, 0.6, 1.0])
+    base = ports(asd=level, die=(0.31, 0.26, 0.0))
+    moved = {
+        side: [p.replace(at=tuple(scale * np.array(p.at))) for p in getattr(base, side)]
+        for side in ("w", "u", "y", "z")
+    }
+    return base.replace(**moved)
+
+
+@cache
+def machine(kind, zeta, elements):
+    """A plate with all its DOFs and the hidden mass at half its width, a quarter of its length."""
+    size = PLATES[kind]["size"]
+    bare = kirchhoff_plate(elements=elements, poisson_ratio=0.35, **PLATES[kind])
+    damped = bare.with_damping(ModalDamping(zeta))
+    row = damped.dofs.row((size[0] / 2, size[1] / 4, 0.0), "z")
+    return FEModel(damped.M + 0.5 * np.outer(row, row), damped.K, damped.D, dofs=damped.dofs)
+
+
+@cache
+def all_modes(kind, zeta, elements=ELEMENTS):
+    return solve_modes(machine(kind, zeta, elements))
+
+
+def on_machine(kind, zeta, level):
+    return sampled(all_modes(kind, zeta, OTHER), channels(kind, level))
+
+
+def filter_of(kind, zeta, level, count=24):
+    modes = all_modes(kind, zeta)
+    return design_kalman(sampled(modes.select(range(count)), channels(kind, level)), larger=modes)
+
+
+def test_covariances_are_those_of_the_closed_form():
+    modes = solve_modes(make_plate(), damping=ModalDamping(0.01))
+    plant = sampled(modes.select(range(24)))
+    found = left_out(plant, larger_plant(plant, modes))
+    assert found.modes.tolist() == list(range(25, modes.n_modes + 1))
+    dofs = modes.dofs
+    see = np.array([dofs.row((0.3, 0.3, 0.0), axis) for axis in ("z", "rx", "ry")])
+    see = np.vstack([see, *(dofs.row(p, "z")[None] for p in CORNERS)])
+    push = np.array([dofs.row(p, "z") for p in INSET])
+    out = slice(24, None)
+    expected = truncated_covariance(
+        modes.omega[out], modes.zeta[out], see @ modes.phi[:, out], push @ modes.phi[:, out], 1e-3
+    )
+    scale = np.sqrt(np.outer(*[np.diag(expected)] * 2))
+    whole = np.block([[found.pois, found.cross], [found.cross.T, found.sensors]])
+    np.testing.assert_allclose(whole / scale, expected / scale, atol=1e-9)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("zeta", DAMPINGS)
+def test_the_prediction_is_the_error_on_the_larger_plant_by_frequency(zeta):
+    """Oracle: the integral of the error's density over all frequencies."""
+    modes = all_modes("paper", zeta).select(range(40))
+    plant = sampled(modes.select(range(24)))
+    estimator = design_kalman(plant, larger=modes)
+    expected = error_by_frequency(*dictionaries(sampled(modes), estimator.system))
+    np.testing.assert_allclose(estimator.variances, expected, rtol=5e-3)
+    assert estimator.certificate.left_out == 16
+    assert estimator.certificate.difference < 1e-9
+
+
+def dictionaries(plant, observer):
+    g = plant.system
+    rows, seen = g.output_index(AXES), g.output_index(["y1", "y2", "y3", "y4"])
+    truth = {"A": g.A, "C1": g.C[rows], "C2": g.C[seen], "factor": plant.noise_factor}
+    truth["R"] = plant.sensor_noise[:4, :4]
+    return truth, {"A": observer.A, "B": observer.B[:, :4], "C": observer.C, "D": observer.D[:, :4]}
+
+
+def test_a_filter_that_knows_nothing_of_them_claims_too_little():
+    """On the updated model with an attachment vector, 0.1 % damping: claims and errors."""
+    modes = all_modes("paper", 0.001)
+    fit = fitted(stage_model(0.001), modes.poles[[5, 6]])
+    for level, claim, truth, cured in ((1e-3, 0.305e-9, 1.56e-9, 0.87e-9),
+                                       (1e-2, 2.38e-9, 21.5e-9, 8.69e-9)):  # fmt: skip
+        plant, whole = sampled(fit.model, ports(level)), sampled(modes, ports(level))
+        blind, knowing = design_kalman(plant), design_kalman(plant, larger=modes)
+        assert blind.rms("die") == pytest.approx(claim, rel=0.02, abs=0)
+        assert blind.rms("die", on=whole) == pytest.approx(truth, rel=0.02, abs=0)
+        assert "truncation is not in these numbers" in repr(blind)
+        assert blind.certificate.left_out is None
+        assert knowing.rms("die") == pytest.approx(cured, rel=0.02, abs=0)
+        assert knowing.rms("die", on=whole) == pytest.approx(knowing.rms("die"), rel=1e-9, abs=0)
+        assert "with 219 modes left out" in repr(knowing)
+
+
+@pytest.mark.slow
+def test_the_best_filter_of_all_modes_bounds_them():
+    modes = all_modes("paper", 0.001)
+    best = design_kalman(sampled(modes, ports(1e-3)))
+    assert best.rms("die") == pytest.approx(0.68e-9, rel=0.02, abs=0)
+
+
+def test_modes_that_the_reduced_model_knows_are_the_default():
+    real = solve_modes(make_plate(elements=(4, 4)), count=40, damping=ModalDamping(0.01))
+    grid = [real.dofs.nearest((x, y, 0), "z") for x in (0, 0.3, 0.6) for y in (0, 0.3, 0.6)]
+    for method in (DesiredDofs(grid), ModalTruncation(9), ModalTruncation(9, static_at=["1:z"])):
+        plant = sampled(reduce(real, method))
+        found = design_kalman(plant)
+        assert found.certificate.left_out == 31
+        assert found.rms("die") == pytest.approx(
+            design_kalman(plant, larger=real).rms("die"), rel=1e-6, abs=0
+        )
+        # the plant itself as the larger one: nothing is left out
+        alone = design_kalman(plant, larger=plant)
+        assert alone.certificate.left_out == 0
+        assert alone.left_out is None
+        assert alone.rms("die") < found.rms("die")
+        assert design_static(plant).rms("die") == pytest.approx(
+            design_static(sampled(real)).rms("die"), rel=1e-9, abs=0
+        )
+        bare = design_static(plant, larger=plant).rms("die")
+        assert bare != pytest.approx(design_static(plant).rms("die"), rel=1e-3, abs=0)
+
+
+def test_refusals():
+    modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.01))
+    plant = sampled(modes.select(range(12)))
+    with pytest.raises(ModelError, match="9 elastic modes"):
+        design_kalman(sampled(modes.select(range(20))), larger=modes.select(range(12)))
+    undamped = modes.replace(zeta=np.where(np.arange(30) < 12, modes.zeta, 0.0))
+    with pytest.raises(ModelError, match="no damping"):
+        design_kalman(plant, larger=undamped)
+    found = design_kalman(plant, larger=modes)
+    with pytest.raises(LabelError, match="channel of y"):
+        found.rms("die", on=sampled(modes, ports(y=ports().y[:3])))
+    with pytest.raises(ModelError, match="sampling time"):
+        found.rms("die", on=assemble_plant(modes, ports()))
+    with pytest.raises(AssumptionError, match="grows without limit"):
+        moved = [sensor.replace(at=(0.3, 0.3, 0.0)) for sensor in ports().y[:1]]
+        error_variances(sampled(modes, ports(y=[*moved, *ports().y[1:]])), found.system)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("zeta", DAMPINGS)
+@pytest.mark.parametrize("kind", PLATES)
+def test_predicted_within_five_percent_on_machines_of_another_mesh(kind, zeta):
+    for level in LEVELS:
+        estimator, truth = filter_of(kind, zeta, level), on_machine(kind, zeta, level)
+        error = estimator.rms("die", on=truth)
+        assert estimator.rms("die") == pytest.approx(error, rel=0.05, abs=0)
+        assert error < 1.02 * design_kalman(estimator.plant).rms("die", on=truth)
