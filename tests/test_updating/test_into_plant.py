@@ -10,6 +10,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import MeasuredModes
 from flexplant.lti import frequency_response
 from flexplant.plant import assemble_plant
+from flexplant.plant.realisation import realised
 from flexplant.reduction import solve_modes
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from flexplant.updating import (
@@ -23,7 +24,8 @@ from flexplant.updating import (
     UpdateResult,
     update,
 )
-from stages import CORNERS, INSET, Z8, ports, reduced
+from oracles_plant import machine
+from stages import CORNERS, INSET, Z8, full, ports, reduced, some_modes
 
 
 def test_a_large_damper_to_the_ground_on_a_free_plate(plate):
@@ -93,9 +95,9 @@ def test_the_full_model_with_the_parameters_of_a_fit(plate):
     noise = np.diag(np.tile(1e-8 * np.abs(exact) ** 2, 2))
     data = [Eigenvalues(MeasuredModes(exact, modes=range(4, 12), covariance=noise))]
     fit = update(rom, unknowns, data)
-    full = fit.applied_to(model)
-    assert isinstance(full, FEModel)
-    assert full.dofs is model.dofs
+    whole = fit.applied_to(model)
+    assert isinstance(whole, FEModel)
+    assert whole.dofs is model.dofs
     mass, damper, modulus, ratio = fit.values
     rise = {"M": np.zeros_like(M), "K": modulus * model.K.toarray()}
     rise["M"][at, at] = mass
@@ -103,14 +105,35 @@ def test_the_full_model_with_the_parameters_of_a_fit(plate):
     rise["D"][at, at] += damper
     for name, change in rise.items():
         before, after = (
-            np.asarray(sp.csc_array(getattr(m, name)).todense()) for m in (model, full)
+            np.asarray(sp.csc_array(getattr(m, name)).todense()) for m in (model, whole)
         )
         error = np.abs(after - before - change).max()
         assert error < 1e-9 * max(np.abs(change).max(), 1e-6 * np.abs(before).max())
     # the structure that was measured: within what the fit leaves
-    found = oracle.poles(full.M.toarray(), full.D, full.K.toarray())
+    found = oracle.poles(whole.M.toarray(), whole.D, whole.K.toarray())
     found = found[found.imag > 500][:8]
     assert np.abs(found / exact - 1).max() < 1e-3
+
+
+@pytest.mark.parametrize("zeta", [0.01, 0.001])
+def test_a_slightly_negative_drag_is_no_obstacle(zeta):
+    """The damper of the paper's update ends at -0.2 zeta N s/m: below the convention for drags."""
+    M, D, K = machine(zeta, mass=0.5)
+    exact = oracle.poles(M, D, K)
+    exact = exact[exact.imag > 500]
+    measured = MeasuredModes(exact[2:4], modes=[6, 7])
+    at = some_modes(zeta).dofs.nearest(Z8, "z")
+    fit = update(reduced(zeta), [AddedMass(at), AddedDamping(at)], [Eigenvalues(measured)])
+    assert fit.values[1] < 0
+    whole = fit.applied_to(full(zeta))
+    found = realised(whole)
+    assert found.n_rigid == 3
+    poles = np.linalg.eigvals(found.pairs[3:]).reshape(-1)
+    poles = poles[poles.imag > 0]
+    np.testing.assert_allclose(poles[np.argsort(poles.imag)][:12], exact[:12], rtol=1e-6)
+    # what feeds energy in beyond that is refused as before
+    with pytest.raises(ModelError, match="FEModel refuses: D is not positive"):
+        fit.replace(values=np.array([0.5, -5.0])).applied_to(full(zeta))
 
 
 def test_a_large_model_stays_sparse_and_a_model_without_damping_is_remarked_on():
@@ -123,12 +146,12 @@ def test_a_large_model_stays_sparse_and_a_model_without_damping_is_remarked_on()
     i = model.dofs.index(at)
     unknowns = (AddedMass(at), AddedStiffness(at))
     fit = _fit_of(unknowns, [0.5, 1e4])
-    full = fit.applied_to(model)
-    assert sp.issparse(full.M)
-    assert sp.issparse(full.K)
-    assert full.M[i, i] - model.M[i, i] == pytest.approx(0.5, rel=1e-12)
-    assert full.K[i, i] - model.K[i, i] == pytest.approx(1e4, rel=1e-6)
-    assert full.rigid_body.shape[1] == 2  # the spring holds the plate at one point
+    whole = fit.applied_to(model)
+    assert sp.issparse(whole.M)
+    assert sp.issparse(whole.K)
+    assert whole.M[i, i] - model.M[i, i] == pytest.approx(0.5, rel=1e-12)
+    assert whole.K[i, i] - model.K[i, i] == pytest.approx(1e4, rel=1e-6)
+    assert whole.rigid_body.shape[1] == 2  # the spring holds the plate at one point
     with pytest.warns(FlexplantWarning, match="has no D of its own"):
         damped = _fit_of([ModeDamping(6)], [0.01]).applied_to(model)
     modes = solve_modes(model, count=8)

@@ -17,7 +17,7 @@ from ..values import ComplexArray, FloatArray, Matrix, Value, real_array
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
 PROPORTIONAL = 1e-9
 #: damping rate of a rigid-body motion, relative to the first elastic frequency, that is let pass
-_RIGID_DRAG = 1e-4
+RIGID_DRAG = 1e-4
 #: eigenvalues closer than this (relative) have no eigenvectors of their own
 _CLUSTER = 1e-7
 #: mixing of shapes by rounding that one Newton step takes out
@@ -138,7 +138,7 @@ class RealForm(NamedTuple):
     def drags(self) -> bool:
         """Whether D damps rigid-body motion more than the convention lets pass."""
         first = self.omega[self.n_rigid] if self.omega.size > self.n_rigid else 0.0
-        return bool(self.drag > _RIGID_DRAG * first)
+        return bool(self.drag > RIGID_DRAG * first)
 
     @property
     def drag(self) -> float:
@@ -192,9 +192,9 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
     if not rigid.shape[1] or not omega.size:
         return
     drag = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max())
-    if drag > _RIGID_DRAG * omega[0]:
+    if drag > RIGID_DRAG * omega[0]:
         raise ModelError(
-            f"D damps rigid-body motion at {drag:.3g} 1/s, more than {_RIGID_DRAG:g} of the first "
+            f"D damps rigid-body motion at {drag:.3g} 1/s, more than {RIGID_DRAG:g} of the first "
             f"elastic frequency ({omega[0]:.4g} rad/s): dampers to ground, and those between "
             f"places that a rigid rotation moves apart, leave no modes at 0. {_PLANT} Else let the "
             "damper act along the line between its ends, or close it as a loop."

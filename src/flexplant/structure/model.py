@@ -311,6 +311,10 @@ class FEModel(Value):
             object.__setattr__(model, name, value)
         return model
 
+    def with_unchecked_damping(self, D: Matrix) -> Self:
+        """Return the model with a D that is known to be symmetric and harmless; not checked."""
+        return self._with(D=frozen(D))
+
     def _with(self, **changes: Any) -> Self:
         return type(self)._proven(**(self._fields() | changes))
 

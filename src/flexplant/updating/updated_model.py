@@ -10,6 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError
+from ..reduction import solve_modes
+from ..reduction.normal_form import RIGID_DRAG
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from ..values import FloatArray, Matrix
@@ -51,7 +53,42 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
             stacklevel=4,
         )
     changes = {name: _sum(getattr(model, name), change) for name, change in total.items()}
-    return _replaced(model, changes, parameters, p)
+    try:
+        return _replaced(model, changes, parameters, p)
+    except ModelError:
+        found = _with_drag(model, changes)
+        if found is None:
+            raise
+        return found
+
+
+def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
+    """Return the model when its D fails for nothing but a slight negative drag of rigid motion.
+
+    A damper to ground that is found from elastic poles comes out at a small number of either sign.
+    What it does to rigid-body motion is left out wherever it is below 1e-4 of the first elastic
+    frequency (`normal_form`), so that its sign there does not matter. With d the drag,
+    ``D + d M`` must be positive semi-definite: no elastic mode gains more than that.
+    """
+    D = changes["D"]
+    if D is None or not model.rigid_body.shape[1]:
+        return None
+    try:
+        held = model.replace(M=changes["M"], K=changes["K"], D=None)
+    except ModelError:
+        return None
+    rigid = held.rigid_body
+    drag = float(np.abs(np.linalg.eigvalsh(rigid.T @ np.asarray(D @ rigid))).max())
+    first = solve_modes(held, count=rigid.shape[1] + 1).omega[-1]
+    if drag > RIGID_DRAG * float(first):
+        return None
+    # the rigid-body part of D + d M comes out at 0 in theory, so twice d: above rounding
+    shifted = _sum(D, 2.0 * drag * held.M)
+    try:
+        model.replace(D=shifted)
+    except ModelError:
+        return None
+    return held.with_unchecked_damping(D)
 
 
 def _replaced(
