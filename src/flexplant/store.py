@@ -1,4 +1,4 @@
-"""Save and load values: one .npz with arrays and a JSON header, no pickle, written atomically."""
+"""The base of all values, and their files: .npz with a JSON header, no pickle, atomic."""
 
 from __future__ import annotations
 
@@ -8,17 +8,84 @@ import uuid
 import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
-from typing import IO, Any
+from types import MappingProxyType
+from typing import IO, Any, ClassVar, Self
 
 import numpy as np
 import scipy.sparse as sp
 
 from .errors import FlexplantError
-from .values import Value, rebuild
 
 _HEADER = "__flexplant__"
+
+
+class Value:
+    """A frozen dataclass whose arrays are read-only copies, also after pickling and loading."""
+
+    registry: ClassVar[dict[str, type[Value]]] = {}
+
+    def __init_subclass__(cls, **kwargs: Any) -> None:
+        super().__init_subclass__(**kwargs)
+        Value.registry[cls.__name__] = cls
+
+    def _set(self, **values: Any) -> None:
+        """Set fields during construction; arrays become read-only copies."""
+        for name, value in values.items():
+            object.__setattr__(self, name, frozen(value))
+
+    def _fields(self) -> dict[str, Any]:
+        return {field.name: getattr(self, field.name) for field in fields(self)}  # type: ignore[arg-type]
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        state = {
+            name: dict(value) if isinstance(value, MappingProxyType) else value
+            for name, value in self._fields().items()
+        }
+        return rebuild, (type(self), state)
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed, checked like a new one."""
+        return replace(self, **changes)  # type: ignore[type-var]
+
+    def save(self, path: str | Path) -> None:
+        """Write the value to one `.npz` file (arrays and JSON, no pickle), atomically.
+
+        Parameters
+        ----------
+        path : str or Path
+            The file; `flexplant.load` reads it back.
+        """
+        save(self, path)
+
+
+def rebuild(cls: type[Value], state: Mapping[str, Any]) -> Value:
+    """Return a value from its fields as they were, without the checks of construction."""
+    value = object.__new__(cls)
+    for name, item in state.items():
+        object.__setattr__(value, name, frozen(item))
+    return value
+
+
+def frozen(value: Any) -> Any:
+    """Return a read-only copy of an array, sparse matrix or mapping; anything else as it is."""
+    if isinstance(value, np.ndarray):
+        if not value.flags.writeable and value.base is None:
+            return value
+        value = np.array(value)
+        value.flags.writeable = False
+    elif sp.issparse(value):
+        sparse: Any = value
+        value = sp.csc_array(sparse, copy=True)
+        value.sum_duplicates()
+        for part in (value.data, value.indices, value.indptr):
+            part.flags.writeable = False
+    elif type(value) is tuple and value and isinstance(value[0], np.ndarray):
+        value = tuple(frozen(item) for item in value)
+    elif isinstance(value, Mapping) and not isinstance(value, MappingProxyType | Value):
+        value = MappingProxyType({key: frozen(item) for key, item in value.items()})
+    return value
 
 
 def save(value: Value, path: str | Path) -> None:

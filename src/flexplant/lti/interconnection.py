@@ -9,6 +9,7 @@ from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray
+from .joining import common_dt, common_fields, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
 
@@ -30,15 +31,13 @@ def append(*systems: System) -> StateSpace:
     """
     parts = [as_statespace(sys) for sys in systems]
     return StateSpace(
-        _stacked([p.A for p in parts]),
-        _stacked([p.B for p in parts]),
-        _stacked([p.C for p in parts]),
-        _stacked([p.D for p in parts]),
-        common_dt(parts),
+        stacked([p.A for p in parts]),
+        stacked([p.B for p in parts]),
+        stacked([p.C for p in parts]),
+        stacked([p.D for p in parts]),
         inputs=[name for p in parts for name in p.inputs],
         outputs=[name for p in parts for name in p.outputs],
-        states=_state_names(parts),
-        blocks=_joined_blocks(parts),
+        **common_fields(parts),
     )
 
 
@@ -55,25 +54,7 @@ def series(first: System, second: System) -> StateSpace:
     ShapeError
         When the numbers of channels differ.
     """
-    g1, g2 = as_statespace(first), as_statespace(second)
-    if len(g1.outputs) != len(g2.inputs):
-        raise ShapeError(
-            f"series needs as many outputs of the first system as inputs of the second, got "
-            f"{len(g1.outputs)} ({_short(g1.outputs)}) and {len(g2.inputs)} ({_short(g2.inputs)})."
-        )
-    # the second system's states first: A stays block upper triangular
-    n1, n2 = g1.n_states, g2.n_states
-    return StateSpace(
-        np.block([[g2.A, g2.B @ g1.C], [np.zeros((n1, n2)), g1.A]]),
-        np.vstack([g2.B @ g1.D, g1.B]),
-        np.hstack([g2.C, g2.D @ g1.C]),
-        g2.D @ g1.D,
-        common_dt([g1, g2]),
-        inputs=g1.inputs,
-        outputs=g2.outputs,
-        states=_state_names([g2, g1]),
-        blocks=_joined_blocks([g2, g1]),
-    )
+    return as_statespace(second) * as_statespace(first)
 
 
 def parallel(first: System, second: System) -> StateSpace:
@@ -89,23 +70,7 @@ def parallel(first: System, second: System) -> StateSpace:
     LabelError
         When the channel names differ.
     """
-    g1, g2 = as_statespace(first), as_statespace(second)
-    if g1.inputs != g2.inputs or g1.outputs != g2.outputs:
-        raise LabelError(
-            f"parallel needs the same channels, got {_short(g1.inputs)} -> {_short(g1.outputs)} "
-            f"and {_short(g2.inputs)} -> {_short(g2.outputs)}. Rename or select them first."
-        )
-    return StateSpace(
-        _stacked([g1.A, g2.A]),
-        np.vstack([g1.B, g2.B]),
-        np.hstack([g1.C, g2.C]),
-        g1.D + g2.D,
-        common_dt([g1, g2]),
-        inputs=g1.inputs,
-        outputs=g1.outputs,
-        states=_state_names([g1, g2]),
-        blocks=_joined_blocks([g1, g2]),
-    )
+    return as_statespace(first) + as_statespace(second)
 
 
 def lft(P: System, K: System) -> StateSpace:
@@ -157,7 +122,7 @@ def lft(P: System, K: System) -> StateSpace:
         common_dt([plant, controller]),
         inputs=[plant.inputs[i] for i in w],
         outputs=[plant.outputs[i] for i in z],
-        states=_state_names([plant, controller]),
+        states=state_names([plant, controller]),
         name=plant.name,
     )
 
@@ -268,7 +233,7 @@ def connect(
     through = np.array([[float(a == b) for b in outer] for a in outputs]).reshape(
         len(outputs), len(outer)
     )
-    A, B, C, D = (_stacked([getattr(p, part) for p in parts]) for part in "ABCD")
+    A, B, C, D = (stacked([getattr(p, part) for p in parts]) for part in "ABCD")
     # block outputs v = C x + D e with e = route v + enter w  =>  v = X (C x + D enter w)
     X = _well_posed(D @ route)
     v_x, v_w = X @ C, X @ D @ enter
@@ -280,25 +245,8 @@ def connect(
         common_dt(parts),
         inputs=outer,
         outputs=list(outputs),
-        states=_state_names(parts),
+        states=state_names(parts),
     )
-
-
-def common_dt(systems: Iterable[StateSpace]) -> float:
-    """Return the sampling time that systems share; static gains fit any.
-
-    Raises
-    ------
-    ModelError
-        When they differ.
-    """
-    found = {sys.dt for sys in systems if sys.n_states} or {sys.dt for sys in systems}
-    if len(found) > 1 and not np.allclose(list(found), next(iter(found)), rtol=1e-12, atol=0):
-        raise ModelError(
-            f"systems with sampling times {sorted(found)} s cannot be connected (0 is continuous). "
-            "Discretise them to one rate first."
-        )
-    return found.pop() if found else 0.0
 
 
 def _well_posed(loop: FloatArray) -> FloatArray:
@@ -318,34 +266,3 @@ def _well_posed(loop: FloatArray) -> FloatArray:
                 "with a sample of delay or a controller without direct feedthrough."
             )
     return np.asarray(np.linalg.inv(np.eye(loop.shape[0]) - loop))
-
-
-def _stacked(matrices: Sequence[FloatArray]) -> FloatArray:
-    """Block diagonal that keeps the widths of empty matrices (scipy's drops them)."""
-    out = np.zeros((sum(m.shape[0] for m in matrices), sum(m.shape[1] for m in matrices)))
-    row = col = 0
-    for matrix in matrices:
-        out[row : row + matrix.shape[0], col : col + matrix.shape[1]] = matrix
-        row, col = row + matrix.shape[0], col + matrix.shape[1]
-    return out
-
-
-def _joined_blocks(parts: Sequence[StateSpace]) -> list[int]:
-    sizes: list[int] = []
-    for part in parts:
-        sizes.extend(
-            part.blocks if part.blocks is not None else ((part.n_states,) if part.n_states else ())
-        )
-    return sizes
-
-
-def _state_names(parts: Sequence[StateSpace]) -> list[str]:
-    """Join state names; where they clash, add the system's place in the list."""
-    plain = [name for part in parts for name in part.states]
-    if len(set(plain)) == len(plain):
-        return plain
-    return [f"{i}:{name}" for i, part in enumerate(parts, 1) for name in part.states]
-
-
-def _short(names: Sequence[str]) -> str:
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")

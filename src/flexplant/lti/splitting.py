@@ -9,13 +9,13 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..values import FloatArray, Value
+from .joining import block_eigenvalues
 from .scaling import state_scale
 from .stability import doubted_poles
 from .statespace import (
     StateSpace,
     System,
     as_statespace,
-    block_eigenvalues,
     is_block_diagonal,
 )
 

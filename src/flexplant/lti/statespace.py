@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import ModelError, ShapeError, unknown_label
+from ..errors import ModelError, unknown_label
 from ..values import (
     ComplexArray,
     FloatArray,
@@ -21,6 +21,7 @@ from ..values import (
     real_array,
     signal_names,
 )
+from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series
 
 if TYPE_CHECKING:
     import control
@@ -109,7 +110,7 @@ class StateSpace(Value):
             inputs=signal_names(self.inputs, m, "u", "inputs"),
             outputs=signal_names(self.outputs, p, "y", "outputs"),
             states=signal_names(self.states, n, "x", "states"),
-            blocks=None if self.blocks is None else _checked_blocks(A, self.blocks),
+            blocks=None if self.blocks is None else checked_blocks(A, self.blocks),
         )
 
     def __repr__(self) -> str:
@@ -186,9 +187,7 @@ class StateSpace(Value):
 
     def __add__(self, other: System) -> StateSpace:
         """Return `parallel(self, other)`: same channels, outputs added."""
-        from .interconnection import parallel
-
-        return parallel(self, other)
+        return StateSpace(**in_parallel(self, as_statespace(other)))
 
     def __sub__(self, other: System) -> StateSpace:
         """Return self + (-other): same channels, outputs subtracted."""
@@ -199,9 +198,7 @@ class StateSpace(Value):
         if isinstance(other, int | float | np.number):
             factor = float(real_array(other, "the factor", ()))
             return self.replace(C=factor * self.C, D=factor * self.D)
-        from .interconnection import series
-
-        return series(other, self)
+        return StateSpace(**in_series(as_statespace(other), self))
 
     def __rmul__(self, other: float) -> StateSpace:
         """Return the system with its outputs times a number."""
@@ -329,39 +326,12 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
     return StateSpace.from_control(sys)
 
 
-def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
-    """Return the eigenvalues of a block upper triangular A; 1 x 1 and 2 x 2 in closed form."""
-    starts = np.concatenate([[0], np.cumsum(blocks)[:-1]]).astype(int)
-    poles = np.zeros(A.shape[0], dtype=np.complex128)
-    sizes = np.asarray(blocks)
-    ones, twos = starts[sizes == 1], starts[sizes == 2]
-    poles[ones] = A[ones, ones]
-    a, b, c, d = (A[twos + i, twos + j] for i in (0, 1) for j in (0, 1))
-    # (a-d)^2/4 + b c rather than mean^2 - det: no cancellation for rigid-body pairs (b or c = 0)
-    root = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
-    poles[twos], poles[twos + 1] = 0.5 * (a + d) + root, 0.5 * (a + d) - root
-    for start, size in zip(starts[sizes > 2], sizes[sizes > 2], strict=True):
-        part = slice(start, start + size)
-        poles[part] = la.eigvals(A[part, part])
-    return poles
-
-
 def is_block_diagonal(g: StateSpace) -> bool:
     """Return whether A is known to be made of 1 x 1 and 2 x 2 diagonal blocks alone."""
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
         return False
     owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
     return not np.any(g.A[owner[:, None] != owner[None, :]])
-
-
-def _checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
-    sizes = tuple(int(size) for size in blocks)
-    if any(size < 1 for size in sizes) or sum(sizes) != A.shape[0]:
-        raise ShapeError(f"blocks must be positive and add up to {A.shape[0]} states, got {sizes}.")
-    owner = np.repeat(np.arange(len(sizes)), sizes)
-    if np.any(A[owner[:, None] > owner[None, :]]):
-        raise ShapeError("A is not block upper triangular with the given blocks; pass blocks=None.")
-    return sizes
 
 
 def _rows(known: Sequence[str], names: Iterable[str], side: str, owner: str | None) -> IntArray:

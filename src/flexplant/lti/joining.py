@@ -1,0 +1,159 @@
+"""Matrices and names of systems side by side, in series and in parallel; blocks of A.
+
+Systems are anything with A, B, C, D, dt, inputs, outputs, states and blocks: the operators of
+`StateSpace` are built upon these functions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import LabelError, ModelError, ShapeError
+from ..values import ComplexArray, FloatArray
+
+
+def in_series(g1: Any, g2: Any) -> dict[str, Any]:
+    """Return the fields of ``g2 g1``: the outputs of g1 drive the inputs of g2, in order.
+
+    Raises
+    ------
+    ShapeError
+        When the numbers of channels differ.
+    ModelError
+        When sampling times differ.
+    """
+    if len(g1.outputs) != len(g2.inputs):
+        raise ShapeError(
+            f"series needs as many outputs of the first system as inputs of the second, got "
+            f"{len(g1.outputs)} ({short_list(g1.outputs)}) and {len(g2.inputs)} "
+            f"({short_list(g2.inputs)})."
+        )
+    # the second system's states first: A stays block upper triangular
+    n1, n2 = g1.A.shape[0], g2.A.shape[0]
+    return {
+        "A": np.block([[g2.A, g2.B @ g1.C], [np.zeros((n1, n2)), g1.A]]),
+        "B": np.vstack([g2.B @ g1.D, g1.B]),
+        "C": np.hstack([g2.C, g2.D @ g1.C]),
+        "D": g2.D @ g1.D,
+        "inputs": g1.inputs,
+        "outputs": g2.outputs,
+        **common_fields([g2, g1]),
+    }
+
+
+def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:
+    """Return the fields of ``g1 + g2``: same channels, outputs added.
+
+    Raises
+    ------
+    LabelError
+        When the channel names differ.
+    ModelError
+        When sampling times differ.
+    """
+    if g1.inputs != g2.inputs or g1.outputs != g2.outputs:
+        first, second = (f"{short_list(g.inputs)} -> {short_list(g.outputs)}" for g in (g1, g2))
+        raise LabelError(
+            f"parallel needs the same channels, got {first} and {second}. Rename or select them "
+            "first."
+        )
+    return {
+        "A": stacked([g1.A, g2.A]),
+        "B": np.vstack([g1.B, g2.B]),
+        "C": np.hstack([g1.C, g2.C]),
+        "D": g1.D + g2.D,
+        "inputs": g1.inputs,
+        "outputs": g1.outputs,
+        **common_fields([g1, g2]),
+    }
+
+
+def common_fields(parts: Sequence[Any]) -> dict[str, Any]:
+    """Return sampling time, state names and blocks of systems whose states follow each other."""
+    return {
+        "dt": common_dt(parts),
+        "states": state_names(parts),
+        "blocks": joined_blocks(parts),
+    }
+
+
+def stacked(matrices: Sequence[FloatArray]) -> FloatArray:
+    """Block diagonal that keeps the widths of empty matrices (scipy's drops them)."""
+    out = np.zeros((sum(m.shape[0] for m in matrices), sum(m.shape[1] for m in matrices)))
+    row = col = 0
+    for matrix in matrices:
+        out[row : row + matrix.shape[0], col : col + matrix.shape[1]] = matrix
+        row, col = row + matrix.shape[0], col + matrix.shape[1]
+    return out
+
+
+def common_dt(systems: Iterable[Any]) -> float:
+    """Return the sampling time that systems share; static gains fit any.
+
+    Raises
+    ------
+    ModelError
+        When they differ.
+    """
+    found = {sys.dt for sys in systems if sys.n_states} or {sys.dt for sys in systems}
+    if len(found) > 1 and not np.allclose(list(found), next(iter(found)), rtol=1e-12, atol=0):
+        raise ModelError(
+            f"systems with sampling times {sorted(found)} s cannot be connected (0 is continuous). "
+            "Discretise them to one rate first."
+        )
+    return found.pop() if found else 0.0
+
+
+def state_names(parts: Sequence[Any]) -> list[str]:
+    """Join state names; where they clash, add the system's place in the list."""
+    plain = [name for part in parts for name in part.states]
+    if len(set(plain)) == len(plain):
+        return plain
+    return [f"{i}:{name}" for i, part in enumerate(parts, 1) for name in part.states]
+
+
+def joined_blocks(parts: Sequence[Any]) -> list[int]:
+    """Return the block sizes of systems one after the other; one block where none are known."""
+    sizes: list[int] = []
+    for part in parts:
+        sizes.extend(
+            part.blocks if part.blocks is not None else ((part.n_states,) if part.n_states else ())
+        )
+    return sizes
+
+
+def short_list(names: Sequence[str]) -> str:
+    """Return the first few names, for a message."""
+    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+
+
+def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
+    """Return the eigenvalues of a block upper triangular A; 1 x 1 and 2 x 2 in closed form."""
+    starts = np.concatenate([[0], np.cumsum(blocks)[:-1]]).astype(int)
+    poles = np.zeros(A.shape[0], dtype=np.complex128)
+    sizes = np.asarray(blocks)
+    ones, twos = starts[sizes == 1], starts[sizes == 2]
+    poles[ones] = A[ones, ones]
+    a, b, c, d = (A[twos + i, twos + j] for i in (0, 1) for j in (0, 1))
+    # (a-d)^2/4 + b c rather than mean^2 - det: no cancellation for rigid-body pairs (b or c = 0)
+    root = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
+    poles[twos], poles[twos + 1] = 0.5 * (a + d) + root, 0.5 * (a + d) - root
+    for start, size in zip(starts[sizes > 2], sizes[sizes > 2], strict=True):
+        part = slice(start, start + size)
+        poles[part] = la.eigvals(A[part, part])
+    return poles
+
+
+def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
+    """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
+    sizes = tuple(int(size) for size in blocks)
+    if any(size < 1 for size in sizes) or sum(sizes) != A.shape[0]:
+        raise ShapeError(f"blocks must be positive and add up to {A.shape[0]} states, got {sizes}.")
+    owner = np.repeat(np.arange(len(sizes)), sizes)
+    if np.any(A[owner[:, None] > owner[None, :]]):
+        raise ShapeError("A is not block upper triangular with the given blocks; pass blocks=None.")
+    return sizes
