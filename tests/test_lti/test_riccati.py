@@ -60,7 +60,8 @@ def test_equals_scipy_on_benign_problems(seed):
     A, C, Q, R, rng = benign(seed)
     S = 0.1 * rng.standard_normal((6, 2))
     sol = solve_dare(A, C, Q=Q, R=R, S=S)
-    P = la.solve_discrete_are(A.T, C.T, Q, R, s=S)
+    # SciPy 1.16.0 to 1.16.2 take s without e for a problem with a singular e
+    P = la.solve_discrete_are(A.T, C.T, Q, R, e=np.eye(len(A)), s=S)
     np.testing.assert_allclose(sol.P, P, rtol=0, atol=1e-8 * np.abs(P).max())
     np.testing.assert_allclose(
         sol.gain, (A @ P @ C.T + S) @ np.linalg.inv(C @ P @ C.T + R), atol=1e-7
@@ -76,7 +77,7 @@ def test_continuous_equals_scipy_on_benign_problems(seed):
     A, C, Q, R, rng = benign(seed)
     S = 0.1 * rng.standard_normal((6, 2))
     sol = solve_care(A, C, Q=Q, R=R, S=S)
-    P = la.solve_continuous_are(A.T, C.T, Q, R, s=S)
+    P = la.solve_continuous_are(A.T, C.T, Q, R, e=np.eye(len(A)), s=S)
     np.testing.assert_allclose(sol.P, P, rtol=0, atol=1e-8 * np.abs(P).max())
     np.testing.assert_allclose(sol.gain, (P @ C.T + S) @ np.linalg.inv(R), atol=1e-7)
     assert sol.spectral_abscissa < 0
