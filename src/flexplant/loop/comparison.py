@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
+from ..lti.grid import refined, resonance_grid
 from ..values import FloatArray, Value, short
 from .closed import ClosedLoop
-from .grid import refined, resonance_grid
 
 #: share of the bandwidth at which low-frequency suppression is compared
 LOW = 0.1

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import AssumptionError
+from ..lti.grid import refined
 from ..values import ComplexArray, FloatArray
-from .grid import refined
 from .sensitivity import Loop, Pieces, checked_grid, inverted, open_gain, taken_apart
 
 

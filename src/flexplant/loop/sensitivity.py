@@ -10,12 +10,12 @@ import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf, frequency_response
+from ..lti.grid import resonance_grid
 from ..lti.interconnection import lft
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, real_array, short
 from .closed import ClosedLoop
-from .grid import resonance_grid
 
 #: a closed loop, or a plant (StandardPlant, StateSpace or measured Frf) and a controller
 Loop: TypeAlias = "ClosedLoop | tuple[Any, Any]"
