@@ -13,7 +13,7 @@ import flexplant
 ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
-    ("errors", "values", "labels", "store", "parallel"),
+    ("errors", "values", "store", "parallel", "places", "dof_columns", "dof_index", "labels"),
     "lti",
     "structure",
     "reduction",

@@ -2,52 +2,21 @@
 
 from __future__ import annotations
 
-import csv
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
+from .dof_columns import columns_of, direction_names, listed, node_numbers
+from .dof_index import DofIndex, unknown_dof
 from .errors import LabelError, ShapeError, unknown_label
+from .places import DIRECTIONS as DIRECTIONS
+from .places import Interpolation as Interpolation
+from .places import Place as Place
 from .values import FloatArray, IntArray, Value, real_array
-
-DIRECTIONS = ("x", "y", "z", "rx", "ry", "rz")
-#: a place: a DOF label, a point (x, y, z) [m], or a mapping {label or point: weight}
-Place: TypeAlias = "str | Sequence[float] | FloatArray | Mapping[Any, float]"
-
-_COLUMNS = ("node", "direction", "x", "y", "z")
-#: of so many labels the closest are found by comparing each with the one asked for
-_COMPARABLE = 2000
-#: node numbers stay exact as floats, and their keys in 64 bits
-_LARGEST_NODE = 2**53
-
-
-class Interpolation(Value):
-    """How displacements between nodes follow from those at the nodes (element shape functions)."""
-
-    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (n,) with which all n DOFs give the motion `direction` at `xyz`.
-
-        Raises
-        ------
-        LabelError
-            When the point is off the structure or the direction is unknown to it.
-        """
-        raise NotImplementedError
-
-    def rows(self, points: FloatArray, direction: str) -> FloatArray:
-        """Return the weights (p, n) at many points (p, 3); the same as `row` one by one.
-
-        Raises
-        ------
-        LabelError
-            When one of them is off the structure.
-        """
-        return np.array([self.row(point, direction) for point in points])
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -86,8 +55,8 @@ class DofSet(Value):
     interpolation: Interpolation | None = None
 
     def __post_init__(self) -> None:
-        nodes = _node_numbers(self.nodes)
-        directions = _directions(self.directions)
+        nodes = node_numbers(self.nodes)
+        directions = direction_names(self.directions)
         if nodes.ndim != 1 or len(directions) != nodes.size:
             raise ShapeError(
                 f"a DofSet needs one node and one direction per DOF, got nodes of shape "
@@ -108,11 +77,11 @@ class DofSet(Value):
                 f"interpolation must be an Interpolation, got {type(self.interpolation).__name__}: "
                 "flexplant.interpolated(dofs) makes one, or leave it out."
             )
-        keys, order = self._sorted_keys
-        doubled = np.flatnonzero(np.diff(keys) == 0)
+        index = self._index
+        doubled = np.flatnonzero(np.diff(index.keys) == 0)
         if doubled.size:
             # the stable sort keeps equal keys in the order of the rows
-            first, second = order[doubled[0]], order[doubled[0] + 1]
+            first, second = index.order[doubled[0]], index.order[doubled[0] + 1]
             raise LabelError(
                 f"DOF '{nodes[first]}:{directions[first]}' appears twice, in rows {first} and "
                 f"{second} (from 0): rows of the matrices would be ambiguous. Drop one of them, or "
@@ -135,31 +104,8 @@ class DofSet(Value):
         return tuple(f"{n}:{d}" for n, d in zip(self.nodes.tolist(), self.directions, strict=True))
 
     @cached_property
-    def _sorted_keys(self) -> tuple[IntArray, IntArray]:
-        """One whole number for each DOF, ascending, and the rows in this order."""
-        keys = self.nodes * len(DIRECTIONS) + self.kinds
-        order = np.arange(keys.size)
-        if np.any(keys[1:] < keys[:-1]):
-            order = np.argsort(keys, kind="stable")
-        return keys[order], order
-
-    def _found(self, label: object) -> int:
-        """Return the row of a label, or -1: by its number, so that a million need no dictionary."""
-        if not isinstance(label, str):
-            return -1
-        node, _, direction = label.partition(":")
-        if direction not in DIRECTIONS:
-            return -1
-        try:
-            number = int(node)
-        except ValueError:
-            return -1
-        if str(number) != node or abs(number) > _LARGEST_NODE:  # "07:z" and "1_0:z" are no labels
-            return -1
-        keys, order = self._sorted_keys
-        key = number * len(DIRECTIONS) + DIRECTIONS.index(direction)
-        place = int(np.searchsorted(keys, key))
-        return int(order[place]) if place < keys.size and keys[place] == key else -1
+    def _index(self) -> DofIndex:
+        return DofIndex(self.nodes, self.kinds)
 
     def __len__(self) -> int:
         return int(self.nodes.size)
@@ -168,7 +114,7 @@ class DofSet(Value):
         return iter(self.labels)
 
     def __contains__(self, label: object) -> bool:
-        return self._found(label) >= 0
+        return self._index.found(label) >= 0
 
     def __repr__(self) -> str:
         counts = np.bincount(self.kinds, minlength=len(DIRECTIONS)).tolist()
@@ -188,28 +134,16 @@ class DofSet(Value):
         LabelError
             When there is no such DOF, with close matches.
         """
-        row = self._found(label)
+        row = self._index.found(label)
         if row < 0:
-            raise self._unknown(label)
+            raise unknown_dof(label, self.nodes, self.directions)
         return row
-
-    def _unknown(self, label: object) -> LabelError:
-        """Return the error for a label that is not there, without comparing it with a million."""
-        if len(self) <= _COMPARABLE:
-            return unknown_label("DOF", label, self.labels)
-        number = re.match(r"-?\d{1,15}", str(label))
-        near = int(number.group()) if number else int(self.nodes[0])
-        rows = np.argsort(np.abs(self.nodes - near), kind="stable")[:6]
-        listed = ", ".join(f"'{self.nodes[i]}:{self.directions[i]}'" for i in rows)
-        return LabelError(
-            f"no DOF {label!r} ({len(self)} known). At the nodes next to it there are: {listed}."
-        )
 
     def indices(self, labels: Iterable[str]) -> IntArray:
         """Return the rows of several DOFs, in the order given."""
         if isinstance(labels, str):
             labels = [labels]
-        labels = _listed(labels, "labels", "a list of DOF labels such as '41:z'")
+        labels = listed(labels, "labels", "a list of DOF labels such as '41:z'")
         return np.array([self.index(label) for label in labels], dtype=np.int64)
 
     def select(self, labels: Iterable[str]) -> DofSet:
@@ -247,7 +181,7 @@ class DofSet(Value):
         """
         keep = np.ones(len(self), dtype=bool)
         if nodes is not None:
-            wanted = _node_numbers(nodes if isinstance(nodes, Iterable) else [nodes])
+            wanted = node_numbers(nodes if isinstance(nodes, Iterable) else [nodes])
             missing = np.setdiff1d(wanted, self.nodes)
             if missing.size:
                 raise LabelError(
@@ -257,7 +191,7 @@ class DofSet(Value):
             keep &= np.isin(self.nodes, wanted)
         if directions is not None:
             given = [directions] if isinstance(directions, str) else directions
-            named = set(_listed(given, "directions", "one or more of x, y, z, rx, ry, rz"))
+            named = set(listed(given, "directions", "one or more of x, y, z, rx, ry, rz"))
             absent = sorted(str(d) for d in named - set(self.directions))
             if absent:
                 raise LabelError(
@@ -384,72 +318,4 @@ class DofSet(Value):
         LabelError
             When a column is missing.
         """
-        if isinstance(table, str | Path):
-            with open(table, newline="", encoding="utf-8") as file:
-                rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
-        else:
-            rows = _listed(table, "a DOF table", "a CSV file or a list of mappings")
-        if not rows or not all(isinstance(row, Mapping) for row in rows):
-            raise LabelError(
-                "a DOF table needs rows with columns node, direction, x, y, z, got "
-                f"{f'a {type(rows[0]).__name__} as its first row' if rows else 'no row'}. "
-                "The first line of a CSV file names its columns."
-            )
-        missing = [c for c in _COLUMNS if any(row.get(c) is None for row in rows)]
-        if missing:
-            raise LabelError(
-                f"a DOF table needs rows with columns {', '.join(_COLUMNS)}; missing: {missing}. "
-                "Name the columns so; where a line is cut short, complete it."
-            )
-        return cls(
-            _node_numbers([_number(row, "node", i) for i, row in enumerate(rows)]),
-            tuple(str(row["direction"]).strip() for row in rows),
-            np.array([[_number(row, c, i) for c in "xyz"] for i, row in enumerate(rows)]),
-        )
-
-
-def _number(row: Mapping[str, Any], column: str, line: int) -> float:
-    try:
-        return float(row[column])
-    except (TypeError, ValueError):
-        raise LabelError(
-            f"column {column!r} of the DOF table holds {row[column]!r:.60} in row {line} (from 0), "
-            "which is no number. Write it with a decimal point and no unit; coordinates are [m]."
-        ) from None
-
-
-def _listed(items: Any, name: str, form: str) -> list[Any]:
-    if not isinstance(items, Iterable):
-        raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
-    return list(items)
-
-
-def _node_numbers(nodes: Any) -> IntArray:
-    try:
-        numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
-        with np.errstate(invalid="ignore"):  # NaN is told below
-            whole = numbers.astype(np.int64)
-    except (TypeError, ValueError, OverflowError):
-        numbers, whole = np.zeros(1), np.ones(1, dtype=np.int64)
-    if numbers.dtype == bool or np.any(whole != numbers) or np.any(abs(whole) > _LARGEST_NODE):
-        raise LabelError(
-            f"node numbers must be whole numbers, got {nodes!r:.80}. Number the nodes, from 1 say, "
-            "and keep the foreign program's names elsewhere."
-        )
-    return np.asarray(whole, dtype=np.int64)
-
-
-def _directions(directions: Any) -> tuple[str, ...]:
-    if isinstance(directions, str):
-        raise LabelError(
-            f"directions must be one for each DOF, got the single {directions!r}: write "
-            f"[{directions!r}] * n."
-        )
-    # the million of a large model are strings already, and few different ones
-    given = tuple(_listed(directions, "directions", "a list with one for each DOF"))
-    try:
-        if all(type(d) is str for d in set(given)):
-            return given
-    except TypeError:
-        pass
-    return tuple(str(direction) for direction in given)
+        return cls(*columns_of(table))

@@ -1,0 +1,101 @@
+"""The columns of a set of DOFs: nodes, directions, coordinates; from a table too."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .errors import LabelError
+from .values import FloatArray, IntArray
+
+_COLUMNS = ("node", "direction", "x", "y", "z")
+#: node numbers stay exact as floats, and their keys in 64 bits
+LARGEST_NODE = 2**53
+
+
+def columns_of(
+    table: str | Path | Iterable[Mapping[str, Any]],
+) -> tuple[IntArray, tuple[str, ...], FloatArray]:
+    """Return nodes (n,), directions and coordinates (n, 3) [m] of a table or a CSV file.
+
+    Raises
+    ------
+    LabelError
+        When a column is missing, or a cell is no number.
+    """
+    if isinstance(table, str | Path):
+        with open(table, newline="", encoding="utf-8") as file:
+            rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
+    else:
+        rows = listed(table, "a DOF table", "a CSV file or a list of mappings")
+    if not rows or not all(isinstance(row, Mapping) for row in rows):
+        raise LabelError(
+            "a DOF table needs rows with columns node, direction, x, y, z, got "
+            f"{f'a {type(rows[0]).__name__} as its first row' if rows else 'no row'}. "
+            "The first line of a CSV file names its columns."
+        )
+    missing = [c for c in _COLUMNS if any(row.get(c) is None for row in rows)]
+    if missing:
+        raise LabelError(
+            f"a DOF table needs rows with columns {', '.join(_COLUMNS)}; missing: {missing}. "
+            "Name the columns so; where a line is cut short, complete it."
+        )
+    return (
+        node_numbers([_number(row, "node", i) for i, row in enumerate(rows)]),
+        tuple(str(row["direction"]).strip() for row in rows),
+        np.array([[_number(row, c, i) for c in "xyz"] for i, row in enumerate(rows)]),
+    )
+
+
+def _number(row: Mapping[str, Any], column: str, line: int) -> float:
+    try:
+        return float(row[column])
+    except (TypeError, ValueError):
+        raise LabelError(
+            f"column {column!r} of the DOF table holds {row[column]!r:.60} in row {line} (from 0), "
+            "which is no number. Write it with a decimal point and no unit; coordinates are [m]."
+        ) from None
+
+
+def listed(items: Any, name: str, form: str) -> list[Any]:
+    """Return items as a list; LabelError when there is nothing to list."""
+    if not isinstance(items, Iterable):
+        raise LabelError(f"{name} must be {form}, got {items!r:.60}. Pass it in [...].")
+    return list(items)
+
+
+def node_numbers(nodes: Any) -> IntArray:
+    """Return node numbers as int64; LabelError when one is not whole or too large."""
+    try:
+        numbers = np.asarray(nodes if isinstance(nodes, np.ndarray) else list(nodes))
+        with np.errstate(invalid="ignore"):  # NaN is refused below
+            whole = numbers.astype(np.int64)
+    except (TypeError, ValueError, OverflowError):
+        numbers, whole = np.zeros(1), np.ones(1, dtype=np.int64)
+    if numbers.dtype == bool or np.any(whole != numbers) or np.any(abs(whole) > LARGEST_NODE):
+        raise LabelError(
+            f"node numbers must be whole numbers, got {nodes!r:.80}. Number the nodes, from 1 say, "
+            "and keep the foreign program's names elsewhere."
+        )
+    return np.asarray(whole, dtype=np.int64)
+
+
+def direction_names(directions: Any) -> tuple[str, ...]:
+    """Return directions as a tuple of str; LabelError for a single one."""
+    if isinstance(directions, str):
+        raise LabelError(
+            f"directions must be one for each DOF, got the single {directions!r}: write "
+            f"[{directions!r}] * n."
+        )
+    # the million of a large model are strings already, and few different ones
+    given = tuple(listed(directions, "directions", "a list with one for each DOF"))
+    try:
+        if all(type(d) is str for d in set(given)):
+            return given
+    except TypeError:
+        pass
+    return tuple(str(direction) for direction in given)
