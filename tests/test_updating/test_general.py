@@ -191,7 +191,8 @@ def test_bounds_hold_and_are_flagged(chain):
     free = update(chain, MASS, residuals, prior=False)
     assert free.at_bound == ()
     tight = [AddedMass("2:z", bounds=(0.0, 0.2)), AddedMass("3:z", bounds=(0.0, None))]
-    fit = update(chain, tight, residuals)
+    with pytest.warns(FlexplantWarning, match="leaves more than noise"):
+        fit = update(chain, tight, residuals)
     assert fit.at_bound == ("mass at 2:z",)
     assert fit.values[0] == pytest.approx(0.2, abs=1e-6)
     assert "at a bound: mass at 2:z" in repr(fit)
@@ -289,7 +290,8 @@ def test_a_robust_loss_shrugs_off_an_outlier(chain):
     wrong = np.array(poles.poles)
     wrong[2] *= 1.05
     residuals = [Eigenvalues(MeasuredModes(wrong, modes=[1, 2, 3, 4], covariance=poles.covariance))]
-    plain = update(chain, MASS, residuals, method=TrustRegion())
+    with pytest.warns(FlexplantWarning, match="fits worst mode 3 "):
+        plain = update(chain, MASS, residuals, method=TrustRegion())
     truth = np.array([0.3, 0.2])
     for loss, share in [("cauchy", 0.2), ("soft_l1", 0.3), ("huber", 0.3)]:
         robust = update(chain, MASS, residuals, method=TrustRegion(loss=loss))

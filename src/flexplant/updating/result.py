@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Value, generator, positive, short
-from .parameters import Parameter
+from .parameters import AddedMass, Parameter
 from .updated_model import applied
 
 
@@ -99,7 +99,8 @@ class UpdateResult(Value):
         ``G = (J^T W J)^-1 J^T W`` with J = [Re S; Im S], whatever the weights. Without:
         ``s^2 (J^T W J)^-1`` with the residual variance ``s^2 = e / (2 m - q)``, so weights are
         relative; it then holds the model's own error too. None when neither is known (no
-        covariance and 2 m = q).
+        covariance and 2 m = q). Widened by ``chi2 / dof`` where that is more than noise
+        (`p_value` below 1e-4).
     correlation : (q, q) array
         The correlation of the estimate for errors of covariance W^-1 (of `covariance` where
         there is one).
@@ -118,6 +119,12 @@ class UpdateResult(Value):
         What every start led to, when there were several.
     unknowns : sequence of Parameter
         What was estimated, as it was given to `update`.
+    chi2 : float or None
+        What is left of the residuals (and priors), squared and summed in units of their noise:
+        about `dof` when the model explains the measurement. None where the noise is not known.
+    dof : int
+        Degrees of freedom: residuals and priors less the parameters that were fitted and did not
+        end at a bound.
     """
 
     parameters: tuple[str, ...]
@@ -132,6 +139,8 @@ class UpdateResult(Value):
     at_bound: tuple[str, ...] = ()
     starts: Starts | None = None
     unknowns: tuple[Parameter, ...] = ()
+    chi2: float | None = None
+    dof: int = 0
 
     def __post_init__(self) -> None:
         self._set(values=self.values, covariance=self.covariance, correlation=self.correlation)
@@ -146,6 +155,31 @@ class UpdateResult(Value):
         """Standard deviations (q,) of the estimate, None when the covariance is not known."""
         return None if self.covariance is None else np.sqrt(np.diag(self.covariance))
 
+    @property
+    def p_value(self) -> float | None:
+        """The probability that noise alone leaves a larger `chi2`, None when that is not known.
+
+        Below 1e-4 the model is wrong somewhere else, or the noise was understated.
+        """
+        if self.chi2 is None or self.dof < 1:
+            return None
+        from scipy.special import chdtrc
+
+        return float(chdtrc(self.dof, self.chi2))
+
+    @property
+    def negative_masses(self) -> tuple[str, ...]:
+        """Names of added masses that are negative by more than two standard deviations.
+
+        Where nothing was taken away the model is too heavy there, or the change is elsewhere.
+        """
+        margin = np.zeros(self.values.size) if self.std is None else 2 * self.std
+        return tuple(
+            q.name
+            for q, value, doubt in zip(self.unknowns, self.values, margin, strict=False)
+            if isinstance(q, AddedMass) and value < -doubt
+        )
+
     def __repr__(self) -> str:
         std = self.std
         doubts = [""] * len(self.parameters) if std is None else [f" +- {s:.2g}" for s in std]
@@ -159,8 +193,12 @@ class UpdateResult(Value):
             lines.append(f"  ... and {len(self.parameters) - 5} more")
         if self.at_bound:
             lines.append(f"  at a bound: {', '.join(self.at_bound[:5])}")
+        if self.negative_masses:
+            lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
         said = "converged" if self.converged else "NOT CONVERGED"
         head = f"<UpdateResult: {said} in {len(self.history)} steps ({self.reason})"
+        if self.p_value is not None:
+            head += f", chi2 {self.chi2:.4g} for {self.dof} dof"
         return "\n".join([head, *lines]) + ">"
 
     def interval(self, level: float = 0.95) -> FloatArray:

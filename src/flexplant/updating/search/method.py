@@ -28,6 +28,15 @@ class Trail:
         self.error.append(float(np.sum(objective.values(point, prior=False) ** 2)))
         self.fraction.append(fraction)
 
+    def joined(self, later: Trail) -> Trail:
+        """Return this way and the one that goes on where it ends."""
+        return Trail(
+            self.p + later.p[1:],
+            self.poles + later.poles[1:],
+            self.error + later.error[1:],
+            self.fraction + later.fraction[1:],
+        )
+
 
 @dataclass
 class Found:

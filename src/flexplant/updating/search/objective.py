@@ -70,6 +70,8 @@ class Objective:
         self.poles_measured = PoleRows(poles) if poles else None
         self.reference: Point | None = None
         self._point: Point | None = None
+        #: points through which modes are followed to where a search begins, numbered at the first
+        self.path: list[FloatArray] = []
 
     @property
     def default_start(self) -> FloatArray:
@@ -78,10 +80,15 @@ class Objective:
         return np.asarray(middle, dtype=np.float64)
 
     def begin(self, p: FloatArray) -> Point:
-        """Return the model at a start, its modes numbered there."""
-        point = first_point(self.family, p)
-        mode_columns(self.numbers, point.eigen) if self.numbers else None
-        return self._set(self._assigned(self._turned(point)), refer=True)
+        """Return the model at a start, its modes numbered there or where `path` begins."""
+        path = [*self.path, p]
+        point = first_point(self.family, path[0])
+        if self.numbers:
+            mode_columns(self.numbers, point.eigen)
+        point = self._set(self._assigned(self._turned(point)), refer=True)
+        for step in path[1:]:
+            point = self.at(step, refer=True)
+        return point
 
     def at(self, p: FloatArray, *, refer: bool = False) -> Point:
         """Return the model at `p`, its modes paired with those of the reference point.

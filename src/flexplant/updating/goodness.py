@@ -1,0 +1,69 @@
+"""Whether an update explains the measurement up to its noise."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.linalg as la
+
+from ..values import FloatArray
+from .point import Point
+from .search import Objective
+
+#: a chi-square that noise exceeds more rarely than this is no noise
+CHANCE = 1e-4
+#: residuals that are named
+NAMED = 3
+
+
+def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[float | None, int]:
+    """Return chi-square (None where the noise is not known) and its degrees of freedom.
+
+    ``min_d |N^-1/2 (r + J d)|^2`` to first order, which for residuals weighted by their own
+    covariance is ``|r|^2``: distributed as chi-square with (residuals and priors) - (parameters
+    that are free) degrees of freedom, whatever the weights of the fit.
+
+    Parameters
+    ----------
+    objective : Objective
+        At the answer.
+    point : Point
+        The answer.
+    free : (q,) bool array
+        Parameters that were fitted and did not end at a bound.
+    """
+    r = objective.values(point)
+    dof = r.size - int(np.sum(free))
+    if not objective.noise_known:
+        return None, max(dof, 0)
+    J = objective.slopes(point)[:, free]
+    weighted = any(bound.noise is not None for bound, _ in objective.rows(point))
+    for bound, rows in objective.rows(point):
+        if bound.noise is not None:
+            factor = la.cholesky(bound.noise, lower=True)
+            r[rows] = la.solve_triangular(factor, r[rows], lower=True)
+            J[rows] = la.solve_triangular(factor, J[rows], lower=True)
+    total = float(r @ r)
+    if weighted and J.shape[1]:
+        length = np.linalg.norm(J, axis=0)
+        Q = la.qr(J / np.where(length > 0, length, 1.0), mode="economic")[0]
+        total -= float(np.sum((Q.T @ r) ** 2))
+    return max(total, 0.0), max(dof, 0)
+
+
+def is_bad(probability: float | None) -> bool:
+    """Return whether noise alone hardly explains what is left."""
+    return probability is not None and probability < CHANCE
+
+
+def worst(objective: Objective, point: Point) -> str:
+    """Return the residuals that fit worst, in words."""
+    r = objective.values(point)
+    found: dict[str, float] = {}
+    for bound, rows in objective.rows(point):
+        part, noise = r[rows], bound.noise
+        size = np.abs(part) if noise is None else np.abs(part) / np.sqrt(np.diag(noise))
+        for row in np.argsort(-size, kind="stable")[: 2 * NAMED].tolist():
+            name = bound.row_name(row)
+            found[name] = max(found.get(name, 0.0), float(size[row]))
+    order = sorted(found, key=lambda name: -found[name])[:NAMED]
+    return ", ".join(f"{name} ({found[name]:.3g} standard deviations)" for name in order)
