@@ -31,6 +31,11 @@ def plant():
 
 
 @cache
+def kalman():
+    return fx.design_kalman(plant())
+
+
+@cache
 def loop():
     servo = fx.design_servo(plant(), bandwidth=50.0)
     return close_loop(plant(), fx.design_static(plant()), servo)
@@ -66,6 +71,11 @@ def machine_frf(**options):
 #: (name, call of one argument, kinds that are allowed there)
 DOORS = [
     ("design_kalman", lambda x: fx.design_kalman(x), ()),
+    ("design_kalman larger", lambda x: fx.design_kalman(plant(), larger=x), ("none",)),
+    ("design_static larger", lambda x: fx.design_static(plant(), larger=x), ("none",)),
+    ("kalman rms on", lambda x: kalman().rms("die", on=x), ("none",)),
+    ("larger_plant", lambda x: fx.larger_plant(x), ()),
+    ("larger_plant larger", lambda x: fx.larger_plant(plant(), x), ("none",)),
     ("design_static", lambda x: fx.design_static(x), ()),
     ("design_servo", lambda x: fx.design_servo(x, bandwidth=50.0), ()),
     ("design_servo bandwidth", lambda x: servo(bandwidth=x), ("fraction",)),

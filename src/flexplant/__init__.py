@@ -14,6 +14,7 @@ from . import testbeds as testbeds
 from .errors import FlexplantError as FlexplantError
 from .errors import FlexplantWarning as FlexplantWarning
 from .estimation import KalmanEstimator as KalmanEstimator
+from .estimation import LeftOut as LeftOut
 from .estimation import StaticEstimator as StaticEstimator
 from .estimation import design_kalman as design_kalman
 from .estimation import design_static as design_static

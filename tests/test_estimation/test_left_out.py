@@ -5,11 +5,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError, LabelError, ModelError
+from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_kalman, design_static
 from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out
-from flexplant.plant import assemble_plant, larger_plant
+from flexplant.plant import Sensor, assemble_plant, larger_plant, lowpass
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce, solve_modes
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from oracles_estimation import error_by_frequency, truncated_covariance
@@ -103,6 +103,7 @@ def dictionaries(plant, observer):
     return truth, {"A": observer.A, "B": observer.B[:, :4], "C": observer.C, "D": observer.D[:, :4]}
 
 
+@pytest.mark.slow
 def test_a_filter_that_knows_nothing_of_them_claims_too_little():
     """On the updated model with an attachment vector, 0.1 % damping: claims and errors."""
     modes = all_modes("paper", 0.001)
@@ -147,6 +148,103 @@ def test_modes_that_the_reduced_model_knows_are_the_default():
         )
         bare = design_static(plant, larger=plant).rms("die")
         assert bare != pytest.approx(design_static(plant).rms("die"), rel=1e-3, abs=0)
+
+
+def steady_error(truth, observer):
+    """|z - hat| after a smooth step of u to an acceleration of 0.5 m/s^2, without noise."""
+    g, seen = truth.system, [*AXES[:1], "y1", "y2", "y3", "y4"]
+    rows, columns = g.output_index(seen), g.input_index(truth.u)
+    C, D = g.C[rows], g.D[np.ix_(rows, columns)]
+    read = [observer.inputs.index(name) for name in (*seen[1:], *truth.u)]
+    By, Dy, B = observer.B[:, read], observer.D[0, read], g.B[:, columns]
+    x, own = np.zeros(g.n_states), np.zeros(observer.n_states)
+    force = 0.5 * 0.6 * 0.6 * 0.0272 * 2702 / 4
+    for k in range(1500):
+        u = np.full(4, force * np.sin(np.pi * min(k / 1000, 0.5)) ** 2)
+        motion = C @ x + D @ u
+        y = np.concatenate([motion[1:], u])
+        error = motion[0] - observer.C[0] @ own - Dy @ y
+        own, x = observer.A @ own + By @ y, g.A @ x + B @ u
+    return abs(error)
+
+
+@pytest.mark.parametrize("delay", [0.5, 1.0])
+@pytest.mark.parametrize("attached", [False, True])
+def test_a_steady_force_bends_the_modes_left_out_and_the_filter_knows(attached, delay):
+    """Nanometres, with an attachment vector in the model (whose compliance counts once) or not."""
+    modes = solve_modes(make_plate(), damping=ModalDamping(0.01)).select(range(120))
+    small = stage_model(0.01) if attached else modes.select(range(24))
+    die = ports(die=(0.05, 0.05, 0.0))
+    plant, whole = (sampled(model, die, delay=delay) for model in (small, modes))
+    blind, knowing = design_kalman(plant), design_kalman(plant, larger=modes)
+    assert steady_error(whole, blind.system) > 1.5e-9
+    assert steady_error(whole, knowing.system) < 0.01e-9
+
+
+def shaped(kind):
+    """Channels with filters, delays and a velocity sensor."""
+    base = ports(die=(0.1, 0.2, 0.0))
+    if kind == "disturbance":
+        return base.replace(w=[d.replace(shape=lowpass(800.0)) for d in base.w])
+    if kind == "filter":
+        return base.replace(y=[s.replace(dynamics=lowpass(2500.0)) for s in base.y])
+    if kind == "delay":
+        return base.replace(y=[s.replace(delay=3.3e-5) for s in base.y])
+    if kind == "actuator":
+        return base.replace(u=[a.replace(dynamics=lowpass(900.0)) for a in base.u])
+    speed = Sensor("v", at=(0.3, 0.3, 0.0), quantity="velocity", asd=1e-7)
+    return base.replace(y=[*base.y, speed])
+
+
+@pytest.mark.parametrize("kind", ["disturbance", "filter", "delay", "actuator", "velocity"])
+def test_filters_delays_and_shapes_act_on_the_modes_left_out(kind):
+    """From many times the best possible error to less than twice: dynamics are accounted for."""
+    modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.003))
+    plant, whole = (sampled(m, shaped(kind)) for m in (modes.select(range(14)), modes))
+    blind, knowing = design_kalman(plant), design_kalman(plant, larger=modes)
+    best = design_kalman(whole, larger=whole).rms("die")
+    assert knowing.rms("die") < 2.0 * best
+    assert blind.rms("die", on=whole) > 1.5 * knowing.rms("die")
+    assert knowing.rms("die", on=whole) == pytest.approx(knowing.rms("die"), rel=1e-9, abs=0)
+
+
+def test_damping_that_couples_the_modes_of_the_larger_plant():
+    """The dense form: internal damper, one pair of modes overdamped."""
+    bare = make_plate(elements=(4, 4)).with_damping(ModalDamping(0.01))
+    rows = [bare.dofs.row((x, 0.15, 0.0), "z") for x in (0.15, 0.3, 0.45)]
+    bend = rows[1] - 0.5 * (rows[0] + rows[2])
+    model = FEModel(bare.M, bare.K, bare.D + 3e4 * np.outer(bend, bend), dofs=bare.dofs)
+    with pytest.warns(FlexplantWarning, match="dense"):
+        whole = sampled(model)
+    plant = sampled(reduce(model, ModalTruncation(16)))
+    blind, knowing = design_kalman(plant), design_kalman(plant, larger=whole)
+    assert knowing.rms("die") < blind.rms("die", on=whole)
+    assert knowing.certificate.difference < 1e-6
+
+
+def test_mode_by_mode_and_all_at_once_give_the_same_variances(monkeypatch):
+    modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.003))
+    whole = sampled(modes)
+    observer = design_kalman(sampled(modes.select(range(12))), larger=modes).system
+    fast = error_variances(whole, observer).values
+    monkeypatch.setattr("flexplant.estimation.error._eigen", lambda *_: None)
+    np.testing.assert_allclose(fast, error_variances(whole, observer).values, rtol=1e-8)
+
+
+def test_a_gain_with_one_sign_flipped_has_another_error():
+    modes = solve_modes(make_plate(elements=(4, 4)), count=30, damping=ModalDamping(0.01))
+    whole = sampled(modes)
+    found = design_kalman(sampled(modes.select(range(12))), larger=modes)
+    D = np.array(found.system.D)
+    D[0, 0] *= -1
+    with pytest.raises(AssumptionError, match="grows without limit"):
+        error_variances(whole, found.system.replace(D=D))
+    # without a rigid-body part it is an error, and a larger one
+    D = np.array(found.system.D)
+    D[0, :4] *= 1 + 0.2 * np.array([1, -1, -1, 1])
+    C = found.system.C[0] - (D - found.system.D)[0, :4] @ found.plant.C2[:4]
+    worse = found.system.replace(D=D, C=np.vstack([C, found.system.C[1:]]))
+    assert error_variances(whole, worse).values[0] > 1.001 * found.variances[0]
 
 
 def test_refusals():

@@ -71,7 +71,7 @@ def error_variances(
     joint = _joint(plant, observer, suspension)
     if joint.modal is None:
         X = solve_stein(joint.A, joint.noise @ joint.noise.T)
-        primal = np.einsum("ij,jk,ik->i", joint.E, X, joint.E)
+        primal = np.sum((joint.E @ X) * joint.E, axis=1)
         dual = np.array([_dual_dense(joint, row) for row in joint.E])
     else:
         primal, dual = _primal(joint), np.array([_dual(joint, row) for row in joint.E])
@@ -219,9 +219,8 @@ def _primal(joint: _Joint) -> FloatArray:
     assert joint.modal is not None  # noqa: S101
     see = _right(joint.E[:, :n], joint.modal[1])
     keep = joint.E[:, n:]
-    total = np.einsum("pi,ij,pj->p", see, inner, see.conj()).real
-    total += 2 * np.einsum("pi,ij,pj->p", keep, cross, see.conj()).real
-    return np.asarray(total + np.einsum("pi,ij,pj->p", keep, own, keep))
+    total = np.sum((see @ inner + 2 * keep @ cross) * see.conj(), axis=1).real
+    return np.asarray(total + np.sum((keep @ own) * keep, axis=1))
 
 
 def _sizes(joint: _Joint) -> FloatArray:
@@ -252,11 +251,11 @@ def _dual(joint: _Joint, row: FloatArray) -> float:
     back = coupling.conj().T @ cross * values
     load = coupling.conj().T @ own @ coupling + back + back.conj().T + np.outer(see.conj(), see)
     inner = load / (1 - np.outer(values.conj(), values))
-    total = np.einsum("im,ij,jm->", driven.conj(), inner, driven).real
-    total += 2 * np.einsum("im,ij,jm->", noise, cross, driven).real
-    return float(total + np.einsum("im,ij,jm->", noise, own, noise))
+    total = np.sum(driven.conj() * (inner @ driven)).real
+    total += 2 * np.sum(noise * (cross @ driven)).real
+    return float(total + np.sum(noise * (own @ noise)))
 
 
 def _dual_dense(joint: _Joint, row: FloatArray) -> float:
     Y = solve_stein(joint.A.T, np.outer(row, row))
-    return float(np.einsum("im,ij,jm->", joint.noise, Y, joint.noise))
+    return float(np.sum(joint.noise * (Y @ joint.noise)))

@@ -141,7 +141,8 @@ def _blocks(realisation: ModalRealisation, ports: Ports) -> _Blocks:
         push = np.einsum("bij,bjm->bim", np.linalg.inv(T), B.reshape(n, 2, -1))
     else:
         values, T = np.linalg.eig(A.astype(np.complex128))
-        order = np.lexsort((values.imag, np.round(np.abs(values), 9)))
+        # conjugate pairs side by side, then the poles of overdamped modes
+        order = np.lexsort((values.imag, np.round(np.abs(values), 9), values.imag == 0))
         poles = values[order].reshape(n, 2)
         see = (C @ T[:, order]).reshape(-1, n, 2)
         push = np.linalg.inv(T)[order].reshape(n, 2, -1) @ B

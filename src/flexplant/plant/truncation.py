@@ -8,7 +8,9 @@ import numpy as np
 
 from ..errors import LabelError, ModelError
 from ..lti.statespace import StateSpace
-from ..reduction import ReducedModel
+from ..reduction import Modes, ReducedModel
+from ..structure import FEModel
+from ..values import short
 from .assembly import assemble_plant
 from .realisation import Structure
 from .standard import StandardPlant, standard_plant
@@ -50,6 +52,12 @@ def larger_plant(
         larger = model.completed()
     if isinstance(larger, StandardPlant | StateSpace) or hasattr(larger, "input_labels"):
         return _matched(plain, standard_plant(larger))
+    given: object = larger
+    if not isinstance(given, FEModel | Modes | ReducedModel):
+        raise ModelError(
+            f"larger must be a structure or a plant with more modes, got {short(given)}. Pass "
+            "Modes, an FEModel, a ReducedModel or a StandardPlant, or leave it out."
+        )
     if plain.ports is None:
         raise ModelError(
             "this plant has no ports to assemble the larger model with: it was not assembled from "
