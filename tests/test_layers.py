@@ -236,12 +236,13 @@ def test_package_files_only_re_export(path):
 
 PROBE = """
 import json, sys, warnings
-import numpy, scipy.linalg, scipy.sparse.linalg, scipy.special
+import numpy, scipy.linalg, scipy.sparse.linalg
 before = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
 import flexplant
 after = list(warnings.filters), numpy.get_printoptions(), numpy.geterr()
 heavy = "matplotlib control cvxpy clarabel filterpy tqdm slycot pandas".split()
-heavy += [f"scipy.{name}" for name in "stats ndimage integrate interpolate signal".split()]
+parts = "stats ndimage integrate interpolate signal optimize spatial special".split()
+heavy += [f"scipy.{name}" for name in parts]
 print(json.dumps({
     "heavy": [name for name in heavy if name in sys.modules],
     "same": [a == b for a, b in zip(before, after)],

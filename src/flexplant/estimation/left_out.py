@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
@@ -175,6 +174,8 @@ def _paired(kept: _Blocks, larger: _Blocks, genuine: IntArray) -> tuple[IntArray
     lengths = np.outer(np.linalg.norm(one, axis=1), np.linalg.norm(two, axis=1))
     alike = np.abs(one @ two.T) / np.where(lengths > 0, lengths, 1.0)
     apart = np.abs(np.log(kept.omega[genuine][:, None] / larger.omega))
+    from scipy.optimize import linear_sum_assignment
+
     rows, columns = linear_sum_assignment(np.minimum(apart, 1.0) + _SHAPE * (1.0 - alike))
     near = apart[rows, columns] < _SAME
     return genuine[rows[near]], columns[near]

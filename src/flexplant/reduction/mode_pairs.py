@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
-from scipy.optimize import linear_sum_assignment
 
 from ..values import FloatArray, IntArray
 
@@ -104,6 +103,8 @@ def _assigned(
         r = n_rigid
         ratio = np.maximum(other_freq[None, r:], 1e-300) / np.maximum(freq[r:, None], 1e-300)
         far = np.minimum(np.abs(np.log(ratio)), 1.0)
+        from scipy.optimize import linear_sum_assignment
+
         rows, columns = linear_sum_assignment(_FREQUENCY * far - score[r:, r:])
         partner[rows + r] = columns + r
     return partner
@@ -136,6 +137,8 @@ def _holders(alike: FloatArray) -> IntArray:
     """Return which members of a cluster hold its partners: all by rising frequency, else by MAC."""
     if alike.shape[0] == alike.shape[1]:
         return np.arange(alike.shape[0])
+    from scipy.optimize import linear_sum_assignment
+
     rows, columns = linear_sum_assignment(-alike)
     return np.asarray(rows[np.argsort(columns)], dtype=np.int64)
 
