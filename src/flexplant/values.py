@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -20,6 +20,21 @@ ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = "FloatArray | sp.csc_array"
+
+
+def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
+    """Return the units of some channels; those of other names are left out.
+
+    Raises
+    ------
+    ModelError
+        When they are no mapping {channel: unit}.
+    """
+    if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
+        raise ModelError(
+            f"units must be a mapping {{channel: unit}}, got {short(units)}: {{'y1': 'm'}}."
+        )
+    return {name: units[name] for name in names if name in units}
 
 
 def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:

@@ -71,21 +71,61 @@ def test_sensitivity():
 
 def run_of(errors):
     time = np.arange(50) * 1e-3
-    return Response(time, np.array(errors), ("die:z", "die:error"))
+    units = {"die:z": "m", "die:error": "m"}
+    return Response(time, np.array(errors), ("die:z", "die:error"), units)
 
 
-@pytest.mark.parametrize(("size", "prefix"), [(3e-9, "n"), (4e-6, "u"), (5e-3, "m"), (20.0, "")])
+@pytest.mark.parametrize(
+    ("size", "prefix"), [(3e-9, "n"), (4e-6, "\N{MICRO SIGN}"), (5e-3, "m"), (20.0, ""), (2e4, "k")]
+)
 def test_response_chooses_a_prefix(size, prefix):
     wave = size * np.sin(np.arange(50))
     ax = fx.plot.response(run_of([wave, 0.5 * wave]))
-    factor = {"n": 1e-9, "u": 1e-6, "m": 1e-3, "": 1.0}[prefix]
+    factor = {"n": 1e-9, "\N{MICRO SIGN}": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3}[prefix]
     np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), 0.5 * wave / factor)
-    assert ax.get_ylabel() == f"[{prefix}m]"
+    assert ax.get_ylabel() == f"displacement [{prefix}m]"
     assert texts(ax) == {"die:error"}
-    both = fx.plot.response(run_of([wave, wave]), ["die:z", "die:error"], unit="rad")
+    unknown = run_of([wave, wave]).replace(units={})
+    both = fx.plot.response(unknown, ["die:z", "die:error"], unit="rad")
     assert len(both.get_lines()) == 2
-    assert both.get_ylabel().endswith("rad]")
+    assert both.get_ylabel() == f"rotation [{prefix}rad]"
+    bare = fx.plot.response(unknown)
+    assert bare.get_ylabel() == "signal"
+    np.testing.assert_allclose(bare.get_lines()[0].get_ydata(), wave)
     assert ink(ax) > 0.005
+
+
+def test_response_gives_each_unit_a_panel():
+    wave = np.sin(np.arange(50))
+    data = [2e-6 * wave, 3e-7 * wave, 4.0 * wave, 5e-9 * wave]
+    names = ["die:z", "die:rx", "u1", "die:error"]
+    units = dict(zip(names, ["m", "rad", "N", "m"], strict=True))
+    run = Response(np.arange(50) * 1e-3, np.array(data), names, units)
+    first = fx.plot.response(run, ["die:z", "die:rx", "u1", "die:error"])
+    panels = first.figure.axes
+    assert panels[0] is first
+    micro = "\N{MICRO SIGN}"
+    labels = [f"displacement [{micro}m]", "rotation [nrad]", "force [N]"]
+    assert [panel.get_ylabel() for panel in panels] == labels
+    assert [len(panel.get_lines()) for panel in panels] == [2, 1, 1]
+    np.testing.assert_allclose(panels[1].get_lines()[0].get_ydata(), 300 * wave)
+    assert [panel.get_xlabel() for panel in panels] == ["", "", "time [s]"]
+    colors = [line.get_color() for panel in panels for line in panel.get_lines()]
+    assert len(set(colors)) == 4
+    assert 0.005 < ink(first) < 0.6
+    with pytest.raises(ModelError, match=r"one unit, got die:z \[m\]; die:rx \[rad\]"):
+        fx.plot.response(run, ["die:z", "die:rx"], ax=first)
+
+
+def test_frf_names_the_unit_of_its_channel():
+    g = some_frf()
+    rotation = g.replace(units={"y1": "rad", "u1": "N m"})
+    assert "1 rad/(N m)]" in fx.plot.frf({"a": rotation, "b": g}, "y1", "u1").get_ylabel()
+    accelerance = g.replace(quantity="acceleration")
+    assert "1 m/s^2/N]" in fx.plot.frf({"a": accelerance}, "y1", "u1").get_ylabel()
+    assert fx.plot.frf({"a": g}, "y1", "u1").get_ylabel().endswith("0 dB = 1]")
+    with pytest.raises(ModelError, match="different units"):
+        fx.plot.frf({"a": rotation, "b": accelerance}, "y1", "u1")
 
 
 def test_response_of_several_runs_and_of_unknown_channels():

@@ -18,6 +18,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
+from ..plant.channel_units import plant_units
 from ..plant.door import TYPE_THIS
 from ..plant.realisation import Structure
 from ..values import FloatArray, Value, real_array
@@ -384,6 +385,7 @@ def _observer(plant: StandardPlant, gain: FloatArray, poi_gain: FloatArray) -> S
         outputs=estimates(channels),
         states=inner.states,
         name="kalman",
+        units=plant_units(plant),
     )
 
 

@@ -40,8 +40,8 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     frf : Frf
         What to write.
     units : mapping {channel: unit}, optional
-        Such as {"y1": "rad", "u1": "N m"}. Where not given: N for inputs, and m, m/s or m/s^2 for
-        outputs by the quantity of the Frf; none when that is not known.
+        Such as {"y1": "rad", "u1": "N m"}. Where not given, those of the Frf; else N for inputs,
+        and m, m/s or m/s^2 for outputs by the quantity of the Frf; none when that is not known.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     """
     if not isinstance(frf, Frf):
         raise ModelError(f"need an Frf, got {type(frf).__name__}: frequency_response(sys) is one.")
-    given = dict(units or {})
+    given = dict(frf.units) | dict(units or {})
     for name in given:
         if name not in (*frf.inputs, *frf.outputs):
             raise LabelError(f"units name {name!r}, which is no channel of {frf!r}.")

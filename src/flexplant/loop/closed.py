@@ -17,6 +17,7 @@ from ..lti.interconnection import connect, lft
 from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
+from ..plant.channel_units import plant_units
 from ..values import Value, name_list, real_array
 from .left_out import LeftOut, growing_modes
 
@@ -77,6 +78,12 @@ class ClosedLoop(Value):
         return tuple(name for name in self.controller.outputs if name not in self.driven)
 
     @cached_property
+    def units(self) -> dict[str, str]:
+        """The SI units of the channels that have a known one, estimates included."""
+        blocks = {name: unit for block in self.blocks for name, unit in block.units.items()}
+        return blocks | plant_units(self.plant)
+
+    @cached_property
     def fed_back(self) -> tuple[str, ...]:
         """The channels of y that u can move; references are not among them."""
         moves = _moved(self.plant, self.driven)
@@ -108,6 +115,7 @@ class ClosedLoop(Value):
             outputs=[*shown, *ear],
             states=g.states,
             name=g.name,
+            units=self.units,
         )
         return lft(opened, self.controller.replace(inputs=ear))
 
@@ -151,7 +159,13 @@ class ClosedLoop(Value):
         except np.linalg.LinAlgError as error:
             raise ModelError("the loop has a pole at one of the frequencies: move it.") from error
         data = Pt[:, z][:, :, w] + Pt[:, z][:, :, u] @ command
-        return Frf(grid, np.moveaxis(data, 0, 2), tuple(self.plant.w), tuple(self.plant.z))
+        return Frf(
+            grid,
+            np.moveaxis(data, 0, 2),
+            tuple(self.plant.w),
+            tuple(self.plant.z),
+            units=self.units,
+        )
 
     @property
     def spectral_radius(self) -> float:

@@ -3,18 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError, unknown_label
-from ..values import ComplexArray, FloatArray, Value, positive, real_array, rebuild, signal_names
+from ..values import (
+    ComplexArray,
+    FloatArray,
+    Value,
+    known_units,
+    positive,
+    real_array,
+    rebuild,
+    signal_names,
+)
 from .grid import default_freq as default_freq
 from .line_correlation import checked_overlap, checked_window, line_correlation
 from .responses import responses
 from .statespace import System, as_statespace
+
+#: of a motion, by the order of its time derivative
+_PER_TIME = ("", "/s", "/s^2")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,6 +58,8 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         correlated (`line_correlation`). None where nothing leaks: computed, or whole periods.
     overlap : float
         Share of a segment that the next one sees again, 0 to below 0.95.
+    units : mapping {channel: unit}, optional
+        SI units of the inputs and outputs that have a known one.
 
     Raises
     ------
@@ -73,6 +87,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     resolution: float | None = None
     window: str | tuple[Any, ...] | None = None
     overlap: float = 0.0
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         freq = checked_freq(self.freq)
@@ -106,11 +121,14 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
                 f"window={window!r} says little without the length of its segments: give "
                 "resolution= too, the inverse of that length [Hz]."
             )
+        inputs = signal_names(self.inputs, data.shape[1], "u", "inputs")
+        outputs = signal_names(self.outputs, data.shape[0], "y", "outputs")
         self._set(
             freq=freq,
             data=data,
-            inputs=signal_names(self.inputs, data.shape[1], "u", "inputs"),
-            outputs=signal_names(self.outputs, data.shape[0], "y", "outputs"),
+            inputs=inputs,
+            outputs=outputs,
+            units=known_units(self.units, (*inputs, *outputs)),
             coherence=coherence,
             variance=variance,
             correlation=correlation,
@@ -201,7 +219,35 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             raise ModelError("zero frequency cannot be integrated: leave it out of the Frf.")
         factor = (2j * np.pi * self.freq) ** order
         variance = None if self.variance is None else self.variance * np.abs(factor) ** 2
-        return self.replace(data=self.data * factor, quantity=quantity, variance=variance)
+        units = {name: unit for name, unit in self.units.items() if name not in self.outputs}
+        for name in set(self.outputs) & set(self.units):
+            units[name] = self.units[name].partition("/")[0] + _PER_TIME[orders[quantity]]
+        return self.replace(
+            data=self.data * factor, quantity=quantity, variance=variance, units=units
+        )
+
+    def unit(self, output: str, input: str) -> str | None:
+        """Return the unit of a response, such as "rad/N"; None when it is not known.
+
+        By the units of the channels, else, of a measurement, by its quantity for one N.
+
+        Parameters
+        ----------
+        output, input : str
+            The channel.
+
+        Raises
+        ------
+        LabelError
+            When a name is unknown.
+        """
+        self._place((output, input))
+        per = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
+        above = self.units.get(output, per.get(self.quantity or ""))
+        below = self.units.get(input, "N" if self.quantity in per else None)
+        if above is None or below is None:
+            return None
+        return f"{above}/({below})" if set(below) & set(" /") else f"{above}/{below}"
 
     def to_control(self, dt: float = 0.0) -> Any:
         """Return a `control.FrequencyResponseData` with the same names.
@@ -301,7 +347,7 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
         array.flags.writeable = False
     fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}
     known = ("quantity", "coherence", "variance", "correlation", "resolution", "window")
-    frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0})
+    frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0, "units": g.units})
     assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
     return frf
 

@@ -9,7 +9,7 @@ from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray
-from .joining import common_dt, common_fields, stacked, state_names
+from .joining import common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
 
@@ -124,6 +124,7 @@ def lft(P: System, K: System) -> StateSpace:
         outputs=[plant.outputs[i] for i in z],
         states=state_names([plant, controller]),
         name=plant.name,
+        units=plant.units,
     )
 
 
@@ -166,6 +167,7 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
         outputs=[*g.outputs, *inner_out],
         states=g.states,
         name=g.name,
+        units=g.units,
     )
     loop = h.replace(C=sign * h.C, D=sign * h.D, inputs=inner_out, outputs=inner_in)
     if not loop.n_states:
@@ -246,6 +248,7 @@ def connect(
         inputs=outer,
         outputs=list(outputs),
         states=state_names(parts),
+        units=joined_units(parts),
     )
 
 

@@ -42,6 +42,8 @@ def in_series(g1: Any, g2: Any) -> dict[str, Any]:
         "inputs": g1.inputs,
         "outputs": g2.outputs,
         **common_fields([g2, g1]),
+        "units": {name: g2.units[name] for name in g2.outputs if name in g2.units}
+        | {name: g1.units[name] for name in g1.inputs if name in g1.units},
     }
 
 
@@ -73,12 +75,21 @@ def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:
 
 
 def common_fields(parts: Sequence[Any]) -> dict[str, Any]:
-    """Return sampling time, state names and blocks of systems whose states follow each other."""
+    """Return what joined systems have in common, their states following each other.
+
+    Sampling time, names and blocks of states, and the units of all channels.
+    """
     return {
         "dt": common_dt(parts),
         "states": state_names(parts),
         "blocks": joined_blocks(parts),
+        "units": joined_units(parts),
     }
+
+
+def joined_units(parts: Sequence[Any]) -> dict[str, str]:
+    """Return the units of the channels of all parts; the first that knows one names it."""
+    return {name: unit for part in reversed(parts) for name, unit in part.units.items()}
 
 
 def stacked(matrices: Sequence[FloatArray]) -> FloatArray:

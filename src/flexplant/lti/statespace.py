@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -17,6 +17,7 @@ from ..values import (
     FloatArray,
     IntArray,
     Value,
+    known_units,
     positive,
     real_array,
     signal_names,
@@ -50,6 +51,8 @@ class StateSpace(Value):
     blocks : sequence of int, optional
         Sizes of the diagonal blocks of A where A is block upper triangular: a structure's modes
         give 2 x 2 blocks. Poles, frequency responses and discretisation then cost O(n).
+    units : mapping {channel: unit}, optional
+        SI units of the inputs and outputs that have a known one, such as "m", "rad" or "N m".
 
     Raises
     ------
@@ -76,6 +79,7 @@ class StateSpace(Value):
     states: Sequence[str] = ()
     name: str | None = None
     blocks: Sequence[int] | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
     if TYPE_CHECKING:  # arrays come in as anything array-like, and are held as float64
 
@@ -91,6 +95,7 @@ class StateSpace(Value):
             states: Sequence[str] = (),
             name: str | None = None,
             blocks: Sequence[int] | None = None,
+            units: Mapping[str, str] = ...,
         ) -> None: ...
 
     def __post_init__(self) -> None:
@@ -101,14 +106,17 @@ class StateSpace(Value):
         A = real_array(A, "A", (n, n))
         B = real_array(self.B, "B", (n, m)) if n else np.zeros((0, m))
         C = real_array(self.C, "C", (p, n)) if n else np.zeros((p, 0))
+        inputs = signal_names(self.inputs, m, "u", "inputs")
+        outputs = signal_names(self.outputs, p, "y", "outputs")
         self._set(
             A=A,
             B=B,
             C=C,
             D=D,
             dt=positive(self.dt, "dt", zero=True),
-            inputs=signal_names(self.inputs, m, "u", "inputs"),
-            outputs=signal_names(self.outputs, p, "y", "outputs"),
+            inputs=inputs,
+            outputs=outputs,
+            units=known_units(self.units, (*inputs, *outputs)),
             states=signal_names(self.states, n, "x", "states"),
             blocks=None if self.blocks is None else checked_blocks(A, self.blocks),
         )
@@ -210,9 +218,11 @@ class StateSpace(Value):
         """Return the system with some channels renamed, as {old: new}."""
         self.input_index(inputs or ())
         self.output_index(outputs or ())
+        new = {**(inputs or {}), **(outputs or {})}
         return self.replace(
             inputs=[(inputs or {}).get(name, name) for name in self.inputs],
             outputs=[(outputs or {}).get(name, name) for name in self.outputs],
+            units={**self.units, **{new.get(n, n): unit for n, unit in self.units.items()}},
         )
 
     def transformed(self, T: npt.ArrayLike, *, states: Sequence[str] = ()) -> StateSpace:

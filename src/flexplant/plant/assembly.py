@@ -12,8 +12,10 @@ from ..lti.discretisation import diagonal_pairs, discretized
 from ..lti.noise import noise_factor
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, positive
+from .channel_units import channel_units
 from .dynamics import structure_system, with_filters, with_gains
 from .ports import Ports
+from .rate_check import check_rate
 from .realisation import MODAL, ModalRealisation, Structure, realised
 from .residual import FastStates, Residual
 from .sampling import sampled_physical
@@ -159,7 +161,8 @@ def _wired(physical: StateSpace, ports: Ports) -> _Wired:
         D[row[ref], column[ref]] = 1.0
     for name in actuators:
         D[row[f"{name}:effort"], column[name]] = 1.0
-    system = physical.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs)
+    units = channel_units(ports)
+    system = physical.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs, units=units)
     return _Wired(system, w, actuators, z, y)
 
 
@@ -191,6 +194,7 @@ def sampled(plant: StandardPlant, rate: float, delay: float) -> StandardPlant:
             "the plant is weighted: sample it first, then weight it with sampled weights "
             "(continuous weights would be distorted by the hold)."
         )
+    check_rate(plant, rate, delay)
     if plant.physical is None or plant.ports is None or plant.realisation is None:
         system = discretized(plant.system, rate, delay=delay, delayed=plant.u)
         return plant.replace(system=system, continuous=plant, delay=float(delay))

@@ -252,7 +252,14 @@ class StandardPlant(Partition, Value):
         Raises
         ------
         ModelError
-            When the plant is sampled already, is weighted, or rate or delay is not positive.
+            When the plant is sampled already, is weighted, or rate or delay is not positive; when
+            they are plausible in another unit only: the lowest elastic mode lies above five times
+            the rate, a delay is below 0.01 samples, or that of a port above 1000 samples.
+
+        Warns
+        -----
+        FlexplantWarning
+            When all elastic modes lie above half the rate.
         """
         from .assembly import sampled
 

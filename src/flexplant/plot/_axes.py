@@ -9,6 +9,16 @@ from matplotlib.axes import Axes
 
 #: one colour a role, in every picture
 MEASURED, REDUCED, UPDATED, FULL = "black", "tab:blue", "tab:red", "tab:green"
+_PREFIXES = (
+    (1e-15, "f"),
+    (1e-12, "p"),
+    (1e-9, "n"),
+    (1e-6, "\N{MICRO SIGN}"),
+    (1e-3, "m"),
+    (1.0, ""),
+    (1e3, "k"),
+    (1e6, "M"),
+)
 CYCLE = (REDUCED, UPDATED, FULL, "tab:orange", "tab:purple", "tab:brown")
 
 
@@ -18,6 +28,22 @@ def axes(ax: Axes | None, **figure: Any) -> Axes:
         return ax
     drawn: Axes = plt.subplots(layout="constrained", **figure)[1]
     return drawn
+
+
+def panel_axes(ax: Axes | None, count: int) -> list[Axes]:
+    """Return the given axes, or `count` new ones, one above the other with the same abscissa."""
+    if ax is not None:
+        return [ax]
+    height = 4.0 if count == 1 else 1.2 + 2.2 * count
+    _, drawn = plt.subplots(
+        count, 1, sharex=True, squeeze=False, layout="constrained", figsize=(8.0, height)
+    )
+    return list(drawn[:, 0])
+
+
+def scale(size: float) -> tuple[float, str]:
+    """Return the factor and the letters of the SI prefix that bring a size to 1 .. 1000."""
+    return next((s for s in _PREFIXES if size < 1e3 * s[0]), _PREFIXES[-1]) if size else (1.0, "")
 
 
 def finish(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

@@ -19,7 +19,7 @@ def frf(
     input: str,
     *,
     colors: Mapping[str, str] | None = None,
-    unit: str = "m/N",
+    unit: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the magnitude of one channel of several FRFs (paper, Figs. 4, 10 and 11).
@@ -32,8 +32,8 @@ def frf(
         The channel.
     colors : mapping {label: color}, optional
         Of some lines.
-    unit : str
-        Of the gain; 0 dB is one of it.
+    unit : str, optional
+        Of the gain, where the responses do not know it; 0 dB is one of it.
     ax : Axes, optional
         Where to draw.
 
@@ -44,7 +44,7 @@ def frf(
     Raises
     ------
     ModelError
-        When there is no such mapping.
+        When there is no such mapping, or the responses are of different units.
     """
     if not isinstance(responses, Mapping) or isinstance(responses, Frf):
         raise ModelError(
@@ -53,13 +53,21 @@ def frf(
     wrong = [found for found in responses.values() if not isinstance(found, Frf)]
     if wrong:
         raise ModelError(f"need Frfs to draw, got {short(wrong[0])}. Use frequency_response(sys).")
+    units = {label: found.unit(output, input) or unit for label, found in responses.items()}
+    known = {own for own in units.values() if own is not None}
+    if len(known) > 1:
+        raise ModelError(
+            f"{output} / {input} is in different units, which share no axis: {units}. Convert one "
+            "(frf.converted), or draw them apart."
+        )
     ax = axes(ax, figsize=(8.0, 4.5))
     for i, (label, response) in enumerate(responses.items()):
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
         gain = 20.0 * np.log10(np.abs(response[output, input]))
         ax.semilogx(response.freq, gain, color=color, label=label, linewidth=1.1)
     ax.legend(frameon=False)
-    return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [dB, 0 dB = 1 {unit}]")
+    one = f"1 {known.pop()}" if known else "1"
+    return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [dB, 0 dB = {one}]")
 
 
 def sensitivity(

@@ -10,21 +10,31 @@ from matplotlib.axes import Axes
 from ..errors import ModelError, unknown_label
 from ..simulation import Response
 from ..values import name_list, short
-from ._axes import CYCLE, axes, finish
+from ._axes import CYCLE, finish, panel_axes, scale
 
-SCALES = ((1e-9, "n"), (1e-6, "u"), (1e-3, "m"), (1.0, ""))
+#: what a unit measures
+_QUANTITY = {
+    "m": "displacement",
+    "rad": "rotation",
+    "N": "force",
+    "N m": "moment",
+    "m/s": "velocity",
+    "rad/s": "angular velocity",
+    "m/s^2": "acceleration",
+    "rad/s^2": "angular acceleration",
+}
 
 
 def response(
     run: Response,
     channels: Sequence[str] | None = None,
     *,
-    unit: str = "m",
+    unit: str | None = None,
     label: str | None = None,
     color: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw channels of a run over time; of several runs the first.
+    """Draw channels of a run over time, one panel for each unit; of several runs the first.
 
     Parameters
     ----------
@@ -32,45 +42,73 @@ def response(
         From `simulate`.
     channels : sequence of str, optional
         Which; the errors (or else the first channel) when not given.
-    unit : str
-        SI unit of the channels; a prefix is chosen.
+    unit : str, optional
+        SI unit of channels that have none in `run.units`. A prefix is chosen in each panel.
     label : str, optional
         Put before the channels' names, to compare runs in one axes.
     color : str, optional
         Of the lines; a cycle when not given.
     ax : Axes, optional
-        Where to draw.
+        Where to draw channels of one unit.
 
     Returns
     -------
     Axes
+        The panel of the first channel; `.figure.axes` are all, in the order of the channels.
 
     Raises
     ------
     LabelError
         When a channel is unknown.
     ModelError
-        When `run` is no Response.
+        When `run` is no Response, or channels of several units shall go into one axes.
     """
     if not isinstance(run, Response):
         raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
     chosen = None if channels is None else name_list(channels, "channels")
-    ax = axes(ax, figsize=(8.0, 4.0))
     names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])
-    signals = []
+    panels: dict[str | None, list[str]] = {}
     for name in names:
         if name not in run:
             raise unknown_label("channel", name, list(run))
-        signals.append(np.atleast_2d(run[name])[0])
-    size = max(float(np.max(np.abs(signal))) for signal in signals)
-    factor, prefix = next((s for s in SCALES if size < 1e3 * s[0]), SCALES[-1])
-    for i, (name, signal) in enumerate(zip(names, signals, strict=True)):
+        panels.setdefault(run.units.get(name, unit), []).append(name)
+    if ax is not None and len(panels) > 1:
+        listed = "; ".join(f"{', '.join(group)} [{u or '?'}]" for u, group in panels.items())
+        raise ModelError(
+            f"one axes holds one unit, got {listed}. Leave ax out, which gives each unit a panel, "
+            "or draw them one after the other."
+        )
+    drawn = panel_axes(ax, len(panels))
+    for (own, group), panel in zip(panels.items(), drawn, strict=True):
+        _panel(panel, run, group, own, names, label=label, color=color)
+    if len(drawn) > 1:
+        for panel in drawn[:-1]:
+            panel.set_xlabel("")
+    return drawn[0]
+
+
+def _panel(
+    ax: Axes,
+    run: Response,
+    group: Sequence[str],
+    unit: str | None,
+    names: Sequence[str],
+    *,
+    label: str | None,
+    color: str | None,
+) -> None:
+    """Draw channels of one unit; colours follow the place among all channels."""
+    signals = [np.atleast_2d(run[name])[0] for name in group]
+    size = max(float(np.max(np.abs(signal), initial=0.0)) for signal in signals)
+    factor, prefix = scale(size) if unit else (1.0, "")
+    for name, signal in zip(group, signals, strict=True):
         ax.plot(
             run.time,
             signal / factor,
-            color=color or CYCLE[i % len(CYCLE)],
+            color=color or CYCLE[names.index(name) % len(CYCLE)],
             label=name if label is None else f"{label}: {name}",
             linewidth=0.8,
         )
     ax.legend(frameon=False, loc="upper right")
-    return finish(ax, x="time [s]", y=f"[{prefix}{unit}]")
+    quantity = f"{_QUANTITY.get(unit or '', 'signal')} [{prefix}{unit}]" if unit else "signal"
+    finish(ax, x="time [s]", y=quantity)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..values import FloatArray, IntArray, Value, check_names, positive, real_array
+from ..values import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
 
 #: one number, or one per run
 Numbers: TypeAlias = "float | FloatArray"
@@ -30,6 +30,8 @@ class Response(Value, Mapping[str, FloatArray]):
         The signals, in SI units.
     names : sequence of str
         The channels.
+    units : mapping {channel: unit}, optional
+        SI units of the channels that have a known one.
 
     Raises
     ------
@@ -49,6 +51,7 @@ class Response(Value, Mapping[str, FloatArray]):
     time: FloatArray
     data: FloatArray
     names: Sequence[str]
+    units: Mapping[str, str] = field(default_factory=dict)
 
     # values are compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
@@ -67,7 +70,7 @@ class Response(Value, Mapping[str, FloatArray]):
                 f"data of {len(names)} channels at {time.size} times must have shape "
                 f"({len(names)}, {time.size}), runs before that, got {data.shape}."
             )
-        self._set(time=time, data=data, names=names)
+        self._set(time=time, data=data, names=names, units=known_units(self.units, names))
 
     def __repr__(self) -> str:
         runs = "" if self.data.ndim == 2 else f"{self.data.shape[0]} runs, "
@@ -260,7 +263,12 @@ class Response(Value, Mapping[str, FloatArray]):
                 "with response.replace(data=response.data[0])."
             )
         return [
-            {"name": name, "data": np.array(self[name]), "fs": 1.0 / self.dt, "unit_str": ""}
+            {
+                "name": name,
+                "data": np.array(self[name]),
+                "fs": 1.0 / self.dt,
+                "unit_str": self.units.get(name, ""),
+            }
             for name in self.names
         ]
 

@@ -152,7 +152,7 @@ def simulate(
                         "loop.is_stable first, or simulate a shorter time."
                     )
                 bar.advance()
-    return Response(time, data[0] if runs is None else data, shown)
+    return Response(time, data[0] if runs is None else data, shown, loop.units)
 
 
 class _Group:
