@@ -57,10 +57,11 @@ def check_rate(plant: StandardPlant, rate: float, delay: float) -> None:
     said = (
         f"all {modes.size} elastic modes of the plant, {modes.min():.4g} Hz and above, lie above "
         f"half the sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The "
-        f"rate is in Hz{_meant(rate, float(modes.min()))}."
+        "rate is in Hz"
     )
     if modes.min() > 0.5 * _HOPELESS * rate:
-        raise ModelError(said)
+        raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
+    said = f"{said}, the model in SI units: are both?"
     warnings.warn(said, FlexplantWarning, stacklevel=4)
 
 
