@@ -3,14 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from typing import Any
 
 from ..labels import Place
 from .forces import BaseAcceleration, OutputDisturbance
 from .ports import Ports, Sensor
-
-if TYPE_CHECKING:
-    from .standard import StandardPlant
 
 _PER_TIME = {"displacement": "", "velocity": "/s", "acceleration": "/s^2"}
 
@@ -49,7 +46,7 @@ def channel_units(ports: Ports) -> dict[str, str]:
     return {name: unit for name, unit in found.items() if unit is not None}
 
 
-def plant_units(plant: StandardPlant) -> dict[str, str]:
+def plant_units(plant: Any) -> dict[str, str]:
     """Return {channel: unit} of a plant, and of what its ports derive: estimates, too."""
     derived = {} if plant.ports is None else channel_units(plant.ports)
     return derived | dict(plant.system.units)

@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 import warnings
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 
 from ..errors import FlexplantWarning, ModelError
-from ..lti.statespace import block_eigenvalues
+from ..lti.joining import block_eigenvalues
 from ..values import FloatArray, positive
-
-if TYPE_CHECKING:
-    from .standard import StandardPlant
 
 #: times half the rate: where even the lowest mode lies above this, the rate is in another unit
 _HOPELESS = 10.0
@@ -24,7 +21,7 @@ _LONGEST = 1000.0
 _LIGHT = 0.3
 
 
-def check_rate(plant: StandardPlant, rate: float, delay: float) -> None:
+def check_rate(plant: Any, rate: float, delay: float) -> None:
     """Judge a sampling rate [Hz] by the modes of a plant, and delays by the rate.
 
     Raises
@@ -74,7 +71,7 @@ def _meant(rate: float, lowest: float) -> str:
     return ""
 
 
-def _elastic(plant: StandardPlant) -> FloatArray:
+def _elastic(plant: Any) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes of a plant."""
     if plant.realisation is not None:
         blocks = plant.realisation.pairs
