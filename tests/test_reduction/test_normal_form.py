@@ -115,7 +115,7 @@ def test_weak_dampers_to_ground_leave_rigid_body_modes_alone():
     [
         (np.diag([100.0, 100]), np.eye(2) * 100, "overdamped"),
         (np.array([[90.0, 10], [10, 30]]), np.diag([100.0, 400]), "overdamped"),
-        (None, np.diag([1.0, -1.0]), "no stiffness"),
+        (None, np.diag([1.0, -1.0]), "negative stiffness"),
         (None, np.diag([1.0, 0.0]), "no stiffness"),
     ],
 )

@@ -189,7 +189,8 @@ def test_pieces_that_nothing_joins():
     )  # fmt: skip
     report = fx.check(fx.FEMatrices(K, M, dofs=dofs))
     assert report.n_pieces == 2
-    assert (report.n_zero, len(report.mechanisms)) == (12, 6)
+    assert (report.n_zero, report.n_rigid, report.mechanisms) == (12, 12, ())
+    assert "2 bodies, each with its own motions" in line(report, "rigid body")[2]
     assert {"connectivity"} <= set(report.of("note"))
     assert fx.check(one).n_pieces == 1
 

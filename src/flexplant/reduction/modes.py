@@ -48,6 +48,10 @@ class Modes(Value):
     residual : (k,) array
         ``||K phi - omega^2 M phi|| / ||K phi||`` of each mode (rigid-body ones: 0), as
         `solve_modes` found it; empty where it is not known.
+    rounding : (k,) array
+        ``eps |phi|^T |K| |phi| / (2 omega^2)`` of each mode (rigid-body ones: 0): the relative
+        error of its frequency when the entries of K are rounded to double precision, which no
+        solver can undo; empty where it is not known.
     certificate : mapping
         What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I),
         `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||) and, for
@@ -69,6 +73,7 @@ class Modes(Value):
     vector_zeta: FloatArray = field(default_factory=_nothing)
     vector_dofs: Sequence[str] = ()
     residual: FloatArray = field(default_factory=_nothing)
+    rounding: FloatArray = field(default_factory=_nothing)
     certificate: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -102,6 +107,7 @@ class Modes(Value):
             vector_zeta=real_array(vector_zeta, "vector_zeta", (m,)),
             vector_dofs=tuple(str(place) for place in places),
             residual=real_array(self.residual, "residual", (k if np.size(self.residual) else 0,)),
+            rounding=real_array(self.rounding, "rounding", (k if np.size(self.rounding) else 0,)),
             certificate={
                 str(name): float(real_array(value, f"certificate {name}", ()))
                 for name, value in self.certificate.items()

@@ -5,8 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
-import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
 from ..parallel import one_thread
@@ -16,18 +14,17 @@ from .factor import by_rows
 from .lanczos import FOUND, BlockLanczos
 from .model import FEModel
 from .pardiso import Pardiso
+from .ritz import absolute, rayleigh_ritz, rounding_of
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
 
 #: modes beyond the last wanted one among which a gap is looked for
 _EXTRA = 4
-#: frequencies closer than this (relative, squared), or than so many roundings, belong together
+#: omega^2 closer than this (relative), or than so many of their roundings, belong together
 _GAP, _GAP_ROUNDINGS = 1e-8, 4.0
 #: more modes than this are not looked for: their shapes and the basis fill the memory
 _MOST = 2000
-#: roundings in the strain energy of an elastic mode below which omega^2 is none
-_ROUNDING = 30 * float(np.finfo(np.float64).eps)
-#: rows that are mixed at a time
-_ROWS = 65536
+#: part of a shape that may be no rigid-body motion when springs alone hold it
+_BENT = 0.1
 #: searches with what is found locked, before giving up
 _SEARCHES = 8
 #: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
@@ -80,7 +77,6 @@ def _counted(
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
     factor: StiffnessFactor | None = stiffness_factor(model, method)
-    largest = factor.largest if factor else 0.0
     below = None
     if np.isfinite(top):
         below = modes_below(model, top) - r
@@ -99,14 +95,17 @@ def _counted(
         factor = factor or stiffness_factor(model, method)
         locked = np.hstack([model.rigid_body, phi])
         more = _search(model, factor, locked, missing, search)
-        squares, phi = _rayleigh_ritz(model, np.hstack([phi, more]))
-        check_stiffness(squares, _rounding(model, phi[:, 0]), r)
+        squares, phi = rayleigh_ritz(model.K, model.M, np.hstack([phi, more]))
+        rounding = rounding_of(model.K, phi)
+        # a motion of the geometry that is not free has springs, which rounding does not hide
+        least = np.where(_suspended(model, phi), 0.0, rounding)
+        check_stiffness(squares, phi, least, model.rigid_body, model.dofs)
         # the count needs the memory
         factor, more = None, np.zeros((n, 0))
-        if below == count and _apart(squares, count, top, largest):
+        if below == count and _apart(squares, count, top, rounding):
             counted, sure, shift = count, count, top
         else:
-            sure, shift = _gap(squares, count, largest)
+            sure, shift = _gap(squares, count, rounding)
             if not sure and squares.size < n - r:
                 missing = min(2 * _EXTRA, n - r - squares.size)
                 continue
@@ -124,9 +123,10 @@ def _counted(
     )
 
 
-def _rounding(model: FEModel, phi: FloatArray) -> float:
-    """Return the rounding in ``phi' K phi``: of the sum of what cancels in it."""
-    return _ROUNDING * float(np.abs(phi) @ (_absolute(by_rows(model.K)) @ np.abs(phi)))
+def _suspended(model: FEModel, phi: FloatArray) -> Any:
+    """Return which shapes (k,) are rigid-body motions, which soft springs hold."""
+    part = model.body_motions.T @ (by_rows(model.M) @ phi)
+    return 1 - np.sum(part**2, axis=0) < _BENT**2
 
 
 def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
@@ -140,10 +140,33 @@ def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
 def _search(
     model: FEModel, factor: StiffnessFactor, locked: FloatArray, want: int, seed: int
 ) -> FloatArray:
-    """Return shapes (n, want) beside the locked ones, residuals down to rounding."""
-    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed)
+    """Return shapes (n, want) beside the locked ones, residuals down to rounding.
+
+    Soft modes first: they are locked, and a new search finds those that their rounding hides.
+    """
+    held = model.body_motions
+    start = None if locked.shape[1] >= held.shape[1] else held
+    found = _searched(model, factor, locked, want, seed, start)
+    while 0 < found.shape[1] < want:
+        beside = np.hstack([locked, found])
+        more = _searched(model, factor, beside, want - found.shape[1], seed, None)
+        if not more.shape[1]:
+            break
+        found = np.hstack([found, more])
+    return found
+
+
+def _searched(
+    model: FEModel,
+    factor: StiffnessFactor,
+    locked: FloatArray,
+    want: int,
+    seed: int,
+    start: FloatArray | None,
+) -> FloatArray:
+    """Return up to `want` shapes of one search."""
+    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed, start=start)
     extra = min(_EXTRA, want - 1)
-    asked = want - extra
     mass, stiffness = by_rows(model.M), by_rows(model.K)
     deflated = np.asarray(mass @ locked)
     best, found = np.inf, np.zeros((locked.shape[0], 0))
@@ -154,7 +177,9 @@ def _search(
         force -= deflated @ (locked.T @ force)
         phi = factor.solve(force)
         phi -= locked @ (deflated.T @ phi)
-        phi, left = _ritz_residual(mass, stiffness, phi, asked)
+        squares, phi = rayleigh_ritz(stiffness, mass, phi)
+        asked = squares.size - extra if squares.size == want else squares.size
+        left = _residual(stiffness, mass, squares[:asked], phi[:, :asked])
         if left < best:
             best, found = left, phi
         if left <= 1:
@@ -162,67 +187,37 @@ def _search(
     return found
 
 
-def _ritz_residual(M: Any, K: Any, phi: FloatArray, asked: int) -> tuple[FloatArray, float]:
-    """Return the Rayleigh-Ritz shapes in the span of phi, and the worst residual of `asked` ones.
+def _residual(K: Any, M: Any, squares: FloatArray, phi: FloatArray) -> float:
+    """Return the worst residual of some modes, ``||K phi - omega^2 M phi|| / ||K phi||``.
 
-    ``||K phi - omega^2 M phi|| / ||K phi||`` in units of what is let pass.
+    In units of what is let pass.
     """
     force, mass = K @ phi, M @ phi
-    squares, mix = la.eigh(_even(phi.T @ force), _even(phi.T @ mass))
-    force, mass = _mixed(force, mix[:, :asked]), _mixed(mass, mix[:, :asked])
-    phi = _mixed(phi, mix)
     size = np.linalg.norm(force, axis=0)
-    mass *= squares[:asked]
+    mass *= squares
     force -= mass
     left = np.linalg.norm(force, axis=0)
     del force, mass
-    rounding = np.finfo(np.float64).eps * np.linalg.norm(
-        _absolute(K) @ np.abs(phi[:, :asked]), axis=0
-    )
-    return phi, float(np.max(left / np.maximum(_RESIDUAL * size, _ROUNDINGS * rounding)))
+    rounding = np.finfo(np.float64).eps * np.linalg.norm(absolute(K) @ np.abs(phi), axis=0)
+    return float(np.max(left / np.maximum(_RESIDUAL * size, _ROUNDINGS * rounding)))
 
 
-def _mixed(X: FloatArray, mix: FloatArray) -> FloatArray:
-    """Return ``X mix`` in the place of X: a second array of this size is memory at its peak."""
-    for begin in range(0, X.shape[0], _ROWS):
-        rows = slice(begin, begin + _ROWS)
-        X[rows, : mix.shape[1]] = X[rows] @ mix
-    return X[:, : mix.shape[1]]
-
-
-def _absolute(K: Any) -> Any:
-    return sp.csr_array((np.abs(K.data), K.indices, K.indptr), shape=K.shape)
-
-
-def _even(A: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (A + A.T))
-
-
-def _rayleigh_ritz(model: FEModel, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
-    stiffness = phi.T @ (by_rows(model.K) @ phi)
-    mass = phi.T @ (by_rows(model.M) @ phi)
-    squares, mix = la.eigh(_even(stiffness), _even(mass))
-    return squares, np.asarray(phi @ mix)
-
-
-def _apart(squares: FloatArray, count: int, top: float, largest: float) -> bool:
+def _apart(squares: FloatArray, count: int, top: float, rounding: FloatArray) -> bool:
     """Return whether `top` is well between the last mode below it and the next."""
     near = squares[count - 1 : count + 1]
-    return bool(
-        np.all(np.abs(near - top) > _closest(top, largest) * top) and near[0] < top < near[-1]
-    )
+    closest = np.maximum(_GAP * top, _GAP_ROUNDINGS * rounding[count - 1 : count + 1])
+    return bool(np.all(np.abs(near - top) > closest) and near[0] < top < near[-1])
 
 
-def _closest(square: float, largest: float) -> float:
-    """Return the relative distance of two omega^2 that rounding of K and M lets tell apart."""
-    return max(_GAP, _GAP_ROUNDINGS * float(np.finfo(np.float64).eps) * largest / square)
+def _gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
+    """Return how many modes lie below the widest gap after the last wanted one, and its middle.
 
-
-def _gap(squares: FloatArray, count: int, largest: float) -> tuple[int, float]:
-    """Return how many modes lie below the widest gap after the last wanted one, and its middle."""
-    above = squares[count - 1 :]
-    wide = np.diff(above) / above[1:]
-    if not wide.size or wide.max() <= _closest(float(above[-1]), largest):
+    Gaps narrower than some roundings of the modes beside them, or than 1e-8, are none.
+    """
+    above, least = squares[count - 1 :], _GAP_ROUNDINGS * rounding[count - 1 :]
+    wide = np.diff(above)
+    real = (wide > _GAP * above[1:]) & (wide > least[1:]) & (wide > least[:-1])
+    if not np.any(real):
         return 0, 0.0
-    i = int(np.argmax(wide))
+    i = int(np.argmax(np.where(real, wide / above[1:], 0.0)))
     return count + i, 0.5 * float(above[i] + above[i + 1])

@@ -6,20 +6,38 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError
+from ..labels import DofSet
 from ..values import FloatArray
 from .factor import dense, unit_diagonal
+from .ritz import rayleigh_ritz, rounding_of, soft_group
+from .zero_energy import beyond, most_moved
 
-#: eigenvalues below this part of the largest one are rounding
-_ROUNDING = 1e-13
+#: eigenvalues above this part of the largest one are right to 1e-9 when M is made the identity
+_DIRECT = 1e-6
+#: the shift of the inverse problem, in roundings of K: K + s M is well away from singular
+_SHIFT = 1e3
+#: steps of inverse iteration, until the eigenvalues change by no more than this
+_STEPS, _SETTLED = 5, 1e-10
 
 
 def elastic_modes(
-    M: FloatArray, K: FloatArray, rigid: FloatArray, count: int | None = None
+    M: FloatArray,
+    K: FloatArray,
+    rigid: FloatArray,
+    count: int | None = None,
+    dofs: DofSet | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the elastic frequencies (k,) [rad/s] and M-orthonormal shapes (n, k), ascending.
 
     ``K phi = omega^2 M phi`` is solved in the M-orthogonal complement of the M-orthonormal
-    rigid-body motions (n, r), so that these mix with no elastic mode.
+    rigid-body motions (n, r), so that these mix with no elastic mode. Each frequency is right to
+    1e-8 of itself, or to its own rounding ``eps |phi|^T |K| |phi| / (2 omega^2)``, whichever is
+    larger: the entries of K, as stored, define it no better.
+
+    The transformation that makes M the identity leaves an error of a rounding of the largest
+    eigenvalue in all of them. Soft modes are therefore improved by inverse iteration with the
+    scaled Cholesky factor of K + s M, whose error is a rounding of each entry [Demmel, "On
+    floating point errors in Cholesky", LAPACK Working Note 14 (1989)].
 
     Raises
     ------
@@ -45,28 +63,89 @@ def elastic_modes(
     if r:
         elastic = np.asarray(la.qr(lower.T @ (rigid / scale[:, None]))[0][:, r:], dtype=np.float64)
         stiffness = elastic.T @ stiffness @ elastic
+    stiffness = 0.5 * (stiffness + stiffness.T)
     # the lowest few alone are faster; divide and conquer gives all of them
     few = kept <= (n - r) // 4
     squares, vectors = la.eigh(
-        0.5 * (stiffness + stiffness.T),
+        stiffness,
         subset_by_index=(0, kept - 1) if few else None,
         driver="evr" if few else "evd",
     )
-    squares, vectors = squares[:kept], vectors[:, :kept]
-    check_stiffness(squares, _ROUNDING * largest, r)
-    return np.sqrt(squares), signed(reach.T @ (elastic @ vectors))
+    if squares[0] < _DIRECT * largest:
+        if few:  # all of them, for the space of the soft ones to be right
+            squares, vectors = la.eigh(stiffness, driver="evd")
+        squares, phi = _improved(M, K, rigid, squares, reach.T @ (elastic @ vectors))
+    else:
+        phi = reach.T @ (elastic @ vectors)
+    squares, phi = squares[:kept], phi[:, :kept]
+    check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs)
+    return np.sqrt(squares), signed(phi)
 
 
-def check_stiffness(squares: FloatArray, rounding: float, n_rigid: int) -> None:
-    """Raise ModelError when the lowest elastic omega^2 is not above rounding."""
-    if squares[0] <= rounding:
+def _improved(
+    M: FloatArray, K: FloatArray, rigid: FloatArray, squares: FloatArray, phi: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return all modes with the soft ones found again, in the span of those given."""
+    end = soft_group(squares)
+    values, soft = rayleigh_ritz(K, M, np.ascontiguousarray(phi[:, :end]))
+    rounding = float(rounding_of(K, np.hstack([rigid, soft])).max())
+    shift = _SHIFT * (rounding or float(np.finfo(np.float64).eps * squares[end]))
+    scaled, scale = unit_diagonal(K + shift * M)
+    try:
+        factor = la.cho_factor(dense(scaled), lower=True)
+    except la.LinAlgError:
         raise ModelError(
-            f"an elastic mode has no stiffness (omega^2 = {squares[0]:.3g} 1/s^2, rounding is "
-            f"about {rounding:.1g}): K is indefinite, or has a zero-energy motion beyond the "
-            f"{n_rigid} rigid-body motions of the geometry, or springs too soft for the digits of "
-            "K. Look for a sign, a mechanism or wrong coordinates (check(model) tells); suspend "
-            "the modes rather than the model on soft springs."
+            f"an elastic mode has a negative stiffness (K + s M is indefinite, s = {shift:.2g} "
+            "1/s^2): the structure is unstable. Look for a sign in K."
+        ) from None
+    inertia = M @ rigid
+    for _ in range(_STEPS):
+        before = values
+        moved = scale[:, None] * la.cho_solve(factor, scale[:, None] * (M @ soft))
+        for _ in range(2):
+            moved -= rigid @ (inertia.T @ moved)
+        values, soft = rayleigh_ritz(K, M, moved)
+        if np.all(np.abs(values - before) <= _SETTLED * np.abs(values)):
+            break
+    stiff = phi[:, end:]
+    for _ in range(2):
+        stiff = stiff - soft @ (soft.T @ (M @ stiff))
+    return np.concatenate([values, squares[end:]]), np.hstack([soft, stiff])
+
+
+def check_stiffness(
+    squares: FloatArray,
+    phi: FloatArray,
+    rounding: FloatArray,
+    rigid: FloatArray,
+    dofs: DofSet | None = None,
+) -> None:
+    """Raise ModelError when an elastic omega^2 (k,) is not above its rounding (k,).
+
+    The DOFs that the first such motion moves most are named as `check` names those of a mechanism.
+    """
+    lost = np.flatnonzero(squares <= rounding)
+    if not lost.size:
+        return
+    first, r = lost[0], rigid.shape[1]
+    found = f"omega^2 = {squares[first]:.3g} 1/s^2, rounding is about {rounding[first]:.1g}"
+    if squares[first] < -10 * rounding[first]:
+        raise ModelError(
+            f"an elastic mode has a negative stiffness ({found}): K is indefinite, the structure "
+            "is unstable. Look for a sign in K."
         )
+    moved = ""
+    if dofs is not None:
+        basis = np.asarray(la.qr(rigid, mode="economic")[0] if r else rigid, dtype=np.float64)
+        motion = beyond(np.hstack([basis, phi[:, lost]]), basis)[:, 0]
+        moved = f" The first moves {', '.join(dofs.labels[i] for i in most_moved(motion)[:4])}."
+    several = "an elastic mode has" if lost.size == 1 else f"{lost.size} elastic modes have"
+    raise ModelError(
+        f"{several} no stiffness ({found}): a mechanism, a zero-energy motion beyond the {r} "
+        f"rigid-body motions of the geometry, or springs too soft for the digits of K.{moved} Join "
+        "or hold these, look for wrong coordinates (check(model) tells), or suspend the modes "
+        "rather than the model on soft springs."
+    )
 
 
 def signed(phi: FloatArray) -> FloatArray:

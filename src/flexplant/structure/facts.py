@@ -98,7 +98,12 @@ def facts(given: FEMatrices) -> Facts:
         zero = lowest.shapes[:, : lowest.n_zero]
         if given.dofs is not None:
             motions = zero_energy(
-                K, given.dofs, zero, located=given.located, rounding=max(ROUNDING, rounding)
+                K,
+                given.dofs,
+                zero,
+                located=given.located,
+                rounding=max(ROUNDING, rounding),
+                M=M,
             )
             mechanisms = motions.mechanisms
     nothing = RigidMass(np.full(3, np.nan), np.full(3, np.nan), np.full((3, 3), np.nan))

@@ -24,6 +24,8 @@ _RESTARTS = 60
 _LOST = 1e-3
 #: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
 _STALE = 1e-11
+#: residuals of this part of the largest value are rounding: no step reduces them
+_ROUNDING = 1e-14
 #: entries of a vector worked on at a time
 _PIECE = 8192
 
@@ -46,6 +48,8 @@ class BlockLanczos:
         About how many modes will be asked for.
     seed : int
         Of the starting block: the same seed gives the same answer.
+    start : (n, s) array, optional
+        Shapes like those of the lowest modes, in the starting block.
     """
 
     def __init__(
@@ -57,6 +61,7 @@ class BlockLanczos:
         want: int,
         seed: int = 0,
         block: int = BLOCK,
+        start: FloatArray | None = None,
     ) -> None:
         self._solve = solve
         self._M = by_rows(M)
@@ -70,7 +75,9 @@ class BlockLanczos:
         self._m = 0
         self._T = np.zeros((0, 0))
         self.steps = 0
-        self._next, self._loaded, _ = self._orthonormal(self._random(self._block))
+        known = np.zeros((n, 0)) if start is None else start[:, : self._block // 2]
+        first = np.hstack([known, self._random(self._block - known.shape[1])])
+        self._next, self._loaded, _ = self._orthonormal(first)
 
     def _reserve(self, want: int) -> None:
         # after a restart want + block vectors are kept; as many again or _STEPS blocks follow
@@ -82,7 +89,9 @@ class BlockLanczos:
     ) -> tuple[FloatArray, FloatArray]:
         """Return the `count` largest theta found and their shapes (n, count).
 
-        The last `extra` of them need not be shapes yet, only values.
+        The last `extra` of them need not be shapes yet, only values. Fewer than `count` are
+        returned where the others are so much smaller than the largest that its rounding hides
+        them: with those returned locked, another search finds the rest.
 
         Raises
         ------
@@ -95,10 +104,17 @@ class BlockLanczos:
             if self._m + self._r >= n or not self._next.shape[1]:
                 return self._ritz(count)
             theta, mix, error = self._step()
-            asked = np.where(np.arange(count) < count - extra, tolerance, max(tolerance, VALUE))
-            done = theta.size >= count and bool(np.all(error[:count] <= asked * theta[:count]))
-            if done:
-                return theta[:count], self._V[self._r : self._r + self._m].T @ mix[:, :count]
+            # what rounding of the largest value lets be found in this search
+            sure = int(np.count_nonzero(theta * FOUND >= _ROUNDING * theta[0]))
+            limited = sure < min(count, theta.size)
+            wanted = sure if limited else count
+            asked = np.full(min(wanted, theta.size), tolerance)
+            if not limited:
+                asked[count - extra :] = max(tolerance, VALUE)
+            limit = np.maximum(asked * theta[: asked.size], _ROUNDING * theta[0])
+            if theta.size >= wanted and np.all(error[: asked.size] <= limit):
+                basis = self._V[self._r : self._r + self._m]
+                return theta[:wanted], basis.T @ mix[:, :wanted]
             if self._r + self._m + 2 * self._next.shape[1] > self._capacity:
                 self._restart(theta, mix, min(count + self._block, theta.size))
         raise SolverError(

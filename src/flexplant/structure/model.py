@@ -19,7 +19,7 @@ from .eigen import elastic_modes
 from .factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
 from .parts import HeldShape, Part, added_matrices, sum_of
 from .precision import digits_of, endangered, held_by_rounding
-from .rigid import rigid_body_basis
+from .rigid import body_motions, rigid_body_basis
 from .units import units
 
 #: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
@@ -129,13 +129,21 @@ class FEModel(Value):
         """The rigid-body motions (n, r), ``K R = 0`` and ``R^T M R = I``.
 
         From the coordinates, hence exact: translations first, then rotations about the centre of
-        gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0) when held. Where
-        coordinates have few digits (down to four), rotations are the null vectors of K next to
-        theirs; what a spring holds, however softly, has none.
+        gravity, in the order x, y, z, rx, ry, rz of those that exist; (n, 0) when held. Pieces
+        that neither K nor M joins have their own each, the largest piece first. Where coordinates
+        have few digits (down to four), rotations are the null vectors of K next to theirs; what a
+        spring holds, however softly, has none.
         """
-        basis = rigid_body_basis(self.M, self.K, self.dofs)
+        basis = rigid_body_basis(self.M, self.K, self.body_motions)
         basis.flags.writeable = False
         return basis
+
+    @cached_property
+    def body_motions(self) -> FloatArray:
+        """The M-orthonormal rigid-body motions (n, r) of every piece, whether held or not."""
+        motions = body_motions(self.M, self.K, self.dofs)
+        motions.flags.writeable = False
+        return motions
 
     @property
     def mass(self) -> float:

@@ -10,6 +10,10 @@ import scipy.sparse.csgraph as csgraph
 
 from ..labels import DofSet
 from ..values import IntArray
+from .factor import by_rows, diagonal
+
+#: more pieces than this are no structure of several bodies
+_MOST_BODIES = 50
 
 
 def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
@@ -17,16 +21,36 @@ def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
 
     Pieces are joined by no entry of K or M, the DOFs of one node counting as joined.
     """
-    n = K.shape[0]
-    joined: Any = sp.csr_array(abs(K)) if M is None else sp.csr_array(abs(K) + abs(M))
-    if dofs is not None:
-        _, node = np.unique(dofs.nodes, return_inverse=True)
-        of_node: Any = sp.csr_array((np.ones(n), (np.arange(n), node)))
-        count, label = csgraph.connected_components(of_node.T @ joined @ of_node, directed=False)
-        label = label[node]
-    else:
-        count, label = csgraph.connected_components(joined, directed=False)
-    sizes = np.bincount(label, minlength=count)
-    place = np.empty(count, dtype=np.int64)
-    place[np.argsort(-sizes, kind="stable")] = np.arange(count)
+    # step by step, each among the parts found before: most structures are whole after the first
+    label: Any = csgraph.connected_components(sp.csr_array(by_rows(K)), directed=False)[1]
+    if M is not None and label.max(initial=0) > 0:
+        entries = sp.coo_array(M)
+        label = _joined(label, *entries.coords)
+    if dofs is not None and label.max(initial=0) > 0:
+        first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)[1:]
+        label = _joined(label, np.arange(label.size), first[node])
+    sizes = np.bincount(label)
+    place = np.empty(sizes.size, dtype=np.int64)
+    place[np.argsort(-sizes, kind="stable")] = np.arange(sizes.size)
     return np.asarray(place[label], dtype=np.int64)
+
+
+def bodies(K: Any, M: Any, dofs: DofSet) -> list[IntArray]:
+    """Return the DOFs of each body: of the pieces that nothing joins, the largest first.
+
+    Loose DOFs without stiffness are no body of their own, they go with the first. More than 50
+    pieces are no structure of several bodies: all DOFs are then taken together.
+    """
+    piece = pieces(K, M, dofs)
+    stiff = np.unique(piece[np.abs(diagonal(K)) > 0])
+    if not 1 < stiff.size <= _MOST_BODIES:
+        return [np.arange(piece.size)]
+    loose = ~np.isin(piece, stiff)
+    return [np.flatnonzero((piece == number) | (loose & (number == stiff[0]))) for number in stiff]
+
+
+def _joined(label: IntArray, one: Any, other: Any) -> IntArray:
+    """Return the number (n,) of the part each DOF belongs to, with some pairs of DOFs joined."""
+    size = int(label.max()) + 1
+    graph = sp.coo_array((np.ones(one.size, bool), (label[one], label[other])), shape=(size, size))
+    return np.asarray(csgraph.connected_components(graph.tocsr(), directed=False)[1][label])

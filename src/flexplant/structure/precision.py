@@ -92,7 +92,7 @@ def held_by_rounding(
     found : (n, r) array, optional
         Rigid-body motions that the model knows already.
     """
-    nearly = nearly_free(K, dofs, digits).shape[1]
+    nearly = nearly_free(K, M, dofs, digits).shape[1]
     if found is not None and force_free(M, K, found):
         nearly -= found.shape[1]
     if nearly <= 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import scipy.linalg as la
@@ -10,14 +10,17 @@ import scipy.linalg as la
 from ..errors import ModelError, SolverError
 from ..labels import DofSet
 from ..values import FloatArray, Matrix
+from .factor import by_rows
 from .lowest import ROUNDING, definite_solver
+from .pieces import bodies
+from .ritz import absolute
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
 _ENERGY_TOLERANCE = 1e-10
-#: of a K that was never written as text
-_ROUNDED = 1e-14
 #: part of all DOFs: forces at fewer are of springs, not of rounding
-_FEW = 0.02
+_FEW, _FEW_ROWS = 0.02, 6
+#: times the usual rounding of a row: a force larger than this is of a spring
+_OUTLIER = 30.0
 #: the same for motions that coordinates of few digits keep from being free: worth a closer look
 _NEARLY = 1e-2
 #: largest force of such a motion at any DOF, of the largest that its parts make anywhere
@@ -49,57 +52,98 @@ def rigid_motions(dofs: DofSet) -> FloatArray:
     return motions
 
 
-def rigid_body_basis(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
+def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:
+    """Return the M-orthonormal rigid-body motions (n, r) of every piece of a structure.
+
+    Each piece that nothing joins to the others has its own six, as far as its DOFs can make them:
+    those of the largest piece come first. Translations precede rotations about the centre of
+    gravity.
+    """
+    motions, part = rigid_motions(dofs), cast(Any, M)
+    found = []
+    for rows in bodies(K, M, dofs):
+        whole = rows.size == len(dofs)
+        own = part if whole else part[rows][:, rows]
+        # independent ones only: some are absent, and with few DOFs some of the six coincide
+        moved = orthonormalised(own, motions[rows], dependent="drop")
+        found.append(moved if whole else np.zeros((len(dofs), moved.shape[1])))
+        found[-1][rows] = moved
+    return np.hstack(found)
+
+
+def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     """Return the M-orthonormal rigid-body vectors (n, r) of a structure, ``K R = 0``.
 
-    They come from the coordinates, not from an eigenvalue solver, so that they are exact.
-    Translations come first, then rotations about the centre of gravity. Partly held structures
-    (a hinge, say) keep the combinations of the six motions that cost no energy. Where coordinates
-    have few digits, rotations are the null vectors of K next to theirs.
+    They are those of the `motions` of its pieces, from `body_motions`, that cost no energy. They
+    come from the coordinates, not from an eigenvalue solver, so that they are exact. Partly held
+    structures (a hinge, say) keep the combinations that cost none. Where coordinates have few
+    digits, rotations are the null vectors of K next to theirs.
     """
-    # independent ones only: some are absent, and with few DOFs some of the six coincide
-    motions = orthonormalised(M, rigid_motions(dofs), dependent="drop")
-    # K and |K| |r|, row by row: forces of rounding size say that no energy is stored
-    size_of_K: Any = abs(K)
-    sizes = np.asarray(size_of_K @ np.abs(motions))
-    scale = np.linalg.norm(sizes, axis=0)
+    # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
+    K = by_rows(K)
+    size_of_K = absolute(K)
+    scale = np.linalg.norm(np.asarray(size_of_K @ np.abs(motions)), axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     force = np.asarray(K @ motions) / scale
-    tolerance = _tolerance(K, force)
-    free = np.linalg.norm(force, axis=0) < tolerance
+    free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
     if np.all(free):
-        return motions
+        return _not_held(M, K, motions, force * scale, _sizes(size_of_K, motions))
     # of the small triangle: the left factor of all DOFs would be a full square matrix
     _, found, right = la.svd(la.qr(force, mode="economic")[1])
     values = np.zeros(scale.size)
     values[: found.size] = found
-    null = right[values < tolerance].T
+    null = right[values < _ENERGY_TOLERANCE].T
     basis = motions[:, free]
     if null.shape[1] > basis.shape[1]:
         basis = orthonormalised(M, motions @ (null / scale[:, None]))
-    near = right[(values >= tolerance) & (values < _NEARLY)].T
+    basis = _not_held(M, K, basis, np.asarray(K @ basis), _sizes(size_of_K, basis))
+    near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
     if not near.shape[1]:
         return basis
     nearly = _everywhere_small(K, size_of_K, motions @ (near / scale[:, None]))
     return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
 
 
-def _tolerance(K: Matrix, force: FloatArray) -> float:
-    """Return the size of relative forces (n, r) that pass for rounding.
+def _sizes(size_of_K: Any, motions: FloatArray) -> FloatArray:
+    """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest.
 
-    Rounding of K leaves forces everywhere; those of soft springs are at a few DOFs only, and are
-    looked at closer however small they are.
+    So that rounding is seen in proportion also where a motion passes through zero.
     """
-    size = np.linalg.norm(force, axis=0)
-    small = (size > _ROUNDED) & (size < _ENERGY_TOLERANCE)
-    if not small.any():
-        return _ENERGY_TOLERANCE
-    entries: Any = K.diagonal()
-    weight = np.where(entries > 0, entries, np.inf)
-    squares = force[:, small] ** 2 / weight[:, None]
-    # the number of rows that share a force: of m equal ones it is m
-    rows = squares.sum(axis=0) ** 2 / np.maximum((squares**2).sum(axis=0), np.finfo(float).tiny)
-    return _ROUNDED if rows.min() < _FEW * force.shape[0] else _ENERGY_TOLERANCE
+    most = np.abs(motions).max(axis=0, initial=0.0)
+    whole: FloatArray = np.asarray(size_of_K.sum(axis=1), dtype=np.float64).reshape(-1, 1)
+    return np.asarray(whole * most)
+
+
+def _not_held(
+    M: Matrix, K: Matrix, motions: FloatArray, force: FloatArray, most: FloatArray
+) -> FloatArray:
+    """Return the combinations of almost force-free motions that no soft spring holds.
+
+    Rounding of K leaves forces at all DOFs, of about the same size relative to what cancels there.
+    Springs leave larger ones at a few DOFs, however soft they are.
+    """
+    n = motions.shape[0]
+    if not motions.size:
+        return motions
+    force = np.abs(force)
+    part = np.divide(force, most, out=np.zeros_like(force), where=most > 0)
+    usual = np.maximum(np.median(part, axis=0), np.finfo(float).eps)
+    rows = np.flatnonzero(np.any(part > _OUTLIER * usual, axis=1))
+    if not rows.size or rows.size > max(_FEW * n, min(_FEW_ROWS, n // 4)):
+        return motions
+    # each row in terms of its rounding, so that springs of any two stiffnesses compare
+    entries: Any = K
+    held = np.asarray(entries[rows] @ motions) / most[rows].max(axis=1, keepdims=True)
+    values = np.zeros(motions.shape[1])
+    _, found, right = la.svd(held)
+    values[: found.size] = found
+    null = right[values < _OUTLIER * usual.max() * np.sqrt(rows.size)].T
+    if null.shape[1] == motions.shape[1] or not null.shape[1]:
+        return motions[:, : null.shape[1]]
+    untouched = np.all(part[rows] <= _OUTLIER * usual, axis=0)
+    if np.count_nonzero(untouched) == null.shape[1]:
+        return motions[:, untouched]
+    return orthonormalised(M, motions @ null)
 
 
 def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:

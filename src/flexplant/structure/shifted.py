@@ -10,15 +10,15 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
 from ..values import FloatArray
-from .factor import diagonal
 from .model import FEModel
 from .multifrontal import MultifrontalCholesky, multifrontal_inertia
 from .ordering import Dissection, dissect
 from .pardiso import Pardiso, PardisoCholesky
+from .ritz import rounding_of
 
-#: the shift, of the largest eigenvalue: far below the first elastic mode of nearly all models,
-#: yet K - sigma M is well away from singular
-_SHIFT = -1e-12
+#: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
+#: of nearly all models, yet K - sigma M is well away from singular
+_SHIFT = -3e3
 #: static responses solve K u = f to this part of the load
 _STATIC = 1e-13
 _held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]]
@@ -47,8 +47,8 @@ class StiffnessFactor:
         self.M: Any = sp.csc_array(model.M)
         self.K: Any = sp.csc_array(model.K)
         self.rigid = model.rigid_body
-        self.largest = float(np.max(diagonal(self.K) / diagonal(self.M)))
-        self.sigma = _SHIFT * self.largest
+        # of motions, not of single DOFs: next to no inertia in some of these says nothing
+        self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
         shifted = sp.csc_array(self.K - self.sigma * self.M)
         self.dissection = dissection_of(model)
         try:

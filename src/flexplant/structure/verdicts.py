@@ -11,7 +11,7 @@ from ..labels import DIRECTIONS
 from ..values import FloatArray
 from .factor import diagonal
 from .facts import Facts
-from .zero_energy import ZeroEnergy
+from .zero_energy import ZeroEnergy, most_moved
 
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
@@ -20,8 +20,6 @@ Line: TypeAlias = tuple[str, str, str, str]
 _SYMMETRY = 1e-9
 #: a diagonal that exceeds all it couples to by this much is a penalty
 _PENALTY = 1e6
-#: DOFs of a mechanism that move at least this part of the most moving one
-_MOVES = 0.05
 #: a body larger than this [m] and lighter, per cube of its size, than that [kg/m^3] is odd
 _LARGE, _LIGHT = 20.0, 1e-5
 _HEAVY = 1e5
@@ -35,9 +33,7 @@ def listed(names: Sequence[str], most: int = 6) -> str:
 
 def spread(found: Facts, motion: FloatArray) -> tuple[str, ...]:
     """Return the DOFs that move most in a motion (n,), the first first."""
-    size = np.abs(motion)
-    order = np.argsort(-size, kind="stable")[:24]
-    return found.names(order[size[order] >= _MOVES * size[order[0]]])
+    return found.names(most_moved(motion))
 
 
 def matrices(found: Facts) -> list[Line]:
@@ -232,6 +228,9 @@ def _freedom(motions: ZeroEnergy) -> str:
     free, held = ", ".join(motions.free), ", ".join(motions.grounded)
     combined = motions.n_rigid - len(motions.free)
     absent = f"; no DOFs for {', '.join(motions.absent)}" if motions.absent else ""
+    if motions.n_bodies > 1:
+        together = f"free in {free}" if free else "held"
+        return f"{motions.n_bodies} bodies, each with its own motions; together {together}{absent}"
     if combined > 0:
         alone = f"free in {free}, and " if free else ""
         among = f"{combined} combination{'s' * (combined != 1)} of {held}"

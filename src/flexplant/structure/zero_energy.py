@@ -10,15 +10,18 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
-from ..values import FloatArray
+from ..values import FloatArray, IntArray
 from .factor import dense
 from .lowest import ROUNDING
+from .pieces import bodies
 from .rigid import orthonormalised, rigid_motions
 
 #: times the energy that rounding of the entries allows: free
 _MARGIN = 3.0
 #: a singular value below this part of the largest is none
 _RANK = 1e-8
+#: DOFs of a mechanism that move at least this part of the most moving one
+_MOVES = 0.05
 #: full matrices beyond this do not fit the memory comfortably
 _LARGEST = 6000
 
@@ -36,7 +39,10 @@ class ZeroEnergy:
     absent : tuple of str
         Which the DOFs cannot make.
     n_rigid : int
-        Independent rigid-body motions without energy, combinations included.
+        Independent rigid-body motions without energy, combinations and those of all bodies
+        included.
+    n_bodies : int
+        Pieces that nothing joins, each with motions of its own.
     rigid : (n, n_rigid) array
         A basis of them.
     mechanisms : (n, m) array
@@ -50,18 +56,26 @@ class ZeroEnergy:
     grounded: tuple[str, ...]
     absent: tuple[str, ...]
     n_rigid: int
+    n_bodies: int
     rigid: FloatArray
     mechanisms: FloatArray
     length_factor: float | None
 
 
 def zero_energy(
-    K: Any, dofs: DofSet, zero_modes: FloatArray, *, located: bool, rounding: float
+    K: Any,
+    dofs: DofSet,
+    zero_modes: FloatArray,
+    *,
+    located: bool,
+    rounding: float,
+    M: Any = None,
 ) -> ZeroEnergy:
     """Return the rigid-body motions of the geometry and the mechanisms among `zero_modes` (n, q).
 
     Free are those whose energy is below three times the relative `rounding` of the entries of K.
-    Rotations are left out where coordinates are not known.
+    Rotations are left out where coordinates are not known. Pieces that neither K nor M joins have
+    their own motions each.
     """
     center = dofs.xyz.mean(axis=0) if len(dofs) else np.zeros(3)
     motions = rigid_motions(dofs.replace(xyz=dofs.xyz - center, interpolation=None))
@@ -74,12 +88,17 @@ def zero_energy(
     most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
     energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
     free = (energy < _MARGIN * rounding * most) & present
-    basis = _independent(motions[:, free])
-    if not free[present].all():
-        combined = _free_combinations(
-            K, size, _independent(motions[:, present]), _MARGIN * rounding
-        )
-        basis = combined if combined.shape[1] > basis.shape[1] else basis
+    several = bodies(K, M, dofs)
+    if len(several) == 1:
+        basis = _free_motions(K, size, motions, _MARGIN * rounding)
+    else:
+        parts = []
+        for rows in several:
+            stiffness, sizes = (A[rows][:, rows] for A in (K, size))
+            found = _free_motions(stiffness, sizes, motions[rows], _MARGIN * rounding)
+            parts.append(np.zeros((len(dofs), found.shape[1])))
+            parts[-1][rows] = found
+        basis = np.hstack(parts)
     return ZeroEnergy(
         free=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
         grounded=tuple(
@@ -89,10 +108,24 @@ def zero_energy(
         ),
         absent=tuple(name for name, there in zip(names, present, strict=True) if not there),
         n_rigid=basis.shape[1],
+        n_bodies=len(several),
         rigid=basis,
-        mechanisms=_beyond(zero_modes, basis),
+        mechanisms=beyond(zero_modes, basis),
         length_factor=_length_factor(K, dofs, motions, free),
     )
+
+
+def _free_motions(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
+    """Return an orthonormal basis (n, r) of the motions, or combinations, without energy."""
+    motions = motions[:, np.any(motions != 0, axis=0)]
+    most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
+    energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
+    free = energy < allowed * most
+    basis = _independent(motions[:, free])
+    if free.all():
+        return basis
+    combined = _free_combinations(K, size, _independent(motions), allowed)
+    return combined if combined.shape[1] > basis.shape[1] else basis
 
 
 def _free_combinations(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
@@ -115,11 +148,11 @@ def _independent(motions: FloatArray) -> FloatArray:
     return np.asarray(spread[:, sizes > _RANK * sizes[0]], dtype=np.float64)
 
 
-def nearly_free(K: Any, dofs: DofSet, digits: int | None) -> FloatArray:
+def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     """Return the rigid-body motions of the geometry that cost no more energy than rounding."""
     rounding = ROUNDING if digits is None else max(ROUNDING, 10.0**-digits)
     none = np.zeros((len(dofs), 0))
-    return zero_energy(K, dofs, none, located=True, rounding=rounding).rigid
+    return zero_energy(K, dofs, none, located=True, rounding=rounding, M=M).rigid
 
 
 def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
@@ -134,7 +167,7 @@ def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
         raise ModelError(
             f"freeing fills K: too large for {len(dofs)} DOFs (limit {_LARGEST}). Export in binary."
         )
-    motions = nearly_free(K, dofs, digits)
+    motions = nearly_free(K, M, dofs, digits)
     if not motions.shape[1]:
         raise ModelError(
             "no rigid-body motion of the geometry is free but for rounding: the structure is held, "
@@ -150,7 +183,14 @@ def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     return np.asarray(0.5 * (full + full.T), dtype=np.float64)
 
 
-def _beyond(zero_modes: FloatArray, rigid: FloatArray) -> FloatArray:
+def most_moved(motion: FloatArray) -> IntArray:
+    """Return the DOFs (from 0, at most 24) that move most in a motion (n,), the first first."""
+    size = np.abs(motion)
+    order = np.argsort(-size, kind="stable")[:24]
+    return np.asarray(order[size[order] >= _MOVES * size[order[0]]], dtype=np.int64)
+
+
+def beyond(zero_modes: FloatArray, rigid: FloatArray) -> FloatArray:
     """Return the part of a space that is not rigid-body motion, as orthonormal columns."""
     extra = zero_modes.shape[1] - rigid.shape[1]
     if extra <= 0:
