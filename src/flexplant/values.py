@@ -18,6 +18,8 @@ from .store import rebuild as rebuild
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
+#: what seeds chance
+Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = "FloatArray | sp.csc_array"
 

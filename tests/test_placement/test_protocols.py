@@ -60,7 +60,7 @@ class Drawn(Search):
 
     draws: int = 30
 
-    def search(self, problem, *, rng=None, executor=None, progress=None):
+    def search(self, problem, rng, executor, progress):
         random = np.random.default_rng(rng)
         total = len(problem.layouts.candidates)
         sets = [

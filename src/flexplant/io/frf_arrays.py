@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 
 from ..errors import FlexplantError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
+from .mat_variables import mat_variables
 from .paths import file_path
 
 _OPTIONAL = ("inputs", "outputs", "quantity", "coherence", "variance")
@@ -119,16 +119,7 @@ def read_frf_mat(
     FileNotFoundError
         When there is no such file.
     """
-    file: Any  # the stubs know names of files only
-    with file_path(path).open("rb") as file:
-        try:
-            content = scipy.io.loadmat(file, chars_as_strings=True)
-        except Exception as error:
-            raise FlexplantError(
-                f"{str(path)!r} cannot be read as a MATLAB file ({error!s:.80}). Version 7.3 is "
-                "another format: save it with '-v7'."
-            ) from None
-    plain = {name: value for name, value in content.items() if not name.startswith("__")}
+    plain = mat_variables(path)
     for side in ("inputs", "outputs"):
         if side in plain:
             plain[side] = [str(np.squeeze(cell)).strip() for cell in np.ravel(plain[side])]

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import scipy.io
 import scipy.sparse as sp
 
 from ..errors import FlexplantError
@@ -16,6 +15,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
 from .formats import Format
+from .mat_variables import mat_variables
 from .paths import file_path
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -132,19 +132,9 @@ def _numpy(path: Path, name: str) -> dict[str, Any]:
 
 
 def _version5(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
-    file: Any  # the stubs know names of files only
-    with path.open("rb") as file:
-        try:
-            content = scipy.io.loadmat(file, struct_as_record=False, squeeze_me=False)
-        except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
-            raise FlexplantError(
-                f"{str(path)!r} cannot be read as a MATLAB file ({error}). Write it in MATLAB with "
-                "save(path, 'K', 'M', '-v7')."
-            ) from None
     variables: dict[str, Any] = {}
-    for name, value in content.items():
-        if not name.startswith("__"):
-            _flatten(name, value, variables)
+    for name, value in mat_variables(path, struct_as_record=False).items():
+        _flatten(name, value, variables)
     names = chosen(variables, wanted, path.name)
     return {part: variables[key] for part, key in names.items() if key is not None}
 

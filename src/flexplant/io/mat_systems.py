@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import scipy.io
 
-from ..errors import FlexplantError, ModelError
+from ..errors import ModelError
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..plant import StandardPlant
 from ..store import written
-from .paths import file_path
+from .mat_variables import mat_variables
 
 
 def write_mat(path: str | Path, system: System | StandardPlant) -> None:
@@ -76,21 +76,12 @@ def read_mat(path: str | Path) -> StateSpace | StandardPlant:
     FileNotFoundError
         When there is no such file.
     """
-    file: Any  # the stubs know names of files only
-    with file_path(path).open("rb") as file:
-        try:
-            content = scipy.io.loadmat(file)
-        except (ValueError, TypeError, NotImplementedError, scipy.io.matlab.MatReadError) as error:
-            raise FlexplantError(
-                f"{str(path)!r} cannot be read as a MATLAB file ({error}). Version 7.3 is another "
-                "format: save it with '-v7'."
-            ) from None
+    content = mat_variables(path)
     missing = [name for name in "ABCD" if name not in content]
     if missing:
-        found = sorted(name for name in content if not name.startswith("__"))
         raise ModelError(
-            f"{str(path)!r} has no {', '.join(missing)}: it holds {found[:8]}. A system object "
-            "must be taken apart in MATLAB: [A, B, C, D, dt] = ssdata(P)."
+            f"{str(path)!r} has no {', '.join(missing)}: it holds {sorted(content)[:8]}. A system "
+            "object must be taken apart in MATLAB: [A, B, C, D, dt] = ssdata(P)."
         )
     blocks = content.get("blocks")
     g = StateSpace(

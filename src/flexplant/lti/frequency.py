@@ -21,6 +21,7 @@ from ..values import (
     signal_names,
 )
 from .grid import default_freq as default_freq
+from .joining import short_list
 from .line_correlation import checked_overlap, checked_window, line_correlation
 from .responses import responses
 from .statespace import System, as_statespace
@@ -138,7 +139,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         )
 
     def __repr__(self) -> str:
-        sides = f"{_listed(self.inputs)} -> {_listed(self.outputs)}"
+        sides = f"{short_list(self.inputs)} -> {short_list(self.outputs)}"
         span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""
         return f"<Frf: {sides}, {self.freq.size} frequencies {span}>"
 
@@ -381,7 +382,3 @@ def _index(known: Sequence[str], name: str, side: str) -> int:
     if name not in known:
         raise unknown_label(side, name, known)
     return list(known).index(name)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, ... {names[-1]} ({len(names)})"

@@ -138,8 +138,8 @@ def joined_blocks(parts: Sequence[Any]) -> list[int]:
 
 
 def short_list(names: Sequence[str]) -> str:
-    """Return the first few names, for a message."""
-    return ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+    """Return names, of many the first and the last."""
+    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, ... {names[-1]} ({len(names)})"
 
 
 def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:

@@ -22,7 +22,7 @@ from ..values import (
     real_array,
     signal_names,
 )
-from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series
+from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series, short_list
 
 if TYPE_CHECKING:
     import control
@@ -124,7 +124,7 @@ class StateSpace(Value):
     def __repr__(self) -> str:
         kind = "continuous" if not self.dt else f"dt {self.dt:g} s"
         named = f" {self.name!r}" if self.name else ""
-        sides = f"{_listed(self.inputs)} -> {_listed(self.outputs)}"
+        sides = f"{short_list(self.inputs)} -> {short_list(self.outputs)}"
         return f"<StateSpace{named}: {self.n_states} states, {kind}, {sides}>"
 
     @property
@@ -354,7 +354,3 @@ def _rows(known: Sequence[str], names: Iterable[str], side: str, owner: str | No
             raise unknown_label(side, name, known, owner or "")
         rows.append(position[name])
     return np.array(rows, dtype=np.int64)
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names) if len(names) <= 4 else f"{names[0]}, ... {names[-1]} ({len(names)})"

@@ -10,7 +10,7 @@ from functools import partial
 import numpy as np
 
 from ..parallel import mapped
-from ..values import FloatArray, seed_sequence, whole
+from ..values import FloatArray, Rng, seed_sequence, whole
 from .problem import Found, Problem, Search
 
 #: an exchange must gain this, relative, to be made: rounding must not make it go round in circles
@@ -40,12 +40,7 @@ class Exchange(Search):
         self._set(starts=whole(self.starts, "starts"))
 
     def search(
-        self,
-        problem: Problem,
-        *,
-        rng: int | np.random.SeedSequence | np.random.Generator | None = None,
-        executor: Executor | None = None,
-        progress: bool | None = None,
+        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
     ) -> Found:
         """Return the best of all starts, bounded by relaxation; see `Search.search`."""
         runs = mapped(

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from ..errors import ModelError
-from ..values import whole
+from ..values import Rng, whole
 from .problem import Found, Problem, Search
 
 
@@ -34,12 +34,7 @@ class Exhaustive(Search):
         self._set(limit=whole(self.limit, "limit"))
 
     def search(
-        self,
-        problem: Problem,
-        *,
-        rng: int | np.random.SeedSequence | np.random.Generator | None = None,
-        executor: Executor | None = None,
-        progress: bool | None = None,
+        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
     ) -> Found:
         """Return the best of all subsets; see `Search.search`. Nothing is random.
 

@@ -8,7 +8,7 @@ from math import comb
 
 import numpy as np
 
-from ..values import FloatArray, Value
+from ..values import FloatArray, Rng, Value
 from .layouts import WEAK, Layouts
 
 
@@ -70,12 +70,7 @@ class Search(Value):
     """A way to search; the base of all of them."""
 
     def search(
-        self,
-        problem: Problem,
-        *,
-        rng: int | np.random.SeedSequence | np.random.Generator | None = None,
-        executor: Executor | None = None,
-        progress: bool | None = None,
+        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
     ) -> Found:
         """Return the best choice that was found.
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
 from ..plant import StandardPlant
-from ..values import Value, name_list, whole
+from ..values import Rng, Value, name_list, whole
 from .candidates import Port, Side, checked_plant, known_candidates, with_side
 from .criterion import Criterion
 from .exchange import Exchange
@@ -94,7 +94,7 @@ def place_sensors(
     method: Search | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
-    rng: int | np.random.SeedSequence | np.random.Generator | None = None,
+    rng: Rng = None,
 ) -> Placement:
     """Return the best choice of `count` sensors among candidates.
 
@@ -156,7 +156,7 @@ def place_actuators(
     method: Search | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
-    rng: int | np.random.SeedSequence | np.random.Generator | None = None,
+    rng: Rng = None,
 ) -> Placement:
     """Return the best choice of `count` actuators among candidates: the dual of `place_sensors`.
 
@@ -215,7 +215,7 @@ def _placed(
     method: Search | None,
     executor: Executor | None,
     progress: bool | None,
-    rng: int | np.random.SeedSequence | np.random.Generator | None,
+    rng: Rng,
 ) -> Placement:
     checked_plant(plant)
     ports = tuple(known_candidates(plant, side, candidates).values())
@@ -241,7 +241,7 @@ def _placed(
             "method must be a search such as Exchange(...) or Exhaustive(), got "
             f"{type(method).__name__}. Pass one."
         )
-    found = method.search(problem, rng=rng, executor=executor, progress=progress)
+    found = method.search(problem, rng, executor, progress)
     if not np.isfinite(found.value):
         raise InfeasibleError(
             f"no choice of {count} of the {len(ports)} candidates has a finite score; the last "
