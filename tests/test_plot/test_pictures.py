@@ -8,7 +8,7 @@ import pytest
 from matplotlib import image
 
 import flexplant as fx
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import Frf
 from flexplant.simulation import Response
 from stages import CORNERS, INSET, Z8, L, fitted, ports, reduced, some_modes
@@ -207,3 +207,55 @@ def test_they_draw_where_they_are_told():
     wave = np.ones((2, 50))
     assert fx.plot.response(run_of(wave), ax=ax) is ax
     assert fx.plot.residual(fitted(reduced(), POLES), ax=ax) is ax
+
+
+def test_frf_shows_what_others_cover_and_differ_by():
+    one, two = some_frf(), some_frf(1.5)
+    ax = fx.plot.frf({"one": one, "two": two}, "y1", "u1", unit="m/N", reference="one")
+    thick, thin, difference = ax.get_lines()
+    assert thick.get_linewidth() > 2 * thin.get_linewidth()
+    np.testing.assert_allclose(difference.get_ydata(), thick.get_ydata() + 20 * np.log10(0.5))
+    assert texts(ax) == {"one", "two", "two less one"}
+    other = some_frf().replace(freq=np.geomspace(2.0, 1e3, 50))
+    ax = fx.plot.frf({"one": one, "other": other}, "y1", "u1", unit="m/N", reference="one")
+    assert len(ax.get_lines()) == 2
+    with pytest.raises(LabelError, match="no response 'three'"):
+        fx.plot.frf({"one": one}, "y1", "u1", reference="three")
+
+
+def test_a_part_of_a_run_has_its_own_prefix():
+    wave = np.where(np.arange(50) < 25, 1e-3, 1e-9) * np.ones(50)
+    ax = fx.plot.response(run_of([wave, wave]), ["die:z"], span=(0.03, 0.045))
+    (line,) = ax.get_lines()
+    np.testing.assert_allclose(line.get_xdata(), np.arange(30, 46) * 1e-3)
+    np.testing.assert_allclose(line.get_ydata(), 1.0)
+    assert ax.get_ylabel() == "displacement [nm]"
+    with pytest.raises(ModelError, match="no sample between 1 and 2 s"):
+        fx.plot.response(run_of([wave, wave]), span=(1.0, 2.0))
+
+
+def test_predictions_beside_what_was_found():
+    rows = {
+        "hopeful": [(1e-9, 4e-9, 3.5e-9, 4.4e-9), (1e-8, 4e-8, 3e-8, 5e-8)],
+        "honest": [(2e-9, 2e-9, 1.9e-9, 2.1e-9)],
+    }
+    ax = fx.plot.predictions(rows, colors={"honest": "tab:blue"})
+    assert [text.get_text() for text in ax.get_yticklabels()] == ["honest", "hopeful"]
+    diamonds = [line for line in ax.get_lines() if line.get_marker() == "D"]
+    np.testing.assert_allclose(diamonds[0].get_xdata(), [1.0, 10.0])
+    np.testing.assert_allclose(diamonds[1].get_xdata(), [2.0])
+    np.testing.assert_allclose(diamonds[1].get_ydata(), 0.0)
+    assert diamonds[1].get_color() == "tab:blue"
+    found = [
+        line for line in ax.get_lines() if line.get_marker() == "|" and line.get_markersize() == 14
+    ]
+    np.testing.assert_allclose(found[0].get_xdata(), [4.0, 40.0])
+    assert ax.get_xlabel() == "rms error [nm]"
+    assert texts(ax) == {"predicted by the design", "on the machine, 95 %"}
+    assert ink(ax) > 0.005
+    with pytest.raises(ModelError, match="mapping of designs"):
+        fx.plot.predictions([1.0])
+    with pytest.raises(ShapeError, match="hopeful"):
+        fx.plot.predictions({"hopeful": [(1.0, 2.0)]})
+    with pytest.raises(ModelError, match="positive"):
+        fx.plot.predictions({"none": [(0.0, 1.0, 0.9, 1.1)]})

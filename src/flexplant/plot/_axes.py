@@ -1,4 +1,4 @@
-"""What all pictures share: axes to draw on, and the colours of the paper's figures."""
+"""What all pictures share: axes to draw on, and one colour for one thing."""
 
 from __future__ import annotations
 
@@ -7,8 +7,11 @@ from typing import Any
 import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-#: one colour a role, in every picture
-MEASURED, REDUCED, UPDATED, FULL = "black", "tab:blue", "tab:red", "tab:green"
+#: one colour for one thing in every picture: the machine, the drawing, the updated model, and the
+#: full model that a reduction stands for
+MEASURED, NOMINAL, UPDATED, FULL = "black", "0.55", "tab:blue", "tab:green"
+#: what is marked, and small differences
+MARK, DIFFERENCE = "tab:red", "tab:orange"
 _PREFIXES = (
     (1e-15, "f"),
     (1e-12, "p"),
@@ -19,7 +22,7 @@ _PREFIXES = (
     (1e3, "k"),
     (1e6, "M"),
 )
-CYCLE = (REDUCED, UPDATED, FULL, "tab:orange", "tab:purple", "tab:brown")
+CYCLE = (UPDATED, "tab:orange", FULL, "tab:purple", "tab:brown", "tab:red")
 
 
 def axes(ax: Axes | None, **figure: Any) -> Axes:

@@ -7,9 +7,9 @@ from collections.abc import Collection, Mapping
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..errors import ModelError
+from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
-from ..values import FloatArray, short
+from ..values import ComplexArray, FloatArray, short
 from ._axes import CYCLE, axes, finish
 
 
@@ -20,9 +20,12 @@ def frf(
     *,
     colors: Mapping[str, str] | None = None,
     unit: str | None = None,
+    reference: str | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw the magnitude of one channel of several FRFs (paper, Figs. 4, 10 and 11).
+
+    The first one is drawn as a thick line, so that those that cover it do not hide it.
 
     Parameters
     ----------
@@ -34,6 +37,9 @@ def frf(
         Of some lines.
     unit : str, optional
         Of the gain, where the responses do not know it; 0 dB is one of it.
+    reference : str, optional
+        A label: the differences of the other responses from this one are drawn as dotted lines,
+        where they share its frequencies.
     ax : Axes, optional
         Where to draw.
 
@@ -43,6 +49,8 @@ def frf(
 
     Raises
     ------
+    LabelError
+        When there is no such reference.
     ModelError
         When there is no such mapping, or the responses are of different units.
     """
@@ -60,14 +68,26 @@ def frf(
             f"{output} / {input} is in different units, which share no axis: {units}. Convert one "
             "(frf.converted), or draw them apart."
         )
+    if reference is not None and reference not in responses:
+        raise unknown_label("response", reference, responses)
     ax = axes(ax, figsize=(8.0, 4.5))
     for i, (label, response) in enumerate(responses.items()):
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
-        gain = 20.0 * np.log10(np.abs(response[output, input]))
-        ax.semilogx(response.freq, gain, color=color, label=label, linewidth=1.1)
+        thick = i == 0 and len(responses) > 1
+        line = {"color": color, "linewidth": 2.6 if thick else 1.1, "alpha": 0.6 if thick else 1.0}
+        ax.semilogx(response.freq, _decibel(response[output, input]), label=label, **line)
+        base = None if reference in (None, label) else responses[str(reference)]
+        if base is not None and np.array_equal(base.freq, response.freq):
+            error = _decibel(response[output, input] - base[output, input])
+            text = f"{label} less {reference}"
+            ax.semilogx(response.freq, error, ":", color=color, label=text, linewidth=1.1)
     ax.legend(frameon=False)
     one = f"1 {known.pop()}" if known else "1"
     return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [dB, 0 dB = {one}]")
+
+
+def _decibel(values: ComplexArray) -> FloatArray:
+    return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), 1e-300)))
 
 
 def sensitivity(

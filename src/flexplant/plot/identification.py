@@ -8,14 +8,14 @@ from matplotlib.axes import Axes
 from ..errors import ModelError
 from ..identification import IdentifiedModes, StabilisationDiagram
 from ..lti.frequency import Frf
-from ._axes import FULL, MEASURED, REDUCED, UPDATED, axes, finish
+from ._axes import DIFFERENCE, MARK, MEASURED, UPDATED, axes, finish
 
 #: marker, colour and legend of the flags 0 to 3
 _MARKS = (
     (".", "0.7", "new"),
-    ("o", "tab:orange", "frequency"),
-    ("d", REDUCED, "and damping"),
-    ("+", UPDATED, "and shape: stable"),
+    ("o", DIFFERENCE, "frequency"),
+    ("d", UPDATED, "and damping"),
+    ("+", MARK, "and shape: stable"),
 )
 
 
@@ -96,7 +96,7 @@ def identified(
     known, fit = frf[output, input][inside], modes.frf(freq)[output, input]
     ax.semilogy(freq, np.abs(known), color=MEASURED, label="measured", linewidth=1.4)
     ax.semilogy(freq, np.abs(fit), "--", color=UPDATED, label="identified", linewidth=1.1)
-    ax.semilogy(freq, np.abs(known - fit), color=FULL, label="difference", linewidth=0.7)
+    ax.semilogy(freq, np.abs(known - fit), color=DIFFERENCE, label="difference", linewidth=0.7)
     if frf.variance is not None:
         place = list(frf.outputs).index(output), list(frf.inputs).index(input)
         deviation = np.sqrt(frf.variance[place][inside])

@@ -14,7 +14,7 @@ from ..placement import SensorMap
 from ..plant import Ports
 from ..structure import Disc, Rectangle
 from ..values import FloatArray, short
-from ._axes import MEASURED, UPDATED, axes, finish
+from ._axes import MARK, MEASURED, axes, finish
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
@@ -56,7 +56,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     if there:
         points: FloatArray = np.array(there, dtype=np.float64)
         ax.plot(points[:, 0], points[:, 1], "P", color=MEASURED, label="sensors", clip_on=False)
-    ax.plot(*found.best[:2], "*", color=UPDATED, markersize=14, label="best place", clip_on=False)
+    ax.plot(*found.best[:2], "*", color=MARK, markersize=14, label="best place", clip_on=False)
     ax.set_aspect("equal")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
     return finish(ax, x="x [m]", y="y [m]")

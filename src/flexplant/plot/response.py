@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
 from ..simulation import Response
-from ..values import name_list, short
+from ..values import name_list, real_array, short
 from ._axes import CYCLE, finish, panel_axes, scale
 
 #: what a unit measures
@@ -32,6 +32,7 @@ def response(
     unit: str | None = None,
     label: str | None = None,
     color: str | None = None,
+    span: tuple[float, float] | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw channels of a run over time, one panel for each unit; of several runs the first.
@@ -48,6 +49,8 @@ def response(
         Put before the channels' names, to compare runs in one axes.
     color : str, optional
         Of the lines; a cycle when not given.
+    span : (start, end) [s], optional
+        The part of the run to draw; all of it when not given. The prefix is chosen for this part.
     ax : Axes, optional
         Where to draw channels of one unit.
 
@@ -61,10 +64,12 @@ def response(
     LabelError
         When a channel is unknown.
     ModelError
-        When `run` is no Response, or channels of several units shall go into one axes.
+        When `run` is no Response, nothing of it is within `span`, or channels of several units
+        shall go into one axes.
     """
     if not isinstance(run, Response):
         raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+    run = run if span is None else _part(run, span)
     chosen = None if channels is None else name_list(channels, "channels")
     names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])
     panels: dict[str | None, list[str]] = {}
@@ -85,6 +90,18 @@ def response(
         for panel in drawn[:-1]:
             panel.set_xlabel("")
     return drawn[0]
+
+
+def _part(run: Response, span: tuple[float, float]) -> Response:
+    """Return the samples of a run within a span of time."""
+    start, end = real_array(span, "span", (2,)).tolist()
+    within = (run.time >= start) & (run.time <= end)
+    if not within.any():
+        raise ModelError(
+            f"the run has no sample between {start:g} and {end:g} s: it lasts from "
+            f"{run.time[0]:g} to {run.time[-1]:g} s. Choose another span."
+        )
+    return run.replace(time=run.time[within], data=run.data[..., within])
 
 
 def _panel(

@@ -13,7 +13,7 @@ from ..errors import ModelError
 from ..labels import DofSet
 from ..plant import Ports
 from ..reduction import Modes
-from ._axes import FULL, REDUCED, UPDATED, axes, finish
+from ._axes import FULL, MARK, NOMINAL, UPDATED, axes, finish
 
 
 def layout(
@@ -53,8 +53,8 @@ def layout(
     if ports is not None:
         for kind, listed, marker, color, size in (
             ("actuators u", ports.u, "o", FULL, 12),
-            ("sensors y", ports.y, "P", REDUCED, 9),
-            ("points of interest", ports.z, "*", UPDATED, 15),
+            ("sensors y", ports.y, "P", UPDATED, 9),
+            ("points of interest", ports.z, "*", MARK, 15),
         ):
             _mark(ax, dofs, kind, listed, marker=marker, color=color, markersize=size)
     for text, place in (marked or {}).items():
@@ -84,7 +84,7 @@ def _point(dofs: DofSet, at: Any) -> Any:
     return np.asarray(at)
 
 
-def mode_shape(modes: Modes, number: int, *, ax: Any = None, color: str = REDUCED) -> Any:
+def mode_shape(modes: Modes, number: int, *, ax: Any = None, color: str = NOMINAL) -> Any:
     """Draw the z-displacements of one mode as a surface (paper, Figs. 5 and 6).
 
     Parameters

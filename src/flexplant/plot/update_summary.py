@@ -15,7 +15,7 @@ from ..lti.frequency import Frf
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
 from ..updating.search import Objective
 from ..values import FloatArray
-from ._axes import MEASURED, REDUCED, UPDATED, finish
+from ._axes import MEASURED, NOMINAL, UPDATED, finish
 
 #: parameters that are drawn by themselves; the rest are left to the repr
 SHOWN = 12
@@ -92,7 +92,7 @@ def update(
 def _errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what: str) -> None:
     place = np.arange(len(seen.modes))
     unit = 100.0
-    ax.bar(place - 0.2, unit * old, 0.38, color=REDUCED, label="before")
+    ax.bar(place - 0.2, unit * old, 0.38, color=NOMINAL, label="before")
     ax.bar(place + 0.2, unit * new, 0.38, color=UPDATED, label="after")
     for x, value in zip(place + 0.2, unit * new, strict=True):
         above = value >= 0
@@ -158,7 +158,7 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
         capsize=4,
         label=f"estimate, {100 * level:g} %",
     )
-    ax.axvline(0.0, color=REDUCED, linewidth=1.0, label="before")
+    ax.axvline(0.0, color=NOMINAL, linewidth=1.0, label="before")
     ax.set_xlim(-1.4, 1.4)
     ax.set_yticks(place, labels, fontsize=8)
     handles, texts = ax.get_legend_handles_labels()
@@ -179,7 +179,7 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
 
 def _convergence(ax: Axes, fit: UpdateResult) -> None:
     steps = np.arange(len(fit.history) + 1)
-    ax.semilogy(steps, np.maximum(fit.history.error, 1e-300), "o-", color=REDUCED, markersize=4)
+    ax.semilogy(steps, np.maximum(fit.history.error, 1e-300), "o-", color=NOMINAL, markersize=4)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
     finish(ax, x="iteration", y="sum of squares of residuals", title="convergence")
 
@@ -191,7 +191,7 @@ def _response(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:
     o, i = np.unravel_index(np.argmax(np.sum(np.abs(frf.data) ** 2, axis=2)), frf.data.shape[:2])
     style = "-" if lines.size > 100 else ".-"
     ax.semilogy(freq, np.abs(frf.data[o, i, lines]), style, color=MEASURED, label="measured", lw=2)
-    for label, model, color in (("before", before, REDUCED), ("after", after, UPDATED)):
+    for label, model, color in (("before", before, NOMINAL), ("after", after, UPDATED)):
         objective = Objective(model, [], [residual])
         tied: Any = objective.bounds[0]
         H = tied.responses(objective.begin(np.zeros(0)))[:, o, i]

@@ -7,7 +7,7 @@ from matplotlib.axes import Axes
 
 from ..updating import UpdateResult
 from ..values import ComplexArray
-from ._axes import CYCLE, MEASURED, REDUCED, axes, finish
+from ._axes import CYCLE, MEASURED, UPDATED, axes, finish
 
 
 def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = None) -> Axes:
@@ -25,7 +25,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     Returns
     -------
     Axes
-        Relative distance to the measured eigenvalue over iterations, on a log scale.
+        Distance to the measured eigenvalue [rad/s] over iterations, on a log scale.
     """
     ax = axes(ax, figsize=(7.0, 4.0))
     steps = np.arange(len(fit.history) + 1)
@@ -47,7 +47,7 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
 
 
 def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
-    """Draw the error e_i of equation (12) over iterations (paper, Fig. 8).
+    """Draw the sum of squared residuals over iterations, e_i of equation (12) (paper, Fig. 8).
 
     Parameters
     ----------
@@ -63,9 +63,9 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     ax = axes(ax, figsize=(7.0, 4.0))
     steps = np.arange(len(fit.history) + 1)
     error = np.maximum(fit.history.error, 1e-300)
-    ax.semilogy(steps, error, "o-", color=REDUCED)
+    ax.semilogy(steps, error, "o-", color=UPDATED)
     ax.set_xticks(steps)
-    return finish(ax, x="iteration", y="e_i, equation (12)")
+    return finish(ax, x="iteration", y="sum of squared residuals")
 
 
 def parameters(
