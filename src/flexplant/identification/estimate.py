@@ -59,7 +59,14 @@ def estimate_frf(
     Frf
         With `coherence` (multiple, the same for all inputs), `variance` E|error|^2 of every entry
         and `correlation` of the errors of different outputs; the last three are None where a
-        single period says nothing about noise.
+        single period says nothing about noise; with the `resolution`, and the `window` and
+        `overlap` of segments.
+
+    Warns
+    -----
+    FlexplantWarning
+        With `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
+        wrong), or when a transient has not died away, with the periods to discard.
 
     Raises
     ------

@@ -12,6 +12,7 @@ from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from .records import Records
 from .spectra import error_statistics
+from .steadiness import inputs_checked, transient, transient_warned
 
 #: a line counts as excited when the weakest direction of the inputs is not this much below the rest
 EXCITED = 1e-3
@@ -85,7 +86,9 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
         keep &= (freq >= method.band[0]) & (freq <= method.band[1])
     if not np.any(keep):
         raise ModelError("no line is excited in all directions of the inputs: check the records.")
-    return frf_of_periods(
+    sides = data.u if data.r is None else data.r
+    periodic = inputs_checked(sides, X[..., keep], samples, data.rate)
+    frf = frf_of_periods(
         freq[keep],
         Y[..., keep],
         U[..., keep],
@@ -96,6 +99,11 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
         quantity=quantity,
         resolution=1.0 / method.period,
     )
+    if periodic:
+        y, u = (_each_period(side, samples)[..., keep] for side in (data.y, data.u))
+        left = y - np.einsum("oif,eipf->eopf", frf.data, u)
+        transient_warned(transient(frf.freq, left, y, discard=method.discard), method.discard)
+    return frf
 
 
 def frf_of_periods(
@@ -155,6 +163,14 @@ def line_spectra(signals: FloatArray, samples: int, periods: int) -> ComplexArra
     lines = np.arange(1, (samples + 1) // 2)
     full = np.fft.rfft(tail, axis=-1) / periods
     return np.asarray(full[..., periods * lines + offsets(periods)[0][:, None]])
+
+
+def _each_period(signals: FloatArray, samples: int) -> ComplexArray:
+    """Return spectra (n_exp, n_channel, n_period, lines) of all periods, the last at the end."""
+    periods = signals.shape[-1] // samples
+    tail = signals[..., signals.shape[-1] - periods * samples :]
+    spectra = np.fft.rfft(tail.reshape(*signals.shape[:-1], periods, samples), axis=-1)
+    return np.asarray(spectra[..., 1 : (samples + 1) // 2])
 
 
 def _mean(spectra: ComplexArray) -> ComplexArray:
