@@ -158,7 +158,7 @@ def transient(
     for length in STRETCHES:
         if length > freq.size:
             break
-        ones = {"size": length, "axis": 0, "mode": "constant"}
+        ones: Any = {"size": length, "axis": 0, "mode": "constant"}
         local: Any = ndi.uniform_filter1d(spread.real, **ones) * length
         local = local + 1j * ndi.uniform_filter1d(spread.imag, **ones) * length
         total = np.trace(local.reshape(-1, count, count), axis1=1, axis2=2).real
