@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import scipy.ndimage as ndi
 
 from ..errors import FlexplantWarning
 from ..values import ComplexArray, FloatArray
@@ -129,6 +128,7 @@ def transient(
     discard : int
         Periods that were left out of the mean.
     """
+    import scipy.ndimage as ndi  # both cost a tenth of a second that few need
     from scipy.stats import f as fisher
 
     first = max(0, min(discard, e.shape[2] - 4))
