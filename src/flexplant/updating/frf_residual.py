@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..labels import Place
@@ -39,7 +40,8 @@ class FrfResidual(Residual):
         Responses of outputs to inputs [quantity / N]; `measured.quantity` says displacement
         (also when None), velocity or acceleration.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        ``E|noise|^2`` of each entry; that of the Frf when not given. Where neither is known,
+        ``E|noise|^2`` of each entry; that of the Frf when not given; the correlation of lines
+        follows from the Frf's window. Where neither is known,
         entries count by their size, each divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: those where the median over the channels of
@@ -159,6 +161,12 @@ class _BoundFrf(Bound):
         if self.magnitude:
             sigma = sigma / np.abs(self.data)
         self.sigma = sigma
+        R = frf.line_correlation()
+        if R is not None and self.noisy:
+            # lines of windowed segments share data: rows are [Re; Im] by line, output and input
+            R = R[lines][:, lines]
+            one = sp.kron(R, sp.eye_array(self.data[0].size))
+            self.noise = sp.csc_array(one if self.magnitude else sp.block_diag([one, one]))
         whole = 1 / sigma
         if not self.magnitude:
             whole = np.sqrt(np.mean(np.abs(self.data) ** 2, axis=0)) / sigma

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
 
 from ..values import FloatArray
 from .point import Point
@@ -39,15 +42,28 @@ def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[fl
     weighted = any(bound.noise is not None for bound, _ in objective.rows(point))
     for bound, rows in objective.rows(point):
         if bound.noise is not None:
-            factor = la.cholesky(bound.noise, lower=True)
-            r[rows] = la.solve_triangular(factor, r[rows], lower=True)
-            J[rows] = la.solve_triangular(factor, J[rows], lower=True)
+            r[rows] = _whitened(bound.noise, r[rows])
+            J[rows] = _whitened(bound.noise, J[rows])
     total = float(r @ r)
     if weighted and J.shape[1]:
         length = np.linalg.norm(J, axis=0)
         Q = la.qr(J / np.where(length > 0, length, 1.0), mode="economic")[0]
         total -= float(np.sum((Q.T @ r) ** 2))
     return max(total, 0.0), max(dof, 0)
+
+
+def _whitened(noise: Any, rows: FloatArray) -> FloatArray:
+    """Return ``L^-1 rows`` with ``noise = L L^T``, which is banded where it is sparse."""
+    if not sp.issparse(noise):
+        return np.asarray(la.solve_triangular(la.cholesky(noise, lower=True), rows, lower=True))
+    sparse: Any = noise
+    coo = sparse.tocoo()
+    apart = coo.row - coo.col
+    width = int(apart.max())
+    band = np.zeros((width + 1, coo.shape[0]))
+    below = apart >= 0
+    band[apart[below], coo.col[below]] = coo.data[below]
+    return np.asarray(la.solve_banded((width, 0), la.cholesky_banded(band, lower=True), rows))
 
 
 def is_bad(probability: float | None) -> bool:
@@ -61,7 +77,7 @@ def worst(objective: Objective, point: Point) -> str:
     found: dict[str, float] = {}
     for bound, rows in objective.rows(point):
         part, noise = r[rows], bound.noise
-        size = np.abs(part) if noise is None else np.abs(part) / np.sqrt(np.diag(noise))
+        size = np.abs(part) if noise is None else np.abs(part) / np.sqrt(noise.diagonal())
         for row in np.argsort(-size, kind="stable")[: 2 * NAMED].tolist():
             name = bound.row_name(row)
             found[name] = max(found.get(name, 0.0), float(size[row]))

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import LabelError
 from ..labels import Place
-from ..values import ComplexArray, FloatArray, Value, short
+from ..values import ComplexArray, FloatArray, Matrix, Value, short
 from .pencil import Family
 from .point import Point
 
@@ -30,7 +30,7 @@ class Bound:
     #: whether the covariance of the measurement is known
     noisy: bool = False
     #: the covariance of the rows where it is known but not the unit matrix
-    noise: FloatArray | None = None
+    noise: Matrix | None = None
     #: what the whole of a measured value is in each row: a part of it is a relative change
     size: FloatArray | float = 1.0
     name: str = ""
