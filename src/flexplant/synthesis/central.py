@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError
+from ..errors import AssumptionError, SolverError
+from ..lti.lyapunov import solve_continuous
 from ..lti.preparation import Prepared
 from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
@@ -16,6 +17,8 @@ from ..values import FloatArray
 
 #: relative: what counts as on the imaginary axis; the largest residual of a Riccati equation
 _AXIS, _RESIDUAL = 1e-10, 1e-6
+#: residuals that are looked at: Newton's correction between them squares the error
+_CORRECTIONS = 4
 #: relative: a difference of the costs of z that is rounding
 _CANCELLED = 1e-12
 #: sensitivity at infinite frequency below which a controller is taken for one of infinite gain
@@ -135,6 +138,15 @@ def quadratic(p: Prepared) -> StateSpace:
     )
 
 
+def _correction(closed: FloatArray, residual: FloatArray, d: FloatArray) -> FloatArray:
+    """Return Newton's correction: what rounding of the invariant subspace left, in states x / d."""
+    try:
+        found = solve_continuous(closed * d[:, None] / d, residual * d * d[:, None])
+    except SolverError as error:
+        raise la.LinAlgError("the solution found does not stabilise.") from error
+    return np.asarray(found / d / d[:, None])
+
+
 def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
     """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A.
 
@@ -204,10 +216,14 @@ def stabilising(
     top, bottom = basis[:n], basis[n:]
     X = np.linalg.solve(top.T, bottom.T).T
     X = 0.5 * (X + X.T)
-    moved, bent = drift.T @ X, X @ spread @ X
-    residual = np.linalg.norm(moved + moved.T - bent + rest)
-    # Q itself: where it cancels with S R^-1 S' the solution is zero but for rounding
-    sizes = (float(np.linalg.norm(term)) for term in (moved, bent, Q))
-    if not residual <= _RESIDUAL * sum(sizes):
+    for _ in range(_CORRECTIONS):
+        moved, bent = drift.T @ X, X @ spread @ X
+        residual = moved + moved.T - bent + rest
+        # Q itself: where it cancels with S R^-1 S' the solution is zero but for rounding
+        sizes = (float(np.linalg.norm(term)) for term in (moved, bent, Q))
+        if np.linalg.norm(residual) <= _RESIDUAL * sum(sizes):
+            break
+        X = X + _correction((drift - spread @ X).T, residual, d)
+    else:
         raise la.LinAlgError("the stabilising solution is too inaccurate.")
     return X, np.asarray(-(BR @ X + SR))
