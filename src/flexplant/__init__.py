@@ -161,6 +161,7 @@ from .synthesis import Lmi as Lmi
 from .synthesis import Riccati as Riccati
 from .synthesis import design_hinf as design_hinf
 from .synthesis import design_servo as design_servo
+from .synthesis import servo_bandwidth as servo_bandwidth
 from .updating import AddedDamping as AddedDamping
 from .updating import AddedMass as AddedMass
 from .updating import AddedStiffness as AddedStiffness

@@ -143,7 +143,7 @@ def loops(model):
     free, soft = sampled(model()), held(model)
     found = []
     for plant in (free, soft):
-        servo = design_servo(plant, bandwidth=50.0)
+        servo = design_servo(plant, bandwidth=50.0, notches=())
         found.append((servo, close_loop(plant, design_kalman(plant), servo)))
     return found
 
@@ -175,7 +175,7 @@ def test_the_loop_of_the_dense_rigid_plate_on_springs():
     """The certificate against eigenvalues of a rigid plate with springs, held and late."""
     from oracles_plant import hold
 
-    servo = design_servo(held(freq=4.0), bandwidth=50.0)
+    servo = design_servo(held(freq=4.0), bandwidth=50.0, notches=())
     gain = newton((L / 2, L / 2))
     omega = 2 * np.pi * 4.0 * np.array([1, 3**0.5, 3**0.5])
     A = np.block([[np.zeros((3, 3)), np.eye(3)], [-np.diag(omega**2), np.zeros((3, 3))]])

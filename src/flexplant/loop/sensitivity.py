@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import cache
 from typing import Any, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -12,11 +13,13 @@ from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf, frequency_response
 from ..lti.grid import resonance_grid
 from ..lti.interconnection import lft
+from ..lti.responses import responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, real_array, short
 from .closed import ClosedLoop
 
+Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
 #: a closed loop, or a plant (StandardPlant, StateSpace or measured Frf) and a controller
 Loop: TypeAlias = "ClosedLoop | tuple[Any, Any]"
 
@@ -227,8 +230,15 @@ def _modelled(
         )
     plant, controller = plant.replace(dt=dt), controller.replace(dt=dt)
 
+    @cache
+    def prepared() -> tuple[Responder, Responder]:  # a dense A is brought to Schur form once
+        return responder(controller), responder(plant)
+
     def respond(freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        return _stack(frequency_response(controller, freq)), _stack(frequency_response(plant, freq))
+        K, P = (one(freq) for one in prepared())
+        return np.ascontiguousarray(K.transpose(2, 0, 1)), np.ascontiguousarray(
+            P.transpose(2, 0, 1)
+        )
 
     return Pieces(tuple(plant.inputs), tuple(plant.outputs), respond, poles, dt, None)
 
@@ -304,6 +314,13 @@ def checked_grid(parts: Pieces, freq: npt.ArrayLike | None) -> FloatArray:
         raise ShapeError(f"freq must be a one-dimensional array [Hz], got {short(freq)}. Pass one.")
     if np.any(grid <= 0):
         raise ModelError("freq must be positive: integrators and free bodies are infinite at 0.")
+    if parts.dt and grid.max() > 0.5 / parts.dt * (1 + 1e-12):
+        raise ModelError(
+            f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / parts.dt:g} "
+            "Hz), where a sampled system has no response of its own. Stay below."
+        )
+    if np.any(np.diff(grid) <= 0):
+        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
     if parts.measured is not None and not np.all(np.isin(grid, parts.measured)):
         raise ModelError(
             "the plant is a measured Frf, known only at its own frequencies: leave freq out."

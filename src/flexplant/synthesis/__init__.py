@@ -5,3 +5,4 @@ from .hinf import design_hinf as design_hinf
 from .lmi import Lmi as Lmi
 from .riccati import Riccati as Riccati
 from .servo import design_servo as design_servo
+from .servo import servo_bandwidth as servo_bandwidth

@@ -1,0 +1,216 @@
+"""The loop that a servo will run in: estimate, flexible modes and delay, at all frequencies."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError, LabelError
+from ..loop.grid import resonance_grid
+from ..lti.interconnection import connect
+from ..lti.responses import responses
+from ..lti.statespace import StateSpace
+from ..plant import Poi, StandardPlant
+from ..values import ComplexArray, FloatArray
+from .servo_axis import Axis
+
+#: |S| at u that a notch is to bring the loop below: 6 dB
+TARGET = 2.0
+#: notches that are placed at most, modes that are tried for each, and what one has to gain
+_NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
+#: loop gain at a resonance below which a notch there serves nothing
+_QUIET = 0.3
+#: loop gain below which a frequency is not looked at
+_SILENT = 0.05
+
+
+@dataclass(frozen=True)
+class ServoLoop:
+    """``S_u = (I + c(f) T_u G(f))^-1``: c of an axis, G from u to the estimates, T_u decoupling.
+
+    Parameters
+    ----------
+    freq : (n_freq,) array [Hz]
+        A grid through the resonances.
+    through : (n_freq, m, m) complex array
+        T_u G at these frequencies.
+    modes : (k,) array [Hz]
+        Elastic modes of the plant at which a notch may be placed.
+    """
+
+    freq: FloatArray
+    through: ComplexArray
+    modes: FloatArray
+
+    @cached_property
+    def _size(self) -> FloatArray:
+        return np.asarray(np.linalg.norm(self.through, axis=(1, 2)))
+
+    def peak(self, axis: Axis) -> float:
+        """Return max_f sigma_max(S_u) over the grid; of an unstable loop too, so check that."""
+        gain = axis.response(self.freq)
+        acts = np.abs(gain) * self._size > _SILENT  # elsewhere |S| is below 1 / (1 - _SILENT)
+        if not np.any(acts):
+            return 1.0
+        loop = gain[acts, None, None] * self.through[acts]
+        S = np.linalg.inv(np.eye(loop.shape[-1]) + loop)
+        # sigma_max is between the Frobenius norm and that over sqrt(m): only candidates by SVD
+        size = np.sqrt(np.sum(np.abs(S) ** 2, axis=(1, 2)))
+        near = size >= size.max() / np.sqrt(S.shape[-1])
+        return float(np.linalg.svd(S[near], compute_uv=False)[:, 0].max())
+
+    def loud(self, axis: Axis) -> FloatArray:
+        """Return the modes [Hz] whose resonances have loop gain, the loudest first."""
+        gain = np.abs(axis.response(self.freq)) * self._size
+        near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
+        peaks = np.max(np.where(near, gain[:, None], 0.0), axis=0, initial=0.0)
+        order = np.argsort(-peaks, kind="stable")
+        return np.asarray(self.modes[order][peaks[order] > _QUIET])
+
+    def notched(self, axis: Axis, stable: Callable[[Axis], bool]) -> Axis:
+        """Return the axis with notches at the modes where they bring |S| at u down.
+
+        One after the other, while |S| is above 6 dB or the loop is unstable: of the loudest modes
+        the one whose notch lowers the peak most. In a stable loop a notch that gains nothing is
+        not placed.
+        """
+        peak = self.peak(axis)
+        for _ in range(_NOTCHES):
+            if peak <= TARGET and stable(axis):
+                break
+            left = [f for f in self.loud(axis).tolist() if f not in axis.notches][:_TRIED]
+            tried = [_with(axis, freq) for freq in left]
+            if not tried:
+                break
+            peaks = [self.peak(one) for one in tried]
+            best = 0 if peak <= TARGET else int(np.argmin(peaks))
+            if TARGET < peak < peaks[best] / _GAIN and stable(axis):
+                break
+            axis, peak = tried[best], peaks[best]
+        return axis
+
+
+def _with(axis: Axis, freq: float) -> Axis:
+    return Axis(axis.bandwidth, axis.rolloff, axis.integrator, (*axis.notches, freq), axis.rate)
+
+
+def servo_loop(
+    plant: StandardPlant, observer: StateSpace | None, poi: Poi, decoupling: FloatArray
+) -> ServoLoop:
+    """Return the loop of a plant with an observer, or with the POI itself as its estimate."""
+    hats = [poi.derived(axis, "hat") for axis in poi.axes]
+    rate = 1.0 / plant.dt
+    poles = plant.system.poles()
+    if observer is not None:
+        poles = np.concatenate([poles, observer.poles()])
+    grid = resonance_grid(poles, plant.dt, points=300)
+    grid = grid[grid < 0.5 * rate * (1.0 - 1e-6)]
+    if observer is None:
+        seen = [poi.channel(axis) for axis in poi.axes]
+        G = _stacked(plant.system.select(seen, plant.u), grid)
+    else:
+        read = [name for name in observer.inputs if name in plant.y]
+        given = [name for name in observer.inputs if name in plant.u]
+        estimate = _stacked(observer.select(hats), grid)
+        P = _stacked(plant.system.select(read, plant.u), grid)
+        places = [observer.inputs.index(name) for name in read]
+        G = estimate[:, :, places] @ P
+        columns = [plant.u.index(name) for name in given]
+        G[:, :, columns] += estimate[:, :, [observer.inputs.index(name) for name in given]]
+    return ServoLoop(grid, decoupling @ G, elastic(plant))
+
+
+def _stacked(system: StateSpace, grid: FloatArray) -> ComplexArray:
+    return np.ascontiguousarray(np.moveaxis(responses(system, grid), -1, 0))
+
+
+def elastic(plant: StandardPlant) -> FloatArray:
+    """Return the frequencies [Hz] of the elastic modes below 0.45 of the rate."""
+    if plant.realisation is None:
+        return np.zeros(0)
+    names = plant.realisation.names
+    count = sum(name.startswith("mode") for name in names) // 2
+    pairs = plant.realisation.pairs[plant.n_rigid : count]
+    freq = np.sqrt(np.abs(np.linalg.det(pairs))) / (2.0 * np.pi)
+    return np.asarray(freq[freq * plant.dt < 0.45])
+
+
+def estimates(plant: StandardPlant, observer: StateSpace | None, poi: Poi) -> StateSpace:
+    """Return u -> estimates as one system; states of the plant first."""
+    hats = [poi.derived(axis, "hat") for axis in poi.axes]
+    if observer is None:
+        seen = [poi.channel(axis) for axis in poi.axes]
+        return plant.system.select(seen, plant.u).replace(outputs=hats)
+    read = [name for name in observer.inputs if name in plant.y]
+    return connect([plant.system.select(read, plant.u), observer], plant.u, hats)
+
+
+def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:
+    """Return the plant whose y are the references and the POI itself, named as estimates."""
+    g, nz = plant.system, len(plant.z)
+    own = [plant.z.index(poi.channel(axis)) for axis in poi.axes]
+    kept = [i for i, name in enumerate(plant.y) if name.endswith(":ref")]
+    rows = [*range(nz), *own, *(nz + i for i in kept)]
+    y = (*(poi.derived(axis, "hat") for axis in poi.axes), *(plant.y[i] for i in kept))
+    system = g.replace(C=g.C[rows], D=g.D[rows], outputs=[*plant.z, *y])
+    return StandardPlant(system, plant.w, plant.u, plant.z, y, {}, delay=plant.delay)
+
+
+def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace | None:
+    """Return the observer as a system of the plant's dt, checked to give the POI's estimates.
+
+    Raises
+    ------
+    LabelError
+        When it does not, or reads something that the plant has not.
+    FlexplantError
+        When it is no system.
+    """
+    if observer is None:
+        return None
+    inner = getattr(observer, "system", observer)
+    if not isinstance(inner, StateSpace):
+        if not hasattr(inner, "input_labels"):
+            raise LabelError(
+                f"observer must be an estimator or a StateSpace with named channels, got "
+                f"{type(observer).__name__}. Pass design_kalman(plant) or design_static(plant)."
+            )
+        inner = StateSpace.from_control(inner)
+    missing = [h for h in (poi.derived(a, "hat") for a in poi.axes) if h not in inner.outputs]
+    if missing:
+        raise LabelError(
+            f"the observer gives {', '.join(inner.outputs[:6])}, but the servo acts on "
+            f"{', '.join(missing)} too. Design it on this plant, or rename its outputs."
+        )
+    unknown = [name for name in inner.inputs if name not in (*plant.y, *plant.u)]
+    if unknown:
+        raise LabelError(
+            f"the observer reads {', '.join(unknown)}, which the plant has neither in y nor in u."
+        )
+    if inner.n_states and not np.isclose(inner.dt, plant.dt, rtol=1e-9, atol=0.0):
+        raise FlexplantError(
+            f"the observer has dt {inner.dt:g} s, the plant {plant.dt:g} s: design both alike."
+        )
+    return inner.replace(dt=plant.dt)
+
+
+def highest(
+    freq: Sequence[float], holds: Callable[[float], bool], *, halvings: int = 6
+) -> float | None:
+    """Return the largest frequency that holds: of a descending grid, then by bisection above."""
+    above: float | None = None
+    for one in freq:
+        if holds(one):
+            if above is None:
+                return one
+            low, high = one, above
+            for _ in range(halvings):
+                middle = float(np.sqrt(low * high))
+                low, high = (middle, high) if holds(middle) else (low, middle)
+            return low
+        above = one
+    return None

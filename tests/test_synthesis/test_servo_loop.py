@@ -1,0 +1,184 @@
+"""The loop that a servo runs in: certificate, notches, largest bandwidth; oracle: dense loops."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverError
+from flexplant.estimation import design_kalman, design_static
+from flexplant.loop import close_loop
+from flexplant.lti import StateSpace
+from flexplant.plant import Poi, assemble_plant
+from flexplant.synthesis import design_servo, servo_bandwidth
+from flexplant.testbeds import wafer_stage
+from oracles_plant import closed_loop
+from stages import RATE, L, block, fitted, ports, reduced, sampled
+
+U, Y = [f"u{i}" for i in range(1, 5)], [f"y{i}" for i in range(1, 5)]
+
+
+@cache
+def machine():
+    return wafer_stage(damping=0.001, rate=RATE, delay=1)
+
+
+@cache
+def updated():
+    model = fitted(reduced(0.001), machine().poles([6, 7]).poles).model
+    plant = sampled(model)
+    return plant, design_static(plant), design_kalman(plant)
+
+
+def truth():
+    return assemble_plant(machine().truth, ports()).discretized(RATE, delay=1)
+
+
+def dense(plant, *systems):
+    """Eigenvalues of plant and blocks, dense."""
+    g = plant.system
+    B, C = g.B[:, -4:], g.C[-5:-1]
+    A, _, _ = closed_loop({"A": g.A, "B": B, "C": C}, Y, U, [block(s) for s in systems])
+    return np.abs(np.linalg.eigvals(A)).max()
+
+
+def peak_at_u(plant, observer, servo, freq):
+    """max sigma_max of S at u by dense solves."""
+    g, top = plant.system, 0.0
+    hats = [servo.inputs.index(name) for name in observer.outputs]
+    reads = [list(observer.inputs).index(n) for n in Y]
+    gives = [list(observer.inputs).index(n) for n in U] if "u1" in observer.inputs else None
+
+    def at(s, z):
+        return s.C @ np.linalg.solve(z * np.eye(s.n_states) - s.A, s.B) + s.D
+
+    for z in np.exp(2j * np.pi * freq / RATE):
+        P = g.C[-5:-1] @ np.linalg.solve(z * np.eye(g.n_states) - g.A, g.B[:, -4:])
+        hat, K = at(observer, z), at(servo, z)[:, hats]
+        G = hat[:, reads] @ P + (0 if gives is None else hat[:, gives])
+        top = max(top, np.linalg.norm(np.linalg.inv(np.eye(4) - K @ G), 2))
+    return top
+
+
+@pytest.mark.parametrize("which", [1, 2], ids=["static", "kalman"])
+def test_the_certificate_is_of_the_loop_that_runs(which):
+    plant, observer = updated()[0], updated()[which]
+    servo = design_servo(plant, bandwidth=50.0, observer=observer)
+    found = servo.certificate
+    radius = dense(plant, observer.system, servo.system)
+    assert radius < 1
+    assert found["spectral radius"] == pytest.approx(radius, abs=1e-7)
+    loop = close_loop(plant, observer, servo)
+    poles = np.log(np.linalg.eigvals(loop.system.A) + 1e-300) * RATE / (2 * np.pi)
+    poles = poles[poles.imag > 3.0]
+    near = (poles.imag + np.abs(poles.real) * np.linspace(-3, 3, 9)[:, None]).ravel()
+    freq = np.unique(np.append(np.geomspace(3, 4900, 300), near[near > 3.0]))
+    top = peak_at_u(plant, observer.system, servo.system, freq[freq < 4990])
+    assert found["modulus margin"] == pytest.approx(1 / top, rel=0.02)
+    assert found["modulus margin"] < found["rigid-body modulus margin"] * 1.02
+    # stable on the machine too
+    assert dense(truth(), observer.system, servo.system) < 1
+
+
+def test_without_an_observer_the_loop_is_on_the_poi_itself():
+    plant = updated()[0]
+    servo = design_servo(plant, bandwidth=50.0)
+    assert "certified on the POI itself" in repr(servo)
+    g, nz = plant.system, len(plant.z)
+    C = g.C[[plant.z.index(name) for name in ("die:z", "die:rx", "die:ry")]]
+    hats = list(servo.system.inputs[1:])
+    A, _, _ = closed_loop({"A": g.A, "B": g.B[:, -4:], "C": C}, hats, U, [block(servo.system)])
+    radius = np.abs(np.linalg.eigvals(A)).max()
+    assert nz and servo.certificate["spectral radius"] == pytest.approx(radius, abs=1e-7)
+
+
+def test_notches_are_placed_where_they_serve():
+    """The Kalman estimate brings the bowl mode back: unstable without a notch, 5 dB with."""
+    plant, static, kalman = updated()
+    bowl = plant.model.modes().freq[5]
+    servo = design_servo(plant, bandwidth=50.0, observer=kalman)
+    by_hand = design_servo(plant, bandwidth=50.0, observer=kalman, notches=[bowl])
+    assert f"notches at {bowl:.4g} Hz" in repr(servo)
+    np.testing.assert_allclose(servo.system.A, by_hand.system.A, rtol=1e-9)
+    with pytest.raises(SolverError, match=r"with its observer is unstable .*mode 6 \(45\d"):
+        design_servo(plant, bandwidth=50.0, observer=kalman, notches=())
+    # the static relation does not see that mode: no notch serves
+    assert "notches" not in repr(design_servo(plant, bandwidth=50.0, observer=static))
+
+
+def test_a_servo_that_cannot_run_is_refused_with_the_bandwidth_that_can():
+    plant, static, kalman = updated()
+    for observer, bandwidth in ((static, 100.0), (kalman, 80.0)):
+        with pytest.raises(SolverError, match=r"mode \d+ .*largest bandwidth .* 6 dB there is"):
+            design_servo(plant, bandwidth=bandwidth, observer=observer, notches=())
+
+
+def test_one_flipped_sign_is_unstable():
+    plant, _, kalman = updated()
+    servo = design_servo(plant, bandwidth=50.0, observer=kalman)
+    g = servo.system
+    for i in range(4):
+        signs = np.ones(4)
+        signs[i] = -1.0
+        wrong = g.replace(C=signs[:, None] * g.C, D=signs[:, None] * g.D)
+        with pytest.warns(FlexplantWarning, match="unstable"):
+            assert close_loop(plant, kalman, wrong).modulus_margin == 0.0
+    lying = kalman.system.replace(C=-kalman.system.C, D=-kalman.system.D)
+    with pytest.raises(SolverError, match="unstable"):
+        design_servo(plant, bandwidth=50.0, observer=lying)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("which", [1, 2], ids=["static", "kalman"])
+def test_the_largest_bandwidth_that_holds_6_dB(which):
+    plant, observer = updated()[0], updated()[which]
+    reach = servo_bandwidth(plant, observer=observer)
+    servo = design_servo(plant, bandwidth=reach, observer=observer)
+    margin = servo.certificate["modulus margin"]
+    assert 0.5 <= margin < 0.55
+    assert "largest bandwidth at 6 dB [Hz]" not in servo.certificate
+    for factor in (1.1, 1.3):
+        more = factor * reach
+        try:
+            beyond = design_servo(plant, bandwidth=more, observer=observer).certificate
+        except SolverError:
+            continue
+        assert beyond["modulus margin"] < 0.5
+        assert beyond["largest bandwidth at 6 dB [Hz]"] == pytest.approx(reach, rel=1e-9)
+    assert servo_bandwidth(plant, observer=observer, peak=4.0) > reach
+
+
+@pytest.mark.slow
+def test_modes_left_out_count():
+    """The truth as the larger plant; a higher rate's roll-off reaches its modes less."""
+    plant, static, _ = updated()
+    servo = design_servo(plant, bandwidth=50.0, observer=static, larger=truth())
+    assert servo.left_out.is_stable
+    radius = dense(truth(), static.system, servo.system)
+    key = "spectral radius with modes left out"
+    assert servo.certificate[key] == pytest.approx(radius, abs=1e-7)
+    quick = {"rolloff": 4000.0, "notches": (), "observer": static}
+    reach = servo_bandwidth(plant, **quick)
+    with_all = servo_bandwidth(plant, **quick, larger=truth())
+    assert with_all <= reach * (1 + 1e-9)
+
+
+def test_refusals():
+    plant, static, kalman = updated()
+    with pytest.raises(LabelError, match="the servo acts on die:ry:hat too"):
+        design_servo(
+            plant,
+            bandwidth=50.0,
+            observer=static.system.select(outputs=["die:hat", "die:rx:hat"]),
+        )
+    other = kalman.system.renamed(inputs={"y1": "q1"})
+    with pytest.raises(LabelError, match="reads q1"):
+        design_servo(plant, bandwidth=50.0, observer=other)
+    with pytest.raises(ModelError, match="peak must be above 1"):
+        servo_bandwidth(plant, peak=1.0)
+    with pytest.raises(SolverError, match="no bandwidth above"):
+        servo_bandwidth(plant, peak=1.02)
+    z = Poi("die", at=(L / 2, L / 2, 0.0), axes=("z",))
+    with pytest.raises(Exception, match="axes that span"):
+        servo_bandwidth(sampled(reduced(0.001), ports(z=[z])))
+    assert isinstance(static.system, StateSpace)
