@@ -70,7 +70,7 @@ def made():
     servo = fx.design_servo(sampled, bandwidth=40.0)
     loop = close_loop(sampled, static, servo)
     yield fx.compare_loops({"servo": loop})
-    yield fx.loop.LeftOut(0.99, True, 0.5, 490)
+    yield fx.loop.SpillOver(0.99, True, 0.5, 490)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
     response = fx.simulate(loop, reference=point, duration=0.05, rng=1)
     candidates = [fx.Sensor(f"c{i}", at=p, asd=1e-12) for i, p in enumerate([*CORNERS, Z8])]

@@ -74,7 +74,8 @@ def test_the_certificate_is_of_the_loop_that_runs(which):
     near = (poles.imag + np.abs(poles.real) * np.linspace(-3, 3, 9)[:, None]).ravel()
     freq = np.unique(np.append(np.geomspace(3, 4900, 300), near[near > 3.0]))
     top = peak_at_u(plant, observer.system, servo.system, freq[freq < 4990])
-    assert found["modulus margin"] == pytest.approx(1 / top, rel=0.02)
+    # the grid of the oracle may miss the top of a resonance, not exceed it
+    assert 0.95 / top < found["modulus margin"] < (1 + 1e-6) / top
     assert found["modulus margin"] < found["rigid-body modulus margin"] * 1.02
     # stable on the machine too
     assert dense(truth(), observer.system, servo.system) < 1

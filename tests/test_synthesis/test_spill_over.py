@@ -8,8 +8,8 @@ import pytest
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.labels import DofSet
-from flexplant.loop import LeftOut, close_loop
-from flexplant.loop.left_out import growing_modes
+from flexplant.loop import SpillOver, close_loop
+from flexplant.loop.spill_over import growing_modes
 from flexplant.plant import (
     Actuator,
     Disturbance,
@@ -183,7 +183,7 @@ def test_a_closed_loop_carries_the_check(tmp_path):
         loop = close_loop(plant, errors, found, larger=many())
     assert loop.is_stable and not loop.left_out.is_stable
     assert loop.left_out.modes == found.left_out.modes
-    assert isinstance(loop.left_out, LeftOut) and "unstable" in repr(loop)
+    assert isinstance(loop.left_out, SpillOver) and "unstable" in repr(loop)
     found.save(tmp_path / "k.npz")
     back = load(tmp_path / "k.npz")
     assert back.left_out.modes == found.left_out.modes and back.notes == found.notes

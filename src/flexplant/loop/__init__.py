@@ -5,10 +5,10 @@ from .closed import close_loop as close_loop
 from .comparison import LoopComparison as LoopComparison
 from .comparison import LoopFigures as LoopFigures
 from .comparison import compare_loops as compare_loops
-from .left_out import LeftOut as LeftOut
 from .margins import bandwidth as bandwidth
 from .margins import modulus_margin as modulus_margin
 from .sensitivity import complementary_sensitivity as complementary_sensitivity
 from .sensitivity import control_sensitivity as control_sensitivity
 from .sensitivity import loop_gain as loop_gain
 from .sensitivity import sensitivity as sensitivity
+from .spill_over import SpillOver as SpillOver

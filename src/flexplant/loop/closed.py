@@ -19,7 +19,7 @@ from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
 from ..plant.channel_units import plant_units
 from ..values import Value, name_list, real_array
-from .left_out import LeftOut, growing_modes
+from .spill_over import SpillOver, growing_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -211,7 +211,7 @@ class ClosedLoop(Value):
         return obstacle(self.monitored)
 
     @cached_property
-    def left_out(self) -> LeftOut | None:
+    def left_out(self) -> SpillOver | None:
         """How the same controller stands on the plant with the modes left out; None: not known."""
         if self.larger is None:
             return None
@@ -222,7 +222,7 @@ class ClosedLoop(Value):
             if whole.is_stable
             else growing_modes(whole.monitored, self.larger.system.states)
         )
-        return LeftOut(
+        return SpillOver(
             stability,
             bool(self.plant.dt),
             whole.modulus_margin,

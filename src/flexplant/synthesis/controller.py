@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ..loop import LeftOut
+from ..loop import SpillOver
 from ..lti.statespace import StateSpace
 from ..values import Value
 
@@ -29,7 +29,7 @@ class Controller(Value):
     reached : mapping {str: float}
         Of a weighted design: the norm from each group of w to each group of z, beside 1, which is
         what the weights ask for. The largest is close to gamma.
-    left_out : LeftOut, optional
+    left_out : SpillOver, optional
         How the loop stands on the plant with the modes left out, where these are known.
     notes : sequence of str
         What the certificate does not cover, and what else is worth knowing.
@@ -41,7 +41,7 @@ class Controller(Value):
     lower: float | None = None
     certificate: Mapping[str, float] | None = None
     reached: Mapping[str, float] | None = None
-    left_out: LeftOut | None = None
+    left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, SolverError
 from ..loop import ClosedLoop, close_loop
-from ..loop.left_out import growing_modes
+from ..loop.spill_over import growing_modes
 from ..lti.interconnection import append, lft, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantError, LabelError
-from ..loop.grid import resonance_grid
+from ..lti.grid import resonance_grid
 from ..lti.interconnection import connect
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace

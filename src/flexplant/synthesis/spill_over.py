@@ -7,12 +7,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from ..errors import FlexplantWarning
-from ..loop import LeftOut, close_loop
+from ..loop import SpillOver, close_loop
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
 
 
-def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> LeftOut | None:
+def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> SpillOver | None:
     """Return how a design's loop stands on the plant with the modes left out; None: not known.
 
     Parameters

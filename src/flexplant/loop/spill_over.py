@@ -18,7 +18,7 @@ _TAKES_PART = 0.3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class LeftOut(Value):
+class SpillOver(Value):
     """The check of a loop on the plant with the modes left out, sampled and delayed alike.
 
     Parameters
@@ -86,7 +86,7 @@ class LeftOut(Value):
         return ", ".join(listed)
 
     def __repr__(self) -> str:
-        return f"<LeftOut: {self.summary}>"
+        return f"<SpillOver: {self.summary}>"
 
     @property
     def summary(self) -> str:
