@@ -15,6 +15,7 @@ import flexplant as fx
 from flexplant import lti, placement, structure, synthesis
 from flexplant import plant as plants
 from flexplant.errors import FlexplantError
+from flexplant.estimation.left_out import LeftOut
 from flexplant.loop import close_loop
 from flexplant.reduction import normal_form, select_dofs
 from flexplant.store import load
@@ -71,6 +72,7 @@ def made():
     loop = close_loop(sampled, static, servo)
     yield fx.compare_loops({"servo": loop})
     yield fx.loop.SpillOver(0.99, True, 0.5, 490)
+    yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
     response = fx.simulate(loop, reference=point, duration=0.05, rng=1)
     candidates = [fx.Sensor(f"c{i}", at=p, asd=1e-12) for i, p in enumerate([*CORNERS, Z8])]
