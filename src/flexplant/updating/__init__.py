@@ -9,7 +9,7 @@ from .frf_residual import FrfResidual as FrfResidual
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identifiability as identifiability
 from .localisation import Localisation as Localisation
-from .localisation import localise as localise
+from .localise import localise as localise
 from .matrix_parameters import MatrixParameter as MatrixParameter
 from .matrix_parameters import ModeDamping as ModeDamping
 from .parameters import AddedDamping as AddedDamping

@@ -66,6 +66,15 @@ def _whitened(noise: Any, rows: FloatArray) -> FloatArray:
     return np.asarray(la.solve_banded((width, 0), la.cholesky_banded(band, lower=True), rows))
 
 
+def chance(chi2: float | None, dof: int) -> float | None:
+    """Return the probability that noise leaves a larger chi-square, None when not known."""
+    if chi2 is None or dof < 1:
+        return None
+    from scipy.special import chdtrc
+
+    return float(chdtrc(dof, chi2))
+
+
 def is_bad(probability: float | None) -> bool:
     """Return whether noise alone hardly explains what is left."""
     return probability is not None and probability < CHANCE

@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import ModelError, unknown_label
 from ..reduction import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Value, generator, positive, short
+from .goodness import chance
 from .parameters import AddedMass, Parameter
 from .updated_model import applied
 
@@ -161,11 +162,7 @@ class UpdateResult(Value):
 
         Below 1e-4 the model is wrong somewhere else, or the noise was understated.
         """
-        if self.chi2 is None or self.dof < 1:
-            return None
-        from scipy.special import chdtrc
-
-        return float(chdtrc(self.dof, self.chi2))
+        return chance(self.chi2, self.dof)
 
     @property
     def negative_masses(self) -> tuple[str, ...]:

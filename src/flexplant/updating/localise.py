@@ -1,0 +1,129 @@
+"""Where was something added: every candidate scored alone, then the best subset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import FloatArray
+from ..values import whole as counted
+from .localisation import Localisation
+from .parameters import Parameter
+from .search import Objective, checked_residuals
+from .sensitivity import checked_parameters
+from .subsets import Subsets
+
+
+def localise(
+    model: Any,
+    residuals: Sequence[Any],
+    candidates: Sequence[Parameter],
+    *,
+    nuisance: Sequence[Parameter] = (),
+    most: int = 3,
+    screen: int = 40,
+) -> Localisation:
+    """Find which of many candidate changes explains a measurement.
+
+    All candidates are screened together, each alone, by linearisation (one rank-one change each,
+    in one product); the best `screen` of them are fitted exactly. Then subsets of up to `most`
+    candidates grow: all candidates are screened again on what the best subsets leave, all pairs
+    to first order, and members are exchanged while that helps. The least extended Bayesian
+    information criterion ``chi^2 + k ln n + 2 ln C(c, k)`` (``n ln(e/n)`` for ``chi^2`` where the
+    noise is not known) chooses; its last term counts in how many ways k of c places can be chosen,
+    so that c places without a change name none. To know what stands out, give more data than
+    `most` unknowns.
+
+    What is wrong everywhere (Young's modulus, damping) hides what is wrong in one place: as
+    `nuisance` it is fitted anew with every candidate and with none at all, so that a candidate is
+    scored by what only it explains: ``(J_c^T r)^2 / (J_c^T J_c)`` with r and J_c free of what the
+    nuisance explains, before the exact fits.
+
+    Parameters
+    ----------
+    model : ReducedModel or FEModel
+        Without the change.
+    residuals : sequence of Residual
+        Measured with the change.
+    candidates : sequence of c Parameter
+        Added masses or springs at every DOF in question, say.
+    nuisance : sequence of Parameter, optional
+        Unknowns beside the candidates; their priors are not used.
+    most : int
+        Largest subset.
+    screen : int
+        How many are fitted exactly.
+
+    Returns
+    -------
+    Localisation
+        Its repr says when the chosen subset leaves more than noise (`p_value`).
+
+    Raises
+    ------
+    ModelError, LabelError
+        As `update`; or when the counts make no sense, a nuisance is a candidate too, or there
+        are no more data than nuisance parameters.
+
+    References
+    ----------
+    Chen, Chen: Extended Bayesian information criteria for model selection with large model spaces,
+    Biometrika 95, 2008.
+    """
+    listed = checked_parameters(candidates)
+    none = isinstance(nuisance, list | tuple) and not nuisance
+    beside = () if none else checked_parameters(nuisance)
+    both = sorted({q.name for q in listed} & {q.name for q in beside})
+    if both:
+        raise ModelError(
+            f"{', '.join(both)}: a candidate and a nuisance at once. Leave it out of one of them."
+        )
+    given = checked_residuals(residuals)
+    most, screen = counted(most, "most"), counted(screen, "screen")
+    whole = Objective(model, [*listed, *beside], given, prior=False)
+    fits = Subsets(whole, given, len(listed))
+    if fits.rows <= len(beside):
+        raise ModelError(
+            f"{fits.rows} data do not tell {len(beside)} nuisance parameters, let alone a "
+            "candidate beside them: measure more modes or lines."
+        )
+    values, score, criterion = _singles(fits, screen)
+    ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
+    best = fits.best(ranked, most)
+    p = np.asarray((fits.fit(best) or (np.zeros(0), 0.0))[0])
+    chi2, dof = fits.chi2(best)
+    return Localisation(
+        candidates=tuple(q.name for q in listed),
+        values=values,
+        score=score,
+        bic=criterion,
+        chosen=tuple(listed[i].name for i in best),
+        chosen_values=np.array(p[: len(best)]),
+        chosen_bic=fits.score(best),
+        nothing_bic=fits.score(()),
+        nuisance=tuple(q.name for q in beside),
+        nuisance_values=np.array(p[len(best) :]),
+        chi2=chi2,
+        dof=dof,
+    )
+
+
+def _singles(fits: Subsets, screen: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return value, share explained and criterion of each candidate alone."""
+    error = (fits.fit(()) or (np.zeros(0), 0.0))[1]
+    explained = fits.explained(())
+    values, score = np.full(fits.count, np.nan), explained / error
+    criterion = np.full(fits.count, np.inf)
+    for i in np.argsort(-explained)[:screen].tolist():
+        found = fits.fit((i,))
+        score[i] = 0.0
+        if found is not None:
+            values[i], score[i] = found[0][0], 1 - found[1] / error
+            criterion[i] = fits.score((i,))
+    for i in np.argsort(-explained)[screen:].tolist():
+        # known to first order only: never better than what was fitted exactly
+        score[i] = min(score[i], float(np.nanmin(score[np.isfinite(criterion)], initial=1.0)))
+    return values, score, criterion
