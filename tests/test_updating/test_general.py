@@ -362,6 +362,22 @@ def test_identifiability_names_what_is_missing(chain, plate):
     assert blind.unseen == (f"mass at {plate.z8}",)
     assert 4 not in blind.missing[f"mass at {plate.z8}"]
     assert np.isinf(blind.std[0])
+    # mirror images: every mode moves with both alike, so none is advised
+    image = plate.model.dofs.nearest((0.3, 0.45, 0.0), "z")
+    pair = Eigenvalues(MeasuredModes(oracle.truth(0.01), modes=[6, 7]))
+    both = [AddedMass(plate.z8), AddedMass(image)]
+    alike = identifiability(plate.reduced(0.01, False), both, [pair])
+    assert alike.mixed == ((both[0].name, both[1].name),)
+    assert alike.missing == {both[0].name: (), both[1].name: ()}
+    assert f"no eigenvalue tells {both[0].name} apart" in repr(alike)
+    # places without symmetry: the modes advised do tell them apart
+    two = [AddedMass(plate.grid[0]), AddedMass(plate.grid[6]), AddedMass(plate.grid[7])]
+    first = identifiability(rom, two, [pair.select([6])])
+    assert first.mixed
+    more = first.missing[two[0].name]
+    assert more
+    told = MeasuredModes([-1 + 100j] * len(more), modes=more)
+    assert identifiability(rom, two, [pair.select([6]), Eigenvalues(told)]).rank > first.rank
 
 
 def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):

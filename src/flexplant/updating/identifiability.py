@@ -10,6 +10,7 @@ import numpy as np
 
 from ..values import FloatArray, Value
 from .parameters import Parameter
+from .pencil import repeated_groups
 from .search import Objective, checked_residuals
 from .sensitivity import checked_parameters, checked_values
 
@@ -19,6 +20,9 @@ CORRELATED = 0.99
 LOST = 1e-6
 #: modes that are named as missing
 NAMED = 3
+#: an eigenvalue that changes by less than this part of what the parts of a combination change it
+#: by does not tell the combination
+CANCELS = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,7 +48,8 @@ class Identifiability(Value):
         Groups of parameters of which a combination cannot be told.
     missing : mapping {str: (int, ...)}
         For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
-        depend on them most.
+        would tell the lost combinations, those that change most first; none where no eigenvalue
+        does, as of mirror images on a symmetric structure.
     """
 
     parameters: tuple[str, ...]
@@ -88,10 +93,11 @@ class Identifiability(Value):
             if abs(self.correlation[i, j]) > CORRELATED
         ]
         lines += [f"  correlated: {text}" for text in close[:2]]
-        lines += [
-            f"  measure modes {', '.join(map(str, modes))} for {name}"
-            for name, modes in list(self.missing.items())[:2]
-        ]
+        for name, modes in list(self.missing.items())[:2]:
+            if modes:
+                lines.append(f"  measure modes {', '.join(map(str, modes))} for {name}")
+            else:
+                lines.append(f"  no eigenvalue tells {name} apart: measure shapes or responses")
         return "\n".join(lines) + ">"
 
 
@@ -167,25 +173,45 @@ def identifiability(
         correlation=correlation,
         unseen=unseen,
         mixed=tuple(mixed),
-        missing=_missing(objective, point, names, poor),
+        missing=_missing(objective, point, names, poor, _lost(Vt[~told], seen, length)),
     )
 
 
+def _lost(vectors: FloatArray, seen: Any, length: FloatArray) -> FloatArray:
+    """Return the combinations (n, q) of the parameters themselves that change no residual."""
+    return np.asarray(vectors / np.where(seen, length, 1.0), dtype=np.float64)
+
+
 def _missing(
-    objective: Objective, point: Any, names: tuple[str, ...], poor: list[str]
+    objective: Objective, point: Any, names: tuple[str, ...], poor: list[str], lost: FloatArray
 ) -> dict[str, tuple[int, ...]]:
-    """Return for each poorly known parameter the unmeasured modes that move most, relatively."""
+    """Return for each poorly known parameter the unmeasured modes that tell a lost combination.
+
+    A mode that moves with a parameter tells nothing new where it moves with the others alike: only
+    the change of its eigenvalue along the combination counts, against what the parts of the
+    combination change it by.
+    """
     numbers = [int(n) for n in point.labels if n and n not in objective.numbers]
-    if not numbers or not poor:
+    if not poor:
         return {}
     columns = point.columns(numbers)
-    S = objective.family.sensitivity(point.eigen, columns)
-    moved = np.abs(S) / np.abs(point.eigen.poles[columns])[:, None]
+    size = np.abs(point.eigen.poles[columns])[:, None]
+    S = objective.family.sensitivity(point.eigen, columns) / size
+    # how repeated modes split has no sign: only their mean tells a direction
+    for group in repeated_groups(point.eigen.poles):
+        mean = np.trace(objective.family.group_derivative(point.eigen, group), axis1=1, axis2=2)
+        for i in [i for i, column in enumerate(columns) if column in group]:
+            S[i] = mean / len(group) / size[i]
+    along = np.abs(S @ lost.T)
+    parts = np.abs(S) @ np.abs(lost.T)
+    # what cancels but for rounding, or the truncation of the model, tells nothing
+    felt = parts > 1e-6 * np.max(parts, axis=0, initial=0.0)
+    told = np.where(felt & (along > CANCELS * parts), along, 0.0)
     found = {}
     for name in poor:
-        share = moved[:, names.index(name)]
-        order = np.argsort(-share)[:NAMED]
-        felt = [numbers[i] for i in order if share[i] > 1e-6 * share.max(initial=0.0) > 0]
-        if felt:
-            found[name] = tuple(felt)
+        own = np.abs(lost[:, names.index(name)]) > 1e-3 * np.abs(lost).max(axis=1, initial=0.0)
+        share = np.max(told[:, own], axis=1, initial=0.0)
+        order = np.argsort(-share, kind="stable")[:NAMED]
+        largest = share.max(initial=0.0)
+        found[name] = tuple(numbers[i] for i in order if share[i] > 1e-6 * largest > 0)
     return found
