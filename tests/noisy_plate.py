@@ -4,7 +4,8 @@ import numpy as np
 
 import oracles_updating as oracle
 from flexplant.lti import Frf
-from flexplant.reduction import DesiredDofs, reduce, solve_modes
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, reduce
 from flexplant.structure import ModalDamping
 from flexplant.updating import AddedDamping, AddedMass, FrfResidual, update
 from plates import make_plate

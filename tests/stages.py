@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 
 from flexplant.identification import MeasuredModes
+from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor, assemble_plant
-from flexplant.reduction import DesiredDofs, reduce, solve_modes
+from flexplant.reduction import DesiredDofs, reduce
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from plates import make_plate

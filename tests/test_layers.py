@@ -15,7 +15,9 @@ ROOT = Path(flexplant.__file__).parent
 ROOMS = (
     ("errors", "values", "store", "parallel", "places", "dof_columns", "dof_index", "labels"),
     "lti",
+    "sparse",
     "structure",
+    "modes",
     "reduction",
     "identification",
     "updating",

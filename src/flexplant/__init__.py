@@ -70,6 +70,8 @@ from .lti import peak_gain as peak_gain
 from .lti import series as series
 from .lti import split_stable as split_stable
 from .lti import tustin as tustin
+from .modes import Modes as Modes
+from .modes import solve_modes as solve_modes
 from .placement import Exchange as Exchange
 from .placement import Exhaustive as Exhaustive
 from .placement import Placement as Placement
@@ -123,7 +125,6 @@ from .reduction import Krylov as Krylov
 from .reduction import MacNeal as MacNeal
 from .reduction import ModalBalanced as ModalBalanced
 from .reduction import ModalTruncation as ModalTruncation
-from .reduction import Modes as Modes
 from .reduction import PivotedQr as PivotedQr
 from .reduction import ReducedModel as ReducedModel
 from .reduction import Rubin as Rubin
@@ -131,11 +132,11 @@ from .reduction import Serep as Serep
 from .reduction import rank_modes as rank_modes
 from .reduction import reduce as reduce
 from .reduction import select_dofs as select_dofs
-from .reduction import solve_modes as solve_modes
 from .simulation import Response as Response
 from .simulation import SetPoint as SetPoint
 from .simulation import setpoint as setpoint
 from .simulation import simulate as simulate
+from .sparse import Pardiso as Pardiso
 from .store import load as load
 from .structure import Damper as Damper
 from .structure import Disc as Disc
@@ -144,7 +145,6 @@ from .structure import FEModel as FEModel
 from .structure import Hysteretic as Hysteretic
 from .structure import ModalDamping as ModalDamping
 from .structure import ModelCheck as ModelCheck
-from .structure import Pardiso as Pardiso
 from .structure import PointMass as PointMass
 from .structure import Rayleigh as Rayleigh
 from .structure import Rectangle as Rectangle

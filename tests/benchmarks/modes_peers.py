@@ -27,8 +27,9 @@ def peak():
 
 def ours(mesh, times, **options):
     """CPU of the checked modes; making the model (its checks) is timed by itself."""
-    from flexplant.reduction import solve_modes
-    from flexplant.structure import FEModel, counted
+    from flexplant.modes import solve_modes
+    from flexplant.modes import sparse_modes as counted
+    from flexplant.structure import FEModel
 
     begin = time.process_time()
     model = FEModel(mesh[0], mesh[1], dofs=meshes.dofs_of(mesh))
@@ -83,8 +84,8 @@ def superlu(A):
 
 def pardiso(A):
     """MKL PARDISO, where MKL is installed (or MKLROOT tells where it is)."""
-    from flexplant.structure import Pardiso
-    from flexplant.structure.pardiso import PardisoCholesky
+    from flexplant.sparse import Pardiso
+    from flexplant.sparse.pardiso import PardisoCholesky
 
     return PardisoCholesky(A, Pardiso()).solve
 
@@ -96,7 +97,7 @@ def main(kind, n, method):
     if method == "ours":
         squares, phi = ours(mesh, times)
     elif method == "mixed":
-        from flexplant.structure import Pardiso
+        from flexplant.sparse import Pardiso
 
         squares, phi = ours(mesh, times, factor=Pardiso())
     else:

@@ -13,6 +13,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 import oracles_reduction as oracle
+from flexplant.modes import solve_modes
 from flexplant.reduction import (
     CraigBampton,
     EffectiveIndependence,
@@ -25,7 +26,6 @@ from flexplant.reduction import (
     rank_modes,
     reduce,
     select_dofs,
-    solve_modes,
 )
 from flexplant.structure import ModalDamping
 from plates import make_plate

@@ -9,6 +9,7 @@ import pytest
 from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, ShapeError
 from flexplant.estimation import check_gain, design_kalman
 from flexplant.lti import StateSpace
+from flexplant.modes import solve_modes
 from flexplant.plant import (
     Actuator,
     Disturbance,
@@ -19,7 +20,6 @@ from flexplant.plant import (
     StandardPlant,
     assemble_plant,
 )
-from flexplant.reduction import solve_modes
 from flexplant.structure import ModalDamping, kirchhoff_plate
 from machines import stage
 from oracles_estimation import mean_square_and_its_error, observer_error, run

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexplant.identification import average_frfs, identify_modes, numbered
-from flexplant.reduction import solve_modes
+from flexplant.modes import solve_modes
 from flexplant.structure import ModalDamping
 from flexplant.testbeds import wafer_stage
 from plates import make_plate

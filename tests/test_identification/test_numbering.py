@@ -7,7 +7,7 @@ import pytest
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.identification import MeasuredModes, numbered
-from flexplant.reduction import solve_modes
+from flexplant.modes import solve_modes
 from flexplant.structure import ModalDamping
 from plates import make_plate
 

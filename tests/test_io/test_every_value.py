@@ -17,7 +17,8 @@ from flexplant import plant as plants
 from flexplant.errors import FlexplantError
 from flexplant.estimation.left_out import LeftOut
 from flexplant.loop import close_loop
-from flexplant.reduction import normal_form, select_dofs
+from flexplant.modes import normal_form
+from flexplant.reduction import select_dofs
 from flexplant.store import load
 from flexplant.updating import eigenvalue_sensitivities
 from flexplant.values import Value

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import flexplant.parallel
+from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
-from flexplant.reduction import solve_modes
 from flexplant.structure import ModalDamping, kirchhoff_plate
 
 SIZE = (0.5, 0.35)

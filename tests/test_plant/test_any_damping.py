@@ -18,6 +18,8 @@ import oracles_damping as oracle
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
+from flexplant.modes import normal_form, solve_modes
+from flexplant.modes.normal_form import modal, real_form
 from flexplant.plant import (
     Actuator,
     Disturbance,
@@ -33,8 +35,6 @@ from flexplant.plant import (
     suspend,
 )
 from flexplant.plant.realisation import ILL_CONDITIONED, realised
-from flexplant.reduction import normal_form, solve_modes
-from flexplant.reduction.normal_form import modal, real_form
 from flexplant.structure import FEModel
 from oracles_plant import delayed_run, first_order, machine, receptance, z_row
 from stages import Z8, full, ports, reduced

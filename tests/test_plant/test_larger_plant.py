@@ -6,8 +6,9 @@ import pytest
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError
 from flexplant.lti import frequency_response
+from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant, larger_plant
-from flexplant.reduction import DesiredDofs, ModalTruncation, reduce, solve_modes
+from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import ModalDamping
 from plates import make_plate
 from stages import ports

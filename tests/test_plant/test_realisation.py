@@ -6,9 +6,9 @@ import pytest
 from flexplant.errors import ModelError
 from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
+from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant
 from flexplant.plant.realisation import realised
-from flexplant.reduction import solve_modes
 from flexplant.structure import FEModel, ModalDamping
 from oracles_plant import machine, motion_row, receptance
 from oracles_structure import poles as dense_poles

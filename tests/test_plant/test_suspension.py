@@ -6,6 +6,7 @@ import pytest
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.lti import frequency_response
+from flexplant.modes import solve_modes
 from flexplant.plant import (
     BaseAcceleration,
     FastStates,
@@ -15,7 +16,6 @@ from flexplant.plant import (
     assemble_plant,
     suspend,
 )
-from flexplant.reduction import solve_modes
 from flexplant.structure import FEModel, ModalDamping
 from oracles_plant import machine, motion_row, receptance, z_row
 from plates import make_plate

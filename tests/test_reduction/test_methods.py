@@ -14,6 +14,7 @@ from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
+from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant, decouple
 from flexplant.reduction import (
     CraigBampton,
@@ -28,7 +29,6 @@ from flexplant.reduction import (
     Serep,
     reduce,
     select_dofs,
-    solve_modes,
 )
 from flexplant.structure import FEModel, ModalDamping, Rayleigh
 from flexplant.updating import AddedMass, Eigenvalues, identifiability, update

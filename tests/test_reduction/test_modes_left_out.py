@@ -7,7 +7,8 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError, ShapeError
-from flexplant.reduction import DesiredDofs, ModalBalanced, ModalTruncation, reduce, solve_modes
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, ModalBalanced, ModalTruncation, reduce
 from flexplant.structure import ModalDamping
 from plates import make_plate
 

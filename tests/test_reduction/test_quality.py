@@ -7,14 +7,8 @@ import scipy.linalg as la
 import oracles_reduction as oracle
 import oracles_structure
 from flexplant.errors import ModelError
-from flexplant.reduction import (
-    CraigBampton,
-    Guyan,
-    ModalBalanced,
-    ModalTruncation,
-    reduce,
-    solve_modes,
-)
+from flexplant.modes import solve_modes
+from flexplant.reduction import CraigBampton, Guyan, ModalBalanced, ModalTruncation, reduce
 from flexplant.reduction.mode_pairs import paired
 from flexplant.structure import ModalDamping
 from plates import make_plate

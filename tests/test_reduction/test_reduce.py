@@ -8,7 +8,8 @@ import pytest
 import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DofSet
-from flexplant.reduction import DesiredDofs, ReducedModel, reduce, select_dofs, solve_modes
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, ReducedModel, reduce, select_dofs
 from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
 from plates import make_plate

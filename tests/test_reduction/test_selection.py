@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import oracles_reduction as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.modes import solve_modes
 from flexplant.reduction import (
     DesiredDofs,
     EffectiveIndependence,
@@ -16,7 +17,6 @@ from flexplant.reduction import (
     PivotedQr,
     reduce,
     select_dofs,
-    solve_modes,
 )
 from plates import make_plate
 

@@ -11,7 +11,7 @@ import oracles_grids as grids
 import oracles_structure as oracle
 from flexplant.errors import FlexplantWarning, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.reduction import solve_modes
+from flexplant.modes import solve_modes
 from flexplant.structure import Hysteretic, ModalDamping, Rayleigh, chain
 
 

@@ -10,6 +10,7 @@ from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.labels import DofSet
 from flexplant.loop import SpillOver, close_loop
 from flexplant.loop.spill_over import growing_modes
+from flexplant.modes import solve_modes
 from flexplant.plant import (
     Actuator,
     Disturbance,
@@ -21,7 +22,7 @@ from flexplant.plant import (
     reference_errors,
     stage_weights,
 )
-from flexplant.reduction import DesiredDofs, reduce, solve_modes
+from flexplant.reduction import DesiredDofs, reduce
 from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import Lmi, design_hinf

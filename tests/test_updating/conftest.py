@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from flexplant.labels import DofSet
-from flexplant.reduction import DesiredDofs, ReducedModel, reduce, solve_modes
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, ReducedModel, reduce
 from flexplant.structure import FEModel, ModalDamping
 from plates import PLATE, make_plate
 

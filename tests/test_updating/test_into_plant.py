@@ -9,9 +9,9 @@ import oracles_updating as oracle
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import MeasuredModes
 from flexplant.lti import frequency_response
+from flexplant.modes import solve_modes
 from flexplant.plant import assemble_plant
 from flexplant.plant.realisation import realised
-from flexplant.reduction import solve_modes
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from flexplant.updating import (
     AddedDamping,

@@ -5,7 +5,8 @@ import pytest
 
 import oracles_updating as oracle
 from flexplant.identification import MeasuredModes
-from flexplant.reduction import DesiredDofs, reduce, solve_modes
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, reduce
 from flexplant.structure import ModalDamping, PointMass
 from flexplant.updating import AddedMass, Eigenvalues, localise
 

@@ -5,7 +5,8 @@ import pytest
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
-from flexplant.reduction import DesiredDofs, reduce, select_dofs, solve_modes
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, reduce, select_dofs
 from flexplant.structure import ModalDamping, kirchhoff_plate
 from flexplant.updating import (
     Eigenvalues,

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import LabelError, ModelError
 from ..labels import Place
-from ..reduction import Modes
+from ..modes import Modes
 from ..values import ComplexArray, FloatArray, positive
 from .measured import MeasuredModes
 

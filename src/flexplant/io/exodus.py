@@ -14,7 +14,7 @@ import scipy.io
 
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
-from ..reduction import Modes
+from ..modes import Modes
 from ..values import FloatArray, Matrix, positive, real_array
 from .formats import Elsewhere
 from .paths import file_path

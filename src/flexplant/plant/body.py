@@ -9,7 +9,8 @@ import numpy as np
 
 from ..errors import ModelError
 from ..labels import DIRECTIONS
-from ..reduction import Modes, ReducedModel
+from ..modes import Modes
+from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..structure.rigid import rigid_motions
 from ..values import FloatArray, Value

@@ -11,8 +11,9 @@ import scipy.linalg as la
 from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..lti.discretisation import block_diagonal
-from ..reduction import Modes, NormalForm, ReducedModel
-from ..reduction.normal_form import PROPORTIONAL, RealForm, modal, real_form
+from ..modes import Modes, NormalForm
+from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form
+from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import ComplexArray, FloatArray, Value
 

@@ -10,7 +10,8 @@ import numpy as np
 
 from ..errors import ModelError
 from ..labels import Place
-from ..reduction import Modes, ReducedModel, normal_form
+from ..modes import Modes, normal_form
+from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import FloatArray, Value, positive
 from .places import checked_direction, checked_place

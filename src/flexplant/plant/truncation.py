@@ -8,7 +8,8 @@ import numpy as np
 
 from ..errors import LabelError, ModelError
 from ..lti.statespace import StateSpace
-from ..reduction import Modes, ReducedModel
+from ..modes import Modes
+from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import short
 from .assembly import assemble_plant

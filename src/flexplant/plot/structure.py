@@ -11,8 +11,8 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError
 from ..labels import DofSet
+from ..modes import Modes
 from ..plant import Ports
-from ..reduction import Modes
 from ._axes import FULL, MARK, NOMINAL, UPDATED, axes, finish
 
 

@@ -1,4 +1,4 @@
-"""Fewer degrees of freedom, same input-output behaviour: modes, attachment vectors, reduction."""
+"""Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality."""
 
 from .bounds import ErrorBound as ErrorBound
 from .component import CraigBampton as CraigBampton
@@ -15,15 +15,11 @@ from .krylov import Krylov as Krylov
 from .methods import DesiredDofs as DesiredDofs
 from .methods import ReductionMethod as ReductionMethod
 from .methods import reduce as reduce
-from .modes import Modes as Modes
-from .normal_form import NormalForm as NormalForm
-from .normal_form import normal_form as normal_form
 from .quality import ReductionQuality as ReductionQuality
 from .ranking import ModeRanking as ModeRanking
 from .ranking import rank_modes as rank_modes
 from .reduced import ReducedModel as ReducedModel
 from .selection import DofSelection as DofSelection
 from .selection import select_dofs as select_dofs
-from .solve import solve_modes as solve_modes
 from .truncation import ModalBalanced as ModalBalanced
 from .truncation import ModalTruncation as ModalTruncation

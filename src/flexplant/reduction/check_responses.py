@@ -8,11 +8,11 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..modes.attachment_vectors import static_response
+from ..modes.modes import Modes
+from ..sparse.factor import dense
 from ..structure import FEModel
-from ..structure.factor import dense
 from ..values import ComplexArray, FloatArray, Matrix
-from .attachment import static_response
-from .modes import Modes
 from .projection import lu_of
 from .reduced import ReducedModel
 

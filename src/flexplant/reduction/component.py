@@ -9,12 +9,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError
+from ..modes.modes import Modes
+from ..modes.solve import solve_modes
+from ..sparse.factor import dense, unit_diagonal
 from ..structure import Damping, FEModel
-from ..structure.factor import dense, unit_diagonal
 from ..values import FloatArray, positive, whole
 from .condensation import Partition
 from .methods import ReductionMethod
-from .modes import Modes
 from .projection import (
     block,
     checked_damping,
@@ -26,7 +27,6 @@ from .projection import (
     undamped,
 )
 from .reduced import ReducedModel
-from .solve import solve_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -10,11 +10,12 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, ShapeError, SolverError
+from ..modes.modes import Modes
+from ..modes.solve import solve_modes
+from ..sparse.factor import unit_diagonal
 from ..structure import Damping, FEModel
-from ..structure.factor import unit_diagonal
 from ..values import FloatArray, IntArray, positive, whole
 from .methods import ReductionMethod, refused_partition
-from .modes import Modes
 from .projection import (
     Solver,
     block,
@@ -27,7 +28,6 @@ from .projection import (
     undamped,
 )
 from .reduced import ReducedModel
-from .solve import solve_modes
 
 _SINGULAR = (
     "K of the condensed DOFs is singular: with the kept DOFs held, the structure can still move "

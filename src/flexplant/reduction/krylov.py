@@ -13,13 +13,13 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
 from ..labels import Place
+from ..modes.attachment_vectors import labels_of, places, static_response
+from ..modes.modes import Modes
+from ..modes.shifted import stiffness_factor
+from ..sparse.factor import DENSE_LIMIT, dense
 from ..structure import Damping, FEModel
-from ..structure.factor import DENSE_LIMIT, dense
-from ..structure.shifted import stiffness_factor
 from ..values import FloatArray, real_array, whole
-from .attachment import labels_of, places, static_response
 from .methods import ReductionMethod
-from .modes import Modes
 from .projection import checked_damping, fe_model, lu_of, projected
 from .reduced import ReducedModel
 

@@ -10,10 +10,10 @@ import scipy.linalg as la
 
 from ..errors import FlexplantError, ModelError, ShapeError
 from ..labels import DofSet
+from ..modes.modes import Modes
 from ..structure import FEModel
 from ..values import FloatArray, Value
 from .criteria import PivotedQr
-from .modes import Modes
 from .projection import labels_given, shown
 from .reduced import ReducedModel
 

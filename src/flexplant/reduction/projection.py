@@ -12,13 +12,13 @@ import scipy.sparse.linalg as spla
 
 from ..errors import LabelError, ModelError, SolverError
 from ..labels import DofSet
+from ..modes.modes import Modes
+from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
+from ..sparse.multifrontal import MultifrontalCholesky
 from ..structure import Damping, FEModel
 from ..structure.eigen import elastic_modes
-from ..structure.factor import DENSE_LIMIT, dense, unit_diagonal
-from ..structure.multifrontal import MultifrontalCholesky
 from ..values import FloatArray, Matrix, name_list, rebuild
 from .bounds import ErrorBound
-from .modes import Modes
 from .reduced import ReducedModel
 
 #: part of a rigid-body motion that a basis may miss

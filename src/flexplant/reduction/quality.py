@@ -9,9 +9,11 @@ import numpy as np
 
 from ..errors import ModelError
 from ..labels import Place
+from ..modes.attachment_vectors import labels_of, places
+from ..modes.modes import Modes
+from ..modes.solve import solve_modes
 from ..structure import FEModel
 from ..values import FloatArray, IntArray, Value, name_list, positive, real_array, whole
-from .attachment import labels_of, places
 from .bounds import ErrorBound
 from .check_responses import (
     SMALL,
@@ -21,10 +23,8 @@ from .check_responses import (
     static_error,
 )
 from .mode_pairs import paired
-from .modes import Modes
 from .projection import undamped
 from .reduced import ReducedModel
-from .solve import solve_modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)

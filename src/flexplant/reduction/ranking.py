@@ -12,9 +12,9 @@ from ..labels import Place
 from ..lti.discretisation import block_diagonal
 from ..lti.hankel import hankel_values
 from ..lti.statespace import StateSpace
+from ..modes.attachment_vectors import labels_of, places
+from ..modes.modes import Modes
 from ..values import FloatArray, IntArray, Value, name_list, real_array
-from .attachment import labels_of, places
-from .modes import Modes
 
 
 def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:

@@ -11,11 +11,11 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import DofSet, Place
+from ..modes.modes import Modes
+from ..modes.normal_form import normal_form
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
 from .bounds import ErrorBound
-from .modes import Modes
-from .normal_form import normal_form
 
 if TYPE_CHECKING:
     from ..structure import FEModel

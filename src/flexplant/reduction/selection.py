@@ -9,9 +9,9 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
+from ..modes.modes import Modes
 from ..values import FloatArray, Value, name_list, positive, real_array, whole
 from .criteria import PivotedQr, SelectionCriterion
-from .modes import Modes
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -90,7 +90,7 @@ def select_dofs(
     Examples
     --------
     >>> from flexplant.structure import kirchhoff_plate
-    >>> from flexplant.reduction import solve_modes
+    >>> from flexplant.modes import solve_modes
     >>> plate = kirchhoff_plate(size=(0.6, 0.6), thickness=0.0272, elements=(4, 4), density=2702,
     ...                         youngs_modulus=70e9, poisson_ratio=0.35)
     >>> near = ["7:z", "12:z", "23:z"]

@@ -11,17 +11,17 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import Place
+from ..modes.attachment_vectors import attachment_vectors, labels_of, places, static_response
+from ..modes.modes import Modes
+from ..modes.solve import solve_modes
 from ..structure import Damping, FEModel, ModalDamping
 from ..values import FloatArray, IntArray, whole
-from .attachment import attachment_vectors, labels_of, places, static_response
 from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod
-from .modes import Modes
 from .projection import checked_damping, inner, undamped
 from .ranking import channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
-from .solve import solve_modes
 
 _SUM = "sum of the peaks of the neglected modes"
 _RESIDUE = "residual flexibility over twice the damping (Cauchy-Schwarz)"

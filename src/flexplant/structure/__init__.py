@@ -1,11 +1,17 @@
 """What the machine is: finite-element matrices with labelled degrees of freedom, and damping."""
 
-from .check import ModelCheck as ModelCheck
-from .check import check as check
+from .attachments import Damper as Damper
+from .attachments import HeldShape as HeldShape
+from .attachments import PointMass as PointMass
+from .attachments import Spring as Spring
 from .damping import Damping as Damping
 from .damping import Hysteretic as Hysteretic
 from .damping import ModalDamping as ModalDamping
 from .damping import Rayleigh as Rayleigh
+from .inspection.check import ModelCheck as ModelCheck
+from .inspection.check import check as check
+from .interpolation import ScatteredShape as ScatteredShape
+from .interpolation import interpolated as interpolated
 from .matrices import FEMatrices as FEMatrices
 from .mesh.beam import beam as beam
 from .mesh.block import solid_block as solid_block
@@ -18,10 +24,3 @@ from .mesh.shapes import BeamShape as BeamShape
 from .mesh.shapes import BlockShape as BlockShape
 from .mesh.shapes import PlateShape as PlateShape
 from .model import FEModel as FEModel
-from .pardiso import Pardiso as Pardiso
-from .parts import Damper as Damper
-from .parts import HeldShape as HeldShape
-from .parts import PointMass as PointMass
-from .parts import Spring as Spring
-from .scattered import ScatteredShape as ScatteredShape
-from .scattered import interpolated as interpolated

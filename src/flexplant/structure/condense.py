@@ -9,8 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
+from ..sparse.factor import symmetric_lu, unit_diagonal
 from ..values import IntArray
-from .factor import symmetric_lu, unit_diagonal
 
 #: so many columns of K_ss^-1 K_sm at once: more of them no longer fit the cache
 _COLUMNS = 256

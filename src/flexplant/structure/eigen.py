@@ -7,9 +7,9 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import DofSet
+from ..sparse.factor import dense, unit_diagonal
+from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
 from ..values import FloatArray
-from .factor import dense, unit_diagonal
-from .ritz import rayleigh_ritz, rounding_of, soft_group
 from .zero_energy import beyond, most_moved
 
 #: eigenvalues above this part of the largest one are right to 1e-9 when M is made the identity

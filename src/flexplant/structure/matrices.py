@@ -13,11 +13,11 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
+from ..sparse.factor import is_positive_definite
 from ..values import FloatArray, IntArray, Value, name_list, real_array, short, whole
 from .completion import completed as completed
 from .completion import square
 from .condense import condensed, no_mass
-from .factor import is_positive_definite
 from .local_axes import cosines
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding

@@ -13,11 +13,11 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError, ShapeError
 from ..labels import DofSet
+from ..sparse.factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
 from ..values import FloatArray, Matrix, Value, frozen, real_array
+from .attachments import HeldShape, Part, added_matrices, sum_of
 from .damping import Damping, ModalDamping, Rayleigh
 from .eigen import elastic_modes
-from .factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
-from .parts import HeldShape, Part, added_matrices, sum_of
 from .precision import digits_of, endangered, held_by_rounding
 from .rigid import body_motions, rigid_body_basis
 from .units import units

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..errors import SolverError
 from ..labels import DofSet
+from ..sparse.lowest import Lowest, lowest_modes
 from ..values import FloatArray
-from .lowest import Lowest, lowest_modes
 from .rigid import force_free
 from .zero_energy import nearly_free
 

@@ -9,11 +9,11 @@ import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
 from ..labels import DofSet
+from ..sparse.factor import by_rows
+from ..sparse.lowest import ROUNDING, definite_solver
+from ..sparse.rayleigh_ritz import absolute
 from ..values import FloatArray, Matrix
-from .factor import by_rows
-from .lowest import ROUNDING, definite_solver
-from .pieces import bodies
-from .ritz import absolute
+from .components import bodies
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
 _ENERGY_TOLERANCE = 1e-10

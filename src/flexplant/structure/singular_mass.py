@@ -11,8 +11,8 @@ import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from ..errors import ModelError
+from ..sparse.factor import dense, diagonal, is_positive_definite, unit_diagonal
 from ..values import FloatArray, IntArray
-from .factor import dense, diagonal, is_positive_definite, unit_diagonal
 
 #: relative to a unit diagonal: an eigenvalue of M below this is none
 _SINGULAR = 1e-11

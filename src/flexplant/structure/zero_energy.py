@@ -10,10 +10,10 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
+from ..sparse.factor import dense
+from ..sparse.lowest import ROUNDING
 from ..values import FloatArray, IntArray
-from .factor import dense
-from .lowest import ROUNDING
-from .pieces import bodies
+from .components import bodies
 from .rigid import orthonormalised, rigid_motions
 
 #: times the energy that rounding of the entries allows: free

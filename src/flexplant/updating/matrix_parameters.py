@@ -10,10 +10,10 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError, ShapeError
-from ..reduction import solve_modes
+from ..modes import solve_modes
+from ..sparse.factor import DENSE_LIMIT, dense
 from ..structure import ModalDamping
 from ..structure.eigen import elastic_modes
-from ..structure.factor import DENSE_LIMIT, dense
 from ..values import FloatArray, Matrix, positive, real_array, short
 from .parameters import Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 

@@ -12,8 +12,8 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 from ..errors import ModelError
+from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
-from ..structure.factor import dense
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray
 from .parameters import Parameter

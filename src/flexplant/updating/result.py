@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, unknown_label
-from ..reduction import Modes, solve_modes
+from ..modes import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Value, generator, positive, short
 from .goodness import chance
 from .parameters import AddedMass, Parameter

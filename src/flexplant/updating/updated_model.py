@@ -10,8 +10,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError
-from ..reduction import solve_modes
-from ..reduction.normal_form import RIGID_DRAG
+from ..modes import solve_modes
+from ..modes.normal_form import RIGID_DRAG
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from ..values import FloatArray, Matrix

@@ -9,8 +9,8 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
+from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
-from ..structure.factor import dense
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray, Matrix, Value, real_array
 

@@ -8,17 +8,17 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError
-from ..values import FloatArray, IntArray
-from .factor import diagonal, is_positive_definite, unit_diagonal
-from .lowest import ROUNDING, Lowest, lowest_modes
-from .masses import RigidMass, rigid_mass
-from .matrices import FEMatrices
-from .pieces import pieces
-from .precision import loss
-from .rigid import rigid_motions
-from .singular_mass import left_out, null_motions
-from .zero_energy import ZeroEnergy, zero_energy
+from ...errors import ModelError, SolverError
+from ...sparse.factor import diagonal, is_positive_definite, unit_diagonal
+from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
+from ...values import FloatArray, IntArray
+from ..components import pieces
+from ..masses import RigidMass, rigid_mass
+from ..matrices import FEMatrices
+from ..precision import loss
+from ..rigid import rigid_motions
+from ..singular_mass import left_out, null_motions
+from ..zero_energy import ZeroEnergy, zero_energy
 
 #: asked of the solver: six rigid-body motions and some elastic modes
 _MODES = 10

@@ -7,10 +7,11 @@ import scipy.sparse as sp
 
 import meshes
 from flexplant.errors import ModelError
-from flexplant.structure import FEModel, counted
-from flexplant.structure.counted import counted_modes
-from flexplant.structure.lanczos import BlockLanczos
-from flexplant.structure.shifted import modes_below, stiffness_factor
+from flexplant.modes import sparse_modes as counted
+from flexplant.modes.lanczos import BlockLanczos
+from flexplant.modes.shifted import modes_below, stiffness_factor
+from flexplant.modes.sparse_modes import counted_modes
+from flexplant.structure import FEModel
 
 
 def model_of(mesh):

@@ -7,11 +7,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..labels import DIRECTIONS
-from ..values import FloatArray
-from .factor import diagonal
-from .facts import Facts
-from .zero_energy import ZeroEnergy, most_moved
+from ...labels import DIRECTIONS
+from ...sparse.factor import diagonal
+from ...values import FloatArray
+from ..zero_energy import ZeroEnergy, most_moved
+from .check_facts import Facts
 
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]

@@ -9,9 +9,10 @@ import scipy.sparse as sp
 
 import meshes
 from flexplant.errors import ModelError, SolverError
-from flexplant.reduction import solve_modes
-from flexplant.structure import FEModel, Pardiso
-from flexplant.structure.pardiso import PardisoCholesky, _loaded
+from flexplant.modes import solve_modes
+from flexplant.sparse import Pardiso
+from flexplant.sparse.pardiso import PardisoCholesky, _loaded
+from flexplant.structure import FEModel
 
 
 @pytest.fixture

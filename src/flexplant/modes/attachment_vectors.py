@@ -11,12 +11,12 @@ import scipy.sparse as sp
 
 from ..errors import ModelError
 from ..labels import DofSet, Place
+from ..sparse.factor import DENSE_LIMIT, dense, diagonal
+from ..sparse.multifrontal import MultifrontalCholesky
 from ..structure import FEModel
 from ..structure.eigen import signed
-from ..structure.factor import DENSE_LIMIT, dense, diagonal
-from ..structure.multifrontal import MultifrontalCholesky
-from ..structure.shifted import stiffness_factor
 from ..values import FloatArray, Matrix, short
+from .shifted import stiffness_factor
 
 #: of a place's whole elastic compliance: what is less than this beyond the modes is rounding
 _NEGLIGIBLE = 1e-9

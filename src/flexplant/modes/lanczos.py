@@ -8,8 +8,8 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import SolverError
+from ..sparse.factor import by_rows
 from ..values import FloatArray, Matrix
-from .factor import by_rows
 
 #: vectors that are solved for at a time
 BLOCK = 12

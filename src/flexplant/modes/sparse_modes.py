@@ -8,13 +8,13 @@ import numpy as np
 
 from ..errors import ModelError, SolverError
 from ..parallel import one_thread
+from ..sparse.factor import by_rows
+from ..sparse.pardiso import Pardiso
+from ..sparse.rayleigh_ritz import absolute, rayleigh_ritz, rounding_of
+from ..structure.eigen import check_stiffness
+from ..structure.model import FEModel
 from ..values import FloatArray
-from .eigen import check_stiffness
-from .factor import by_rows
 from .lanczos import FOUND, BlockLanczos
-from .model import FEModel
-from .pardiso import Pardiso
-from .ritz import absolute, rayleigh_ritz, rounding_of
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
 
 #: modes beyond the last wanted one among which a gap is looked for

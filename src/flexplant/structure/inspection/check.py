@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import FloatArray, Value
-from .facts import Facts, facts
-from .matrices import FEMatrices
-from .model import FEModel
-from .precision import verdict
-from .verdicts import Line, listed, masses, matrices, rigid, scales, spread, zero_rows
+from ...errors import ModelError
+from ...values import FloatArray, Value
+from ..matrices import FEMatrices
+from ..model import FEModel
+from ..precision import verdict
+from .check_facts import Facts, facts
+from .check_lines import Line, listed, masses, matrices, rigid, scales, spread, zero_rows
 
 _WIDTH = 100
 

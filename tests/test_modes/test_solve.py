@@ -7,8 +7,9 @@ import scipy.sparse as sp
 import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
 from flexplant.labels import DofSet
-from flexplant.reduction import solve, solve_modes
-from flexplant.structure import FEModel, ModalDamping, Rayleigh, Spring, counted
+from flexplant.modes import solve, solve_modes
+from flexplant.modes import sparse_modes as counted
+from flexplant.structure import FEModel, ModalDamping, Rayleigh, Spring
 from plates import make_plate
 
 # Hz, rad/s; oracle: oracles_structure (Gauss quadrature, scipy.linalg.eigh, first-order poles)

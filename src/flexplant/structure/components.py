@@ -9,8 +9,8 @@ import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
 from ..labels import DofSet
+from ..sparse.factor import by_rows, diagonal
 from ..values import IntArray
-from .factor import by_rows, diagonal
 
 #: more pieces than this are no structure of several bodies
 _MOST_BODIES = 50

@@ -10,17 +10,17 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
 from ..labels import Place
+from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
+from ..sparse.pardiso import Pardiso
+from ..sparse.rayleigh_ritz import absolute, rounding_of
 from ..structure import Damping, FEModel, ModalDamping
-from ..structure.counted import counted_modes
 from ..structure.eigen import elastic_modes, signed
-from ..structure.factor import DENSE_LIMIT, by_rows, dense, diagonal
-from ..structure.pardiso import Pardiso
-from ..structure.ritz import absolute, rounding_of
-from ..structure.shifted import modes_below, stiffness_factor
 from ..values import FloatArray, positive, short
-from .attachment import attachment_vectors, labels_of, places, projected_zeta
+from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
+from .shifted import modes_below, stiffness_factor
+from .sparse_modes import counted_modes
 
 #: M-orthonormality that is asked of every answer
 _ORTHONORMAL = 1e-12

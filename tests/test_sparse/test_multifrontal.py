@@ -9,9 +9,9 @@ from hypothesis import strategies as st
 
 import meshes
 from flexplant.errors import SolverError
-from flexplant.structure.factor import is_positive_definite, lowest_eigenvalue_bound
-from flexplant.structure.multifrontal import MultifrontalCholesky, multifrontal_inertia
-from flexplant.structure.ordering import dissect
+from flexplant.sparse.factor import is_positive_definite, lowest_eigenvalue_bound
+from flexplant.sparse.multifrontal import MultifrontalCholesky, multifrontal_inertia
+from flexplant.sparse.ordering import dissect
 
 
 def random_sparse(seed, n, links):

@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
+from ..sparse.multifrontal import MultifrontalCholesky, multifrontal_inertia
+from ..sparse.ordering import Dissection, dissect
+from ..sparse.pardiso import Pardiso, PardisoCholesky
+from ..sparse.rayleigh_ritz import rounding_of
+from ..structure.model import FEModel
 from ..values import FloatArray
-from .model import FEModel
-from .multifrontal import MultifrontalCholesky, multifrontal_inertia
-from .ordering import Dissection, dissect
-from .pardiso import Pardiso, PardisoCholesky
-from .ritz import rounding_of
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular

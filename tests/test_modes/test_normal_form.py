@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 import oracles_structure as oracle
 from flexplant.errors import ModelError
-from flexplant.reduction import NormalForm, normal_form
+from flexplant.modes import NormalForm, normal_form
 
 
 def chain(masses, stiffnesses):

@@ -11,7 +11,7 @@ import oracles_modes as oracle
 from flexplant import check
 from flexplant.errors import ModelError
 from flexplant.labels import DofSet
-from flexplant.reduction import solve, solve_modes
+from flexplant.modes import solve, solve_modes
 from flexplant.structure import FEModel, Spring, beam, kirchhoff_plate
 
 ALUMINIUM = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}

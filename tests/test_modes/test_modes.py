@@ -7,7 +7,7 @@ import pytest
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DofSet
-from flexplant.reduction import Modes, solve_modes
+from flexplant.modes import Modes, solve_modes
 from flexplant.store import load
 from flexplant.structure import ModalDamping
 from plates import make_plate

@@ -9,7 +9,7 @@ import scipy.linalg as la
 import oracles_structure as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.labels import DofSet
-from flexplant.reduction import solve_modes
+from flexplant.modes import solve_modes
 from flexplant.store import load
 from flexplant.structure import (
     Damper,
