@@ -16,6 +16,9 @@ from .pairing import mac as _mac
 from .search import Objective, checked_residuals
 from .shapes import ModeShapes
 
+#: a distance in ln(frequency) that outweighs any MAC: few sensors see many modes alike
+APART = 0.3
+
 
 def mac(X: Any, Y: Any) -> FloatArray:
     """Return the modal assurance criterion (m, m') of each shape of X with each of Y.
@@ -183,6 +186,8 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
         if isinstance(measured, MeasuredModes):
             modes, poles = measured.modes or (), measured.poles
             columns = point.columns(modes)
+            if isinstance(residual, ModeShapes) and residual.assign:
+                columns = _paired(residual, tied.rows @ point.eigen.X, point.eigen.poles)
             found = point.eigen.poles[columns]
             if isinstance(residual, ModeShapes):
                 shapes = mac(residual.shapes, tied.rows @ point.eigen.X[:, columns])
@@ -198,6 +203,15 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
         frac=responses,
         fdac=spectrum,
     )
+
+
+def _paired(residual: ModeShapes, X: ComplexArray, poles: ComplexArray) -> list[int]:
+    """Return the mode of the model for each measured one: by MAC and by frequency, one to one."""
+    from scipy.optimize import linear_sum_assignment
+
+    far = np.abs(np.log(np.abs(poles) / np.abs(residual.measured.poles)[:, None]))
+    score = _mac(np.asarray(residual.shapes, dtype=np.complex128), X)
+    return [int(i) for i in linear_sum_assignment(far / APART - score)[1]]
 
 
 def _shapes(value: Any, name: str) -> ComplexArray:
