@@ -9,8 +9,9 @@ from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, Mode
 from flexplant.estimation import design_kalman, design_static
 from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out
+from flexplant.lti import lowpass
 from flexplant.modes import solve_modes
-from flexplant.plant import Sensor, assemble_plant, larger_plant, lowpass
+from flexplant.plant import Sensor, assemble_plant, larger_plant
 from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from oracles_estimation import error_by_frequency, truncated_covariance

@@ -15,10 +15,11 @@ from flexplant.errors import (
     ModelError,
     SolverError,
 )
+from flexplant.lti import lowpass
 from flexplant.placement import PoiLqr, PoiVariance, score_actuators, score_sensors
 from flexplant.placement.layouts import layouts_of
 from flexplant.placement.quadratic import Quadratic
-from flexplant.plant import Sensor, StandardPlant, lowpass
+from flexplant.plant import Sensor, StandardPlant
 from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
 

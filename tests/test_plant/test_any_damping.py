@@ -17,7 +17,7 @@ import flexplant as fx
 import oracles_damping as oracle
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.labels import DofSet
-from flexplant.lti import frequency_response
+from flexplant.lti import frequency_response, lowpass
 from flexplant.modes import normal_form, solve_modes
 from flexplant.modes.normal_form import modal, real_form
 from flexplant.plant import (
@@ -31,7 +31,6 @@ from flexplant.plant import (
     StandardPlant,
     assemble_plant,
     decouple,
-    lowpass,
     suspend,
 )
 from flexplant.plant.realisation import ILL_CONDITIONED, realised

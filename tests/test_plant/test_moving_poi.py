@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
-from flexplant.plant import Actuator, Feedthrough, Poi, Sensor, assemble_plant, lowpass
+from flexplant.lti import lowpass
+from flexplant.plant import Actuator, Feedthrough, Poi, Sensor, assemble_plant
 from oracles_plant import motion_row, receptance, z_row
 from stages import AXES, CORNERS, INSET, OFF_NODE, RATE, Z8, L, full, ports, reduced, some_modes
 

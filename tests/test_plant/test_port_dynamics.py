@@ -7,7 +7,7 @@ import scipy.linalg as la
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
 from flexplant.estimation import design_kalman
 from flexplant.labels import DofSet
-from flexplant.lti import StateSpace, frequency_response
+from flexplant.lti import StateSpace, frequency_response, lowpass, pade
 from flexplant.lti.discretisation import discretized
 from flexplant.plant import (
     Actuator,
@@ -20,8 +20,6 @@ from flexplant.plant import (
     Reference,
     Sensor,
     assemble_plant,
-    lowpass,
-    pade,
     stage_weights,
     suspend,
 )

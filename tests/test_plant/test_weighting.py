@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
-from flexplant.lti import StateSpace, frequency_response, tustin
-from flexplant.plant import StandardPlant, assemble_plant, highpass, lowpass
+from flexplant.lti import StateSpace, frequency_response, highpass, lowpass, tustin
+from flexplant.plant import StandardPlant, assemble_plant
 from stages import RATE, ports, some_modes
 
 FREQ = np.array([1.0, 50.0, 245.0, 700.0])

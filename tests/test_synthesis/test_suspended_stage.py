@@ -17,7 +17,7 @@ from flexplant.plant import (
     stage_weights,
     suspend,
 )
-from flexplant.plant.carried import carried, rigid_gain
+from flexplant.plant.rigid.rigid_motion import carried, rigid_gain
 from flexplant.simulation import simulate
 from flexplant.structure import FEModel
 from flexplant.synthesis import design_hinf, design_servo

@@ -18,8 +18,8 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
+from ..plant.channel_sides import TYPE_THIS
 from ..plant.channel_units import plant_units
-from ..plant.door import TYPE_THIS
 from ..plant.realisation import Structure
 from ..values import FloatArray, Value, real_array
 from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors

@@ -9,8 +9,8 @@ import numpy as np
 from ..errors import AssumptionError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
-from ..plant.carried import carried_of, seen, structure_of
 from ..plant.realisation import Structure
+from ..plant.rigid.rigid_motion import carried_of, seen, structure_of
 from ..values import FloatArray, Value
 from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .error import error_variances

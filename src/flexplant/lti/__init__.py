@@ -38,3 +38,9 @@ from .splitting import Split as Split
 from .splitting import split_stable as split_stable
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace
+from .weights import highpass as highpass
+from .weights import inverse_sensitivity as inverse_sensitivity
+from .weights import leadlag as leadlag
+from .weights import lowpass as lowpass
+from .weights import notch as notch
+from .weights import pade as pade

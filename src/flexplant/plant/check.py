@@ -13,12 +13,12 @@ from ..errors import AssumptionError, unknown_label
 from ..labels import DIRECTIONS
 from ..lti.scaling import state_scale
 from ..lti.statespace import StateSpace
+from ..lti.zeros import axis_zeros
 from ..reduction import ReducedModel
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, Value
 from .standard import StandardPlant
 from .visibility import WEAK, ModeVisibility, mode_visibility
-from .zeros import axis_zeros
 
 #: a motion weaker than this beside the strongest one counts as absent
 _ABSENT = 1e-8

@@ -11,10 +11,10 @@ from ..labels import Place
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..values import FloatArray
-from .body import inertia_load
 from .forces import BaseAcceleration, OutputDisturbance
 from .ports import QUANTITIES, Poi, Ports, filter_of
 from .realisation import ModalRealisation
+from .rigid.rigid_body import inertia_load
 
 
 def load_of(realisation: ModalRealisation, port: Any) -> FloatArray:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from ..labels import Place
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive, real_array
-from .places import checked_direction, checked_filter, checked_name, checked_place
+from .port_checks import checked_direction, checked_filter, checked_name, checked_place
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,12 +10,12 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
+from ..lti.weights import pade
 from ..values import Value, check_names, positive, short
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration, OutputDisturbance
 from .forces import Disturbance as Disturbance
-from .places import checked_direction, checked_filter, checked_name, checked_place
-from .weights import pade
+from .port_checks import checked_direction, checked_filter, checked_name, checked_place
 
 #: what may be in w
 Disturbing: TypeAlias = Disturbance | BaseAcceleration | OutputDisturbance

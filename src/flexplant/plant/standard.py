@@ -14,7 +14,7 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import FloatArray, IntArray, Value, name_list, positive, short
-from .door import TYPE_THIS, sides
+from .channel_sides import TYPE_THIS, sides
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation
@@ -22,7 +22,7 @@ from .realisation import ModalRealisation
 if TYPE_CHECKING:
     from .check import AssumptionReport
     from .moving import Along
-    from .uncertainty import UncertainPlant
+    from .uncertainty.uncertain_plant import UncertainPlant
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -426,7 +426,7 @@ class StandardPlant(Partition, Value):
             When there is no covariance, the fit is of another model, or the doubt covers negative
             stiffness or damping.
         """
-        from .uncertainty import uncertain
+        from .uncertainty.uncertain_plant import uncertain
 
         return uncertain(
             self,

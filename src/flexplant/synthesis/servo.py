@@ -16,7 +16,7 @@ from ..loop.spill_over import growing_modes
 from ..lti.interconnection import append, lft, series
 from ..lti.statespace import StateSpace, as_statespace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant
-from ..plant.carried import carried_of, require_weak, rigid_gain
+from ..plant.rigid.rigid_motion import carried_of, require_weak, rigid_gain
 from ..values import FloatArray, positive, real_array
 from .controller import Controller
 from .servo_axis import Axis, rigid_body, rigid_peak

@@ -11,7 +11,7 @@ from ..lti.discretisation import discretized, tustin
 from ..lti.interconnection import series
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
-from ..plant.weights import leadlag, lowpass, notch
+from ..lti.weights import leadlag, lowpass, notch
 from ..values import ComplexArray, FloatArray
 
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import CertificateError, ModelError
-from ..lti.frequency import default_freq, frequency_response
-from ..lti.interconnection import series
-from ..lti.statespace import StateSpace, System
-from ..values import ComplexArray, FloatArray, Value
-from .assembly import assemble_plant
-from .realisation import Structure
-from .standard import StandardPlant, standard_plant
+from ...errors import CertificateError, ModelError
+from ...lti.frequency import default_freq, frequency_response
+from ...lti.interconnection import series
+from ...lti.statespace import StateSpace, System
+from ...values import ComplexArray, FloatArray, Value
+from ..assembly import assemble_plant
+from ..realisation import Structure
+from ..standard import StandardPlant, standard_plant
 
 #: the weight lies this far above the largest difference found
 _MARGIN = 1.05

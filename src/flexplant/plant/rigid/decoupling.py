@@ -7,15 +7,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError, unknown_label
-from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, name_list
-from .body import RigidBody, rigid_body_of
-from .dynamics import load_of
-from .forces import Actuator
-from .ports import Ports, Sensor, filter_of
-from .realisation import ModalRealisation
-from .standard import StandardPlant, standard_plant
+from ...errors import AssumptionError, ModelError, unknown_label
+from ...lti.statespace import StateSpace
+from ...values import FloatArray, Value, name_list
+from ..dynamics import load_of
+from ..forces import Actuator
+from ..ports import Ports, Sensor, filter_of
+from ..realisation import ModalRealisation
+from ..standard import StandardPlant, standard_plant
+from .rigid_body import RigidBody, rigid_body_of
 
 #: relative: what the sensors show or the actuators push of other axes
 _CLEAN = 1e-6

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray
+from .statespace import StateSpace
 
 #: a zero closer to the limit than this, relative to its size, is tested as if it were on it
 _NEAR = 1e-6

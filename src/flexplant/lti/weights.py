@@ -8,9 +8,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import ModelError
-from ..lti.interconnection import series
-from ..lti.statespace import StateSpace
 from ..values import positive, real_array
+from .interconnection import series
+from .statespace import StateSpace
 
 
 def first_order(b1: float, b0: float, omega: float) -> StateSpace:

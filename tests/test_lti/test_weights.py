@@ -6,8 +6,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import ModelError, ShapeError
-from flexplant.lti import frequency_response, series, tustin
-from flexplant.plant import highpass, inverse_sensitivity, leadlag, lowpass, notch
+from flexplant.lti import (
+    frequency_response,
+    highpass,
+    inverse_sensitivity,
+    leadlag,
+    lowpass,
+    notch,
+    series,
+    tustin,
+)
 
 FREQS = st.floats(1e-2, 1e4)
 

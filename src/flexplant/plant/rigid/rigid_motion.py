@@ -8,13 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantError, unknown_label
-from ..values import FloatArray, IntArray
-from .body import inertia, rigid_body_of
-from .dynamics import load_of, poi_row, static_gain
-from .ports import Ports, filter_of
-from .realisation import ModalRealisation
-from .standard import StandardPlant
+from ...errors import AssumptionError, FlexplantError, unknown_label
+from ...values import FloatArray, IntArray
+from ..dynamics import load_of, poi_row, static_gain
+from ..ports import Ports, filter_of
+from ..realisation import ModalRealisation
+from ..standard import StandardPlant
+from .rigid_body import inertia, rigid_body_of
 
 #: part of its kinetic energy that a suspension mode has in rigid-body motion, at least. Springs at
 #: the corners of a plate that put it at 0.4 of its first elastic frequency leave more, a clamped

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
-from ..labels import DIRECTIONS
-from ..modes import Modes
-from ..reduction import ReducedModel
-from ..structure import FEModel
-from ..structure.rigid import rigid_motions
-from ..values import FloatArray, Value
-from .realisation import ModalRealisation, Structure
+from ...errors import ModelError
+from ...labels import DIRECTIONS
+from ...modes import Modes
+from ...reduction import ReducedModel
+from ...structure import FEModel
+from ...structure.rigid import rigid_motions
+from ...values import FloatArray, Value
+from ..realisation import ModalRealisation, Structure
 
 #: relative: a rigid-body motion that the shapes make up to this is one of theirs
 _SPANNED = 1e-7

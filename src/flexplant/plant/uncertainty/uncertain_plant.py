@@ -9,17 +9,17 @@ from typing import Any, Literal
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import LabelError, ModelError, unknown_label
-from ..identification import MeasuredModes
-from ..lti.statespace import StateSpace
-from ..structure.rigid import orthonormalised
-from ..updating import UpdateResult, eigenvalue_sensitivities
-from ..updating.parameters import Parameter
-from ..values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
-from .assembly import assemble_plant
+from ...errors import LabelError, ModelError, unknown_label
+from ...identification import MeasuredModes
+from ...lti.statespace import StateSpace
+from ...structure.rigid import orthonormalised
+from ...updating import UpdateResult, eigenvalue_sensitivities
+from ...updating.parameters import Parameter
+from ...values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
+from ..assembly import assemble_plant
+from ..realisation import MODAL, ModalRealisation, Structure
+from ..standard import StandardPlant
 from .neglected import NeglectedModes, neglected_modes, opened
-from .realisation import MODAL, ModalRealisation, Structure
-from .standard import StandardPlant
 
 #: relative doubts below this open no channel
 _KNOWN = 1e-12

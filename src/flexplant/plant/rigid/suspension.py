@@ -8,13 +8,13 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import ModelError
-from ..labels import Place
-from ..modes import Modes, normal_form
-from ..reduction import ReducedModel
-from ..structure import FEModel
-from ..values import FloatArray, Value, positive
-from .places import checked_direction, checked_place
+from ...errors import ModelError
+from ...labels import Place
+from ...modes import Modes, normal_form
+from ...reduction import ReducedModel
+from ...structure import FEModel
+from ...values import FloatArray, Value, positive
+from ..port_checks import checked_direction, checked_place
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not

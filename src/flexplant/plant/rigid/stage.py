@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, LabelError, ModelError, unknown_label
-from ..lti.discretisation import tustin
-from ..lti.interconnection import series
-from ..lti.statespace import StateSpace
-from ..values import Value, positive
-from .carried import Carried, carried_of, require_weak, rigid_gain, seen, structure_of
-from .forces import BaseAcceleration, OutputDisturbance
-from .ports import Ports
-from .standard import StandardPlant, standard_plant
-from .weights import inverse_sensitivity, leadlag
+from ...errors import AssumptionError, LabelError, ModelError, unknown_label
+from ...lti.discretisation import tustin
+from ...lti.interconnection import series
+from ...lti.statespace import StateSpace
+from ...lti.weights import inverse_sensitivity, leadlag
+from ...values import Value, positive
+from ..forces import BaseAcceleration, OutputDisturbance
+from ..ports import Ports
+from ..standard import StandardPlant, standard_plant
+from .rigid_motion import Carried, carried_of, require_weak, rigid_gain, seen, structure_of
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
 #: the table in `stage_weights`)
