@@ -124,12 +124,36 @@ def test_abaqus_coordinates_and_scale_factors(tmp_path):
         ("2 2\n1 1 1\n", "size of a matrix"),
         ("2 3 1\n1 1 1\n", "not square"),
         ("", "size of a matrix"),
+        ("2 2 1\n99999999999999999999 1 1\n", r"row 1e\+20"),
+        ("2 2 1\n1 1 1e400\n", "line 3.*finite"),
+        ("2 2 3\n1 1 1\n2 1 -1\n1 2 -1\n", r"both \(2, 1\) and \(1, 2\)"),
+        ("2 2 3\n1 1 1\n2 1 -1D0\n1 2 -1\n", r"both \(2, 1\) and \(1, 2\)"),
     ],
 )
+@pytest.mark.filterwarnings("error")
 def test_matrix_market_entries_that_do_not_fit_are_refused(tmp_path, body, match):
     (tmp_path / "K.mtx").write_text(f"%%MatrixMarket matrix coordinate real symmetric\n{body}")
     with pytest.raises(FlexplantError, match=match):
         fx.io.read_matrix_market(tmp_path / "K.mtx")
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_plain_matrix_market_lines_go_through_the_fast_reader(tmp_path, monkeypatch, end):
+    """Every digit arrives, and the slower reader of any notation is not called."""
+    values = np.random.default_rng(3).standard_normal(400) * 10.0 ** np.arange(-200, 200)
+    lines = [f"{i} {i} {value!r}" for i, value in enumerate(values.tolist(), 1)]
+    lines += ["7 3 -.5", "\t9 3  2.  ", "3 11 1E-3", "3 11 1e-3"]  # either triangle, one twice
+    text = [f"%%MatrixMarket matrix coordinate real symmetric{end}400 400 {len(lines)}", *lines]
+    (tmp_path / "K.mtx").write_bytes(end.join(text).encode())
+    with monkeypatch.context() as patched:
+        patched.setattr("flexplant.io.matrix_market.rows_of_numbers", None)
+        fast = fx.io.read_matrix_market(tmp_path / "K.mtx").K.toarray()
+    assert np.array_equal(np.diag(fast), values)
+    assert fast[6, 2] == fast[2, 6] == -0.5
+    assert fast[8, 2] == fast[2, 8] == 2.0
+    assert fast[10, 2] == fast[2, 10] == 2e-3
+    (tmp_path / "K.mtx").write_bytes(end.join(text).replace("1E-3", "1D-3").encode())
+    assert np.array_equal(fx.io.read_matrix_market(tmp_path / "K.mtx").K.toarray(), fast)
 
 
 def test_a_blank_within_a_field_does_not_shift_the_others():

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import gzip
+import re
 import zlib
+from io import BytesIO
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
+from scipy.io import mmread
 
 from ..errors import FlexplantError, ModelError, ShapeError
 from ..labels import DofSet
@@ -20,6 +23,11 @@ from .numbers import rows_of_numbers, wrong_line
 
 #: lines whose digits are counted
 _SAMPLE = 4000
+#: lines of row, column and a number in the plain form of C, which SciPy's fast reader reads whole
+_PLAIN = re.compile(
+    rb"(?:[ \t]*+\d++[ \t]++\d++[ \t]++-?(?:\d++(?:\.\d*+)?|\.\d++)(?:[eE][-+]?\d++)?+"
+    rb"[ \t]*+\r?(?:\n|\Z))*+\s*+"
+)
 
 
 def read_matrix_market(
@@ -75,6 +83,21 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     body = content[head.start :]
     if b"%" in body:
         body = b"\n".join(b"" if line[:1] == b"%" else line for line in body.split(b"\n"))
+    if head.listed:
+        entries = _plain_entries(body, head)
+        if entries is None:
+            entries = _entries(_numbers(body, head, path), head, path)
+        matrix = _mirrored(entries, head, path) if head.symmetric else entries
+    else:
+        matrix = _columns(_numbers(body, head, path)[:, 0], head)
+    if head.whole:
+        return matrix, None
+    lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
+    return matrix, text_digits(line.split()[-1] for line in lines if line.strip())
+
+
+def _numbers(body: bytes, head: _Header, path: Path) -> FloatArray:
+    """Return the numbers (entries, 3 or 1) of all lines, in any notation of C or Fortran."""
     width = 3 if head.listed else 1
     table = rows_of_numbers(body, width)
     if table is None or not np.all(np.isfinite(table)):
@@ -83,19 +106,15 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
         due = "row, column and value" if head.listed else "one number"
         raise FlexplantError(
             f"{str(path)!r}, line {head.lines + at + 1}: expected {due}, got "
-            f"{lines[at].strip()[:72].decode('latin-1')!r}. A number has a decimal point and may "
-            "end in E, D or no letter and its exponent. Is the file cut short?"
+            f"{lines[at].strip()[:72].decode('latin-1')!r}. A number is finite, has a decimal "
+            "point and may end in E, D or no letter and its exponent. Is the file cut short?"
         )
     if len(table) != head.entries:
         raise FlexplantError(
             f"{str(path)!r} announces {head.entries} entries and holds {len(table)}. Is it cut "
             "short?"
         )
-    matrix = _listed(table, head, path) if head.listed else _columns(table[:, 0], head)
-    if head.whole:
-        return matrix, None
-    lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
-    return matrix, text_digits(line.split()[-1] for line in lines if line.strip())
+    return table
 
 
 class _Header(NamedTuple):
@@ -151,22 +170,67 @@ def _header(content: bytes, path: Path) -> _Header:
     )
 
 
-def _listed(table: FloatArray, head: _Header, path: Path) -> Any:
-    """Return the matrix of lines `row column value`; of a symmetric one both triangles."""
-    at = table[:, :2].astype(np.int64)
-    wrong = np.any((table[:, :2] != at) | (at < 1) | (at > head.shape), axis=1)
+def _plain_entries(body: bytes, head: _Header) -> Any | None:
+    """Return the matrix of the entries by SciPy's reader; None where it may not read what is there.
+
+    It drops what it cannot parse (`7.5D+03` becomes 7.5): it gets plain lines only.
+    """
+    if head.whole or not _PLAIN.fullmatch(body):
+        return None
+    sizes = f"{head.shape[0]} {head.shape[1]} {head.entries}"
+    first = f"%%MatrixMarket matrix coordinate real general\n{sizes}\n".encode()
+    try:
+        entries = mmread(BytesIO(first + body), spmatrix=False)
+    except (ValueError, OverflowError):  # a wrong index, count or size: the error of ours names it
+        return None
+    return entries if np.all(np.isfinite(entries.data)) else None
+
+
+def _entries(table: FloatArray, head: _Header, path: Path) -> Any:
+    """Return the matrix of lines `row column value`."""
+    at = table[:, :2]
+    wrong = np.any((at != np.floor(at)) | (at < 1) | (at > head.shape), axis=1)
     if wrong.any():
-        i, j = table[int(np.argmax(wrong)), :2]
+        i, j = at[int(np.argmax(wrong))]
         raise FlexplantError(
             f"{str(path)!r}, entry {int(np.argmax(wrong)) + 1}: row {i:g}, column {j:g} of a "
             f"matrix of {head.shape[0]} x {head.shape[1]}, counted from 1. Write it again."
         )
-    i, j, values = at[:, 0] - 1, at[:, 1] - 1, table[:, 2]
-    if head.symmetric:
-        off = i != j
-        i, j = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])
-        values = np.concatenate([values, values[off]])
-    return sp.coo_array((values, (i, j)), shape=head.shape)
+    i, j = at.T.astype(np.int64) - 1
+    return sp.coo_array((table[:, 2], (i, j)), shape=head.shape)
+
+
+def _mirrored(entries: Any, head: _Header, path: Path) -> Any:
+    """Return the symmetric matrix of which the file lists one of each pair of entries."""
+    i, j = entries.coords
+    _refuse_both_triangles(entries, head, path)
+    off = i != j
+    values = np.concatenate([entries.data, entries.data[off]])
+    places = np.concatenate([i, j[off]]), np.concatenate([j, i[off]])
+    return sp.coo_array((values, places), shape=head.shape)
+
+
+def _refuse_both_triangles(entries: Any, head: _Header, path: Path) -> None:
+    """Refuse a symmetric file that lists entries on both sides of the diagonal.
+
+    Raises
+    ------
+    FlexplantError
+        When (i, j) and (j, i) are there: the matrix would have twice the value.
+    """
+    i, j = (np.asarray(place, dtype=np.int64) for place in entries.coords)
+    above, below = np.flatnonzero(i < j), np.flatnonzero(i > j)
+    if not above.size or not below.size:
+        return
+    n = head.shape[0]
+    both = np.intersect1d((i * n + j)[below], (j * n + i)[above])
+    if both.size:
+        row, column = divmod(int(both[0]), n)
+        raise FlexplantError(
+            f"{str(path)!r} is called symmetric and lists both ({row + 1}, {column + 1}) and "
+            f"({column + 1}, {row + 1}): by the format an entry stands for the pair, which would "
+            "double both. Write one triangle, or call the matrix general."
+        )
 
 
 def _columns(values: FloatArray, head: _Header) -> FloatArray:
