@@ -96,7 +96,6 @@ CIRCLES = [
     {"loop.closed", "loop.margins", "loop.sensitivity"},
     {f"plant.{name}" for name in ("assembly", "check", "moving", "standard",
         "uncertainty.neglected", "uncertainty.uncertain_plant", "visibility", "weighting")},
-    {f"reduction.{name}" for name in ("check_responses", "projection", "quality", "reduced")},
 ]  # fmt: skip
 
 

@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Protocol, Self
 
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
+from ..labels import DofSet
 from ..modes.attachment_vectors import static_response
 from ..modes.modes import Modes
-from ..sparse.factor import dense
+from ..sparse.factor import dense, dynamic_lu
 from ..structure import FEModel
 from ..values import ComplexArray, FloatArray, Matrix
-from .projection import lu_of
-from .reduced import ReducedModel
+from .bounds import ErrorBound
 
 #: up to this many DOFs responses are solved densely, at many frequencies
 SMALL = 600
@@ -22,6 +23,30 @@ SMALL = 600
 _GRID = (60, 6)
 #: resonances looked at, of small and of large models
 _RESONANCES = (200, 6)
+
+
+@dataclass(frozen=True, eq=False, repr=False, match_args=False)
+class Reduced(Protocol):
+    """What a comparison reads of a `ReducedModel`, which offers it as its `quality`."""
+
+    M: FloatArray
+    D: FloatArray
+    K: FloatArray
+    T: FloatArray
+    full_dofs: DofSet
+    rigid_body: FloatArray
+    condition: float
+    bound: ErrorBound | None
+
+    @property
+    def is_physical(self) -> bool:
+        """Whether all coordinates are DOFs of the structure."""
+
+    def modes(self) -> Modes:
+        """Return all modes."""
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed."""
 
 
 def check_frequencies(low: float, high: float, resonances: FloatArray, small: bool) -> FloatArray:
@@ -62,7 +87,7 @@ def _as_like(D: Matrix, K: Matrix) -> Any:
 def _solved(matrix: Any, B: FloatArray, many: bool) -> ComplexArray:
     is_sparse = sp.issparse(matrix)
     if many and is_sparse:
-        lu = lu_of(matrix)
+        lu = dynamic_lu(matrix)
         loads = B.astype(np.complex128)
         solved = lu.solve(loads)
         return np.asarray(solved + lu.solve(loads - matrix @ solved))
@@ -91,7 +116,7 @@ def _modal_response(modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray
 
 
 def reduced_response(
-    reduced: ReducedModel, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float | None
+    reduced: Reduced, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float | None
 ) -> ComplexArray:
     """Return responses (f, p, q) of the reduced model: with a loss factor, or its own D."""
     omega = 2 * np.pi * freq[:, None, None]
@@ -107,7 +132,7 @@ def reduced_response(
 def static_error(
     full: FEModel | Modes,
     modes: Modes,
-    reduced: ReducedModel,
+    reduced: Reduced,
     B: FloatArray,
     C: FloatArray,
     Br: FloatArray,

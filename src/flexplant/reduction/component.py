@@ -12,7 +12,7 @@ from ..errors import ModelError
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import dense, unit_diagonal
-from ..structure import Damping, FEModel
+from ..structure import Damping, FEModel, ModalDamping
 from ..values import FloatArray, positive, whole
 from .condensation import Partition
 from .methods import ReductionMethod
@@ -24,7 +24,6 @@ from .projection import (
     labels_given,
     projected,
     shown,
-    undamped,
 )
 from .reduced import ReducedModel
 
@@ -125,7 +124,9 @@ class _FreeInterface(ReductionMethod):
         """Return the model, its modes with vectors, T, and the map from (u_b, p) to (p, g)."""
         model, labels = fe_model(structure, self), tuple(boundary)
         b = len(labels)
-        modes = solve_modes(undamped(model), count=count, compliance_at=list(labels))
+        modes = solve_modes(
+            model, damping=ModalDamping(0.0), count=count, compliance_at=list(labels)
+        )
         rows = model.dofs.indices(labels)
         phi, vectors = np.real(modes.phi), modes.vectors
         at = vectors[rows]

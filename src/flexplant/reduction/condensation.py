@@ -13,7 +13,7 @@ from ..errors import ModelError, ShapeError, SolverError
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
-from ..structure import Damping, FEModel
+from ..structure import Damping, FEModel, ModalDamping
 from ..values import FloatArray, IntArray, positive, whole
 from .methods import ReductionMethod, refused_partition
 from .projection import (
@@ -25,7 +25,6 @@ from .projection import (
     labels_given,
     projected,
     shown,
-    undamped,
 )
 from .reduced import ReducedModel
 
@@ -288,7 +287,7 @@ class Serep(ReductionMethod):
         model, labels = fe_model(structure, self), tuple(self.dofs)
         rows = model.dofs.indices(labels)
         numbers = tuple(range(1, len(labels) + 1)) if self.modes is None else tuple(self.modes)
-        modes = solve_modes(undamped(model), count=max(numbers))
+        modes = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         phi = np.real(modes.phi)[:, kept_columns(numbers, modes)]
         condition = refused_partition(modes.dofs, phi, labels, f"{len(labels)} modes", 1e6)
         return projected(

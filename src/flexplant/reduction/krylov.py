@@ -16,11 +16,11 @@ from ..labels import Place
 from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.modes import Modes
 from ..modes.shifted import stiffness_factor
-from ..sparse.factor import DENSE_LIMIT, dense
+from ..sparse.factor import DENSE_LIMIT, dense, dynamic_lu
 from ..structure import Damping, FEModel
 from ..values import FloatArray, real_array, whole
 from .methods import ReductionMethod
-from .projection import checked_damping, fe_model, lu_of, projected
+from .projection import checked_damping, fe_model, projected
 from .reduced import ReducedModel
 
 #: M-norm of what is new in a vector, of the whole vector, below which it adds nothing
@@ -184,7 +184,7 @@ def _factorised(matrix: Any, omega: float) -> Callable[[Any], Any]:
                 "is infinite there. Move it a little."
             )
         return lambda loads: la.lu_solve(factor, loads * size[:, None]) * size[:, None]
-    lu = lu_of(matrix)
+    lu = dynamic_lu(matrix)
 
     def solve(loads: Any) -> Any:
         loads = np.ascontiguousarray(np.asarray(loads, dtype=kind))

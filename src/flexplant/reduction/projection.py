@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
-import scipy.sparse.linalg as spla
 
 from ..errors import LabelError, ModelError, SolverError
 from ..labels import DofSet
@@ -17,7 +16,7 @@ from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..structure import Damping, FEModel
 from ..structure.eigen import elastic_modes
-from ..values import FloatArray, Matrix, name_list, rebuild
+from ..values import FloatArray, Matrix, name_list
 from .bounds import ErrorBound
 from .reduced import ReducedModel
 
@@ -67,29 +66,6 @@ class Solver:
         return np.asarray(la.cho_solve(self._factor, loads * scale) * scale)
 
 
-def lu_of(matrix: Any) -> Any:
-    """Return the SuperLU factorisation of an indefinite or complex symmetric sparse matrix.
-
-    Raises
-    ------
-    SolverError
-        When it is singular.
-    """
-    splu: Any = spla.splu
-    try:
-        return splu(
-            sp.csc_matrix(matrix),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:
-        raise SolverError(
-            f"a dynamic stiffness is singular ({error}): the frequency is a resonance of the "
-            "undamped structure. Move it a little, or give the structure damping."
-        ) from error
-
-
 def labels_given(dofs: Iterable[str], what: str) -> tuple[str, ...]:
     """Return labels as a tuple, none of them twice.
 
@@ -128,15 +104,6 @@ def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
         f"{type(structure).__name__} do not hold: reduce(model, {type(method).__name__}(...)) "
         "with the FEModel."
     )
-
-
-def undamped(model: FEModel) -> FEModel:
-    """Return the model without its D, its matrices not checked again."""
-    if model.D is None:
-        return model
-    bare = rebuild(FEModel, {**model._fields(), "D": None})
-    assert isinstance(bare, FEModel)  # noqa: S101  # rebuild keeps the class
-    return bare
 
 
 def block(matrix: Matrix, rows: Any, columns: Any) -> Any:

@@ -12,19 +12,18 @@ from ..labels import Place
 from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
-from ..structure import FEModel
+from ..structure import FEModel, ModalDamping
 from ..values import FloatArray, IntArray, Value, name_list, positive, real_array, whole
 from .bounds import ErrorBound
 from .check_responses import (
     SMALL,
+    Reduced,
     check_frequencies,
     full_response,
     reduced_response,
     static_error,
 )
 from .mode_pairs import paired
-from .projection import undamped
-from .reduced import ReducedModel
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -174,7 +173,7 @@ class ReductionQuality(Value):
 
 
 def quality_of(
-    reduced: ReducedModel,
+    reduced: Reduced,
     full: FEModel | Modes,
     band: tuple[float, float],
     inputs: Any,
@@ -248,7 +247,7 @@ def _band(band: Any) -> tuple[float, float]:
     return float(ends[0]), float(ends[1])
 
 
-def _channels(reduced: ReducedModel, inputs: Any, outputs: Any) -> tuple[list[Place], list[Place]]:
+def _channels(reduced: Reduced, inputs: Any, outputs: Any) -> tuple[list[Place], list[Place]]:
     pushed: list[Any] = places(inputs)
     watched: list[Any] = places(outputs)
     if not pushed and reduced.bound is not None:
@@ -262,7 +261,7 @@ def _rows(full: FEModel | Modes, at: list[Place]) -> FloatArray:
     return np.array([full.dofs.row(place) for place in at]).reshape(-1, len(full.dofs))
 
 
-def _loss(reduced: ReducedModel, loss: float | None) -> float:
+def _loss(reduced: Reduced, loss: float | None) -> float:
     if loss is not None:
         return positive(loss, "loss", zero=True)
     if not np.any(reduced.D):
@@ -271,25 +270,23 @@ def _loss(reduced: ReducedModel, loss: float | None) -> float:
     return 2.0 * float(np.mean(modes.zeta[modes.n_rigid :]))
 
 
-def _full_modes(
-    reduced: ReducedModel, full: FEModel | Modes, count: int | None, high: float
-) -> Modes:
+def _full_modes(reduced: Reduced, full: FEModel | Modes, count: int | None, high: float) -> Modes:
     if isinstance(full, Modes):
         return full
-    bare, asked = undamped(full), 0
+    asked = 0
     if count is not None:
         asked = whole(count, "count", maximum=full.n_dof)
     # the reduced model has about as many in the band: a count is cheaper than "all below"
     asked = max(asked, int(np.sum(_undamped_modes(reduced).freq <= high)) + 8)
     while True:
-        found = solve_modes(bare, count=min(asked, full.n_dof))
+        found = solve_modes(full, count=min(asked, full.n_dof), damping=ModalDamping(0.0))
         if found.n_modes == full.n_dof or found.freq[-1] > high:
             return found
         asked *= 2
 
 
 def _compared(
-    full: FEModel | Modes, modes: Modes, reduced: ReducedModel, count: int | None, high: float
+    full: FEModel | Modes, modes: Modes, reduced: Reduced, count: int | None, high: float
 ) -> dict[str, Any]:
     """Return the pairs of full and reduced modes, and how alike they are."""
     wanted = whole(count, "count") if count is not None else int(np.sum(modes.freq <= high))
@@ -323,7 +320,7 @@ def _compared(
     }
 
 
-def _undamped_modes(reduced: ReducedModel) -> Modes:
+def _undamped_modes(reduced: Reduced) -> Modes:
     bare = reduced.replace(D=np.zeros_like(reduced.D))
     found = bare.modes()
     if not reduced.is_physical:

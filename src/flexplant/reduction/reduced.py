@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy.linalg as la
@@ -13,14 +12,11 @@ from ..errors import ModelError
 from ..labels import DofSet, Place
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
+from ..structure import FEModel
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
 from .bounds import ErrorBound
-
-if TYPE_CHECKING:
-    from ..structure import FEModel
-    from .quality import ReductionQuality
-
+from .quality import ReductionQuality, quality_of
 
 #: how the names of coordinates begin that hold the static compliance of what was left out
 STATIC = "static "
@@ -317,7 +313,7 @@ class ReducedModel(Value):
         freq: FloatArray | None = None,
         loss: float | None = None,
     ) -> ReductionQuality:
-        """Return how well this model stands for the full one, by a route of its own.
+        """Return how well this model stands for the full one, checked by another computation.
 
         Parameters
         ----------
@@ -344,8 +340,6 @@ class ReducedModel(Value):
         LabelError
             When a place is unknown.
         """
-        from .quality import quality_of
-
         return quality_of(self, full, band, inputs, outputs, count, freq, loss)
 
 

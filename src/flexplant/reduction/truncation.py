@@ -19,7 +19,7 @@ from ..values import FloatArray, IntArray, whole
 from .bounds import ErrorBound
 from .condensation import kept_columns, mode_numbers
 from .methods import ReductionMethod
-from .projection import checked_damping, inner, undamped
+from .projection import checked_damping, inner
 from .ranking import channels, peak_gains, rank_modes
 from .reduced import STATIC, ReducedModel
 
@@ -107,7 +107,7 @@ class ModalTruncation(ReductionMethod):
 
     def _from_model(self, model: FEModel, static: Any) -> ReducedModel:
         numbers = self._numbers
-        solved = solve_modes(undamped(model), count=max(numbers))
+        solved = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         law = self.damping
         if law is not None:
             solved = solved.replace(zeta=law.zeta(solved.omega))

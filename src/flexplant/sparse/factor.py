@@ -60,6 +60,45 @@ def unit_diagonal(matrix: Matrix) -> tuple[Matrix, FloatArray]:
     return scale[:, None] * np.asarray(matrix) * scale, scale
 
 
+def diagonal_lu(matrix: Any, singular: str) -> Any:
+    """Return the SuperLU factorisation of a symmetric sparse matrix, real or complex.
+
+    Pivots are taken from the diagonal where they are not zero, so that solutions need a refinement.
+
+    Raises
+    ------
+    SolverError
+        When the matrix is singular; `singular` says what that means.
+    """
+    splu: Any = spla.splu
+    try:
+        return splu(
+            sp.csc_matrix(matrix),
+            permc_spec="MMD_AT_PLUS_A",
+            diag_pivot_thresh=0.0,
+            options={"SymmetricMode": True},
+        )
+    except RuntimeError as error:
+        raise SolverError(
+            f"a sparse symmetric factorisation met a singular matrix ({error}): {singular}"
+        ) from error
+
+
+def dynamic_lu(stiffness: Any) -> Any:
+    """Return the factorisation of a sparse dynamic stiffness ``s^2 M + s D + K``.
+
+    Raises
+    ------
+    SolverError
+        When it is singular.
+    """
+    return diagonal_lu(
+        stiffness,
+        "the frequency of a dynamic stiffness is a resonance of the undamped structure. Move it a "
+        "little, or give the structure damping.",
+    )
+
+
 def symmetric_lu(matrix: Matrix) -> Any:
     """Return the SuperLU factorisation of a symmetric sparse matrix with diagonal pivots only.
 
@@ -68,18 +107,11 @@ def symmetric_lu(matrix: Matrix) -> Any:
     SolverError
         When the matrix is singular, or SuperLU had to leave the diagonal.
     """
-    try:
-        lu = spla.splu(
-            sp.csc_matrix(matrix),
-            permc_spec="MMD_AT_PLUS_A",
-            diag_pivot_thresh=0.0,
-            options={"SymmetricMode": True},
-        )
-    except RuntimeError as error:
-        raise SolverError(
-            f"a sparse symmetric factorisation met a singular matrix ({error}): the shift hits an "
-            "eigenvalue, or DOFs without any stiffness are in the model. Remove those DOFs."
-        ) from error
+    lu = diagonal_lu(
+        matrix,
+        "the shift hits an eigenvalue, or DOFs without any stiffness are in the model. Remove "
+        "those DOFs.",
+    )
     if not np.array_equal(lu.perm_r, lu.perm_c):
         raise SolverError(
             "a sparse symmetric factorisation met a zero pivot and left the diagonal: its inertia "
