@@ -36,6 +36,7 @@ from flexplant.plant import (
 from flexplant.plant.realisation import ILL_CONDITIONED, realised
 from flexplant.structure import FEModel
 from oracles_plant import delayed_run, first_order, machine, receptance, z_row
+from oracles_ports import noise_of_late_outputs
 from stages import Z8, full, ports, reduced
 
 FREQ = np.array([0.5, 20.0, 150.0, 268.0, 402.0, 800.0])
@@ -208,7 +209,21 @@ def test_the_same_noise_with_a_filter_and_a_late_sensor():
     P = oracle.stationary(plant.system.A, plant.process_noise)
     row = plant.system.C[list(plant.system.outputs).index("y")]
     exact = C @ oracle.white_response(A, B[:, 1:], 1e-2) @ C.T
-    assert row @ P @ row == pytest.approx(exact[0, 0], rel=1e-7)
+    assert row @ P @ row == pytest.approx(exact[0, 0], rel=1e-7, abs=0)
+    # one sample's share: the motion at its end, and 0.7 of a sample earlier, as the sensor sees it
+    now = quietly(model_of(M, D, K), given.replace(y=[given.y[0].replace(delay=0.0)]))
+    now = now.discretized(RATE, delay=0.4).system
+    see = np.zeros((2, plant.system.n_states))
+    own = [plant.system.states.index(state) for state in now.states]
+    see[0, own] = now.C[now.outputs.index("y")]
+    see[1, plant.system.states.index("y:late1")] = 1.0
+    root = B[:, 1:] * 1e-2 / np.sqrt(2.0)
+    coarse, fine = (
+        noise_of_late_outputs(A, root, C, 1 / RATE, [0.7 / RATE], n) for n in (1000, 2000)
+    )
+    shared = fine + (fine - coarse) / 3.0  # the oracle is second order
+    found = see @ plant.process_noise @ see.T
+    np.testing.assert_allclose(found, shared, rtol=1e-8)
 
 
 def test_norms_are_those_of_the_matrices():
