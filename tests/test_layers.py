@@ -4,9 +4,8 @@ import ast
 import json
 import subprocess
 import sys
+from functools import cache
 from pathlib import Path
-
-import pytest
 
 import flexplant
 
@@ -37,6 +36,11 @@ LEVEL = {
 HEAVY = {"matplotlib", "control", "cvxpy", "clarabel", "filterpy", "tqdm"}
 MODULES = sorted(ROOT.rglob("*.py"))
 LONGEST = 500
+
+
+@cache
+def tree_of(path):
+    return ast.parse(path.read_text())
 
 
 def name_of(path):
@@ -80,7 +84,7 @@ def test_rooms_import_only_from_rooms_above():
         room = room_of(path)
         if room == "__init__":
             continue
-        for line, module in imported(ast.parse(path.read_text()), package_of(path)):
+        for line, module in imported(tree_of(path), package_of(path)):
             parts = module.split(".")
             if parts[0] != "flexplant":
                 continue
@@ -104,7 +108,7 @@ def modules_of(root):
     found = {}
     for path in sorted(root.rglob("*.py")):
         parts = path.relative_to(root).with_suffix("").parts
-        found[".".join(parts)] = ast.parse(path.read_text())
+        found[".".join(parts)] = tree_of(path)
     return found
 
 
@@ -209,30 +213,47 @@ def at_module_level(tree):
     return found
 
 
-@pytest.mark.parametrize("path", MODULES, ids=name_of)
-def test_heavy_packages_are_imported_where_they_are_needed(path):
-    allowed = {"matplotlib"} if room_of(path) == "plot" else set()
-    found = at_module_level(ast.parse(path.read_text())) & HEAVY
-    assert found <= allowed, f"import {sorted(found - allowed)} inside the functions that need them"
+def test_heavy_packages_are_imported_where_they_are_needed():
+    wrong = []
+    for path in MODULES:
+        allowed = {"matplotlib"} if room_of(path) == "plot" else set()
+        found = (at_module_level(tree_of(path)) & HEAVY) - allowed
+        if found:
+            wrong.append(f"{name_of(path)} imports {sorted(found)}")
+    assert not wrong, "import inside the functions that need them: " + ", ".join(wrong)
 
 
-@pytest.mark.parametrize("path", [p for p in MODULES if p.name == "__init__.py"], ids=name_of)
-def test_package_files_only_re_export(path):
-    root = path.parent == ROOT
-    for node in ast.parse(path.read_text()).body:
-        docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
-        names = [ast.unparse(t) for t in node.targets] if isinstance(node, ast.Assign) else []
-        lazy = (
-            root and isinstance(node, ast.FunctionDef) and node.name in ("__getattr__", "__dir__")
-        )
-        checking = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
-        assert (
-            docstring
-            or lazy
-            or checking
-            or isinstance(node, ast.Import | ast.ImportFrom)
-            or names in (["__version__"], ["__all__"])
-        ), f"line {node.lineno}: {ast.unparse(node)[:80]}"
+def only_exports(node, *, root):
+    """Whether a statement of a package file re-exports or documents."""
+    docstring = isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)
+    names = [ast.unparse(t) for t in node.targets] if isinstance(node, ast.Assign) else []
+    lazy = root and isinstance(node, ast.FunctionDef) and node.name in ("__getattr__", "__dir__")
+    checking = isinstance(node, ast.If) and "TYPE_CHECKING" in ast.dump(node.test)
+    return (
+        docstring
+        or lazy
+        or checking
+        or isinstance(node, ast.Import | ast.ImportFrom)
+        or names in (["__version__"], ["__all__"])
+    )
+
+
+def test_package_files_only_re_export():
+    wrong = [
+        f"{name_of(path)}:{node.lineno} {ast.unparse(node)[:80]}"
+        for path in MODULES
+        if path.name == "__init__.py"
+        for node in tree_of(path).body
+        if not only_exports(node, root=path.parent == ROOT)
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_what_package_files_may_hold():
+    code = "'Doc.'\nfrom . import x\n__all__ = ['x']\ny = 1\ndef __getattr__(name): return 1\n"
+    body = ast.parse(code).body
+    assert [only_exports(node, root=False) for node in body] == [True, True, True, False, False]
+    assert only_exports(body[-1], root=True)
 
 
 PROBE = """

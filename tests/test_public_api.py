@@ -51,53 +51,60 @@ def test_there_is_something_public():
     assert len(PUBLIC) < 260
 
 
-@pytest.mark.parametrize("name", PUBLIC)
-def test_has_a_docstring(name):
-    item = PUBLIC[name]
-    if not (inspect.isclass(item) or inspect.isroutine(item)):
-        pytest.skip("a constant")
+def described(name, item):
+    """Return what is wrong with the docstring of a class or a function, or None."""
     doc = vars(item).get("__doc__") if inspect.isclass(item) else item.__doc__
-    assert doc and doc.strip(), f"{name} has no docstring"
+    if not doc or not doc.strip():
+        return f"{name} has no docstring"
     # what dataclass writes when there is none
-    assert not doc.startswith(f"{name}("), f"{name} has no docstring of its own"
+    return f"{name} has no docstring of its own" if doc.startswith(f"{name}(") else None
 
 
-@pytest.mark.parametrize("name", METHODS)
-def test_methods_have_docstrings(name):
-    assert (METHODS[name].__doc__ or "").strip(), f"{name} has no docstring"
+def parameters_described(name, item):
+    wanted = [p.name for p in parameters(item)]
+    listed_ones = listed(sections(item).get("Parameters", ""))
+    missing = [p for p in wanted if p not in listed_ones]
+    return f"{name} does not describe {missing} under Parameters" if missing else None
 
 
-@pytest.mark.parametrize("name", DOCUMENTED)
-def test_every_parameter_is_documented(name):
-    wanted = [p.name for p in parameters(DOCUMENTED[name])]
-    if not wanted:
-        pytest.skip("no parameters")
-    described = listed(sections(DOCUMENTED[name]).get("Parameters", ""))
-    missing = [p for p in wanted if p not in described]
-    assert not missing, f"{name} does not describe {missing} under Parameters"
-
-
-@pytest.mark.parametrize("name", FUNCTIONS)
-def test_functions_say_what_they_raise(name):
-    if not parameters(FUNCTIONS[name]):
-        pytest.skip("no parameters")
-    raised = sections(FUNCTIONS[name]).get("Raises", "")
-    names = {
-        n for head in re.findall(r"^(\w[\w, ]*)$", raised, re.MULTILINE) for n in head.split(", ")
-    }
+def raises_named(name, item):
+    if not parameters(item):
+        return None
+    raised = sections(item).get("Raises", "")
+    heads = re.findall(r"^(\w[\w, ]*)$", raised, re.MULTILINE)
+    names = {n for head in heads for n in head.split(", ")}
     known = {c.__name__ for c in all_errors(FlexplantError)} | {"OSError", "FileNotFoundError"}
-    assert names & known, f"{name} does not say under Raises which errors a wrong use meets"
-    assert names <= known, f"{name} names {sorted(names - known)}, which are no errors of ours"
+    if not names & known:
+        return f"{name} does not say under Raises which errors a wrong use meets"
+    if names - known:
+        return f"{name} names {sorted(names - known)}, which are no errors of ours"
+    return None
 
 
-@pytest.mark.parametrize("name", DOCUMENTED | METHODS)
-def test_no_open_keywords(name):
-    kinds = parameters((DOCUMENTED | METHODS)[name])
-    assert not [p for p in kinds if p.kind is p.VAR_KEYWORD], f"{name} takes **keywords"
+def keywords_closed(name, item):
+    open_ones = [p for p in parameters(item) if p.kind is p.VAR_KEYWORD]
+    return f"{name} takes **keywords" if open_ones else None
 
 
 def all_errors(base):
     return {base}.union(*(all_errors(sub) for sub in base.__subclasses__()))
+
+
+DESCRIBED = {n: i for n, i in PUBLIC.items() if inspect.isclass(i) or inspect.isroutine(i)}
+
+
+@pytest.mark.parametrize(
+    ("check", "items"),
+    [
+        (described, DESCRIBED | METHODS),
+        (parameters_described, DOCUMENTED),
+        (raises_named, FUNCTIONS),
+        (keywords_closed, DOCUMENTED | METHODS),
+    ],
+)
+def test_every_public_name(check, items):
+    wrong = [line for name, item in items.items() if (line := check(name, item))]
+    assert not wrong, "\n".join(wrong)
 
 
 def test_the_checks_can_fail():
@@ -110,5 +117,11 @@ def test_the_checks_can_fail():
             One.
         """
 
-    assert listed(sections(bad)["Parameters"]) == {"first"}
+    assert parameters_described("bad", bad) == (
+        "bad does not describe ['second', 'rest'] under Parameters"
+    )
+    assert raises_named("bad", bad).startswith("bad does not say under Raises")
+    assert keywords_closed("bad", bad) == "bad takes **keywords"
+    assert described("bad", bad) is None
+    assert described("x", lambda: None) == "x has no docstring"
     assert [p.name for p in parameters(bad)] == ["first", "second", "rest"]
