@@ -280,3 +280,13 @@ def test_importing_it_is_light_and_changes_nothing():
     found = json.loads(answer.stdout)
     assert found == {"heavy": [], "same": [True, True, True], "numpy": True}
     assert not answer.stderr
+
+
+def test_class_names_are_unique():
+    where = {}
+    for path in MODULES:
+        for node in ast.parse(path.read_text()).body:
+            if isinstance(node, ast.ClassDef):
+                where.setdefault(node.name, []).append(name_of(path))
+    twice = {name: found for name, found in where.items() if len(found) > 1}
+    assert not twice, f"one name for two classes: {twice}"

@@ -13,12 +13,12 @@ from flexplant.updating import (
     AddedMass,
     Eigenvalues,
     GaussNewton,
-    Method,
     TrustRegion,
+    UpdateMethod,
     update,
 )
-from flexplant.updating.search import Found
-from flexplant.updating.search.method import Trail
+from flexplant.updating.search import SearchEnd
+from flexplant.updating.search.update_method import Trail
 
 
 def test_scattered_poles_converge_with_every_gauss_newton(plate):
@@ -56,7 +56,7 @@ def test_the_stopping_test_is_relative(make, method):
 
 
 @dataclass(frozen=True, eq=False)
-class Simplex(Method):
+class Simplex(UpdateMethod):
     """Nelder and Mead's method on the sum of squares: a method made outside of the library."""
 
     def search(self, objective, start, *, most=None, tolerance=1e-10):
@@ -71,7 +71,7 @@ class Simplex(Method):
         found = minimize(cost, start, method="Nelder-Mead", tol=1e-9, options={"maxiter": 400})
         objective.at(found.x, refer=True)
         trail.add(objective, found.x, 1.0)
-        return Found(found.x, found.fun, trail, found.success, found.message)
+        return SearchEnd(found.x, found.fun, trail, found.success, found.message)
 
 
 def test_a_new_method_is_a_value_with_a_search(make):

@@ -3,7 +3,7 @@
 from .average import average_frfs as average_frfs
 from .diagram import PoleSelection as PoleSelection
 from .diagram import StabilisationDiagram as StabilisationDiagram
-from .estimate import estimate_frf as estimate_frf
+from .frf_estimation import estimate_frf as estimate_frf
 from .identified import IdentifiedModes as IdentifiedModes
 from .identify import identify_modes as identify_modes
 from .identify import stabilisation_diagram as stabilisation_diagram

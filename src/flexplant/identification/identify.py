@@ -12,15 +12,15 @@ from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
 from ..parallel import one_thread
 from ..values import positive, real_array, short, whole
-from .answer import answer
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
 from .leakage import leakage_warned
+from .line_weights import PreparedLines, prepared
+from .pole_split import backed, reseated, separated
+from .pole_test import freedom, supported
 from .refine import Lines, refined
-from .separate import backed, reseated, separated
-from .support import freedom, supported
-from .unexplained import BROADEST, completed, exact, lessened, unexplained, warned
-from .weights import Prepared, prepared
+from .residual_peaks import BROADEST, completed, exact, lessened, unexplained, warned
+from .result import answer
 from .windows import diagram_of, weighted_by_remainder, windows
 
 #: numbers of residual terms of modes above the band that are tried
@@ -246,7 +246,7 @@ def _identified(
     return found
 
 
-def _affordable(orders: list[int], ready: Prepared) -> list[int]:
+def _affordable(orders: list[int], ready: PreparedLines) -> list[int]:
     fewest = min(window.seen.stop - window.seen.start for window in windows(ready))
     if 2 * (orders[-1] + 1) > fewest:
         raise ModelError(

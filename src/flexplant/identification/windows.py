@@ -9,8 +9,8 @@ import numpy as np
 
 from ..values import ComplexArray, FloatArray
 from .diagram import StabilisationDiagram, built_diagram
+from .line_weights import PreparedLines
 from .plscf import Moments, OrderPoles
-from .weights import Prepared
 
 #: lines of a part, and the share of it that is looked at beyond each of its ends
 LINES, OVERLAP = 400, 0.25
@@ -27,7 +27,7 @@ class Window:
     seen: slice
 
 
-def windows(ready: Prepared) -> list[Window]:
+def windows(ready: PreparedLines) -> list[Window]:
     """Return parts of about 400 lines, cut where the responses are weakest."""
     import scipy.ndimage as ndi
 
@@ -48,7 +48,7 @@ def windows(ready: Prepared) -> list[Window]:
 
 
 def diagram_of(
-    ready: Prepared, orders: list[int], tolerances: tuple[float, float, float], max_zeta: float
+    ready: PreparedLines, orders: list[int], tolerances: tuple[float, float, float], max_zeta: float
 ) -> StabilisationDiagram:
     """Return the diagrams of all parts as one; a track belongs where its median lies."""
     low, high = float(ready.freq[0]), float(ready.freq[-1])
@@ -84,7 +84,7 @@ def diagram_of(
     )
 
 
-def weighted_by_remainder(ready: Prepared, order: int) -> Prepared:
+def weighted_by_remainder(ready: PreparedLines, order: int) -> PreparedLines:
     """Return the same with weights from what matrix fractions of high order leave."""
     now = ready
     n_out, n_in, n_freq = ready.data.shape
@@ -100,7 +100,7 @@ def weighted_by_remainder(ready: Prepared, order: int) -> Prepared:
     return now
 
 
-def _moments(ready: Prepared, window: Window, order: int) -> Moments:
+def _moments(ready: PreparedLines, window: Window, order: int) -> Moments:
     seen = window.seen
     return Moments(ready.freq[seen], ready.data[:, :, seen], ready.line_weight[:, seen], order)
 

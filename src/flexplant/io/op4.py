@@ -190,7 +190,7 @@ def _read(
 
 
 @dataclass(frozen=True)
-class _Layout:
+class _MatrixLayout:
     """How integers and record lengths are stored."""
 
     order: str  # "<" or ">"
@@ -198,12 +198,12 @@ class _Layout:
     marker: int  # bytes of a record length: 4 or 8
 
 
-def _layout(content: bytes, path: str) -> _Layout:
+def _layout(content: bytes, path: str) -> _MatrixLayout:
     for order in "<>":
         for marker in (8, 4):  # 8 first: in little endian its first half looks like one of 4
             length = int(np.frombuffer(content, f"{order}i{marker}", 1)[0])
             if length in (24, 48):
-                return _Layout(order, length // 6, marker)
+                return _MatrixLayout(order, length // 6, marker)
     raise FlexplantError(
         f"{path!r}, byte 0: an OUTPUT4 file begins with a record of 24 or 48 bytes, got "
         f"{content[:8].hex(' ')}. It is another format (OUTPUT2?), or was changed in transfer: "

@@ -20,7 +20,7 @@ DOUBLINGS = 50
 NEWTON_STEPS = 10
 
 
-class Problem(NamedTuple):
+class RiccatiProblem(NamedTuple):
     """A problem with whitened outputs (R is J, a diagonal of signs) and no cross term."""
 
     A: FloatArray
@@ -35,7 +35,7 @@ class Problem(NamedTuple):
         """Return ``C' J C``, the information that one measurement brings."""
         return np.asarray((self.C.T * self.J) @ self.C)
 
-    def scaled(self, d: FloatArray) -> Problem:
+    def scaled(self, d: FloatArray) -> RiccatiProblem:
         """Return the problem in states x / d."""
         return self._replace(
             A=self.A * d / d[:, None],
@@ -50,20 +50,20 @@ class Discrete:
 
     equation = "discrete Riccati equation"
 
-    def start(self, p: Problem) -> FloatArray:
+    def start(self, p: RiccatiProblem) -> FloatArray:
         """Return the first scale of the states, from accumulated noise and information."""
         return _scale(accumulated(p.A, p.Q), accumulated(p.A.T, p.G))
 
-    def doubling(self, p: Problem) -> tuple[FloatArray, int]:
+    def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
         """Return P and the number of doublings."""
         return _doubling(p.A.T, p.G, p.Q)
 
-    def gain(self, p: Problem, P: FloatArray) -> FloatArray:
+    def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
         """Return the gain K (n, p) that belongs to P."""
         inner = (p.C @ P) @ p.C.T + np.diag(p.J)
         return np.asarray(la.solve(inner, p.C @ P @ p.A.T, assume_a="sym").T)
 
-    def residual(self, p: Problem, P: FloatArray, K: FloatArray) -> FloatArray:
+    def residual(self, p: RiccatiProblem, P: FloatArray, K: FloatArray) -> FloatArray:
         """Return the residual of the equation, given the gain of P."""
         # Joseph form: a sum of squares in P and J, so rounding stays relative to P
         closed = p.A - K @ p.C
@@ -81,11 +81,11 @@ class Discrete:
         """Tell whether the closed loop is so slow that its stability may be rounding."""
         return bool(np.max(np.abs(poles)) > 0.99)
 
-    def relative(self, p: Problem, residual: FloatArray, P: FloatArray) -> float:
+    def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
         """Return the size of a residual relative to the terms of the equation."""
         return float(np.linalg.norm(residual) / (np.linalg.norm(P) or 1.0))
 
-    def defect(self, p: Problem) -> str:
+    def defect(self, p: RiccatiProblem) -> str:
         """Return which mode makes a stabilising solution impossible, or ""."""
         return _defect(p, lambda s: np.abs(s) - 1.0, 1.0)
 
@@ -95,17 +95,17 @@ class Continuous:
 
     equation = "continuous Riccati equation"
 
-    def start(self, p: Problem) -> FloatArray:
+    def start(self, p: RiccatiProblem) -> FloatArray:
         """Return the first scale of the states, from accumulated noise and information."""
         A, Q, G, _ = self._cayley(p)
         return _scale(accumulated(A.T, Q), accumulated(A, G))
 
-    def doubling(self, p: Problem) -> tuple[FloatArray, int]:
+    def doubling(self, p: RiccatiProblem) -> tuple[FloatArray, int]:
         """Return P and the number of doublings."""
         A, Q, G, _ = self._cayley(p)
         return _doubling(A, G, Q)
 
-    def _cayley(self, p: Problem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    def _cayley(self, p: RiccatiProblem) -> tuple[FloatArray, FloatArray, FloatArray, float]:
         """Return the discrete (control form) problem of the same solution, and the shift."""
         n = p.A.shape[0]
         moduli = np.abs(la.eigvals(np.block([[p.A.T, -p.G], [-p.Q, -p.A]])))
@@ -136,11 +136,11 @@ class Continuous:
             )
         return best[1]
 
-    def gain(self, p: Problem, P: FloatArray) -> FloatArray:
+    def gain(self, p: RiccatiProblem, P: FloatArray) -> FloatArray:
         """Return the gain K (n, p) that belongs to P."""
         return np.asarray(P @ p.C.T * p.J)
 
-    def residual(self, p: Problem, P: FloatArray, K: FloatArray) -> FloatArray:
+    def residual(self, p: RiccatiProblem, P: FloatArray, K: FloatArray) -> FloatArray:
         """Return the residual of the equation, given the gain of P."""
         closed = p.A - K @ p.C
         return np.asarray(closed @ P + P @ closed.T + (K * p.J) @ K.T + p.Q)
@@ -157,17 +157,17 @@ class Continuous:
         """Tell whether the closed loop is so slow that its stability may be rounding."""
         return bool(np.max(poles.real) > -0.01 * np.max(np.abs(poles)))
 
-    def relative(self, p: Problem, residual: FloatArray, P: FloatArray) -> float:
+    def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
         """Return the size of a residual relative to the terms of the equation."""
         size = np.linalg.norm(p.A) * np.linalg.norm(P) + np.linalg.norm(p.Q)
         return float(np.linalg.norm(residual) / (size or 1.0))
 
-    def defect(self, p: Problem) -> str:
+    def defect(self, p: RiccatiProblem) -> str:
         """Return which mode makes a stabilising solution impossible, or ""."""
         return _defect(p, np.real, 0.0)
 
 
-class Solved(NamedTuple):
+class DoublingResult(NamedTuple):
     """P, the gain on the caller's outputs, closed-loop poles, relative residual, iterations."""
 
     P: FloatArray
@@ -179,7 +179,7 @@ class Solved(NamedTuple):
 
 @one_thread()
 @np.errstate(over="ignore", invalid="ignore")
-def solved(problem: Problem, kind: Discrete | Continuous) -> Solved:
+def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> DoublingResult:
     """Return the stabilising solution, scaled back.
 
     Raises
@@ -190,7 +190,7 @@ def solved(problem: Problem, kind: Discrete | Continuous) -> Solved:
     n = problem.A.shape[0]
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))
-        return Solved(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
+        return DoublingResult(np.zeros((0, 0)), empty, np.zeros(0, dtype=np.complex128), 0.0, 0)
     d = kind.start(problem)
     first = problem.scaled(d)
     try:
@@ -215,7 +215,7 @@ def solved(problem: Problem, kind: Discrete | Continuous) -> Solved:
     if kind.slow(poles) and (reason := kind.defect(first)):
         raise SolverError(f"{kind.equation}: {reason}")
     gain = ((K + scaled.gain) * d[:, None]) @ problem.whitening
-    return Solved(P * d * d[:, None], gain, poles, residual, doublings + steps)
+    return DoublingResult(P * d * d[:, None], gain, poles, residual, doublings + steps)
 
 
 def _doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, int]:
@@ -237,7 +237,7 @@ def _doubling(A: FloatArray, G: FloatArray, H: FloatArray) -> tuple[FloatArray, 
 
 
 def _newton(
-    p: Problem, kind: Discrete | Continuous, P: FloatArray
+    p: RiccatiProblem, kind: Discrete | Continuous, P: FloatArray
 ) -> tuple[FloatArray, FloatArray, float, int]:
     """Correct P by Newton (Kleinman) steps until the correction is rounding."""
     last = np.inf
@@ -269,7 +269,9 @@ def _scale(states: FloatArray, information: FloatArray) -> FloatArray:
     return scale_of(variance)
 
 
-def _defect(p: Problem, growth: Callable[[ComplexArray], FloatArray], marginal: float) -> str:
+def _defect(
+    p: RiccatiProblem, growth: Callable[[ComplexArray], FloatArray], marginal: float
+) -> str:
     """Return why no strictly stabilising solution exists, or "" (Popov-Belevitch-Hautus)."""
     lam = la.eigvals(p.A).astype(np.complex128)
     size = max(1.0 if marginal else 0.0, float(np.max(np.abs(lam), initial=0.0)))

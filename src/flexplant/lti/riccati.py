@@ -17,7 +17,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray, Value, real_array
-from .doubling import Continuous, Discrete, Problem, solved
+from .doubling import Continuous, Discrete, RiccatiProblem, solved
 from .lyapunov import symmetric
 
 
@@ -249,7 +249,7 @@ def _dual(solution: RiccatiSolution) -> RiccatiSolution:
 
 def _problem(
     A: FloatArray, C: FloatArray, Q: FloatArray, R: FloatArray, S: FloatArray | None
-) -> Problem:
+) -> RiccatiProblem:
     A = real_array(A, "A", (None, None))
     n = A.shape[0]
     A = real_array(A, "A", (n, n))
@@ -274,4 +274,4 @@ def _problem(
     J = np.sign(values)
     C, cross = whitening @ C, cross @ whitening.T
     shift = cross * J
-    return Problem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening)
+    return RiccatiProblem(A - shift @ C, C, Q - shift @ cross.T, J, shift, whitening)

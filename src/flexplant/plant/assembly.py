@@ -17,13 +17,13 @@ from .dynamics import structure_system, with_filters, with_gains
 from .ports import Ports
 from .rate_check import check_rate
 from .realisation import MODAL, ModalRealisation, Structure, realised
-from .residual import FastStates, Residual
+from .residual import FastStates, ResidualForm
 from .sampling import sampled_physical
 from .standard import StandardPlant
 
 
 def assemble_plant(
-    model: Structure | ModalRealisation, ports: Ports, *, residual: Residual | None = None
+    model: Structure | ModalRealisation, ports: Ports, *, residual: ResidualForm | None = None
 ) -> StandardPlant:
     """Return the standard plant of a structure with its channels.
 
@@ -70,7 +70,7 @@ def assemble_plant(
     """
     _check_ports(ports)
     way = FastStates() if residual is None else residual
-    if not isinstance(way, Residual):
+    if not isinstance(way, ResidualForm):
         raise ModelError(
             f"residual must be FastStates() or Feedthrough(), got {type(residual).__name__}."
         )

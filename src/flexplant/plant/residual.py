@@ -11,7 +11,7 @@ from ..values import Value, positive
 from .realisation import ModalRealisation
 
 
-class Residual(Value):
+class ResidualForm(Value):
     """How the residual compliance of a reduction appears in a plant."""
 
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
@@ -20,7 +20,7 @@ class Residual(Value):
 
 
 @dataclass(frozen=True, eq=False)
-class FastStates(Residual):
+class FastStates(ResidualForm):
     """Attachment vectors stay modes of their own, at their own high frequencies (the default).
 
     The plant stays strictly proper between forces and displacements, so that it can be sampled
@@ -33,7 +33,7 @@ class FastStates(Residual):
 
 
 @dataclass(frozen=True, eq=False)
-class Feedthrough(Residual):
+class Feedthrough(ResidualForm):
     """Attachment vectors, or all modes above a frequency, become their static flexibility.
 
     Displacements then answer forces at once: D12, D22 and D11 hold ``phi phi' / omega^2`` of what

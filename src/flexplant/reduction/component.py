@@ -14,7 +14,7 @@ from ..modes.solve import solve_modes
 from ..sparse.factor import dense, unit_diagonal
 from ..structure import Damping, FEModel, ModalDamping
 from ..values import FloatArray, positive, whole
-from .condensation import Partition
+from .condensation import DofPartition
 from .methods import ReductionMethod
 from .projection import (
     block,
@@ -83,7 +83,7 @@ class CraigBampton(ReductionMethod):
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""
         model, labels = fe_model(structure, self), tuple(self.boundary)
-        part = Partition(model, labels)
+        part = DofPartition(model, labels)
         T, count = part.static, 0
         if self.modes or self.below is not None:
             fixed = self._fixed(model, part)
@@ -99,7 +99,7 @@ class CraigBampton(ReductionMethod):
             damping=self.damping,
         )
 
-    def _fixed(self, model: FEModel, part: Partition) -> FloatArray:
+    def _fixed(self, model: FEModel, part: DofPartition) -> FloatArray:
         rows = part.others
         if self.modes > rows.size:
             raise ModelError(

@@ -59,7 +59,7 @@ def _loose(model: FEModel, kept: IntArray) -> str:
     )
 
 
-class Partition:
+class DofPartition:
     """Kept rows, the others, and the static shapes ``-Kss^-1 Ksm`` between them."""
 
     def __init__(self, model: FEModel, labels: tuple[str, ...]) -> None:
@@ -126,7 +126,7 @@ class Guyan(ReductionMethod):
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the condensed model; `reduce` is the public way."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
-        part = Partition(model, labels)
+        part = DofPartition(model, labels)
         return projected(
             model,
             part.static,
@@ -189,7 +189,7 @@ class Irs(ReductionMethod):
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the condensed model; `reduce` is the public way."""
         model, labels = fe_model(structure, self), tuple(self.dofs)
-        part = Partition(model, labels)
+        part = DofPartition(model, labels)
         rigid = model.rigid_body[part.kept]
         T, before = part.static, np.zeros(0)
         done = 0

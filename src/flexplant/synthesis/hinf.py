@@ -14,14 +14,14 @@ from ..plant import StandardPlant, standard_plant
 from ..values import short
 from .certificate import certified_norm, reached_norms
 from .controller import Controller
-from .method import Method
+from .method import SynthesisMethod
 from .riccati import Riccati
 from .spill_over import spill_over, unchecked
 
 
 def design_hinf(
     plant: StandardPlant | System,
-    method: Method | None = None,
+    method: SynthesisMethod | None = None,
     *,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,

@@ -23,7 +23,7 @@ from .lmi_programs import (
     same_states,
     smallest_gamma,
 )
-from .method import Solved
+from .method import SolvedController
 
 #: gap between value and lower bound at which no other coordinates are tried
 _GAP = 5e-4
@@ -83,7 +83,7 @@ class Lmi(Value):
             time_limit=positive(self.time_limit, "time_limit"),
         )
 
-    def solve(self, problem: Prepared) -> Solved:
+    def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.
 
         `lower` is a bound by weak duality from multipliers repaired to satisfy their equations;
@@ -113,7 +113,7 @@ class Lmi(Value):
             except (FlexplantError, la.LinAlgError) as error:
                 failures.append(f"{100 * back_off:.3g} % above it: {error}")
                 continue
-            return Solved(*K, norm, min(found.lower, norm))
+            return SolvedController(*K, norm, min(found.lower, norm))
         raise SolverError(
             f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
             + " ".join(failures)

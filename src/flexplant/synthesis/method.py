@@ -8,7 +8,7 @@ from ..lti.preparation import Prepared
 from ..values import FloatArray
 
 
-class Solved(NamedTuple):
+class SolvedController(NamedTuple):
     """A controller of the prepared problem, with what its method claims."""
 
     A: FloatArray
@@ -19,8 +19,8 @@ class Solved(NamedTuple):
     lower: float
 
 
-class Method(Protocol):
+class SynthesisMethod(Protocol):
     """A way to solve the prepared problem: `Riccati()` or `Lmi()`."""
 
-    def solve(self, problem: Prepared) -> Solved:
+    def solve(self, problem: Prepared) -> SolvedController:
         """Return a controller of the prepared problem."""

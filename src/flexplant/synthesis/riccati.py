@@ -16,7 +16,7 @@ from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive
 from .central import OnAxisError, central, quadratic, riccati_solutions
-from .method import Solved
+from .method import SolvedController
 
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
@@ -60,7 +60,7 @@ class Riccati(Value):
             tolerance=positive(self.tolerance, "tolerance"),
         )
 
-    def solve(self, problem: Prepared) -> Solved:
+    def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.
 
         Raises
@@ -87,7 +87,7 @@ class Riccati(Value):
                 "hardly sees."
             )
         if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
-            return Solved(least.A, least.B, least.C, least.D, 0.0, 0.0)
+            return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
         scaled = problem.measured_in(unit)
         high, low = self._searched(scaled)
         controller, norm = self._accepted(scaled, high)
@@ -95,7 +95,7 @@ class Riccati(Value):
             controller = least.replace(C=least.C / unit)
             norm = _norm(scaled, controller)
         _require_finite_gain(scaled, controller, unit * norm)
-        return Solved(
+        return SolvedController(
             controller.A,
             controller.B,
             unit * controller.C,

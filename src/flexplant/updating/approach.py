@@ -8,11 +8,11 @@ import numpy as np
 
 from ..errors import FlexplantError
 from ..values import FloatArray
-from .frf_residual import FrfResidual
-from .residuals import Eigenvalues
-from .residuals_base import Residual
+from .residuals.eigenvalues import Eigenvalues
+from .residuals.frf_residual import FrfResidual
+from .residuals.mode_shapes import ModeShapes
+from .residuals.residual import Residual
 from .search import Objective, TrustRegion
-from .shapes import ModeShapes
 
 #: relative variance of each entry of a response in the first fit, beside its noise
 EVEN = 0.1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..values import ComplexArray, FloatArray, IntArray
-from .pencil import groups
+from .family import groups
 
 #: modes closer than this, relatively, are a cluster: their shapes mix at the least change
 CLUSTER = 0.02

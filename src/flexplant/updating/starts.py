@@ -8,9 +8,9 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..values import FloatArray, generator, real_array, short
-from .result import Starts
-from .search import Found, Objective
-from .sensitivity import checked_values
+from .search import Objective, SearchEnd
+from .sensitivities import checked_values
+from .update_result import Starts
 
 
 def all_starts(objective: Objective, start: Any, starts: Any, seed: int) -> list[FloatArray]:
@@ -33,7 +33,7 @@ def all_starts(objective: Objective, start: Any, starts: Any, seed: int) -> list
     return list(values)
 
 
-def summary(begins: list[FloatArray], ends: list[Found | None]) -> Starts | None:
+def summary(begins: list[FloatArray], ends: list[SearchEnd | None]) -> Starts | None:
     """Return what several starts led to, None for one."""
     if len(begins) == 1:
         return None

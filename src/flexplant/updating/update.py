@@ -11,17 +11,17 @@ import numpy as np
 from ..errors import FlexplantError, FlexplantWarning, ModelError, SolverError
 from ..values import FloatArray, flag, positive, seed_sequence
 from .approach import approached
-from .estimate import covariance
-from .goodness import chi_square, is_bad, worst
-from .parameters import Parameter
-from .residuals import Eigenvalues
-from .residuals_base import Residual
-from .result import History, UpdateResult
-from .search import Found, GaussNewton, Method, Objective, TrustRegion, checked_residuals
-from .search.method import Trail
-from .sensitivity import checked_parameters
+from .judgement.covariance import covariance
+from .judgement.goodness import chi_square, is_bad, worst
+from .parameters.added import Parameter
+from .residuals.eigenvalues import Eigenvalues
+from .residuals.residual import Residual
+from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
+from .search.update_method import Trail
+from .sensitivities import checked_parameters
 from .starts import all_starts, summary
 from .unit_check import check_units
+from .update_result import History, UpdateResult
 from .updated_model import changed_model
 
 #: a parameter this close to its bound, relative to their distance, is at it
@@ -33,7 +33,7 @@ def update(
     parameters: Sequence[Parameter],
     residuals: Sequence[Residual],
     *,
-    method: Method | None = None,
+    method: UpdateMethod | None = None,
     start: Sequence[float] | FloatArray | None = None,
     starts: int | FloatArray | None = None,
     seed: int = 0,
@@ -68,7 +68,7 @@ def update(
     residuals : sequence of Residual
         What to fit: `Eigenvalues`, `ModeShapes`, `FrfResidual`, `Antiresonances`,
         `StaticCompliance`, mixed freely.
-    method : Method, optional
+    method : UpdateMethod, optional
         `GaussNewton`, `TrustRegion`, `Tikhonov` or `Lasso`. None: as said above.
     start : (q,) array [kg, N s/m, N/m], optional
         Values to begin with. When not given zeros, or the means of priors, inside the bounds; then
@@ -117,7 +117,7 @@ def update(
     """
     listed = checked_parameters(parameters)
     given = checked_residuals(residuals)
-    if method is not None and not isinstance(method, Method):
+    if method is not None and not isinstance(method, UpdateMethod):
         raise ModelError(
             f"method must be GaussNewton(), TrustRegion(), Tikhonov() or Lasso(), got {method!r}. "
             "Pass one of them, or None."
@@ -185,7 +185,7 @@ def _approach(
 
 
 def _result(
-    model: Any, objective: Objective, method: Method, best: Found, begin: FloatArray
+    model: Any, objective: Objective, method: UpdateMethod, best: SearchEnd, begin: FloatArray
 ) -> UpdateResult:
     """Return what the best search found and how well it is known."""
     point = objective.at(best.p)
@@ -243,12 +243,12 @@ def _complaint(fit: UpdateResult, objective: Objective, p: FloatArray) -> str:
 def _searched(
     objective: Objective,
     begins: list[FloatArray],
-    method: Method,
+    method: UpdateMethod,
     most: int | None,
     tolerance: float,
-) -> tuple[Found, list[Found | None]]:
+) -> tuple[SearchEnd, list[SearchEnd | None]]:
     """Return the best end, the objective being there, and what every start led to."""
-    ends: list[Found | None] = []
+    ends: list[SearchEnd | None] = []
     trouble: FlexplantError | None = None
     for begin in begins:
         try:

@@ -15,8 +15,8 @@ from ..modes.normal_form import RIGID_DRAG
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from ..values import FloatArray, Matrix
-from .parameters import Parameter
-from .pencil import Family
+from .family import Family
+from .parameters.added import Parameter
 
 
 def changed_model(model: Any, family: Family, p: FloatArray) -> Any:

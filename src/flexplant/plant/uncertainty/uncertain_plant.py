@@ -14,7 +14,7 @@ from ...identification import MeasuredModes
 from ...lti.statespace import StateSpace
 from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult, eigenvalue_sensitivities
-from ...updating.parameters import Parameter
+from ...updating.parameters.added import Parameter
 from ...values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from ..assembly import assemble_plant
 from ..realisation import MODAL, ModalRealisation, Structure

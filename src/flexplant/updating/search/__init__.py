@@ -2,9 +2,9 @@
 
 from .gauss_newton import GaussNewton as GaussNewton
 from .lasso import Lasso as Lasso
-from .method import Found as Found
-from .method import Method as Method
 from .objective import Objective as Objective
 from .objective import checked_residuals as checked_residuals
 from .tikhonov import Tikhonov as Tikhonov
 from .trust_region import TrustRegion as TrustRegion
+from .update_method import SearchEnd as SearchEnd
+from .update_method import UpdateMethod as UpdateMethod

@@ -8,9 +8,9 @@ import numpy as np
 
 from ...errors import ModelError, SolverError
 from ...values import FloatArray, positive
-from ..point import Point
-from .method import Found, Method, Trail
+from ..point_model import Point
 from .objective import Objective
+from .update_method import SearchEnd, Trail, UpdateMethod
 
 #: what rounding leaves of an eigenvalue, relatively; the error may rise by as much
 ROUNDING = 1e-11
@@ -24,7 +24,7 @@ EXACT, STEP = "residual below the tolerance", "step below the tolerance"
 
 
 @dataclass(frozen=True, eq=False)
-class GaussNewton(Method):
+class GaussNewton(UpdateMethod):
     """The paper's weighted Gauss-Newton iteration, (13) and (14), steps halved where they harm.
 
     Eigenvalues alone are weighted by W of (12). It ends where a full step would change nothing
@@ -66,8 +66,8 @@ class GaussNewton(Method):
         *,
         most: int | None = None,
         tolerance: float = 1e-10,
-    ) -> Found:
-        """Return where Gauss-Newton steps from `start` end; see `Method.search`."""
+    ) -> SearchEnd:
+        """Return where Gauss-Newton steps from `start` end; see `UpdateMethod.search`."""
         trail = Trail()
         p, point = start, objective.begin(start)
         r, size = objective.values(point), objective.size(point)
@@ -91,7 +91,7 @@ class GaussNewton(Method):
             exact = _is_small(r, size, tolerance)
             if exact or small:
                 converged, reason = True, EXACT if exact else STEP
-        return Found(p, float(r @ r) / 2, trail, converged, reason)
+        return SearchEnd(p, float(r @ r) / 2, trail, converged, reason)
 
 
 def _is_small(rows: FloatArray, size: FloatArray, tolerance: float) -> bool:

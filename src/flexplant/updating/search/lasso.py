@@ -9,9 +9,9 @@ import numpy as np
 
 from ...errors import ModelError, SolverError
 from ...values import FloatArray, positive
-from .method import Found, Method, Trail, units
 from .objective import Objective
 from .trust_region import TrustRegion
+from .update_method import SearchEnd, Trail, UpdateMethod, units
 
 #: weights on the path
 PATH = 13
@@ -22,7 +22,7 @@ NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Lasso(Method):
+class Lasso(UpdateMethod):
     """Sparse change: penalty ``weight |(p - start) / unit|_1`` on a sequence of linear problems.
 
     Most parameters end at exactly their start: those are the ones without a change. The convex
@@ -62,14 +62,14 @@ class Lasso(Method):
         *,
         most: int | None = None,
         tolerance: float = 1e-10,
-    ) -> Found:
-        """Return where the search from `start` ends; see `Method.search`."""
+    ) -> SearchEnd:
+        """Return where the search from `start` ends; see `UpdateMethod.search`."""
         return _lasso(objective, start, self.weight, most=most or self.steps, tolerance=tolerance)
 
 
 def _lasso(
     objective: Objective, start: FloatArray, weight: float | None, *, most: int, tolerance: float
-) -> Found:
+) -> SearchEnd:
     """Minimise with an l1 penalty on the change; None: the weight of least BIC, refitted."""
     J = objective.slopes(objective.begin(start), prior=False)
     r = objective.values(objective.at(start), prior=False)
@@ -77,7 +77,7 @@ def _lasso(
     if weight is not None:
         return _sparse(objective, start, unit, weight, most, tolerance)
     largest = float(np.abs((J * unit).T @ r).max())
-    best: tuple[float, tuple[int, ...], Found] | None = None
+    best: tuple[float, tuple[int, ...], SearchEnd] | None = None
     tried: set[tuple[int, ...]] = set()
 
     def judged(key: tuple[int, ...], begin: FloatArray) -> None:
@@ -121,7 +121,7 @@ def refitted(
     active: Any,
     most: int,
     tolerance: float,
-) -> Found:
+) -> SearchEnd:
     """Minimise over some parameters, the others held at the start."""
     lower, upper = objective.lower, objective.upper
     held = 1e-9 * np.maximum(np.abs(start), 1e-9)
@@ -144,7 +144,7 @@ def _sparse(
     weight: float,
     most: int,
     tolerance: float,
-) -> Found:
+) -> SearchEnd:
     """Solve a sequence of convex problems, each linear in the residuals, steps halved."""
     import cvxpy
 
@@ -197,4 +197,4 @@ def _sparse(
         if size < max(tolerance, 1e-6) * max(1.0, float(np.abs(aim).max())):
             converged, reason = True, "step below the tolerance"
             break
-    return Found(p, total(r, p), trail, converged, reason)
+    return SearchEnd(p, total(r, p), trail, converged, reason)

@@ -9,13 +9,13 @@ import numpy as np
 
 from ...errors import ModelError
 from ...values import ComplexArray, FloatArray
-from ..parameters import Parameter
-from ..pencil import Family
-from ..point import Point, first_point
-from ..residuals import BoundEigenvalues
-from ..residuals_base import Bound, Residual
-from ..sensitivity import mode_columns
-from ..splitting import PoleRows, turned
+from ..family import Family
+from ..parameters.added import Parameter
+from ..point_model import Point, first_point
+from ..repeated_modes import PoleRows, turned
+from ..residuals.eigenvalues import BoundEigenvalues
+from ..residuals.residual import Bound, Residual
+from ..sensitivities import mode_columns
 
 
 class Objective:

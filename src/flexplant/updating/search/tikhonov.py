@@ -7,16 +7,16 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...values import FloatArray, positive
-from .method import Found, Method, units
 from .objective import Objective
 from .trust_region import TrustRegion, minimised
+from .update_method import SearchEnd, UpdateMethod, units
 
 #: weights tried for an L-curve
 PATH = 13
 
 
 @dataclass(frozen=True, eq=False)
-class Tikhonov(Method):
+class Tikhonov(UpdateMethod):
     """Trust region with a penalty ``weight^2 |(p - start) / unit|^2``.
 
     The unit of each parameter is its prior standard deviation, half the width of finite bounds, or
@@ -56,12 +56,12 @@ class Tikhonov(Method):
         *,
         most: int | None = None,
         tolerance: float = 1e-10,
-    ) -> Found:
-        """Return where the search from `start` ends; see `Method.search`."""
+    ) -> SearchEnd:
+        """Return where the search from `start` ends; see `UpdateMethod.search`."""
         J = objective.slopes(objective.begin(start), prior=False)
         unit = units(objective, J)
 
-        def solved(size: float, begin: FloatArray) -> Found:
+        def solved(size: float, begin: FloatArray) -> SearchEnd:
             def extra(p: FloatArray) -> tuple[FloatArray, FloatArray]:
                 return size * (p - start) / unit, np.diag(size / unit)
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from ...errors import ModelError
 from ...values import FloatArray, positive
-from .method import Found, Method, Trail, units
 from .objective import Objective
+from .update_method import SearchEnd, Trail, UpdateMethod, units
 
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
 LOSSES = ("linear", "huber", "soft_l1", "cauchy")
@@ -21,7 +21,7 @@ Extra = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
 
 
 @dataclass(frozen=True, eq=False)
-class TrustRegion(Method):
+class TrustRegion(UpdateMethod):
     """Levenberg-Marquardt steps in a trust region that keeps to the bounds of the parameters.
 
     `scipy.optimize.least_squares` (method trf) with exact gradients.
@@ -61,8 +61,8 @@ class TrustRegion(Method):
         *,
         most: int | None = None,
         tolerance: float = 1e-10,
-    ) -> Found:
-        """Return where the search from `start` ends; see `Method.search`."""
+    ) -> SearchEnd:
+        """Return where the search from `start` ends; see `UpdateMethod.search`."""
         return minimised(objective, start, self, most=most or self.steps, tolerance=tolerance)
 
 
@@ -74,7 +74,7 @@ def minimised(
     most: int,
     tolerance: float,
     extra: Extra | None = None,
-) -> Found:
+) -> SearchEnd:
     """Minimise by least_squares, first as if there were no bounds, again within them if needed.
 
     Steps that keep away from bounds cost half as much again where none of them is active. Only
@@ -105,7 +105,7 @@ def _within(
     most: int,
     tolerance: float,
     extra: Extra | None,
-) -> Found:
+) -> SearchEnd:
     from scipy.optimize import least_squares
 
     trail = Trail()
@@ -157,7 +157,7 @@ def _within(
     reason = {0: "max_iterations reached", 1: "gradient is zero", 2: "error no longer falls"}.get(
         answer.status, "step below the tolerance"
     )
-    return Found(p, float(answer.cost), trail, answer.status > 0, reason)
+    return SearchEnd(p, float(answer.cost), trail, answer.status > 0, reason)
 
 
 def _data_loss(name: Loss, rows: int) -> Callable[[FloatArray], FloatArray]:

@@ -13,14 +13,14 @@ from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray
 from .diagram import StabilisationDiagram
 from .identified import IdentifiedModes
+from .line_weights import PreparedLines
+from .pole_test import freedom
 from .refine import Fit, Lines
-from .support import freedom
-from .weights import Prepared
 
 
 def answer(
     frf: Frf,
-    ready: Prepared,
+    ready: PreparedLines,
     lines: Lines,
     fit: Fit,
     band: tuple[float, float],
@@ -72,7 +72,7 @@ def answer(
     )
 
 
-def _covariance(fit: Fit, ready: Prepared) -> FloatArray:
+def _covariance(fit: Fit, ready: PreparedLines) -> FloatArray:
     """Return the covariance of [Re lambda; Im lambda] of all poles."""
     size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
     # participation of repeated poles is known up to a rotation only: no doubt is asked of it
@@ -89,7 +89,7 @@ def _covariance(fit: Fit, ready: Prepared) -> FloatArray:
     return np.asarray((chosen + chosen.T) / 2)
 
 
-def _shape_covariance(fit: Fit, ready: Prepared) -> ComplexArray:
+def _shape_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
     r"""Return E[n n^H] (m, n_out, n_out) of the errors n of each shape.
 
     With poles and participation theta, the error of the shape at output a is

@@ -8,10 +8,10 @@ import numpy as np
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray
-from .pencil import Eigen, Family, repeated_groups
-from .point import Point
-from .residuals import BoundEigenvalues
-from .sensitivity import split
+from .family import Eigen, Family, repeated_groups
+from .point_model import Point
+from .residuals.eigenvalues import BoundEigenvalues
+from .sensitivities import split
 
 #: a parameter's effect below this share of what it could have is rounding
 UNSEEN = 1e-9

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError
-from ..identification import MeasuredModes
-from ..values import ComplexArray, FloatArray, positive, real_array
-from .pencil import Family, groups
-from .point import Point
-from .residuals_base import Bound, Residual, split_parts
-from .shapes import chosen_modes
+from ...errors import LabelError, ModelError
+from ...identification import MeasuredModes
+from ...values import ComplexArray, FloatArray, positive, real_array
+from ..family import Family, groups
+from ..point_model import Point
+from .mode_shapes import chosen_modes
+from .residual import Bound, Residual, split_parts
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -16,7 +16,7 @@ from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray
-from .parameters import Parameter
+from .parameters.added import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
 REPEATED = 1e-8

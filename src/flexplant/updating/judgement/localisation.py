@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import unknown_label
-from ..values import FloatArray, Value
+from ...errors import unknown_label
+from ...values import FloatArray, Value
 from .goodness import chance, is_bad
 
 #: single candidates within this of the best BIC are as good

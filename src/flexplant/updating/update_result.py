@@ -10,8 +10,8 @@ import numpy as np
 from ..errors import ModelError, unknown_label
 from ..modes import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Value, generator, positive, short
-from .goodness import chance
-from .parameters import AddedMass, Parameter
+from .judgement.goodness import chance
+from .parameters.added import AddedMass, Parameter
 from .updated_model import applied
 
 

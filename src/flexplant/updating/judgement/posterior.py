@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import FloatArray, Value, generator
-from .parameters import Parameter
-from .result import UpdateResult
-from .search import Objective, checked_residuals
-from .sensitivity import checked_parameters
+from ...errors import ModelError
+from ...values import FloatArray, Value, generator
+from ..parameters.added import Parameter
+from ..search import Objective, checked_residuals
+from ..sensitivities import checked_parameters
+from ..update_result import UpdateResult
 
 #: stretch of the moves
 STRETCH = 2.0

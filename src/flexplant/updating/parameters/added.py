@@ -9,9 +9,9 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import LabelError, ModelError, unknown_label
-from ..labels import DIRECTIONS, Place
-from ..values import Matrix, Value, real_array, short
+from ...errors import LabelError, ModelError, unknown_label
+from ...labels import DIRECTIONS, Place
+from ...values import Matrix, Value, real_array, short
 
 #: derivatives of M, D and K to one parameter, None where zero
 Derivatives: TypeAlias = "tuple[Matrix | None, Matrix | None, Matrix | None]"

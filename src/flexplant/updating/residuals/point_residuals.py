@@ -8,14 +8,14 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError, ShapeError
-from ..labels import Place
-from ..values import ComplexArray, FloatArray, positive, real_array
-from .held import Held
-from .parameters import checked_direction, checked_place
-from .pencil import Family
-from .point import Point
-from .residuals_base import Bound, Residual, place_rows, split_parts
+from ...errors import ModelError, ShapeError
+from ...labels import Place
+from ...values import ComplexArray, FloatArray, positive, real_array
+from ..family import Family
+from ..parameters.added import checked_direction, checked_place
+from ..point_model import Point
+from .residual import Bound, Residual, place_rows, split_parts
+from .zero_order_hold import Held
 
 #: generalised eigenvalues beyond this multiple of the largest frequency are infinite
 INFINITE = 1e3

@@ -8,9 +8,9 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..values import FloatArray
-from .point import Point
-from .search import Objective
+from ...values import FloatArray
+from ..point_model import Point
+from ..search import Objective
 
 #: a chi-square that noise exceeds more rarely than this is no noise
 CHANCE = 1e-4

@@ -11,8 +11,8 @@ import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
 from ..values import ComplexArray, FloatArray, Value, real_array, short
-from .parameters import Parameter
-from .pencil import Eigen, Family, repeated_groups
+from .family import Eigen, Family, repeated_groups
+from .parameters.added import Parameter
 
 
 class Rotation(NamedTuple):

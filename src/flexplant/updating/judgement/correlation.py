@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
-from ..identification import MeasuredModes
-from ..values import ComplexArray, FloatArray, Value, short
-from .frf_residual import FrfResidual
-from .pairing import mac as _mac
-from .search import Objective, checked_residuals
-from .shapes import ModeShapes
+from ...errors import ModelError, ShapeError
+from ...identification import MeasuredModes
+from ...values import ComplexArray, FloatArray, Value, short
+from ..pairing import mac as _mac
+from ..residuals.frf_residual import FrfResidual
+from ..residuals.mode_shapes import ModeShapes
+from ..search import Objective, checked_residuals
 
 #: a distance in ln(frequency) that outweighs any MAC: few sensors see many modes alike
 APART = 0.3

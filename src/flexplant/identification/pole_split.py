@@ -9,8 +9,8 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..values import ComplexArray
+from .pole_test import CHANCE, freedom, price
 from .refine import Fit, Lines, projected_cost, refined
-from .support import CHANCE, freedom, price
 
 #: half the distance at which a pole is taken apart, in parts of its damping
 APART = 0.5

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, SolverError
-from ..values import FloatArray
+from ...errors import ModelError, SolverError
+from ...values import FloatArray
+from ..search import Objective, SearchEnd, TrustRegion
+from ..search.lasso import bic
 from .goodness import chance, is_bad
-from .search import Found, Objective, TrustRegion
-from .search.lasso import bic
 
 #: best subsets of each size that grow
 BEAM = 3
@@ -192,7 +192,7 @@ class Subsets:
         parameters = [self.whole.parameters[i] for i in picked]
         return Objective(family.model, parameters, self.residuals, prior=False, family=family)
 
-    def _search(self, subset: list[int]) -> Found:
+    def _search(self, subset: list[int]) -> SearchEnd:
         picked = [*subset, *self.beside]
         return TrustRegion().search(
             self._objective(picked), self.start[picked], most=50, tolerance=1e-8

@@ -39,7 +39,7 @@ class Trail:
 
 
 @dataclass
-class Found:
+class SearchEnd:
     """What a search ended with."""
 
     p: FloatArray
@@ -49,7 +49,7 @@ class Found:
     reason: str
 
 
-class Method(Value):
+class UpdateMethod(Value):
     """A way to minimise the residuals.
 
     A new method is a subclass with a `search`, in a module of its own.
@@ -79,7 +79,7 @@ class Method(Value):
         *,
         most: int | None = None,
         tolerance: float = 1e-10,
-    ) -> Found:
+    ) -> SearchEnd:
         """Return where the search from `start` ends.
 
         Parameters

@@ -10,8 +10,8 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray, IntArray
+from .family import Eigen, Family
 from .pairing import pair
-from .pencil import Eigen, Family
 
 
 class Point:

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..values import FloatArray
-from .point import Point
-from .search import Objective
+from ...values import FloatArray
+from ..point_model import Point
+from ..search import Objective
 
 #: singular values of the scaled sensitivities below this part of the largest say nothing
 SINGULAR = 1e-9

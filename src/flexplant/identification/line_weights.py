@@ -17,7 +17,7 @@ WINDOW = 41
 
 
 @dataclass(frozen=True, eq=False)
-class Prepared:
+class PreparedLines:
     """Displacement responses of the band, the smaller side as references (second axis)."""
 
     freq: FloatArray
@@ -64,7 +64,7 @@ class Prepared:
         mean = 1.0 / np.sqrt(np.mean(self.weight**-2.0, axis=1))
         return np.asarray(mean / mean.max())
 
-    def from_errors(self, power: FloatArray, fitted_share: float) -> Prepared:
+    def from_errors(self, power: FloatArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from the squared errors of a rough fit."""
         # at sharp peaks such a fit leaves more than noise; the median does not see them
         import scipy.ndimage as ndi
@@ -72,20 +72,20 @@ class Prepared:
         power = ndi.median_filter(power, (1, 1, WINDOW), mode="nearest") / np.log(2.0)
         return self._weighted(power, fitted_share)
 
-    def from_residuals(self, error: ComplexArray, fitted_share: float) -> Prepared:
+    def from_residuals(self, error: ComplexArray, fitted_share: float) -> PreparedLines:
         """Return the same with weights from what a fit left, averaged over lines."""
         import scipy.ndimage as ndi
 
         power = ndi.uniform_filter1d(np.abs(error) ** 2, WINDOW, axis=2, mode="nearest")
         return self._weighted(power, fitted_share)
 
-    def _weighted(self, power: FloatArray, fitted_share: float) -> Prepared:
+    def _weighted(self, power: FloatArray, fitted_share: float) -> PreparedLines:
         floor = 1e-26 * np.mean(np.abs(self.data) ** 2, axis=2, keepdims=True)
         variance = np.maximum(power / (1.0 - fitted_share), floor)
         return replace(self, weight=np.sqrt(2.0 / variance))
 
 
-def prepared(frf: Any, band: Any) -> Prepared:
+def prepared(frf: Any, band: Any) -> PreparedLines:
     """Return what is fitted of an FRF, checked."""
     if not isinstance(frf, Frf):
         raise ModelError(
@@ -125,7 +125,7 @@ def prepared(frf: Any, band: Any) -> Prepared:
     swapped = data.shape[0] < data.shape[1]
     if swapped:
         data, weight = data.transpose(1, 0, 2), weight.transpose(1, 0, 2)
-    return Prepared(freq, data, weight, correlation, known, swapped, lines)
+    return PreparedLines(freq, data, weight, correlation, known, swapped, lines)
 
 
 def checked_band(band: Any, freq: FloatArray) -> tuple[float, float]:

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, ShapeError
-from ..identification import MeasuredModes
-from ..labels import Place
-from ..values import ComplexArray, FloatArray, flag, real_array, short, whole
-from .pairing import CLUSTER, mac
-from .parameters import checked_direction, checked_place
-from .pencil import Family, groups
-from .point import Point
-from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
+from ...errors import LabelError, ModelError, ShapeError
+from ...identification import MeasuredModes
+from ...labels import Place
+from ...values import ComplexArray, FloatArray, flag, real_array, short, whole
+from ..family import Family, groups
+from ..pairing import CLUSTER, mac
+from ..parameters.added import checked_direction, checked_place
+from ..point_model import Point
+from .residual import Bound, Residual, channel_places, place_rows, split_parts
 
 #: of MAC that a distance of one in ln(frequency) outweighs when modes are assigned
 NEARNESS = 0.3

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError
-from ..values import ComplexArray, FloatArray
-from .point import Point
+from ...errors import ModelError
+from ...values import ComplexArray, FloatArray
+from ..point_model import Point
 
 
 class Held:

@@ -7,13 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import FloatArray
-from ..values import whole as counted
+from ...errors import ModelError
+from ...values import FloatArray
+from ...values import whole as counted
+from ..parameters.added import Parameter
+from ..search import Objective, checked_residuals
+from ..sensitivities import checked_parameters
 from .localisation import Localisation
-from .parameters import Parameter
-from .search import Objective, checked_residuals
-from .sensitivity import checked_parameters
 from .subsets import Subsets
 
 

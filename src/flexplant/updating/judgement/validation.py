@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import FloatArray, Value, generator, positive
+from ...errors import ModelError
+from ...values import FloatArray, Value, generator, positive
+from ..parameters.added import Parameter
+from ..residuals.residual import Residual
+from ..search import Objective, checked_residuals
+from ..search.update_method import UpdateMethod
+from ..sensitivities import checked_parameters
+from ..update import update
+from ..update_result import UpdateResult
 from .correlation import Correlation, correlate
-from .parameters import Parameter
-from .residuals_base import Residual
-from .result import UpdateResult
-from .search import Objective, checked_residuals
-from .search.method import Method
-from .sensitivity import checked_parameters
-from .update import update
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,7 +63,7 @@ def validate(
     residuals: Sequence[Residual],
     unused: Sequence[Residual],
     *,
-    method: Method | None = None,
+    method: UpdateMethod | None = None,
     start: Sequence[float] | FloatArray | None = None,
     starts: int | FloatArray | None = None,
     seed: int = 0,

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError
-from ..labels import Place
-from ..values import ComplexArray, FloatArray, Matrix, Value, short
-from .pencil import Family
-from .point import Point
+from ...errors import LabelError
+from ...labels import Place
+from ...values import ComplexArray, FloatArray, Matrix, Value, short
+from ..family import Family
+from ..point_model import Point
 
 
 class Residual(Value):

@@ -11,8 +11,8 @@ import scipy.linalg as la
 
 from ..errors import FlexplantWarning, SolverError
 from ..values import ComplexArray
+from .pole_test import freedom, price
 from .refine import Fit, Lines, projected_cost, refined
-from .support import freedom, price
 
 #: lengths [lines] of the stretches that are looked at
 STRETCHES = (3, 9, 27, 81)

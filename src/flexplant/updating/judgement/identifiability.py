@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ..values import FloatArray, Value
-from .parameters import Parameter
-from .pencil import repeated_groups
-from .search import Objective, checked_residuals
-from .sensitivity import checked_parameters, checked_values
+from ...values import FloatArray, Value
+from ..family import repeated_groups
+from ..parameters.added import Parameter
+from ..search import Objective, checked_residuals
+from ..sensitivities import checked_parameters, checked_values
 
 #: correlations beyond this are told
 CORRELATED = 0.99

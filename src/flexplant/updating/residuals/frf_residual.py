@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, ShapeError
-from ..labels import Place
-from ..lti import Frf
-from ..values import ComplexArray, FloatArray, flag, positive, real_array, short
-from .held import Held
-from .parameters import checked_direction
-from .pencil import Family
-from .point import Point
-from .residuals_base import Bound, Residual, channel_places, place_rows, split_parts
+from ...errors import ModelError, ShapeError
+from ...labels import Place
+from ...lti import Frf
+from ...values import ComplexArray, FloatArray, flag, positive, real_array, short
+from ..family import Family
+from ..parameters.added import checked_direction
+from ..point_model import Point
+from .residual import Bound, Residual, channel_places, place_rows, split_parts
+from .zero_order_hold import Held
 
 #: time derivatives of each quantity
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
