@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 import oracles_loop as oracle
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
@@ -50,6 +51,27 @@ def test_figures_are_those_of_a_dense_sweep(loops, found):
     assert found["servo"].bandwidth > 1.2 * found["half"].bandwidth
     assert found["half"].low_freq == found["servo"].low_freq
     assert found["half"].low > 1.5 * found["servo"].low
+
+
+def test_eigenvalues_and_schur_forms_are_computed_once(monkeypatch):
+    """For stability, margin, repr, response and comparison together."""
+    sizes = {"eigvals": [], "schur": []}
+    for name, seen in sizes.items():
+        plain = getattr(la, name)
+
+        def counted(A, *rest, plain=plain, seen=seen, **options):
+            seen.append(len(A))
+            return plain(A, *rest, **options)
+
+        monkeypatch.setattr(la, name, counted)
+    loop = close_loop(stage(), observer(), servo())
+    assert loop.is_stable
+    assert loop.system.is_stable
+    assert loop.spectral_radius < 1 < 1 / loop.modulus_margin
+    assert "stable" in repr(loop)
+    loop.frequency_response([1.0, 10.0])
+    compare_loops({"servo": loop})
+    assert sizes == {"eigvals": [loop.monitored.n_states], "schur": [loop.controller.n_states]}
 
 
 def test_it_reads_as_a_table_and_survives_a_file(found, tmp_path):

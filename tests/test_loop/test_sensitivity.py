@@ -170,7 +170,7 @@ def test_bandwidth_needs_some_suppression(loop):
 def test_bad_input(loop):
     with pytest.raises(ModelError, match="ClosedLoop or a tuple"):
         sensitivity(loop.plant)
-    with pytest.raises(ShapeError, match="one-dimensional"):
+    with pytest.raises(ShapeError, match="freq must have shape"):
         sensitivity(loop, freq=3.0)
     with pytest.raises(ModelError, match="positive"):
         sensitivity(loop, freq=[0.0, 1.0])

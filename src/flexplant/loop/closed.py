@@ -11,14 +11,17 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
-from ..lti.frequency import Frf, frequency_response
-from ..lti.interconnection import connect, lft
+from ..errors import FlexplantWarning, ModelError, unknown_label
+from ..lti.frequency import Frf, sampled_freq
+from ..lti.interconnection import lft
+from ..lti.responses import Responder, remembered, responder
 from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
 from ..plant.channel_units import plant_units
-from ..values import Value, name_list, real_array
+from ..values import ComplexArray, FloatArray, Value, name_list
+from .blocks import as_block, check_inputs, drives, joined
+from .broken import BrokenLoop, moved
 from .spill_over import SpillOver, growing_modes
 
 
@@ -86,8 +89,7 @@ class ClosedLoop(Value):
     @cached_property
     def fed_back(self) -> tuple[str, ...]:
         """The channels of y that u can move; references are not among them."""
-        moves = _moved(self.plant, self.driven)
-        return tuple(name for name, moved in zip(self.plant.y, moves, strict=True) if moved)
+        return moved(self.plant, self.driven)
 
     @cached_property
     def monitored(self) -> StateSpace:
@@ -145,26 +147,59 @@ class ClosedLoop(Value):
         ModelError
             When a frequency is not allowed, or the loop is singular at one.
         """
-        grid = real_array(freq, "freq", (None,))
-        P = frequency_response(self.plant.system, grid)
-        heard = list(self.controller.inputs)
-        K = frequency_response(self.controller.select(outputs=self.driven), grid).data
-        w, u = (self.plant.system.input_index(names) for names in (self.plant.w, self.driven))
-        z, y = (self.plant.system.output_index(names) for names in (self.plant.z, heard))
-        Kt = np.moveaxis(K, 2, 0)
-        Pt = np.moveaxis(P.data, 2, 0)
-        back = np.eye(u.size) - Kt @ Pt[:, y][:, :, u]
-        try:
-            command = np.linalg.solve(back, Kt @ Pt[:, y][:, :, w])
-        except np.linalg.LinAlgError as error:
-            raise ModelError("the loop has a pole at one of the frequencies: move it.") from error
-        data = Pt[:, z][:, :, w] + Pt[:, z][:, :, u] @ command
-        return Frf(
-            grid,
-            np.moveaxis(data, 0, 2),
-            tuple(self.plant.w),
-            tuple(self.plant.z),
-            units=self.units,
+        grid = sampled_freq(freq, self.plant.dt)
+        data = self._responses(self.plant.w, self.plant.z)(grid)
+        return Frf(grid, data, tuple(self.plant.w), tuple(self.plant.z), units=self.units)
+
+    def gain(self, reference: str, error: str) -> Responder:
+        """Return the function of frequency [Hz] that gives the response from a w to a z.
+
+        Prepared once for many calls: the frequencies are not checked, (1, 1, n_freq) comes back.
+
+        Parameters
+        ----------
+        reference : str
+            A channel of w.
+        error : str
+            A channel of z.
+        """
+        return self._responses([reference], [error])
+
+    def _responses(self, w: Sequence[str], z: Sequence[str]) -> Responder:
+        g, ports = self.plant.system, self.controller.inputs
+        plant = responder(g.select([*z, *ports], [*w, *self.driven]))
+        p, m = len(z), len(w)
+
+        def found(freq: FloatArray) -> ComplexArray:
+            K = np.moveaxis(self._controller_response(freq), 2, 0)
+            P = np.moveaxis(plant(freq), 2, 0)
+            back = np.eye(K.shape[1]) - K @ P[:, p:, m:]
+            try:
+                command = np.linalg.solve(back, K @ P[:, p:, :m])
+            except np.linalg.LinAlgError as error:
+                raise ModelError(
+                    "the loop has a pole at one of the frequencies: move it."
+                ) from error
+            return np.moveaxis(P[:, :p, :m] + P[:, :p, m:] @ command, 0, 2)
+
+        return found
+
+    @cached_property
+    def _controller_response(self) -> Responder:
+        """From y to the driven actuators; the first grid, that of all poles, is needed again."""
+        return remembered(responder(self.controller.select(outputs=self.driven)))
+
+    @cached_property
+    def broken(self) -> BrokenLoop:
+        """Plant and controller between u and the y that u moves."""
+        read = self.controller.input_index(self.fed_back)
+        return BrokenLoop(
+            self.driven,
+            self.fed_back,
+            lambda freq: self._controller_response(freq)[:, read],
+            responder(self.plant.system.select(self.fed_back, self.driven)),
+            self.monitored.poles,
+            self.plant.dt,
         )
 
     @property
@@ -238,9 +273,7 @@ class ClosedLoop(Value):
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
         loop's resonances. An unstable loop has none: 0.
         """
-        from .margins import modulus_margin
-
-        return modulus_margin(self)
+        return self.broken.modulus_margin
 
 
 def close_loop(
@@ -302,7 +335,7 @@ def close_loop(
     (True, -10.0)
     """
     plant = standard_plant(plant)
-    systems = tuple(_block(block, i, plant.dt) for i, block in enumerate(blocks, 1))
+    systems = tuple(as_block(block, i, plant.dt) for i, block in enumerate(blocks, 1))
     if not systems:
         raise ModelError(
             "close_loop needs at least one block that drives an actuator: pass a StateSpace, "
@@ -312,9 +345,9 @@ def close_loop(
     for name in resting:
         if name not in plant.u:
             raise unknown_label("actuator to leave idle", name, plant.u)
-    driven, watched = _drives(plant, systems, resting)
-    _check_inputs(plant, systems)
-    controller = _joined(plant, systems, driven, watched)
+    driven, watched = drives(plant, systems, resting)
+    check_inputs(plant, systems)
+    controller = joined(plant, systems, driven, watched)
     loop = ClosedLoop(plant, systems, controller, resting, _completed(plant, larger))
     found = loop.left_out
     if not loop.is_stable:
@@ -353,120 +386,3 @@ def _completed(plant: StandardPlant, larger: Any) -> StandardPlant | None:
             "loop on plant.unweighted (with that block first) to check it with the modes left out."
         )
     return None
-
-
-def _joined(
-    plant: StandardPlant, systems: Sequence[StateSpace], driven: list[str], watched: list[str]
-) -> StateSpace:
-    """Return the blocks as one system from y to the driven actuators and what is watched."""
-    heard = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
-    none = np.zeros((0, 0))
-    silent = [name for name in heard if name not in driven]
-    zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
-    # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: signals are
-    # joined in units in which direct gains are at most one, powers of two so that no digit changes
-    units = _units(systems)
-    scaled = [_in_units(sys, units) for sys in systems]
-    joined = connect(
-        [*scaled, zero] if silent else scaled,
-        inputs=plant.y,
-        outputs=[*driven, *watched],
-        adding=driven,
-    )
-    row = np.array([units[name] for name in (*driven, *watched)])[:, None]
-    return joined.replace(C=joined.C * row, D=joined.D * row, dt=plant.dt)
-
-
-def _units(systems: Sequence[StateSpace]) -> dict[str, float]:
-    """Return a size for each output of a block: its largest direct gain from outside."""
-    units = {name: 1.0 for sys in systems for name in sys.outputs}
-    for _ in systems:  # along chains of blocks, which are no longer than there are blocks
-        sizes = dict.fromkeys(units, 0.0)
-        for sys in systems:
-            gains = np.abs(sys.D) * [units.get(name, 1.0) for name in sys.inputs]
-            for name, gain in zip(sys.outputs, gains.max(axis=1, initial=0.0), strict=True):
-                sizes[name] = max(sizes[name], float(gain))
-        units = {n: float(2.0 ** np.ceil(np.log2(s))) if s else 1.0 for n, s in sizes.items()}
-    return units
-
-
-def _in_units(sys: StateSpace, units: dict[str, float]) -> StateSpace:
-    row = np.array([units.get(name, 1.0) for name in sys.outputs])[:, None]
-    column = np.array([units.get(name, 1.0) for name in sys.inputs])
-    return sys.replace(B=sys.B * column, C=sys.C / row, D=sys.D / row * column)
-
-
-def _block(block: Any, place: int, dt: float) -> StateSpace:
-    """Return a block as a StateSpace of the plant's dt."""
-    inner = getattr(block, "system", block)
-    if isinstance(block, StandardPlant) or not (
-        isinstance(inner, StateSpace) or hasattr(inner, "input_labels")
-    ):
-        raise ModelError(
-            f"block {place} is a {type(block).__name__}, not a system with named channels. Pass a "
-            "StateSpace with inputs= and outputs=, or a value with such a .system."
-        )
-    sys = inner if isinstance(inner, StateSpace) else StateSpace.from_control(inner)
-    if sys.n_states and not np.isclose(sys.dt, dt, rtol=1e-9, atol=0.0):
-        raise ModelError(
-            f"block {place} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
-            "Design it on plant.discretized(rate), or discretise it at the plant's rate."
-        )
-    return sys.replace(dt=dt)
-
-
-def _drives(
-    plant: StandardPlant, systems: Sequence[StateSpace], idle: tuple[str, ...]
-) -> tuple[list[str], list[str]]:
-    """Return driven actuators and monitored outputs; refuse what is driven twice or not at all."""
-    produced = [name for sys in systems for name in sys.outputs]
-    taken = {name: side for side in "wzy" for name in getattr(plant, side)}
-    for name in produced:
-        if name in taken:
-            raise LabelError(
-                f"a block drives {name!r}, which the plant has in {taken[name]}: the name would be "
-                "driven twice. Rename the block's output: system.renamed(outputs={...})."
-            )
-        if name in idle:
-            raise LabelError(f"actuator {name!r} is driven by a block, so it cannot be idle.")
-        if produced.count(name) > 1 and name not in plant.u:
-            raise LabelError(
-                f"{name!r} is an output of {produced.count(name)} blocks: only outputs to "
-                "actuators add. Rename one: system.renamed(outputs={...})."
-            )
-    for name in plant.u:
-        if name not in produced and name not in idle:
-            error = unknown_label("block output", name, produced)
-            raise LabelError(
-                f"nothing drives actuator {name!r}: {error} Rename the block's output, or pass "
-                f"idle=[{name!r}] if it rests on purpose."
-            )
-    watched = [name for name in produced if name not in plant.u]
-    return [name for name in plant.u if name in produced], watched
-
-
-def _check_inputs(plant: StandardPlant, systems: Sequence[StateSpace]) -> None:
-    produced = [name for sys in systems for name in sys.outputs]
-    known = [*plant.y, *plant.u, *produced]
-    clash = sorted({*plant.y, *plant.z} & set(plant.u))
-    if clash:
-        raise LabelError(f"{clash} name both an output and an actuator: rename one of them.")
-    for place, sys in enumerate(systems, 1):
-        for name in sys.inputs:
-            if name in known:
-                continue
-            owner = f"what can drive block {place}: plant.y, plant.u and outputs of blocks"
-            error = unknown_label("signal", name, known, owner)
-            hidden = next((side for side in "zw" if name in getattr(plant, side)), None)
-            why = (
-                f" It is in the plant's {hidden}, which no controller can read: estimate it."
-                if hidden
-                else ""
-            )
-            raise LabelError(f"{error}{why}")
-
-
-def _moved(plant: StandardPlant, driven: Sequence[str]) -> npt.NDArray[np.bool_]:
-    """Return which y can move with u: their rows see a state or an actuator."""
-    g = plant.system.select(plant.y, driven)
-    return np.asarray(np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
-from ..lti.grid import refined, resonance_grid
+from ..lti.grid import climbed
 from ..values import FloatArray, Value, short
 from .closed import ClosedLoop
 
@@ -153,15 +153,8 @@ def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tup
 
 def _sensitivity(loop: ClosedLoop, reference: str, error: str) -> tuple[FloatArray, FloatArray]:
     """Return frequencies and |S|, refined where it is largest."""
-    freq = resonance_grid(loop.monitored.poles(), loop.plant.dt)
-    size = np.abs(loop.frequency_response(freq)[error, reference])
-    for _ in range(4):
-        fresh = refined(freq, size)
-        more = np.abs(loop.frequency_response(fresh)[error, reference])
-        order = np.argsort(np.concatenate([freq, fresh]))
-        freq = np.concatenate([freq, fresh])[order]
-        size = np.concatenate([size, more])[order]
-    return freq, size
+    gain = loop.gain(reference, error)
+    return climbed(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
 
 
 def _bandwidth(curve: tuple[FloatArray, FloatArray] | None) -> float:
@@ -195,7 +188,7 @@ def _figures(
     top = int(np.argmax(curve[1]))
     low = nan
     if np.isfinite(low_freq):
-        low = abs(complex(loop.frequency_response([low_freq])[pair[1], pair[0]][0]))
+        low = float(abs(loop.gain(*pair)(np.array([low_freq]))[0, 0, 0]))
     return LoopFigures(
         True, decay, reached, float(curve[1][top]), float(curve[0][top]), low, low_freq,
         loop.modulus_margin,

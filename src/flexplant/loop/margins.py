@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..errors import AssumptionError
-from ..lti.grid import refined
 from ..values import ComplexArray, FloatArray
-from .sensitivity import Loop, Pieces, checked_grid, inverted, open_gain, taken_apart
+from .broken import BrokenLoop, inverted, largest
+from .sensitivity import Loop, taken_apart
 
 
 def modulus_margin(loop: Loop) -> float:
@@ -29,18 +29,7 @@ def modulus_margin(loop: Loop) -> float:
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
     """
-    parts = taken_apart(loop)
-    if parts.measured is None and not _stable(parts):
-        return 0.0
-    grid = checked_grid(parts, None)
-    values = _largest(inverted(open_gain(parts, grid, "u")))
-    for _ in range(6 if parts.measured is None else 0):
-        fresh = refined(grid, values)
-        more = _largest(inverted(open_gain(parts, fresh, "u")))
-        order = np.argsort(np.concatenate([grid, fresh]))
-        grid = np.concatenate([grid, fresh])[order]
-        values = np.concatenate([values, more])[order]
-    return 1.0 / float(values.max())
+    return taken_apart(loop).modulus_margin
 
 
 def bandwidth(loop: Loop) -> float:
@@ -67,13 +56,13 @@ def bandwidth(loop: Loop) -> float:
         When channels do not match, or `loop` is of another type.
     """
     parts = taken_apart(loop)
-    if parts.measured is None and not _stable(parts):
+    if parts.is_unstable:
         raise AssumptionError(
             "the closed loop is not stable, so |S| is the size of no response of it and gives no "
             "bandwidth. Stabilise it first: see loop.spectral_radius and loop.modulus_margin."
         )
-    grid = checked_grid(parts, None)
-    loop_low = open_gain(parts, grid[:1], "u")[0]
+    grid = parts.grid
+    loop_low = parts.gain(grid[:1])[0]
     vectors, gains, _ = np.linalg.svd(loop_low)
     acting = np.asarray(vectors[:, gains >= 1e-6 * gains[0]], dtype=np.complex128)
     values = _sensitivity_along(acting, parts, grid)
@@ -95,17 +84,6 @@ def bandwidth(loop: Loop) -> float:
     return high
 
 
-def _stable(parts: Pieces) -> bool:
-    poles = parts.poles()
-    edge = np.abs(poles) - 1.0 if parts.dt else poles.real
-    return bool(np.max(edge, initial=-1.0) < 0)
-
-
-def _largest(S: ComplexArray) -> FloatArray:
-    """Return the largest singular value at each frequency."""
-    return np.asarray(np.linalg.svd(S, compute_uv=False)[:, 0])
-
-
-def _sensitivity_along(acting: ComplexArray, parts: Pieces, grid: FloatArray) -> FloatArray:
+def _sensitivity_along(acting: ComplexArray, parts: BrokenLoop, grid: FloatArray) -> FloatArray:
     """Return sigma_max of S_u in the space of some orthonormal directions of u (columns)."""
-    return _largest(inverted(acting.conj().T @ open_gain(parts, grid, "u") @ acting))
+    return largest(inverted(acting.conj().T @ parts.gain(grid) @ acting))

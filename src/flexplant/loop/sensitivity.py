@@ -2,40 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import cache
-from typing import Any, Literal, NamedTuple, TypeAlias
+from collections.abc import Callable
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..lti.frequency import Frf, frequency_response
-from ..lti.grid import resonance_grid
+from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.interconnection import lft
-from ..lti.responses import responder
+from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray, real_array, short
+from ..values import ComplexArray, FloatArray, short
+from .broken import BrokenLoop, inverted, moved
 from .closed import ClosedLoop
 
-Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
 #: a closed loop, or a plant (StandardPlant, StateSpace or measured Frf) and a controller
 Loop: TypeAlias = "ClosedLoop | tuple[Any, Any]"
-
-
-class Pieces(NamedTuple):
-    """A loop taken apart: y = P u, u = K y; `respond` gives K (f, nu, ny) and P (f, ny, nu).
-
-    `poles` gives those of the closed loop, or of the controller when the plant was measured.
-    """
-
-    u: tuple[str, ...]
-    y: tuple[str, ...]
-    respond: Callable[[FloatArray], tuple[ComplexArray, ComplexArray]]
-    poles: Callable[[], ComplexArray]
-    dt: float
-    measured: FloatArray | None  # the frequencies of a measured plant
 
 
 def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u") -> Frf:
@@ -65,7 +49,7 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
         When `freq` is not an array of positive frequencies.
     """
     parts, grid = _prepared(loop, freq)
-    return _frf(grid, open_gain(parts, grid, at), parts, at, at)
+    return _frf(grid, parts.gain(grid, at), parts, at, at)
 
 
 def sensitivity(
@@ -95,7 +79,7 @@ def sensitivity(
         When `freq` is not an array of positive frequencies.
     """
     parts, grid = _prepared(loop, freq)
-    return _frf(grid, inverted(open_gain(parts, grid, at)), parts, at, at)
+    return _frf(grid, inverted(parts.gain(grid, at)), parts, at, at)
 
 
 def complementary_sensitivity(
@@ -125,7 +109,7 @@ def complementary_sensitivity(
         When `freq` is not an array of positive frequencies.
     """
     parts, grid = _prepared(loop, freq)
-    L = open_gain(parts, grid, at)
+    L = parts.gain(grid, at)
     return _frf(grid, -L @ inverted(L), parts, at, at)
 
 
@@ -156,7 +140,7 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
     return _frf(grid, inverted(K @ P) @ K, parts, "u", "y")
 
 
-def taken_apart(loop: Loop) -> Pieces:
+def taken_apart(loop: Loop) -> BrokenLoop:
     """Return plant and controller between u and y.
 
     Raises
@@ -167,15 +151,14 @@ def taken_apart(loop: Loop) -> Pieces:
         When `loop` is of another type.
     """
     if isinstance(loop, ClosedLoop):
-        plant: Any = loop.plant.system.select(loop.fed_back, loop.driven)
-        controller = loop.controller.select(loop.driven, loop.fed_back)
-        return _modelled(plant, controller, loop.monitored.poles)
+        return loop.broken
     if not isinstance(loop, tuple) or len(loop) != 2:
         raise ModelError(
             f"need a ClosedLoop or a tuple (plant, controller), got {short(loop)}. Type "
             "close_loop(plant, controller) or (plant, controller)."
         )
-    plant, controller = loop[0], _controller(loop[1])
+    plant: Any = loop[0]
+    controller = _controller(loop[1])
     if hasattr(plant, "frdata"):  # python-control's
         plant = Frf.from_control(plant)
     if isinstance(plant, Frf):
@@ -185,7 +168,7 @@ def taken_apart(loop: Loop) -> Pieces:
         if unread:
             raise unknown_label("y for the controller", unread[0], plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
-        fed = ClosedLoop(plant, (controller,), controller, _idle(plant, driven)).fed_back
+        fed = moved(plant, driven)
         read = [name for name in controller.inputs if name in fed]
         plant, controller = plant.system.select(read, driven), controller.select(driven, read)
     elif not isinstance(plant, StateSpace):
@@ -199,26 +182,9 @@ def taken_apart(loop: Loop) -> Pieces:
     return _modelled(plant, controller, lambda: lft(plant, controller).poles())
 
 
-def open_gain(parts: Pieces, grid: FloatArray, at: str) -> ComplexArray:
-    """Return K P or P K on a grid, frequency first."""
-    if at not in ("u", "y"):
-        raise LabelError(f"a loop is broken at 'u' or 'y', got {short(at)}. Pass one of them.")
-    K, P = parts.respond(grid)
-    return K @ P if at == "u" else P @ K
-
-
-def inverted(L: ComplexArray) -> ComplexArray:
-    """Return (I - L)^-1, frequency first."""
-    return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) - L))
-
-
-def _idle(plant: StandardPlant, driven: Sequence[str]) -> tuple[str, ...]:
-    return tuple(name for name in plant.u if name not in driven)
-
-
 def _modelled(
     plant: StateSpace, controller: StateSpace, poles: Callable[[], ComplexArray]
-) -> Pieces:
+) -> BrokenLoop:
     dt = plant.dt or controller.dt
     if (
         plant.n_states
@@ -230,17 +196,10 @@ def _modelled(
         )
     plant, controller = plant.replace(dt=dt), controller.replace(dt=dt)
 
-    @cache
-    def prepared() -> tuple[Responder, Responder]:  # a dense A is brought to Schur form once
-        return responder(controller), responder(plant)
-
-    def respond(freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        K, P = (one(freq) for one in prepared())
-        return np.ascontiguousarray(K.transpose(2, 0, 1)), np.ascontiguousarray(
-            P.transpose(2, 0, 1)
-        )
-
-    return Pieces(tuple(plant.inputs), tuple(plant.outputs), respond, poles, dt, None)
+    return BrokenLoop(
+        tuple(plant.inputs), tuple(plant.outputs), remembered(responder(controller)),
+        responder(plant), poles, dt,
+    )  # fmt: skip
 
 
 def _controller(law: Any) -> StateSpace:
@@ -262,7 +221,7 @@ def _quantities(law: Any) -> dict[str, str]:
     return {} if ports is None else {sensor.name: sensor.quantity for sensor in ports.y}
 
 
-def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> Pieces:
+def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:
     for name in controller.inputs:
         if name not in plant.outputs:
             error = unknown_label("measured output", name, plant.outputs, "the Frf")
@@ -280,47 +239,36 @@ def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) ->
     if not driven:
         raise unknown_label("measured input", controller.outputs[0], plant.inputs, "the Frf")
     controller = controller.select(driven)
-    P = _stack(plant.select(controller.inputs, driven))
-
-    def respond(freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        place = np.searchsorted(plant.freq, freq)
-        return _stack(frequency_response(controller, freq)), P[place]
-
-    return Pieces(
-        tuple(driven), tuple(controller.inputs), respond, controller.poles, controller.dt,
+    P = plant.select(controller.inputs, driven).data
+    return BrokenLoop(
+        tuple(driven),
+        tuple(controller.inputs),
+        lambda freq: frequency_response(controller, freq).data,
+        lambda freq: np.asarray(P[:, :, np.searchsorted(plant.freq, freq)], dtype=np.complex128),
+        controller.poles,
+        controller.dt,
         np.array(plant.freq),
-    )  # fmt: skip
+    )
 
 
-def _prepared(loop: Loop, freq: npt.ArrayLike | None) -> tuple[Pieces, FloatArray]:
+def _prepared(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, FloatArray]:
     parts = taken_apart(loop)
-    return parts, checked_grid(parts, freq)
+    return parts, parts.grid if freq is None else _checked(parts, freq)
 
 
-def checked_grid(parts: Pieces, freq: npt.ArrayLike | None) -> FloatArray:
-    """Return the asked frequencies, or a grid of our own.
+def _checked(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
+    """Return frequencies that were given.
 
     Raises
     ------
     ModelError, ShapeError
         When they are no array of positive frequencies, or were not measured.
     """
-    if freq is None:
-        if parts.measured is not None:
-            return parts.measured
-        return resonance_grid(parts.poles(), parts.dt)
-    grid = real_array(freq, "freq")
-    if grid.ndim != 1 or not grid.size:
-        raise ShapeError(f"freq must be a one-dimensional array [Hz], got {short(freq)}. Pass one.")
-    if np.any(grid <= 0):
+    grid = sampled_freq(freq, parts.dt)
+    if not grid.size:
+        raise ShapeError("freq must hold at least one frequency [Hz], got none. Pass one.")
+    if grid[0] <= 0:
         raise ModelError("freq must be positive: integrators and free bodies are infinite at 0.")
-    if parts.dt and grid.max() > 0.5 / parts.dt * (1 + 1e-12):
-        raise ModelError(
-            f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / parts.dt:g} "
-            "Hz), where a sampled system has no response of its own. Stay below."
-        )
-    if np.any(np.diff(grid) <= 0):
-        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
     if parts.measured is not None and not np.all(np.isin(grid, parts.measured)):
         raise ModelError(
             "the plant is a measured Frf, known only at its own frequencies: leave freq out."
@@ -328,11 +276,6 @@ def checked_grid(parts: Pieces, freq: npt.ArrayLike | None) -> FloatArray:
     return grid
 
 
-def _stack(frf: Frf) -> ComplexArray:
-    """Return the data with frequency first, for stacked matrix products."""
-    return np.ascontiguousarray(np.moveaxis(np.asarray(frf.data, dtype=np.complex128), -1, 0))
-
-
-def _frf(freq: FloatArray, data: ComplexArray, parts: Pieces, to: str, fro: str) -> Frf:
+def _frf(freq: FloatArray, data: ComplexArray, parts: BrokenLoop, to: str, fro: str) -> Frf:
     names = {"u": parts.u, "y": parts.y}
     return Frf(freq, np.moveaxis(data, 0, -1), inputs=names[fro], outputs=names[to])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError, unknown_label
@@ -334,14 +335,7 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
     g = as_statespace(sys)
     if freq is None:
         freq = default_freq(g)
-    freq = checked_freq(freq)
-    if g.dt and freq.size and freq[-1] > 0.5 / g.dt * (1 + 1e-12):
-        raise ModelError(
-            f"frequency {freq[-1]:g} Hz lies above half the sampling rate ({0.5 / g.dt:g} Hz), "
-            "where a sampled system has no response of its own. Stay below."
-        )
-    if np.any(np.diff(freq) <= 0):
-        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
+    freq = sampled_freq(freq, g.dt)
     data = responses(g, freq)
     # the checks of Frf hold already: its copy and its look at every entry cost twice the response
     for array in (freq, data):
@@ -353,12 +347,32 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
     return frf
 
 
-def checked_freq(freq: FloatArray) -> FloatArray:
+def checked_freq(freq: npt.ArrayLike) -> FloatArray:
     """Return frequencies as a finite array (n,) that is not negative."""
     freq = real_array(freq, "freq", (None,))
     if freq.size and freq.min() < 0:
         raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
     return freq
+
+
+def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
+    """Return frequencies [Hz] at which a system of sampling time dt has a response.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When they are no array, a frequency is negative or above half the rate, or they do not
+        increase.
+    """
+    grid = checked_freq(freq)
+    if dt and grid.size and grid.max() > 0.5 / dt * (1 + 1e-12):
+        raise ModelError(
+            f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / dt:g} Hz), "
+            "where a sampled system has no response of its own. Stay below."
+        )
+    if np.any(np.diff(grid) <= 0):
+        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
+    return grid
 
 
 def _checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 
 from ..errors import ModelError
@@ -169,3 +171,26 @@ def refined(grid: FloatArray, values: FloatArray, *, peaks: int = 6, parts: int 
     left, right = grid[np.maximum(tops - 1, 0)], grid[np.minimum(tops + 1, grid.size - 1)]
     share = np.arange(1, 2 * parts) / (2 * parts)
     return np.setdiff1d((left[:, None] + (right - left)[:, None] * share).ravel(), grid)
+
+
+def climbed(
+    find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies and values of a function of them, refined some times where it is highest.
+
+    Parameters
+    ----------
+    find : function
+        Of frequencies [Hz], gives a value for each.
+    grid : (n_freq,) array [Hz]
+        Where it begins.
+    rounds : int
+        How often `refined` adds frequencies.
+    """
+    values = find(grid)
+    for _ in range(rounds):
+        fresh = refined(grid, values)
+        both = np.concatenate([grid, fresh])
+        order = np.argsort(both)
+        grid, values = both[order], np.concatenate([values, find(fresh)])[order]
+    return grid, values

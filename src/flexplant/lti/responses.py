@@ -16,12 +16,16 @@ from .scaling import state_scale
 from .statespace import StateSpace
 
 #: entries of the largest intermediate array of a back substitution (complex): it stays in cache
-CHUNK = 200_000
+CHUNK = 400_000
+#: rows of a back substitution that are solved together
+ROWS = 32
 #: frequencies at a time in block form: the scalar functions of all modes stay in cache
 MODAL_STEP = 512
 
 #: responses (p, m, n_s), and whether they are finite for certain: large arrays are not read again
 Modal: TypeAlias = Callable[[ComplexArray], tuple[ComplexArray, bool]]
+#: the responses (p, m, n_freq) at frequencies [Hz]
+Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
 #: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument
 Solver = Callable[[ComplexArray, ComplexArray], None]
 
@@ -31,7 +35,7 @@ def responses(g: StateSpace, freq: FloatArray) -> ComplexArray:
     return responder(g)(freq)
 
 
-def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
+def responder(g: StateSpace) -> Responder:
     """Return the function of frequency [Hz] that gives the responses, prepared once."""
     shape = len(g.outputs), len(g.inputs)
     if not g.n_states or not g.D.size:
@@ -58,6 +62,22 @@ def responder(g: StateSpace) -> Callable[[FloatArray], ComplexArray]:
             with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
                 solve(s[part], out[:, :, part])
         return _finite(out, freq)
+
+    return found
+
+
+def remembered(find: Responder) -> Responder:
+    """Return the same function of frequency, which keeps its answer at the first frequencies."""
+    first: list[tuple[FloatArray, ComplexArray]] = []
+
+    def found(freq: FloatArray) -> ComplexArray:
+        if first and np.array_equal(freq, first[0][0]):
+            return first[0][1]
+        data = find(freq)
+        data.flags.writeable = False
+        if not first:
+            first.append((freq, data))
+        return data
 
     return found
 
@@ -311,10 +331,15 @@ def _schur(g: StateSpace) -> Solver:
 
     def add(s: ComplexArray, out: ComplexArray) -> None:
         X = np.broadcast_to(turned[:, :, None], (n, m, s.size)).copy()
-        for i in range(n - 1, -1, -1):
-            if i < n - 1:
-                X[i] += (T[i, i + 1 :] @ X[i + 1 :].reshape(n - 1 - i, -1)).reshape(m, s.size)
-            X[i] /= s - T[i, i]
+        for end in range(n, 0, -ROWS):  # rows below a block go into it by one matrix product
+            block = slice(max(end - ROWS, 0), end)
+            X[block] += (T[block, end:] @ X[end:].reshape(n - end, m * s.size)).reshape(
+                -1, m, s.size
+            )
+            for i in range(end - 1, block.start - 1, -1):
+                known = X[i + 1 : end].reshape(end - 1 - i, m * s.size)
+                X[i] += (T[i, i + 1 : end] @ known).reshape(m, s.size)
+                X[i] /= s - T[i, i]
         out += (seen @ X.reshape(n, -1)).reshape(out.shape)
 
     return add

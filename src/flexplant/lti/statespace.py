@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -141,6 +141,13 @@ class StateSpace(Value):
     def poles(self) -> ComplexArray:
         """Return the eigenvalues of A, block by block where its blocks are known [rad/s or 1]."""
         return self._poles.copy()
+
+    def replace(self, **changes: Any) -> Self:
+        """Return a copy with some fields changed, checked like a new one; known poles go along."""
+        new = super().replace(**changes)
+        if "_poles" in self.__dict__ and not changes.keys() & {"A", "blocks"}:
+            new.__dict__["_poles"] = self._poles
+        return new
 
     @property
     def is_stable(self) -> bool:

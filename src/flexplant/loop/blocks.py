@@ -1,0 +1,137 @@
+"""The blocks of a controller: joined by name, each signal driven once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..lti.interconnection import connect
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+
+
+def joined(
+    plant: StandardPlant, systems: Sequence[StateSpace], driven: list[str], watched: list[str]
+) -> StateSpace:
+    """Return the blocks as one system from y to the driven actuators and what is watched."""
+    heard = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
+    none = np.zeros((0, 0))
+    silent = [name for name in heard if name not in driven]
+    zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
+    # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: signals are
+    # joined in units in which direct gains are at most one, powers of two so that no digit changes
+    units = _units(systems)
+    scaled = [_in_units(sys, units) for sys in systems]
+    joined = connect(
+        [*scaled, zero] if silent else scaled,
+        inputs=plant.y,
+        outputs=[*driven, *watched],
+        adding=driven,
+    )
+    row = np.array([units[name] for name in (*driven, *watched)])[:, None]
+    return joined.replace(C=joined.C * row, D=joined.D * row, dt=plant.dt)
+
+
+def _units(systems: Sequence[StateSpace]) -> dict[str, float]:
+    """Return a size for each output of a block: its largest direct gain from outside."""
+    units = {name: 1.0 for sys in systems for name in sys.outputs}
+    for _ in systems:  # along chains of blocks, which are no longer than there are blocks
+        sizes = dict.fromkeys(units, 0.0)
+        for sys in systems:
+            gains = np.abs(sys.D) * [units.get(name, 1.0) for name in sys.inputs]
+            for name, gain in zip(sys.outputs, gains.max(axis=1, initial=0.0), strict=True):
+                sizes[name] = max(sizes[name], float(gain))
+        units = {n: float(2.0 ** np.ceil(np.log2(s))) if s else 1.0 for n, s in sizes.items()}
+    return units
+
+
+def _in_units(sys: StateSpace, units: dict[str, float]) -> StateSpace:
+    row = np.array([units.get(name, 1.0) for name in sys.outputs])[:, None]
+    column = np.array([units.get(name, 1.0) for name in sys.inputs])
+    return sys.replace(B=sys.B * column, C=sys.C / row, D=sys.D / row * column)
+
+
+def as_block(block: Any, place: int, dt: float) -> StateSpace:
+    """Return a block as a StateSpace of the plant's dt.
+
+    Raises
+    ------
+    ModelError
+        When it is no system, or of another sampling time.
+    """
+    inner = getattr(block, "system", block)
+    if isinstance(block, StandardPlant) or not (
+        isinstance(inner, StateSpace) or hasattr(inner, "input_labels")
+    ):
+        raise ModelError(
+            f"block {place} is a {type(block).__name__}, not a system with named channels. Pass a "
+            "StateSpace with inputs= and outputs=, or a value with such a .system."
+        )
+    sys = inner if isinstance(inner, StateSpace) else StateSpace.from_control(inner)
+    if sys.n_states and not np.isclose(sys.dt, dt, rtol=1e-9, atol=0.0):
+        raise ModelError(
+            f"block {place} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
+            "Design it on plant.discretized(rate), or discretise it at the plant's rate."
+        )
+    return sys.replace(dt=dt)
+
+
+def drives(
+    plant: StandardPlant, systems: Sequence[StateSpace], idle: tuple[str, ...]
+) -> tuple[list[str], list[str]]:
+    """Return the driven actuators and the monitored outputs.
+
+    Raises
+    ------
+    LabelError
+        When a name is driven twice, or an actuator not at all and is not idle.
+    """
+    produced = [name for sys in systems for name in sys.outputs]
+    taken = {name: side for side in "wzy" for name in getattr(plant, side)}
+    for name in produced:
+        if name in taken:
+            raise LabelError(
+                f"a block drives {name!r}, which the plant has in {taken[name]}: the name would be "
+                "driven twice. Rename the block's output: system.renamed(outputs={...})."
+            )
+        if name in idle:
+            raise LabelError(f"actuator {name!r} is driven by a block, so it cannot be idle.")
+        if produced.count(name) > 1 and name not in plant.u:
+            raise LabelError(
+                f"{name!r} is an output of {produced.count(name)} blocks: only outputs to "
+                "actuators add. Rename one: system.renamed(outputs={...})."
+            )
+    for name in plant.u:
+        if name not in produced and name not in idle:
+            error = unknown_label("block output", name, produced)
+            raise LabelError(
+                f"nothing drives actuator {name!r}: {error} Rename the block's output, or pass "
+                f"idle=[{name!r}] if it rests on purpose."
+            )
+    watched = [name for name in produced if name not in plant.u]
+    return [name for name in plant.u if name in produced], watched
+
+
+def check_inputs(plant: StandardPlant, systems: Sequence[StateSpace]) -> None:
+    """Raise LabelError when an input of a block is connected to nothing."""
+    produced = [name for sys in systems for name in sys.outputs]
+    known = [*plant.y, *plant.u, *produced]
+    clash = sorted({*plant.y, *plant.z} & set(plant.u))
+    if clash:
+        raise LabelError(f"{clash} name both an output and an actuator: rename one of them.")
+    for place, sys in enumerate(systems, 1):
+        for name in sys.inputs:
+            if name in known:
+                continue
+            owner = f"what can drive block {place}: plant.y, plant.u and outputs of blocks"
+            error = unknown_label("signal", name, known, owner)
+            hidden = next((side for side in "zw" if name in getattr(plant, side)), None)
+            why = (
+                f" It is in the plant's {hidden}, which no controller can read: estimate it."
+                if hidden
+                else ""
+            )
+            raise LabelError(f"{error}{why}")

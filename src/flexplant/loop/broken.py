@@ -1,0 +1,107 @@
+"""A loop broken between plant and controller: its gain and distance to the critical point."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from ..errors import LabelError
+from ..lti.grid import climbed, resonance_grid
+from ..lti.responses import Responder
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray, short
+
+Side = Literal["u", "y"]
+
+
+@dataclass(frozen=True)
+class BrokenLoop:
+    """A loop taken apart: y = P u, u = K y.
+
+    Parameters
+    ----------
+    u, y : tuple of str
+        The channels between the two.
+    controller, plant : function of frequency [Hz]
+        K (nu, ny, n_freq) and P (ny, nu, n_freq).
+    poles : function
+        Of the closed loop; of the controller when the plant was measured.
+    dt : float [s]
+        Sampling time, 0 when continuous.
+    measured : (n_freq,) array [Hz], optional
+        The frequencies of a measured plant.
+    """
+
+    u: tuple[str, ...]
+    y: tuple[str, ...]
+    controller: Responder
+    plant: Responder
+    poles: Callable[[], ComplexArray]
+    dt: float
+    measured: FloatArray | None = None
+
+    def respond(self, freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+        """Return K (n_freq, nu, ny) and P (n_freq, ny, nu)."""
+        K, P = self.controller(freq), self.plant(freq)
+        return np.ascontiguousarray(K.transpose(2, 0, 1)), np.ascontiguousarray(
+            P.transpose(2, 0, 1)
+        )
+
+    def gain(self, freq: FloatArray, at: Side = "u") -> ComplexArray:
+        """Return K P (broken at u) or P K (at y), frequency first.
+
+        Raises
+        ------
+        LabelError
+            When `at` is neither.
+        """
+        if at not in ("u", "y"):
+            raise LabelError(f"a loop is broken at 'u' or 'y', got {short(at)}. Pass one of them.")
+        K, P = self.respond(freq)
+        return K @ P if at == "u" else P @ K
+
+    @cached_property
+    def grid(self) -> FloatArray:
+        """Frequencies [Hz] through the resonances of the closed loop, or those measured."""
+        if self.measured is not None:
+            return self.measured
+        return resonance_grid(self.poles(), self.dt)
+
+    @property
+    def is_unstable(self) -> bool:
+        """Whether a pole is not strictly inside the stability region; a measured plant has none."""
+        if self.measured is not None:
+            return False
+        poles = self.poles()
+        edge = np.abs(poles) - 1.0 if self.dt else poles.real
+        return bool(np.max(edge, initial=-1.0) >= 0)
+
+    @property
+    def modulus_margin(self) -> float:
+        """``1 / max_f sigma_max(S_u)``, over a grid refined at its peaks; 0 when unstable."""
+        if self.is_unstable:
+            return 0.0
+        rounds = 6 if self.measured is None else 0
+        _, size = climbed(lambda freq: largest(inverted(self.gain(freq))), self.grid, rounds)
+        return 1.0 / float(size.max())
+
+
+def inverted(L: ComplexArray) -> ComplexArray:
+    """Return (I - L)^-1, frequency first."""
+    return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) - L))
+
+
+def largest(S: ComplexArray) -> FloatArray:
+    """Return the largest singular value at each frequency."""
+    return np.asarray(np.linalg.svd(S, compute_uv=False)[:, 0])
+
+
+def moved(plant: StandardPlant, driven: Sequence[str]) -> tuple[str, ...]:
+    """Return the y that can move with some of u: their rows see a state or an actuator."""
+    g = plant.system.select(plant.y, driven)
+    moves = np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1)
+    return tuple(name for name, one in zip(plant.y, moves, strict=True) if one)
