@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -142,13 +142,6 @@ class StateSpace(Value):
         """Return the eigenvalues of A, block by block where its blocks are known [rad/s or 1]."""
         return self._poles.copy()
 
-    def replace(self, **changes: Any) -> Self:
-        """Return a copy with some fields changed, checked like a new one; known poles go along."""
-        new = super().replace(**changes)
-        if "_poles" in self.__dict__ and not changes.keys() & {"A", "blocks"}:
-            new.__dict__["_poles"] = self._poles
-        return new
-
     @property
     def is_stable(self) -> bool:
         """Whether all poles lie strictly inside the stability region."""
@@ -177,13 +170,16 @@ class StateSpace(Value):
         """
         rows = self.output_index(self.outputs if outputs is None else outputs)
         cols = self.input_index(self.inputs if inputs is None else inputs)
-        return self.replace(
+        chosen = self.replace(
             B=self.B[:, cols],
             C=self.C[rows],
             D=self.D[np.ix_(rows, cols)],
             inputs=[self.inputs[i] for i in cols],
             outputs=[self.outputs[i] for i in rows],
         )
+        if "_poles" in self.__dict__:  # they stay
+            chosen.__dict__["_poles"] = self._poles
+        return chosen
 
     def __getitem__(self, key: tuple[str | Sequence[str], str | Sequence[str]]) -> StateSpace:
         """Return the channel `sys["output", "input"]`; lists of names select several."""
