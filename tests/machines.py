@@ -5,7 +5,7 @@ import numpy as np
 from flexplant.lti import StateSpace
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.noise import noise_factor
-from flexplant.plant import StandardPlant
+from flexplant.plant import Foreign, StandardPlant
 
 RATE = 2000.0
 OMEGA = 2 * np.pi * np.array([0.0, 60.0, 150.0, 400.0])
@@ -60,7 +60,7 @@ def stage(*, delay=1.0, rate=RATE, asd=1e-2, sensor_asd=1e-9, stiffer=1.0, block
         tuple(z),
         ("y1", "y2", "die:ref"),
         {"amp": asd, "y1:noise": sensor_asd, "y2:noise": sensor_asd},
-        noise_factor=factor,
+        Foreign(factor),
     )
 
 

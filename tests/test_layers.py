@@ -95,13 +95,6 @@ def test_rooms_import_only_from_rooms_above():
     assert not wrong, "\n".join(wrong)
 
 
-#: circles between modules that are still there: this list only gets shorter
-CIRCLES = [
-    {f"plant.{name}" for name in ("assembly", "check", "moving", "standard",
-        "uncertainty.neglected", "uncertainty.uncertain_plant", "visibility", "weighting")},
-]  # fmt: skip
-
-
 def modules_of(root):
     """Return {dotted name: tree} of the modules under a folder, packages by their own name."""
     found = {}
@@ -165,11 +158,8 @@ def circles(graph):
 
 
 def test_no_circles_between_modules():
-    found = circles(imports_of(modules_of(ROOT)))
-    new = [sorted(circle) for circle in found if not any(circle <= known for known in CIRCLES)]
-    assert not new, f"modules import each other, also inside functions: {new}"
-    gone = [sorted(known) for known in CIRCLES if known not in found]
-    assert not gone, f"these circles are smaller or gone, shorten CIRCLES: {gone}"
+    found = [sorted(circle) for circle in circles(imports_of(modules_of(ROOT)))]
+    assert not found, f"modules import each other, also inside functions: {found}"
 
 
 def test_circles_are_found(tmp_path):

@@ -52,7 +52,7 @@ def stage():
 
 
 def placed(**options):
-    names = [sensor.name for sensor in plant().ports.y]
+    names = [sensor.name for sensor in plant().assembled.ports.y]
     return fx.place_sensors(plant(), options.pop("candidates", names), **({"count": 4} | options))
 
 
@@ -237,15 +237,15 @@ def test_a_plant_where_a_system_is_needed_is_told_which_systems_it_has():
 
 def test_a_system_where_a_plant_is_needed_is_told_what_it_lacks():
     """Its labels tell w, u, z and y; densities, ports and shapes are not in it."""
-    names = [sensor.name for sensor in plant().ports.y]
+    names = [sensor.name for sensor in plant().assembled.ports.y]
     lacking = {
         fx.design_kalman: r"no noise density.*from_statespace\(sys, w=\[.*noise_factor",
-        fx.design_static: r"assembled from a .*structure: assemble_plant\(",
-        lambda s: fx.design_servo(s, bandwidth=50.0): r"assembled from a structure: assemble_plant",
-        lambda s: fx.stage_weights(s, 30.0): r"assembled from a .*structure: assemble_plant\(",
-        lambda s: fx.place_sensors(s, names, 4): r"no structure. Make it by assemble_plant\(",
-        lambda s: fx.score_sensors(s, [names]): r"no structure. Make it by assemble_plant\(",
-        lambda s: fx.sensor_map(s, [(0.3, 0.3, 0.0)], asd=1e-12): r"no structure. Make it by",
+        fx.design_static: r"assembled from a structure.*assemble_plant\(",
+        lambda s: fx.design_servo(s, bandwidth=50.0): r"assembled from a structure.*assemble_plant",
+        lambda s: fx.stage_weights(s, 30.0): r"assembled from a structure.*assemble_plant\(",
+        lambda s: fx.place_sensors(s, names, 4): r"from a structure.* Make it by assemble_plant\(",
+        lambda s: fx.score_sensors(s, [names]): r"from a structure.* Make it by assemble_plant\(",
+        lambda s: fx.sensor_map(s, [(0.3, 0.3, 0.0)], asd=1e-12): r"from a structure.* Make it by",
     }
     for sys in (plant().system, plant().system.to_control()):
         for function, words in lacking.items():

@@ -99,6 +99,7 @@ def made():
     yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)
     yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)
     yield from (plants.GroundSpring(Z8, 1e3), plants.decouple(plant), plants.FastStates())
+    yield plants.StandardPlant.from_statespace(plant.system)
     yield from (plants.Feedthrough(), plants.OutputDisturbance("hum", "y1", asd=1e-12))
     yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
     yield structure.interpolated(modes.dofs).interpolation
@@ -248,10 +249,10 @@ def test_files_of_other_versions(tmp_path, monkeypatch):
     plant = zoo()["StandardPlant"]
     kept = plant._fields()
     monkeypatch.setattr(type(plant), "_fields", lambda self: {
-        name: part for name, part in kept.items() if name != "unweighted"
+        name: part for name, part in kept.items() if name != "origin"
     })  # fmt: skip
     plant.save(tmp_path / "old")
-    assert load(tmp_path / "old").unweighted is None
+    assert load(tmp_path / "old").origin.structure is None
     monkeypatch.setattr(type(plant), "_fields", lambda self: {
         name: part for name, part in kept.items() if name != "system"
     })  # fmt: skip

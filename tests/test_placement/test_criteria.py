@@ -47,15 +47,15 @@ def test_a_factor_scales_a_rotation(make):
 
 def test_refusals_name_the_motion(make):
     plant, sensors, actuators = make(1)
-    blind = plant.with_ports(plant.ports.replace(y=sensors[:2]))
+    blind = plant.with_ports(plant.assembled.ports.replace(y=sensors[:2]))
     with pytest.raises(AssumptionError, match="y does not see the rigid-body"):
         PoiVariance("die")(blind)
-    weak = plant.with_ports(plant.ports.replace(u=actuators[:2]))
+    weak = plant.with_ports(plant.assembled.ports.replace(u=actuators[:2]))
     with pytest.raises(AssumptionError, match="u does not reach the rigid-body"):
         PoiLqr("die")(weak)
     with pytest.raises(AssumptionError, match=r"z does not see the rigid-body.*rotation"):
         PoiLqr("die", "z")(plant)
-    still = plant.with_ports(plant.ports.replace(w=plant.ports.w[:2]))
+    still = plant.with_ports(plant.assembled.ports.replace(w=plant.assembled.ports.w[:2]))
     for criterion in (PoiVariance("die"), PoiLqr("die")):
         with pytest.raises(AssumptionError, match="w does not excite the rigid-body"):
             criterion(still)

@@ -44,7 +44,7 @@ class Precision(Criterion):
     sides = "y"
 
     def __call__(self, plant):
-        return -sum(worth(sensor) for sensor in plant.ports.y)
+        return -sum(worth(sensor) for sensor in plant.assembled.ports.y)
 
     def scorer(self, plant, candidates):
         return Additive([worth(sensor) for sensor in candidates])

@@ -30,7 +30,7 @@ def names_count(plant):
 
 
 def first_place(plant):
-    return float(plant.ports.y[0].at[0])
+    return float(plant.assembled.ports.y[0].at[0])
 
 
 @pytest.mark.parametrize("seed", [4, 5])
@@ -40,7 +40,7 @@ def test_sensor_scores_are_those_of_the_recursion(make, seed):
     scores = score_sensors(plant, layouts, PoiVariance("die", {"z": 1.0, "rx": 0.1}))
     n = 16
     for rank, given in enumerate(scores.order):
-        sampled = plant.with_ports(plant.ports.replace(y=layouts[given]))
+        sampled = plant.with_ports(plant.assembled.ports.replace(y=layouts[given]))
         rows = sampled.C1[:2, :n] * np.array([1.0, 0.1])[:, None]
         expected = kalman_variance(
             sampled.system.A[:n, :n],
@@ -62,7 +62,7 @@ def test_actuator_scores_are_those_of_the_recursion(make, delay):
     layouts = [actuators[:3], actuators[3:8]]
     scores = score_actuators(plant, layouts, PoiLqr("die", {"z": 1, "rx": 0.2, "ry": 0.1}))
     for rank, given in enumerate(scores.order):
-        sampled = plant.with_ports(plant.ports.replace(u=layouts[given]))
+        sampled = plant.with_ports(plant.assembled.ports.replace(u=layouts[given]))
         rows = sampled.C1[:3] * np.array([1.0, 0.2, 0.1])[:, None]
         expected = lqr_cost(sampled.system.A, sampled.B2, sampled.process_noise, rows, 1e-9)
         assert scores.values[rank] == pytest.approx(expected, rel=1e-7, abs=0.0)
@@ -72,7 +72,8 @@ def test_velocity_sensors_count_too(make):
     plant, sensors, _ = make(4)
     moving = Sensor("v", at=sensors[5].at, quantity="velocity", asd=1e-9)
     scores = score_sensors(plant, [[*sensors[:3], moving], sensors[:3], [moving, *sensors[:2]]])
-    direct = PoiVariance()(plant.with_ports(plant.ports.replace(y=[*sensors[:3], moving])))
+    ports = plant.assembled.ports.replace(y=[*sensors[:3], moving])
+    direct = PoiVariance()(plant.with_ports(ports))
     assert scores.values[0] == pytest.approx(direct, rel=1e-9, abs=0.0)
     assert scores.best == ("s0", "s1", "s2", "v")
     assert scores.values[1] > 1.0001 * scores.values[0]
@@ -117,7 +118,7 @@ def test_names_stand_for_sensors(make):
     assert by_name.values[0] == by_value.values[0]
     scores = score_sensors(plant, [("s0", "s4", "s5")], candidates=sensors)
     assert scores.best == ("s0", "s4", "s5")
-    assert [s.name for s in scores.on(plant).ports.y] == ["s0", "s4", "s5"]
+    assert [s.name for s in scores.on(plant).assembled.ports.y] == ["s0", "s4", "s5"]
     assert PoiVariance()(scores.on(plant)) == pytest.approx(scores.values[0], rel=1e-9, abs=0.0)
 
 
@@ -130,7 +131,7 @@ def test_ports_with_filters_take_the_slow_way(make):
     assert not isinstance(layouts_of(plant, "y", slow, PoiVariance()).scorer, Quadratic)
     assert isinstance(layouts_of(plant, "y", sensors[:3], PoiVariance()).scorer, Quadratic)
     value = score_sensors(plant, [slow]).values[0]
-    direct = PoiVariance()(plant.with_ports(plant.ports.replace(y=slow)))
+    direct = PoiVariance()(plant.with_ports(plant.assembled.ports.replace(y=slow)))
     assert value == direct
 
 
@@ -228,10 +229,10 @@ def test_bad_input(make):
         score_sensors(plant.weighted(z={"die:z": 2.0}), [sensors[:3]])
     with pytest.raises(ModelError, match="need a StandardPlant"):
         score_sensors("plant", [sensors[:3]])
-    with pytest.raises(ModelError, match="no structure"):
+    with pytest.raises(ModelError, match="not assembled from a structure"):
         score_sensors(plant.system, [sensors[:3]])
     bare = StandardPlant.from_statespace(plant.system, w=plant.w, u=plant.u, z=plant.z, y=plant.y)
-    with pytest.raises(ModelError, match="no structure"):
+    with pytest.raises(ModelError, match="not assembled from a structure"):
         score_sensors(bare, [sensors[:3]])
 
 
@@ -243,6 +244,6 @@ def test_candidates_that_fit_no_filter_are_refused(make):
     shaken = Sensor("acc", at=sensors[0].at, quantity="acceleration", asd=1e-6)
     with pytest.raises(AssumptionError, match=r"reaches 'acc'"):
         score_sensors(plant, [[*sensors[:3], shaken]])
-    still = plant.with_ports(plant.ports.replace(w=plant.ports.w[:2]))
+    still = plant.with_ports(plant.assembled.ports.replace(w=plant.assembled.ports.w[:2]))
     with pytest.raises(AssumptionError, match="w does not excite"):
         score_sensors(still, [sensors[:3]])

@@ -106,7 +106,7 @@ def test_a_plain_callable(make):
     plant, sensors, _ = make(11)
 
     def to_the_left(sampled):
-        return sum(sensor.at[0] for sensor in sampled.ports.y)
+        return sum(sensor.at[0] for sensor in sampled.assembled.ports.y)
 
     found = place_sensors(plant, sensors, 3, to_the_left, method=Exchange(starts=2), rng=0)
     proven = place_sensors(plant, sensors, 3, to_the_left, method=Exhaustive())
@@ -182,7 +182,7 @@ def test_seeds_repeat(make):
 
 def test_placements_are_saved(make, tmp_path):
     plant, sensors, _ = make(12)
-    found = place_sensors(plant, sensors, 4, lambda p: float(p.ports.y[0].at[0]), rng=3)
+    found = place_sensors(plant, sensors, 4, lambda p: float(p.assembled.ports.y[0].at[0]), rng=3)
     found.save(tmp_path / "best.npz")
     again = load(tmp_path / "best.npz")
     assert repr(again) == repr(found)

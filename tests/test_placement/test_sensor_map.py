@@ -16,8 +16,8 @@ def test_every_point_is_the_plant_with_one_more_sensor(make, tmp_path):
     plant, _, _ = make(21)
     found = sensor_map(plant, GRID, PoiVariance("die"), asd=2e-11)
     for point, value in zip(GRID, found.values, strict=True):
-        more = [*plant.ports.y, Sensor("more", at=point, asd=2e-11)]
-        direct = PoiVariance("die")(plant.with_ports(plant.ports.replace(y=more)))
+        more = [*plant.assembled.ports.y, Sensor("more", at=point, asd=2e-11)]
+        direct = PoiVariance("die")(plant.with_ports(plant.assembled.ports.replace(y=more)))
         assert value == pytest.approx(direct, rel=1e-9, abs=0.0)
     assert found.without == pytest.approx(PoiVariance("die")(plant), rel=1e-9, abs=0.0)
     assert np.all(found.ratio < 1)
@@ -29,7 +29,7 @@ def test_every_point_is_the_plant_with_one_more_sensor(make, tmp_path):
 
 def test_a_plant_whose_sensors_do_not_suffice(make):
     plant, sensors, _ = make(21)
-    two = plant.with_ports(plant.ports.replace(y=sensors[:2]))
+    two = plant.with_ports(plant.assembled.ports.replace(y=sensors[:2]))
     (x1, y1, _), (x2, y2, _) = (sensor.at for sensor in sensors[:2])
     between = (0.5 * (x1 + x2), 0.5 * (y1 + y2), 0.0)
     found = sensor_map(two, [between, GRID[0], GRID[8]], asd=1e-11)
@@ -64,7 +64,7 @@ def test_no_sensor_is_tried_where_none_can_be(make, tmp_path):
 def test_names_do_not_collide(make):
     plant, sensors, _ = make(21)
     taken = [s.replace(name=f"extra{i}") for i, s in enumerate(sensors[:3])]
-    other = plant.with_ports(plant.ports.replace(y=taken))
+    other = plant.with_ports(plant.assembled.ports.replace(y=taken))
     assert sensor_map(other, GRID[:2], asd=1e-11).values == pytest.approx(
         sensor_map(plant, GRID[:2], asd=1e-11).values, rel=1e-12, abs=0.0
     )
@@ -82,6 +82,6 @@ def test_bad_input(make):
         sensor_map(plant, GRID, asd=0.0)
     with pytest.raises(ModelError, match="continuous"):
         sensor_map(plant.continuous, GRID, asd=1e-11)
-    one = plant.with_ports(plant.ports.replace(y=sensors[:1]))
+    one = plant.with_ports(plant.assembled.ports.replace(y=sensors[:1]))
     with pytest.raises(AssumptionError, match="rigid-body"):
         sensor_map(one, GRID[:1], asd=1e-11)

@@ -38,9 +38,10 @@ def test_a_filtered_candidate_is_scored_by_its_own_filter(filtered):
     slow = fx.Sensor("slow", at=(0.3, 0.3, 0.0), asd=NOISE, dynamics=fx.lowpass(50.0))
     fast = fx.Sensor("fast", at=(0.3, 0.3, 0.0), asd=NOISE)
     layouts = [["y1", "y2", "y3", name] for name in ("fast", "slow")]
-    scores = fx.score_sensors(filtered, layouts, candidates=[*filtered.ports.y, slow, fast])
+    own = filtered.assembled.ports
+    scores = fx.score_sensors(filtered, layouts, candidates=[*own.y, slow, fast])
     value = dict(zip(scores.layouts, scores.values, strict=True))
-    rebuilt = filtered.with_ports(filtered.ports.replace(y=[*filtered.ports.y[:3], slow]))
+    rebuilt = filtered.with_ports(own.replace(y=[*own.y[:3], slow]))
     truth = fx.design_kalman(rebuilt).rms("die") ** 2
     assert value["y1", "y2", "y3", "slow"] == pytest.approx(truth, rel=1e-6, abs=0.0)
     assert value["y1", "y2", "y3", "fast"] < value["y1", "y2", "y3", "slow"]
@@ -49,9 +50,9 @@ def test_a_filtered_candidate_is_scored_by_its_own_filter(filtered):
 def test_disturbances_that_are_no_forces_at_a_place_can_be_placed_against():
     noisy = [*ports().w, fx.BaseAcceleration("floor", direction="z", asd=1e-6)]
     plant = fx.assemble_plant(some_modes(), ports(w=noisy)).discretized(RATE, delay=1)
-    found = fx.place_sensors(plant, plant.ports.y, count=3)
+    found = fx.place_sensors(plant, plant.assembled.ports.y, count=3)
     assert len(found.chosen) == 3
-    rebuilt = plant.with_ports(plant.ports.replace(y=found.ports))
+    rebuilt = plant.with_ports(plant.assembled.ports.replace(y=found.ports))
     truth = fx.design_kalman(rebuilt).rms("die") ** 2
     assert found.value == pytest.approx(truth, rel=1e-6, abs=0.0)
 

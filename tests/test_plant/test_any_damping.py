@@ -178,7 +178,7 @@ def test_noise_of_a_sample_is_exact_and_a_covariance(case):
     # oracle: the integral in 200 pieces, expm of M, D, K
     expected = oracle.sample_covariance(*chain(case), np.eye(4)[1], 1e-2, 1 / RATE)
     plant = plant_of(case).discretized(RATE)
-    realisation = plant.realisation
+    realisation = plant.assembled.realisation
     see = np.vstack([realisation.motion(np.eye(4), 0), realisation.motion(np.eye(4), 1)])
     G = see @ plant.noise_factor[plant.modal_states]
     found = G @ G.T
@@ -273,9 +273,10 @@ def test_the_form_is_said(case, says):
     given = model_of(*chain(case))
     if dense:
         with pytest.warns(FlexplantWarning, match=r"not in modal blocks but dense.*plant\.form"):
-            shared = assemble_plant(given, channels()).realisation
+            shared = assemble_plant(given, channels()).assembled.realisation
     else:
-        shared = assemble_plant(given, channels()).realisation  # a warning would be an error here
+        # a warning would be an error here
+        shared = assemble_plant(given, channels()).assembled.realisation
     # what was said once is not said again by plants of the same modes
     assert assemble_plant(shared, channels()).form == plant.form
     assert plant.at({"p": "1:z"}).form == plant.form
@@ -285,7 +286,7 @@ def test_a_proportional_pair_stays_a_block_however_damped():
     plant = plant_of("held proportional")
     assert tuple(plant.system.blocks) == (2, 2, 2, 2)
     assert np.count_nonzero(plant.system.poles().imag) == 4
-    assert plant.realisation.coupling is None
+    assert plant.assembled.realisation.coupling is None
     found = [mode.zeta for mode in plant.check().modes]
     np.testing.assert_allclose(found, [2.0, 1.0, 0.7, 1e-3], rtol=1e-8)
     assert all(0 < mode.shares["u"] <= 1 for mode in plant.check().modes)
@@ -420,7 +421,7 @@ def test_a_plate_that_is_dragged_is_still_a_stage():
     model = stuck_plate()
     freq = np.array([40.0, 246.0, 700.0])
     see = model.row((0.2, 0.4, 0.0))[None]
-    push = np.array([model.row(port.at) for port in plant.ports.u])
+    push = np.array([model.row(port.at) for port in plant.assembled.ports.u])
     gain = frequency_response(moved.system.select(["die:z"], plant.u), freq).data
     exact = receptance(model.M, model.D, model.K, see, push, 2 * np.pi * freq)
     np.testing.assert_allclose(gain, exact, rtol=1e-6)
@@ -465,8 +466,8 @@ def test_a_free_plate_of_all_dofs_on_a_strong_damper():
     freq = np.array([5.0, 245.7, 1500.0])
     M, D, K = machine(0.001)
     damped = D + 5e4 * np.outer(z_row(*Z8[:2]), z_row(*Z8[:2]))
-    push = np.array([z_row(x, y) for x, y, _ in [port.at for port in plant.ports.u]])
-    see = np.array([z_row(x, y) for x, y, _ in [port.at for port in plant.ports.y]])
+    push = np.array([z_row(x, y) for x, y, _ in [port.at for port in plant.assembled.ports.u]])
+    see = np.array([z_row(x, y) for x, y, _ in [port.at for port in plant.assembled.ports.y]])
     gain = frequency_response(plant.system.select(plant.y[:4], plant.u), freq).data
     np.testing.assert_allclose(
         gain, receptance(M, damped, K, see, push, 2 * np.pi * freq), rtol=1e-5

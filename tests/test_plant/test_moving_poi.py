@@ -93,7 +93,7 @@ def test_moving_an_actuator_changes_one_column_of_b():
     )
     # reciprocity: force at the POI's place is the POI's row
     spot = plant.at({"u2": (L / 2, L / 2, 0.0)}).system
-    first = plant.realisation.pairs[:, 0, 1]
+    first = plant.modal_blocks[:, 0, 1]
     np.testing.assert_allclose(
         spot.B[1::2, column], spot.C[0, 0::2] * first, rtol=1e-12, atol=1e-15
     )
@@ -102,10 +102,10 @@ def test_moving_an_actuator_changes_one_column_of_b():
 def test_several_ports_move_at_once():
     plant = assemble_plant(some_modes(), ports())
     moved = plant.at({"die": OFF_NODE, "y1": Z8, "amp1": OFF_NODE})
-    assert moved.ports.poi("die").at == OFF_NODE
-    assert moved.ports.sensor("y1").at == Z8
-    assert moved.ports.w[0].at == OFF_NODE
-    assert plant.ports.sensor("y1").at != Z8
+    assert moved.assembled.ports.poi("die").at == OFF_NODE
+    assert moved.assembled.ports.sensor("y1").at == Z8
+    assert moved.assembled.ports.w[0].at == OFF_NODE
+    assert plant.assembled.ports.sensor("y1").at != Z8
 
 
 def test_refusals():

@@ -126,7 +126,7 @@ def test_the_matrix_is_block_triangular_with_exact_rigid_poles():
     assert g.states[:2] == ("y1|x1", "y1|x2")
     assert g.states[-1] == "u1|x1"
     assert g.blocks == (2, 2, 2, 2, 2, 2, 2, 1)
-    assert [g.states[i] for i in plant.modal_states] == list(plant.realisation.names)
+    assert [g.states[i] for i in plant.modal_states] == list(plant.assembled.realisation.names)
     rigid = plant.modal_states[:2]
     assert not g.poles()[rigid].any()
     sampled = plant.discretized(5e3, delay=0.4)
@@ -185,7 +185,8 @@ def test_an_acceleration_keeps_its_direct_part_through_delays():
 
 
 def test_one_delay_for_all_is_that_of_discretized():
-    g = assemble_plant(model(), channels(u=[Actuator("u1", at="1:x")], w=[], y=[])).physical
+    plant = assemble_plant(model(), channels(u=[Actuator("u1", at="1:x")], w=[], y=[]))
+    g = plant.assembled.physical
     for delay in (0.0, 1.0, 0.25, 2.75):
         wanted = discretized(g, 5e3, delay=delay, delayed=["u1"])
         pairs = g.A.reshape(5, 2, 5, 2)[np.arange(5), :, np.arange(5)]
@@ -202,7 +203,7 @@ def test_one_delay_for_all_is_that_of_discretized():
 
 
 def test_the_flow_is_the_dense_exponential():
-    g = assemble_plant(model(), channels()).physical
+    g = assemble_plant(model(), channels()).assembled.physical
     pairs = g.A[2:12, 2:12].reshape(5, 2, 5, 2)[np.arange(5), :, np.arange(5)]
     for scale in (1.0, 1e7):  # units of the inputs' filters: N or 0.1 uN
         A = g.A.copy()

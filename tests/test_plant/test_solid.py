@@ -46,10 +46,10 @@ def test_modes_of_the_block():
 def test_all_assumptions_hold_and_one_sensor_less_is_named():
     plant = found()["plant"]
     assert found()["report"].ok
-    fewer = plant.with_ports(plant.ports.replace(y=plant.ports.y[:-1]))
+    fewer = plant.with_ports(plant.assembled.ports.replace(y=plant.assembled.ports.y[:-1]))
     assert not fewer.check()["detectable"].holds
     assert "translation y" in fewer.check()["detectable"].finding
-    fewer = plant.with_ports(plant.ports.replace(u=plant.ports.u[:-1]))
+    fewer = plant.with_ports(plant.assembled.ports.replace(u=plant.assembled.ports.u[:-1]))
     assert not fewer.check()["stabilisable"].holds
 
 

@@ -110,8 +110,8 @@ def test_moving_the_poi_changes_rows_of_c_alone(plant):
         ]  # die:z, rx, ry and the error
         if base.dt:
             np.testing.assert_array_equal(moved.process_noise, base.process_noise)
-        assert moved.ports.poi("die").at == OFF_NODE
-        assert base.ports.poi("die").at == (L / 2, L / 2, 0.0)
+        assert moved.assembled.ports.poi("die").at == OFF_NODE
+        assert base.assembled.ports.poi("die").at == (L / 2, L / 2, 0.0)
 
 
 def test_moving_one_of_several():
@@ -135,7 +135,7 @@ def test_moving_off_the_plate_is_refused(plant):
         plant.at((0.61, 0.3, 0.0))
     with pytest.raises(ModelError, match="NaN"):
         plant.at((np.nan, 0.3, 0.0))
-    with pytest.raises(ModelError, match="no ports"):
+    with pytest.raises(ModelError, match="not assembled from a structure"):
         StandardPlant.from_statespace(elsewhere(), u=["force"], y=["seen"]).at(Z8)
 
 
@@ -147,7 +147,7 @@ def test_other_ports_on_the_same_modes():
     for name in "ABCD":
         np.testing.assert_array_equal(getattr(again.system, name), getattr(fresh.system, name))
     np.testing.assert_array_equal(again.process_noise, fresh.process_noise)
-    assert again.realisation is base.realisation
+    assert again.assembled.realisation is base.assembled.realisation
     assert again.y == ("s", "die:ref")
     weighted = base.weighted(z={"die:z": 2.0})
     with pytest.raises(ModelError, match=r"not weighted.*unweighted"):
@@ -272,3 +272,55 @@ def test_other_kinds_are_refused_at_the_door(plant):
     for call, words in doors:
         with pytest.raises(FlexplantError, match=words):
             call()
+
+
+class TestWhereItCameFrom:
+    """`assembled` for a plant of a structure, weighted or not; a clear error for others."""
+
+    def test_assembled(self):
+        plant = assemble_plant(some_modes(), ports())
+        fast = plant.discretized(1e4, delay=1.5)
+        assert fast.assembled.continuous is plant
+        assert fast.continuous is plant
+        assert plant.continuous is plant
+        assert fast.delay == fast.assembled.delay == 1.5
+        assert plant.unweighted is plant
+        assert plant.is_assembled
+        assert not plant.is_weighted
+        factor = fast.assembled.noise_factor
+        np.testing.assert_array_equal(fast.process_noise, factor @ factor.T)
+
+    def test_weighted(self):
+        plant = assemble_plant(some_modes(), ports()).discretized(1e4, delay=1.5)
+        heavy = plant.weighted(z={"die:z": 2.0}).weighted(w={plant.w[0]: 3.0})
+        assert heavy.is_weighted
+        assert heavy.unweighted is plant
+        assert heavy.assembled is plant.assembled
+        assert heavy.delay == 1.5
+        assert heavy.continuous is heavy
+        with pytest.raises(ModelError, match="process noise"):
+            _ = heavy.process_noise
+
+    def test_elsewhere(self):
+        plant = assemble_plant(some_modes(), ports())
+        bare = StandardPlant.from_statespace(plant.system)
+        for foreign in (bare, bare.discretized(1e4, delay=1), bare.weighted(z={"die:z": 2.0})):
+            assert not foreign.is_assembled
+            assert not foreign.modal_blocks.size
+            with pytest.raises(ModelError, match=r"not assembled.*Make it by assemble_plant"):
+                _ = foreign.assembled
+        assert bare.discretized(1e4, delay=1).delay == 1
+        assert bare.discretized(1e4).continuous is bare
+
+    def test_noise_known_elsewhere(self):
+        """A plant that was exported and read again, with its noise: the same Kalman filter."""
+        plant = assemble_plant(some_modes(), ports()).discretized(1e4, delay=1)
+        again = StandardPlant.from_statespace(
+            plant.system, asd=plant.asd, noise_factor=plant.noise_factor
+        )
+        np.testing.assert_allclose(again.process_noise, plant.process_noise, rtol=1e-12, atol=0.0)
+
+    def test_check_is_made_once(self):
+        plant = assemble_plant(some_modes(), ports())
+        assert plant.check() is plant.check()
+        assert plant.check().assumptions is plant.check().assumptions

@@ -234,7 +234,7 @@ def test_macneal_leaves_out_the_residual_mass(plate, matrices):
     # the plant answers so too, with a feedthrough
     plant = assemble_plant(model, ports())
     see = model.row("1:z")
-    inner = plant.realisation
+    inner = plant.assembled.realisation
     assert see @ model.condensed()[2] @ see == pytest.approx(
         inner.at_once(see[None], see[None])[0, 0]
     )

@@ -19,7 +19,7 @@ from flexplant.errors import (
 )
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace
-from flexplant.plant import StandardPlant
+from flexplant.plant import Foreign, StandardPlant, Weighted
 from flexplant.simulation import setpoint, simulate
 from flexplant.simulation import simulate as simulate_function
 from machines import RATE, block, matrices, observer, servo, stage
@@ -150,7 +150,7 @@ def test_linear_in_noise_and_reference(factor, seed):
     plant = stage(blocks=True)
     loud = plant.replace(
         asd={name: factor * level for name, level in plant.asd.items()},
-        noise_factor=factor * plant.noise_factor,
+        origin=Foreign(factor * plant.noise_factor),
     )
     ramp = np.linspace(0, 1e-6, 100)
     options = {"duration": 100 / RATE, "rng": seed}
@@ -198,7 +198,7 @@ def test_big_machine_is_fast():
     )
     plant = StandardPlant(
         g, ("w",), ("u1", "u2", "u3", "u4"), ("z",), ("y1", "y2", "y3", "y4"), {"w": 1.0},
-        noise_factor=rng.standard_normal((2 * pairs, 60)),
+        Foreign(rng.standard_normal((2 * pairs, 60))),
     )  # fmt: skip
     law = StateSpace(
         0.5 * np.eye(60), 1e-3 * rng.standard_normal((60, 4)), 1e-3 * rng.standard_normal((4, 60)),
@@ -279,7 +279,7 @@ def test_assumptions_are_checked(loop):
     with pytest.raises(ModelError, match="process noise"):
         simulate(close_loop(unknown, gain), duration=1.0)
     assert simulate(close_loop(unknown, gain), duration=1.0, noise=False).rms("z") == 0.0
-    weighted = loop.plant.replace(unweighted=loop.plant)
+    weighted = loop.plant.replace(origin=Weighted(loop.plant))
     with pytest.raises(AssumptionError, match="unweighted"):
         simulate(close_loop(weighted, *loop.blocks), duration=1.0)
 

@@ -25,7 +25,7 @@ def checked_plant(given: StandardPlant | System) -> StandardPlant:
         When it has no POI or no sensor.
     """
     plant = standard_plant(given)
-    if plant.unweighted is not None:
+    if plant.is_weighted:
         raise ModelError(
             "the plant is weighted: an estimator is of physical channels. Use plant.unweighted."
         )
@@ -55,8 +55,7 @@ def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant
     ModelError
         When it is no plant, or has further POIs.
     """
-    other = standard_plant(on)
-    other = other.unweighted or other
+    other = standard_plant(on).unweighted
     for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
         for name in names:
             if name not in getattr(other, side):

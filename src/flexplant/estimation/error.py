@@ -63,10 +63,10 @@ def error_variances(
     SolverError
         When the error is not stable.
     """
-    if plant.noise_factor is None or not np.isclose(plant.dt, observer.dt, rtol=1e-9, atol=0.0):
+    if not np.isclose(plant.dt, observer.dt, rtol=1e-9, atol=0.0):
         raise ModelError(
-            "the error of an observer needs a plant of its sampling time "
-            f"({observer.dt:g} s, got {plant.dt:g} s) that was assembled and sampled."
+            "the error of an observer needs a plant of its sampling time, "
+            f"{observer.dt:g} s, got {plant.dt:g} s."
         )
     joint = _joint(plant, observer, suspension)
     if joint.modal is None:
@@ -92,7 +92,6 @@ class _Joint(NamedTuple):
 
 def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | None) -> _Joint:
     g, factor = plant.system, plant.noise_factor
-    assert factor is not None  # noqa: S101  # error_variances has refused it
     read = [name for name in observer.inputs if name in plant.y and name not in plant.w]
     observer = observer.select(observer.outputs, read)
     C1, C2 = g.C[g.output_index(poi_channels(plant))], g.C[g.output_index(read)]
@@ -123,9 +122,8 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
 def _parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
     """Return the states of modes on the unit circle, and all others that noise reaches."""
     g, factor = plant.system, plant.noise_factor
-    assert factor is not None  # noqa: S101
     kept = np.zeros(0, dtype=np.int64)
-    if plant.realisation is not None:
+    if plant.is_assembled:
         states = plant.modal_states.reshape(-1, 2)
         blocks = g.A[states[:, :, None], states[:, None, :]]
         undamped = np.abs(np.linalg.eigvals(blocks)).max(axis=1) >= _ON_CIRCLE

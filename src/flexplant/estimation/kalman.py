@@ -18,7 +18,6 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
-from ..plant.channel_sides import TYPE_THIS
 from ..plant.channel_units import plant_units
 from ..plant.realisation import Structure
 from ..values import FloatArray, Value, real_array
@@ -231,13 +230,6 @@ def design_kalman(
         raise AssumptionError(
             "the plant is continuous, this filter runs at samples: use "
             "plant.discretized(rate, delay=1)."
-        )
-    if plant.noise_factor is None:
-        raise ModelError(
-            "labels carry no noise density: a Kalman filter needs the process noise of each sample "
-            "and the sensors' asd. Use assemble_plant(model, ports).discretized(rate), or type "
-            f"{TYPE_THIS}.replace(noise_factor=G), G G' the covariance that w adds to x in one "
-            "sample."
         )
     _check_noises(plant)
     plant.check().require(("excited", "detectable"), "a stationary Kalman filter")

@@ -10,10 +10,10 @@ import numpy as np
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..plant.assembly import with_flexibility
 from ..plant.dynamics import structure_system
 from ..plant.ports import Ports, filter_of
 from ..plant.realisation import ModalRealisation
+from ..plant.rebuilding import with_flexibility
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..values import ComplexArray, FloatArray, IntArray, Value
@@ -81,13 +81,9 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
         When one is not assembled from a structure, the larger one has fewer modes, or a mode left
         out has no damping.
     """
-    small, big, ports = plant.realisation, larger.realisation, plant.ports
-    if small is None or big is None or ports is None or larger.ports is None:
-        raise ModelError(
-            "modes left out are counted between plants that were assembled from structures: use "
-            "assemble_plant(model, ports), and pass larger= as Modes or a model."
-        )
-    kept, all_modes = _blocks(small, ports), _blocks(big, larger.ports)
+    own, others_own = plant.assembled, larger.assembled
+    small, big, ports = own.realisation, others_own.realisation, own.ports
+    kept, all_modes = _blocks(small, ports), _blocks(big, others_own.ports)
     kept_omega, kept_static = kept.omega, kept.static
     genuine = np.setdiff1d(np.arange(kept_omega.size), _of_vectors(small))
     if genuine.size > all_modes.omega.size:
@@ -105,7 +101,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     # an acceleration has no static part: what modes answer at once they take back at rest
     moving = [i for i, sensor in enumerate(ports.y) if sensor.quantity == "acceleration"]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
-    covariance = _covariance(all_modes, others, larger.ports)
+    covariance = _covariance(all_modes, others, others_own.ports)
     nz = covariance.shape[0] - len(ports.y)
     return LeftOut(
         others + big.n_rigid + 1,
@@ -237,4 +233,4 @@ def _quiet(fresh: StandardPlant, plant: StandardPlant, stand_ins: IntArray) -> S
     factor = np.array(plant.noise_factor)
     elastic = plant.modal_states[2 * plant.n_rigid :].reshape(-1, 2)
     factor[elastic[stand_ins].reshape(-1)] = 0.0
-    return fresh.replace(noise_factor=factor)
+    return fresh.replace(origin=fresh.assembled.replace(noise_factor=factor))

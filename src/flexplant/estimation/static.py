@@ -10,7 +10,7 @@ from ..errors import AssumptionError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..plant.rigid.rigid_motion import carried_of, seen, structure_of
+from ..plant.rigid.rigid_motion import carried_of, seen
 from ..values import FloatArray, Value
 from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .error import error_variances
@@ -79,12 +79,7 @@ class StaticEstimator(Value):
         plant = self.larger or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
-        elif plant.noise_factor is None:
-            raise AssumptionError(
-                "the rms needs the process noise of a plant that was assembled and sampled: "
-                "assemble_plant(model, ports).discretized(rate)."
-            )
-        held = carried_of(plant) if plant.realisation is not None else None
+        held = carried_of(plant) if plant.is_assembled else None
         found = error_variances(plant, self.system, None if held is None else held.modes)
         return float(np.sqrt(found.values[row]))
 
@@ -124,7 +119,7 @@ def design_static(
     The paper, section 5: "the static geometric relation".
     """
     plant = checked_plant(plant)
-    ports = structure_of(plant)[1]
+    ports = plant.assembled.ports
     motions = carried_of(plant)
     kinds = {s.name: s.quantity for s in ports.y}
     used = [name for name in sensors(plant) if kinds.get(name) == "displacement"]

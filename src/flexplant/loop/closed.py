@@ -378,7 +378,7 @@ def _completed(plant: StandardPlant, larger: Any) -> StandardPlant | None:
     ModelError
         When the plant is seen through a block, which the larger one is not.
     """
-    if plant.unweighted is None:
+    if not plant.is_weighted:
         return larger_plant(plant, larger)
     if larger is not None:
         raise ModelError(

@@ -217,8 +217,10 @@ def _controller(law: Any) -> StateSpace:
 
 def _quantities(law: Any) -> dict[str, str]:
     """Return what the sensors measure that a controller was designed for, as far as it knows."""
-    ports = getattr(getattr(law, "plant", None), "ports", None)
-    return {} if ports is None else {sensor.name: sensor.quantity for sensor in ports.y}
+    plant = getattr(law, "plant", None)
+    if not isinstance(plant, StandardPlant) or not plant.is_assembled:
+        return {}
+    return {sensor.name: sensor.quantity for sensor in plant.assembled.ports.y}
 
 
 def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) -> BrokenLoop:

@@ -6,8 +6,7 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, TypeAlias
 
 from ..errors import LabelError, ModelError, unknown_label
-from ..plant import Actuator, Ports, Sensor, StandardPlant, standard_plant
-from ..plant.realisation import ModalRealisation
+from ..plant import Actuator, Sensor, StandardPlant, standard_plant
 from ..values import short
 
 Port: TypeAlias = "Sensor | Actuator"
@@ -16,27 +15,11 @@ Side: TypeAlias = Literal["y", "u"]
 KIND: dict[str, type[Any]] = {"y": Sensor, "u": Actuator}
 
 
-def structure_of(plant: StandardPlant) -> tuple[Ports, ModalRealisation]:
-    """Return the ports and the modal realisation of a plant.
-
-    Raises
-    ------
-    ModelError
-        When it was not assembled from a structure.
-    """
-    if plant.realisation is None or plant.ports is None:
-        raise ModelError(
-            "placement needs the structure for rows of candidates, this plant has no structure. "
-            "Make it by assemble_plant(model, ports).discretized(rate)."
-        )
-    return plant.ports, plant.realisation
-
-
 def checked_plant(plant: StandardPlant) -> None:
     """Raise ModelError unless the plant is sampled, not weighted, and made of a structure."""
     plant = standard_plant(plant)  # a system with labels is one too, without a structure
-    structure_of(plant)
-    if plant.unweighted is not None:
+    _ = plant.assembled
+    if plant.is_weighted:
         raise ModelError("placement needs the plant before weights: use plant.unweighted.")
     if not plant.dt:
         raise ModelError(
@@ -47,7 +30,7 @@ def checked_plant(plant: StandardPlant) -> None:
 
 def with_side(plant: StandardPlant, side: Side, chosen: Sequence[Port]) -> StandardPlant:
     """Return the plant with these sensors or actuators instead of its own."""
-    return plant.with_ports(structure_of(plant)[0].replace(**{side: tuple(chosen)}))
+    return plant.with_ports(plant.assembled.ports.replace(**{side: tuple(chosen)}))
 
 
 def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> dict[str, Port]:
@@ -65,7 +48,7 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
             f"candidates are a list of {KIND[side].__name__}s or names, got {short(given)}. "
             "Put them in a list."
         )
-    own: dict[str, Port] = {p.name: p for p in getattr(plant.ports, side)}
+    own: dict[str, Port] = {p.name: p for p in getattr(plant.assembled.ports, side)}
     found: dict[str, Port] = {}
     for item in given:
         port = item

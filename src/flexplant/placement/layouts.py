@@ -11,11 +11,10 @@ import numpy as np
 
 from ..errors import AssumptionError, CertificateError
 from ..parallel import mapped
-from ..plant import Sensor, StandardPlant, assemble_plant
-from ..plant.check import Assumption
+from ..plant import Assumption, Sensor, StandardPlant, assemble_plant
 from ..plant.ports import QUANTITIES
 from ..values import FloatArray
-from .candidates import Port, Side, checked_plant, structure_of, with_side
+from .candidates import Port, Side, checked_plant, with_side
 from .criterion import Criterion, OnPlant, Scorer, as_criterion
 from .poi_lqr import PoiLqr
 from .poi_variance import PoiVariance
@@ -117,9 +116,9 @@ class Layouts:
             )
 
     def _finding(self, chosen: Sequence[int]) -> Assumption:
-        ports, realisation = structure_of(self.plant)
-        only = ports.replace(**{self.side: [self.candidates[i] for i in chosen]})
-        return assemble_plant(realisation, only).check()[ASSUMPTION[self.side]]
+        own = self.plant.assembled
+        only = own.ports.replace(**{self.side: [self.candidates[i] for i in chosen]})
+        return assemble_plant(own.realisation, only).check()[ASSUMPTION[self.side]]
 
 
 def layouts_of(
@@ -154,7 +153,7 @@ def layouts_of(
 
 def _rigid(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
     """Return unit rows (N, r): a sensor sees positions, an actuator moves velocities."""
-    realisation = structure_of(plant)[1]
+    realisation = plant.assembled.realisation
     rows = np.zeros((len(candidates), realisation.n_rigid))
     for i, port in enumerate(candidates):
         row = realisation.row(port.at, port.direction)

@@ -7,10 +7,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, unknown_label
 from ..plant import Disturbance, Poi, StandardPlant
 from ..values import FloatArray, positive
-from .candidates import structure_of
 
 #: axes of a POI that count, each once or by a factor
 Axes: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
@@ -50,12 +49,7 @@ def shown(poi: str | None, axes: Axes) -> str:
 
 def poi_of(plant: StandardPlant, name: str | None) -> Poi:
     """Return the POI of this name, or the only one."""
-    ports = plant.ports
-    if ports is None:
-        raise ModelError(
-            "the criterion looks its POI up in the plant's ports, this plant has none. Make it by "
-            "assemble_plant(model, ports), or pass a callable of your own."
-        )
+    ports = plant.assembled.ports
     if name is not None:
         return ports.poi(name)
     if len(ports.z) != 1:
@@ -91,9 +85,7 @@ def structure_part(
     plant: StandardPlant, factors: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, the noise factor and the rows of the POI on the structure's own states."""
-    n = structure_of(plant)[1].outputs.shape[1]
-    if plant.noise_factor is None:
-        raise ModelError("the plant is not sampled: use plant.discretized(rate).")
+    n = plant.assembled.realisation.outputs.shape[1]
     return plant.system.A[:n, :n], plant.noise_factor[:n], poi_rows(plant, factors)[:, :n]
 
 
@@ -107,9 +99,9 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
     candidates : sequence of Sensor or Actuator
         All that may be chosen.
     """
-    ports, realisation = structure_of(plant)
+    ports, realisation = plant.assembled.ports, plant.assembled.realisation
     forces = all(isinstance(port, Disturbance) for port in ports.w)
-    rigidly = getattr(realisation, "static_inputs", None) is None
+    rigidly = realisation.static_inputs is None
     return forces and rigidly and all(map(bare, (*ports.w, *ports.u, *ports.y, *candidates)))
 
 

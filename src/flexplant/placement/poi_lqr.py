@@ -15,7 +15,6 @@ from ..lti.riccati import control_dare
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import positive
-from .candidates import structure_of
 from .criterion import Criterion, Scorer
 from .poi_axes import (
     Axes,
@@ -106,7 +105,7 @@ class PoiLqr(Criterion):
         plant.check().require(("excited",), "a stationary controller")
         poi = poi_of(plant, self.poi)
         axes = tuple(axis for axis in poi.axes if poi.channel(axis) in factors)
-        seen = structure_of(plant)[0].replace(z=[poi.replace(axes=axes)], references=())
+        seen = plant.assembled.ports.replace(z=[poi.replace(axes=axes)], references=())
         plant.with_ports(seen).check().require(("performance",), f"a controller for {self!r}")
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
@@ -119,7 +118,7 @@ class PoiLqr(Criterion):
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)
         A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=True))
-        realisation = structure_of(plant)[1]
+        realisation = plant.assembled.realisation
         n, count = A.shape[0], len(candidates)
         whole, fraction = divmod(plant.delay, 1.0)
         constant = 0.0

@@ -12,7 +12,6 @@ from ..errors import AssumptionError
 from ..estimation import design_kalman
 from ..plant import Disturbance, StandardPlant
 from ..plant.ports import QUANTITIES
-from .candidates import structure_of
 from .criterion import Criterion, Scorer
 from .poi_axes import Axes, bare, checked_axes, factors_of, plain, shown, structure_part
 from .quadratic import quadratic
@@ -73,7 +72,7 @@ class PoiVariance(Criterion):
         """Raise AssumptionError when w misses a rigid-body mode or a candidate fits no filter."""
         factors_of(plant, self.poi, self.axes, every=False)
         plant.check().require(("excited",), "a stationary Kalman filter")
-        ports, realisation = structure_of(plant)
+        ports, realisation = plant.assembled.ports, plant.assembled.realisation
         silent = [sensor.name for sensor in candidates if sensor.asd <= 0]
         if silent:
             raise AssumptionError(
@@ -101,7 +100,7 @@ class PoiVariance(Criterion):
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)
         A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=False))
-        realisation = structure_of(plant)[1]
+        realisation = plant.assembled.realisation
         items = np.zeros((len(candidates), A.shape[0]))
         for i, sensor in enumerate(candidates):
             row = realisation.row(sensor.at, sensor.direction)

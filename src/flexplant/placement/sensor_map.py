@@ -132,7 +132,7 @@ def sensor_map(
             + (" outside the excluded zones." if zones else ".")
         )
     noise = positive(asd, "asd", zero=True)
-    own = plant.ports.y if plant.ports is not None else ()
+    own = plant.assembled.ports.y
     taken = {sensor.name for sensor in own}
     prefix = next(p for p in ("extra", "extra_", "extra__", "extra___") if f"{p}1" not in taken)
     tried = [

@@ -1,13 +1,16 @@
 """Ports and the standard plant: the one bridge from (M, D, K) to (A, B, C, D)."""
 
 from .assembly import assemble_plant as assemble_plant
-from .check import Assumption as Assumption
-from .check import AssumptionReport as AssumptionReport
+from .assumption import Assumption as Assumption
+from .assumptions import AssumptionReport as AssumptionReport
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
 from .forces import OutputDisturbance as OutputDisturbance
 from .moving import Along as Along
+from .origin import Assembled as Assembled
+from .origin import Foreign as Foreign
+from .origin import Weighted as Weighted
 from .ports import Poi as Poi
 from .ports import Ports as Ports
 from .ports import Reference as Reference
@@ -24,8 +27,8 @@ from .rigid.suspension import suspend as suspend
 from .standard import StandardPlant as StandardPlant
 from .standard import standard_plant as standard_plant
 from .truncation import larger_plant as larger_plant
+from .uncertainty.delta import Delta as Delta
 from .uncertainty.neglected import NeglectedModes as NeglectedModes
 from .uncertainty.neglected import neglected_modes as neglected_modes
-from .uncertainty.uncertain_plant import Delta as Delta
 from .uncertainty.uncertain_plant import UncertainPlant as UncertainPlant
 from .visibility import ModeVisibility as ModeVisibility

@@ -48,7 +48,7 @@ def channel_units(ports: Ports) -> dict[str, str]:
 
 def plant_units(plant: Any) -> dict[str, str]:
     """Return {channel: unit} of a plant, and of what its ports derive: estimates, too."""
-    derived = {} if plant.ports is None else channel_units(plant.ports)
+    derived = channel_units(plant.assembled.ports) if plant.is_assembled else {}
     return derived | dict(plant.system.units)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -12,11 +12,10 @@ import numpy.typing as npt
 from ..errors import LabelError, ModelError, unknown_label
 from ..values import FloatArray, Value, real_array
 from .forces import Actuator, Disturbance
+from .partition import Partition
 from .ports import Poi, Ports, filter_of
 from .realisation import ModalRealisation
-
-if TYPE_CHECKING:
-    from .standard import StandardPlant
+from .rebuilding import rebuilt
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,10 +52,8 @@ class Along(Value):
         return f"<Along {self.points.shape[0]} points: {', '.join(self.channels)}>"
 
 
-def moved(ports: Ports | None, places: Any) -> Ports:
+def moved(ports: Ports, places: Any) -> Ports:
     """Return ports with some of them elsewhere; one POI, or {name: place} of any ports."""
-    if ports is None:
-        raise ModelError("this plant has no ports: its POIs have no places to move.")
     if not isinstance(places, Mapping):
         if len(ports.z) != 1:
             raise LabelError(
@@ -74,19 +71,16 @@ def moved(ports: Ports | None, places: Any) -> Ports:
     return ports.replace(w=there(ports.w), u=there(ports.u), z=there(ports.z), y=there(ports.y))
 
 
-def along(plant: StandardPlant, name: str, points: npt.ArrayLike) -> Along:
+def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
     """Return what depends on the place of a POI or a force, at many points at once."""
-    if plant.ports is None or plant.realisation is None or plant.unweighted is not None:
-        raise ModelError(
-            "moving a port needs a plant assembled from a structure and not weighted: use "
-            "assemble_plant(model, ports), or plant.unweighted."
-        )
+    if plant.is_weighted:
+        raise ModelError("the plant is weighted: a port moves on plant.unweighted.")
     places = real_array(points, "points", (None, 3))
-    port = _port(plant.ports, name)
+    port = _port(plant.assembled.ports, name)
     if isinstance(port, Poi):
-        return _poi_along(plant, plant.realisation, port, places)
+        return _poi_along(plant, port, places)
     if isinstance(port, Actuator | Disturbance):
-        return _force_along(plant, plant.realisation, port, places)
+        return _force_along(plant, port, places)
     raise ModelError(
         f"{name!r} is a {type(port).__name__}: POIs, actuators and disturbances move along points. "
         "plant.at({name: point}) moves any port."
@@ -116,11 +110,9 @@ def rows_along(realisation: ModalRealisation, points: FloatArray, direction: str
     return np.asarray(model.dofs.rows(points, direction))
 
 
-def _poi_along(
-    plant: StandardPlant, realisation: ModalRealisation, poi: Poi, points: FloatArray
-) -> Along:
-    g = plant.system
-    tracked = plant.ports is not None and poi.name in [r.poi for r in plant.ports.references]
+def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
+    g, realisation = plant.system, plant.assembled.realisation
+    tracked = poi.name in [r.poi for r in plant.assembled.ports.references]
     channels = [poi.channel(axis) for axis in poi.axes]
     shown = [*channels, *([poi.derived(poi.axes[0], "error")] if tracked else [])]
     at = g.output_index(shown)
@@ -129,7 +121,7 @@ def _poi_along(
     if realisation.static_outputs is not None:
         # forces reach a POI at once too, through filters and delays: what the whole plant knows
         for i, point in enumerate(points):
-            there = plant.at({poi.name: point.tolist()}).system
+            there = _elsewhere(plant, poi.name, point).system
             C[i], D[i] = there.C[at], there.D[at]
         return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
     for k, axis in enumerate(poi.axes):
@@ -140,28 +132,26 @@ def _poi_along(
     return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
 
 
-def _force_along(
-    plant: StandardPlant,
-    realisation: ModalRealisation,
-    port: Actuator | Disturbance,
-    points: FloatArray,
-) -> Along:
+def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatArray) -> Along:
     if plant.dt or filter_of(port) is not None:
         raise ModelError(
             f"the place of {port.name!r} acts through a filter, a hold or a delay, so that more "
             "than a column of B depends on it. Use plant.continuous.along for a force without "
             "dynamics, or plant.at({name: point}) point by point."
         )
-    g = plant.system
+    g, realisation = plant.system, plant.assembled.realisation
     i = int(g.input_index([port.name])[0])
     B = np.zeros((points.shape[0], g.n_states, 1))
     rows = rows_along(realisation, points, port.direction)
     B[:, plant.modal_states, 0] = rows @ realisation.inputs
     D = np.repeat(g.D[None, :, i : i + 1], points.shape[0], axis=0)
-    accelerations = plant.ports is not None and any(
-        sensor.quantity == "acceleration" for sensor in plant.ports.y
-    )
+    accelerations = any(sensor.quantity == "acceleration" for sensor in plant.assembled.ports.y)
     if accelerations or realisation.static_inputs is not None:
         for k, point in enumerate(points):
-            D[k] = plant.at({port.name: point.tolist()}).system.D[:, i : i + 1]
+            D[k] = _elsewhere(plant, port.name, point).system.D[:, i : i + 1]
     return Along(port.name, points, (port.name,), np.zeros((points.shape[0], 0, g.n_states)), D, B)
+
+
+def _elsewhere(plant: Partition, name: str, point: FloatArray) -> Partition:
+    """Return the plant with one port at a point."""
+    return rebuilt(plant, ports=moved(plant.assembled.ports, {name: point.tolist()}))

@@ -1,18 +1,42 @@
-"""The parts of a standard plant: its systems and matrices between w, u, z and y."""
+"""A system partitioned into w, u, z and y, and what is known of where it came from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
-from ..errors import ModelError
-from ..lti.statespace import StateSpace
-from ..values import FloatArray
+from ..errors import LabelError, ModelError, unknown_label
+from ..lti.statespace import StateSpace, System, as_statespace
+from ..values import FloatArray, IntArray, Value, name_list, positive, short
+from .channel_sides import TYPE_THIS, sides
+from .origin import ELSEWHERE, Assembled, Foreign, Origin
 
 
-class Partition:
-    """What a plant's system is between its four groups of channels."""
+@dataclass(frozen=True, eq=False, repr=False)
+class Partition(Value):
+    """The data of a standard plant; `StandardPlant` adds what is done with it.
+
+    Parameters
+    ----------
+    system : StateSpace
+        ``[w; u] -> [z; y]``.
+    w, u, z, y : sequences of str
+        Names of its channels.
+    asd : mapping {str: float}
+        One-sided amplitude spectral density of the w channels that are white noise.
+    origin : Assembled, Weighted or Foreign
+        Where it came from.
+
+    Raises
+    ------
+    LabelError
+        When the names are not those of the system's channels, in this order.
+    ModelError
+        When a density is negative or not finite.
+    """
 
     system: StateSpace
     w: tuple[str, ...]
@@ -20,11 +44,225 @@ class Partition:
     z: tuple[str, ...]
     y: tuple[str, ...]
     asd: Mapping[str, float]
+    origin: Origin = ELSEWHERE
+
+    def __post_init__(self) -> None:
+        for side in "wuzy":
+            self._set(**{side: tuple(getattr(self, side))})
+        if (*self.w, *self.u) != tuple(self.system.inputs):
+            raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
+        if (*self.z, *self.y) != tuple(self.system.outputs):
+            raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
+        for name in self.asd:
+            if name not in self.w:
+                raise unknown_label("w channel with an asd", name, self.w)
+        asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
+        self._set(asd=asd)
+
+    def __repr__(self) -> str:
+        kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
+        named = f" {self.system.name!r}" if self.system.name else ""
+        lines = [f"<StandardPlant{named}: {self.system.n_states} states, {kind}>"]
+        for side in "wuzy":
+            names = getattr(self, side)
+            shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
+            lines.append(f"  {side} ({len(names)}) {shown}")
+        delays = self.assembled.ports.delays if self.is_assembled else {}
+        if delays and not self.dt:
+            late = ", ".join(f"{name} {delay:g} s" for name, delay in delays.items())
+            lines.append(f"  delays that act once it is sampled: {late}")
+        if self.form.startswith("dense"):
+            lines.append(f"  {self.form}")
+        return "\n".join(lines)
+
+    @classmethod
+    def of(cls, given: Any) -> Self:
+        """Return a plant; of a system with labels when these tell w, u, z and y.
+
+        Raises
+        ------
+        LabelError
+            When the labels do not tell.
+        ModelError
+            When it is neither.
+        """
+        if isinstance(given, cls):
+            return given
+        if isinstance(given, StateSpace) or hasattr(given, "input_labels"):
+            return cls.from_statespace(given)
+        raise ModelError(
+            f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports), "
+            f"or by {TYPE_THIS}."
+        )
+
+    @classmethod
+    def from_statespace(
+        cls,
+        sys: System,
+        *,
+        u: Sequence[str] | None = None,
+        y: Sequence[str] | None = None,
+        w: Sequence[str] | None = None,
+        z: Sequence[str] | None = None,
+        asd: Mapping[str, float] | None = None,
+        noise_factor: FloatArray | None = None,
+    ) -> Self:
+        """Return the standard plant of a system made elsewhere.
+
+        Parameters
+        ----------
+        sys : StateSpace or control.StateSpace
+            With named channels.
+        u, y : sequences of str, optional
+            Inputs that the controller drives, outputs that it reads. Both may be left out when
+            the channels are named like those of an assembled plant (`u1:effort`, `y1:noise`,
+            `die:z`, `die:ref`), as those of `plant.to_control()` are.
+        w, z : sequences of str, optional
+            Disturbances and performance; the remaining channels when not given.
+        asd : mapping, optional
+            One-sided amplitude spectral densities of white w channels.
+        noise_factor : (n, r) array, optional
+            G with G G' the covariance of x that disturbances add in one sample.
+
+        Returns
+        -------
+        StandardPlant
+            With inputs [w; u] and outputs [z; y].
+
+        Raises
+        ------
+        LabelError
+            When a name is unknown or on two sides, or none is given and the channels do not tell.
+        """
+        g = as_statespace(sys)
+        if u is None and y is None and w is None and z is None:
+            w, u, z, y = sides(g)
+        if u is None or y is None:
+            raise LabelError(
+                f"name both u and y, got u = {u} and y = {y}. Type {TYPE_THIS}, or leave all four "
+                "out when the channels are named like those of an assembled plant."
+            )
+        u, y = name_list(u, "u"), name_list(y, "y")
+        w = [n for n in g.inputs if n not in u] if w is None else list(name_list(w, "w"))
+        z = [n for n in g.outputs if n not in y] if z is None else list(name_list(z, "z"))
+        return cls(
+            g.select([*z, *y], [*w, *u]),
+            tuple(w), tuple(u), tuple(z), tuple(y), dict(asd or {}),
+            Foreign(None if noise_factor is None else np.asarray(noise_factor, dtype=np.float64)),
+        )  # fmt: skip
+
+    @property
+    def is_assembled(self) -> bool:
+        """Whether it was assembled from a structure, weighted since or not."""
+        return self.origin.structure is not None
+
+    @property
+    def assembled(self) -> Assembled:
+        """What it was assembled from: ports, realisation, noise, delay, the plant before sampling.
+
+        Of a weighted plant, what the plant underneath was assembled from.
+
+        Raises
+        ------
+        ModelError
+            When the plant was made elsewhere.
+        """
+        found = self.origin.structure
+        if found is None:
+            raise ModelError(
+                "this plant was not assembled from a structure: its ports, modes and process noise "
+                "are not known. Make it by assemble_plant(model, ports)."
+            )
+        return found
+
+    @property
+    def is_weighted(self) -> bool:
+        """Whether it was made by `weighted` or `through`."""
+        return self.origin.plain is not None
+
+    @property
+    def unweighted(self) -> Self:
+        """The plant before `weighted` and `through`; this plant where there is no weight."""
+        found: Self | None = self.origin.plain
+        return self if found is None else found
+
+    @property
+    def continuous(self) -> Self:
+        """The plant before sampling; this plant where it is continuous, or nothing is known."""
+        found: Self | None = self.origin.continuous
+        return self if found is None else found
+
+    @property
+    def delay(self) -> float:
+        """Delay of the inputs u [samples]."""
+        return self.origin.delay
 
     @property
     def dt(self) -> float:
         """Sampling time [s]; 0 when continuous."""
         return self.system.dt
+
+    @property
+    def n_rigid(self) -> int:
+        """Number of rigid-body modes."""
+        return self.assembled.realisation.n_rigid if self.is_assembled else 0
+
+    @property
+    def form(self) -> str:
+        """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
+
+        Weights and filters of the ports add blocks of their own.
+        """
+        return self.assembled.realisation.form if self.is_assembled else "as given"
+
+    @property
+    def model(self) -> Any:
+        """The structural model that the plant was assembled from, or None."""
+        return self.assembled.realisation.model if self.is_assembled else None
+
+    @property
+    def modal_blocks(self) -> FloatArray:
+        """The (b, 2, 2) blocks of the structure's modes [rad/s], before sampling; none without."""
+        return self.assembled.realisation.pairs if self.is_assembled else np.zeros((0, 2, 2))
+
+    @property
+    def modal_states(self) -> IntArray:
+        """Where the states of the structure's modes are; sensors' filters stand before them.
+
+        Raises
+        ------
+        ModelError
+            When the plant was not assembled from a structure, or has other states now.
+        """
+        names = self.assembled.realisation.names
+        if names[0] not in self.system.states:
+            raise ModelError(f"the plant has lost the states of its modes ({names[0]!r}, ...).")
+        first = self.system.states.index(names[0])
+        return np.arange(first, first + len(names), dtype=np.int64)
+
+    @property
+    def noise_factor(self) -> FloatArray:
+        """G (n, r), G G' the covariance that white disturbances add to x in one sample.
+
+        Raises
+        ------
+        ModelError
+            When it is not known.
+        """
+        found = self.origin.noise_factor
+        if found is None:
+            raise ModelError(
+                "labels carry no noise density, so that the process noise of each sample is not "
+                "known. Use assemble_plant(model, ports).discretized(rate), or type "
+                f"{TYPE_THIS[:-1]}, noise_factor=G), G G' the covariance that w adds to x in one "
+                "sample."
+            )
+        return found
+
+    @property
+    def process_noise(self) -> FloatArray:
+        """Covariance (n, n) that white disturbances add to x in one sample."""
+        return self.noise_factor @ self.noise_factor.T
 
     @property
     def sensor_noise(self) -> FloatArray:
@@ -33,6 +271,24 @@ class Partition:
             raise ModelError("sensor noise per sample needs a sampled plant: discretized(rate).")
         variance = [0.5 * self.asd.get(f"{name}:noise", 0.0) ** 2 / self.dt for name in self.y]
         return np.diag(variance)
+
+    def channel(self, name: str, side: str = "z") -> str:
+        """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
+
+        Raises
+        ------
+        LabelError
+            When it means none.
+        """
+        names: tuple[str, ...] = getattr(self, side)
+        if name in names:
+            return name
+        for poi in self.assembled.ports.z if self.is_assembled else ():
+            for axis in poi.axes:
+                aliases = (poi.derived(axis, "hat"), poi.derived(axis, "error"))
+                if name in aliases or (name == poi.name and axis == poi.axes[0]):
+                    return poi.channel(axis)
+        raise unknown_label(f"channel of {side}", name, names)
 
     B1 = property(lambda self: self.Gzw.B, doc="w to dx/dt.")
     B2 = property(lambda self: self.Gzu.B, doc="u to dx/dt.")

@@ -41,7 +41,7 @@ def check_rate(plant: Any, rate: float, delay: float) -> None:
             f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s and changes "
             f"nothing. If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
         )
-    for name, late in ({} if plant.ports is None else plant.ports.delays).items():
+    for name, late in (plant.assembled.ports.delays if plant.is_assembled else {}).items():
         if late * rate > _LONGEST:
             raise ModelError(
                 f"the delay of {name!r} is {late:g} s, {late * rate:.4g} samples at {rate:g} Hz: "
@@ -73,9 +73,8 @@ def _meant(rate: float, lowest: float) -> str:
 
 def _elastic(plant: Any) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes of a plant."""
-    if plant.realisation is not None:
-        blocks = plant.realisation.pairs
-        poles = [block_eigenvalues(block, (2,)) for block in blocks]
+    if plant.is_assembled:
+        poles = [block_eigenvalues(block, (2,)) for block in plant.modal_blocks]
         size = np.array([float(np.sqrt(np.abs(p[0] * p[1]))) for p in poles])
     else:
         found = plant.system.poles()

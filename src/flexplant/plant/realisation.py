@@ -77,6 +77,11 @@ class ModalRealisation(Value):
         self._set(coupling=self.coupling)
 
     @property
+    def n_modes(self) -> int:
+        """Number of modes, rigid-body ones included, residual vectors not."""
+        return sum(name.startswith("mode") for name in self.names) // 2
+
+    @property
     def A(self) -> FloatArray:
         """The (2 b, 2 b) matrix: block-diagonal, but for coupled velocities."""
         A = block_diagonal(self.pairs)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import FlexplantWarning, ModelError
 from ..values import Value, positive
-from .realisation import ModalRealisation
+from .realisation import MODAL, ModalRealisation, Structure, realised
 
 
 class ResidualForm(Value):
@@ -102,3 +103,35 @@ class Feedthrough(ResidualForm):
             static_inputs=settled,
             coupling=coupling,
         )
+
+
+def modes_of(
+    model: Structure | ModalRealisation, residual: ResidualForm | None = None
+) -> ModalRealisation:
+    """Return the modes of a structure as a plant takes them; FastStates where nothing is given.
+
+    Raises
+    ------
+    ModelError
+        When the model or `residual` is of another type.
+
+    Warns
+    -----
+    FlexplantWarning
+        When damping couples the modes so that blocks cannot hold it.
+    """
+    way = FastStates() if residual is None else residual
+    if not isinstance(way, ResidualForm):
+        raise ModelError(
+            f"residual must be FastStates() or Feedthrough(), got {type(residual).__name__}."
+        )
+    realisation = realised(model)
+    if realisation.form != MODAL and realisation is not model:
+        warnings.warn(
+            f"this plant is not in modal blocks but {realisation.form}. It is exact all the same; "
+            "the damping couples its modes, so that what costs O(n) a frequency or sample costs "
+            "O(n^2) or more, and mode by mode uncertainty is not defined. See plant.form.",
+            FlexplantWarning,
+            stacklevel=3,
+        )
+    return way.applied(realisation)

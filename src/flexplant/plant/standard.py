@@ -1,32 +1,28 @@
-"""The standard plant: one StateSpace and the names of w, u, z, y in it."""
+"""The standard plant: one StateSpace, the names of w, u, z, y in it, and what is done with it."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError, unknown_label
 from ..labels import Place
-from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, IntArray, Value, name_list, positive, short
-from .channel_sides import TYPE_THIS, sides
+from ..lti.statespace import StateSpace, System
+from .assumptions import AssumptionReport
+from .moving import Along, along, moved
 from .partition import Partition
 from .ports import Ports
-from .realisation import ModalRealisation
-
-if TYPE_CHECKING:
-    from .check import AssumptionReport
-    from .moving import Along
-    from .uncertainty.uncertain_plant import UncertainPlant
+from .rebuilding import rebuilt, sampled, structural
+from .uncertainty.opening import uncertain
+from .uncertainty.uncertain_plant import UncertainPlant
+from .weighting import measured_through, weighted
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StandardPlant(Partition, Value):
+class StandardPlant(Partition):
     """A plant with disturbances w, inputs u, performance z and measurements y.
 
     ::
@@ -47,22 +43,9 @@ class StandardPlant(Partition, Value):
         Names of its channels.
     asd : mapping {str: float}
         One-sided amplitude spectral density of the w channels that are white noise.
-    ports : Ports, optional
-        Where the channels are.
-    realisation : ModalRealisation, optional
-        The structure's modes.
-    physical : StateSpace, optional
-        Forces to motions, before noise, references and efforts are wired to it.
-    continuous : StandardPlant, optional
-        The plant before sampling.
-    delay : float [samples]
-        Of the inputs u.
-    noise_factor : (n, r) array, optional
-        G with G G' the covariance of x that disturbances add in one sample.
-    unweighted : StandardPlant, optional
-        The plant before `weighted` and `through`.
-    reading : StateSpace, optional
-        The block of `through`: from `unweighted.y` to y.
+    origin : Assembled, Weighted or Foreign
+        Where it came from: `plant.assembled` holds ports, modes, noise and delay of a plant that
+        was assembled from a structure, `plant.unweighted` is the plant before weights.
 
     Raises
     ------
@@ -72,165 +55,10 @@ class StandardPlant(Partition, Value):
         When a density is negative or not finite.
     """
 
-    system: StateSpace
-    w: tuple[str, ...]
-    u: tuple[str, ...]
-    z: tuple[str, ...]
-    y: tuple[str, ...]
-    asd: Mapping[str, float]
-    ports: Ports | None = None
-    realisation: ModalRealisation | None = None
-    physical: StateSpace | None = None
-    continuous: StandardPlant | None = None
-    delay: float = 0.0
-    noise_factor: FloatArray | None = None
-    unweighted: StandardPlant | None = None
-    reading: StateSpace | None = None
-
-    def __post_init__(self) -> None:
-        for side in "wuzy":
-            self._set(**{side: tuple(getattr(self, side))})
-        if (*self.w, *self.u) != tuple(self.system.inputs):
-            raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
-        if (*self.z, *self.y) != tuple(self.system.outputs):
-            raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
-        for name in self.asd:
-            if name not in self.w:
-                raise unknown_label("w channel with an asd", name, self.w)
-        asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
-        self._set(asd=asd, noise_factor=self.noise_factor)
-
-    def __repr__(self) -> str:
-        kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
-        named = f" {self.system.name!r}" if self.system.name else ""
-        lines = [f"<StandardPlant{named}: {self.system.n_states} states, {kind}>"]
-        for side in "wuzy":
-            names = getattr(self, side)
-            shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
-            lines.append(f"  {side} ({len(names)}) {shown}")
-        if self.ports is not None and self.ports.delays and not self.dt:
-            late = ", ".join(f"{name} {delay:g} s" for name, delay in self.ports.delays.items())
-            lines.append(f"  delays that act once it is sampled: {late}")
-        if self.form.startswith("dense"):
-            lines.append(f"  {self.form}")
-        return "\n".join(lines)
-
-    @classmethod
-    def from_statespace(
-        cls,
-        sys: System,
-        *,
-        u: Sequence[str] | None = None,
-        y: Sequence[str] | None = None,
-        w: Sequence[str] | None = None,
-        z: Sequence[str] | None = None,
-        asd: Mapping[str, float] | None = None,
-    ) -> StandardPlant:
-        """Return the standard plant of a system made elsewhere.
-
-        Parameters
-        ----------
-        sys : StateSpace or control.StateSpace
-            With named channels.
-        u, y : sequences of str, optional
-            Inputs that the controller drives, outputs that it reads. Both may be left out when
-            the channels are named like those of an assembled plant (`u1:effort`, `y1:noise`,
-            `die:z`, `die:ref`), as those of `plant.to_control()` are.
-        w, z : sequences of str, optional
-            Disturbances and performance; the remaining channels when not given.
-        asd : mapping, optional
-            One-sided amplitude spectral densities of white w channels.
-
-        Returns
-        -------
-        StandardPlant
-            With inputs [w; u] and outputs [z; y].
-
-        Raises
-        ------
-        LabelError
-            When a name is unknown or on two sides, or none is given and the channels do not tell.
-        """
-        g = as_statespace(sys)
-        if u is None and y is None and w is None and z is None:
-            w, u, z, y = sides(g)
-        if u is None or y is None:
-            raise LabelError(
-                f"name both u and y, got u = {u} and y = {y}. Type {TYPE_THIS}, or leave all four "
-                "out when the channels are named like those of an assembled plant."
-            )
-        u, y = name_list(u, "u"), name_list(y, "y")
-        w = [n for n in g.inputs if n not in u] if w is None else list(name_list(w, "w"))
-        z = [n for n in g.outputs if n not in y] if z is None else list(name_list(z, "z"))
-        ordered = g.select([*z, *y], [*w, *u])
-        return cls(ordered, tuple(w), tuple(u), tuple(z), tuple(y), dict(asd or {}))
-
-    @property
-    def n_rigid(self) -> int:
-        """Number of rigid-body modes."""
-        return self.realisation.n_rigid if self.realisation is not None else 0
-
-    @property
-    def form(self) -> str:
-        """`modal blocks`, `dense: ` and why modes are coupled, or `as given` without a structure.
-
-        Weights and filters of the ports add blocks of their own.
-        """
-        return self.realisation.form if self.realisation is not None else "as given"
-
-    @property
-    def model(self) -> Any:
-        """The structural model that the plant was assembled from, or None."""
-        return self.realisation.model if self.realisation is not None else None
-
-    @property
-    def modal_states(self) -> IntArray:
-        """Where the states of the structure's modes are; sensors' filters stand before them.
-
-        Raises
-        ------
-        ModelError
-            When the plant was not assembled from a structure.
-        """
-        if self.realisation is None or self.realisation.names[0] not in self.system.states:
-            raise ModelError("this plant has no modes: it was not assembled from a structure.")
-        first = self.system.states.index(self.realisation.names[0])
-        return np.arange(first, first + len(self.realisation.names), dtype=np.int64)
-
     @cached_property
     def structural(self) -> StateSpace:
         """The structure alone, [w; u] -> [z; y], continuous; filters as their static gains."""
-        from .assembly import structural
-
         return structural(self)
-
-    @property
-    def process_noise(self) -> FloatArray:
-        """Covariance (n, n) that white disturbances add to x in one sample."""
-        if self.noise_factor is None:
-            raise ModelError(
-                "process noise per sample is known only for a plant that was assembled from a "
-                "structure and sampled: use assemble_plant(model, ports).discretized(rate)."
-            )
-        return self.noise_factor @ self.noise_factor.T
-
-    def channel(self, name: str, side: str = "z") -> str:
-        """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.
-
-        Raises
-        ------
-        LabelError
-            When it means none.
-        """
-        names: tuple[str, ...] = getattr(self, side)
-        if name in names:
-            return name
-        for poi in self.ports.z if self.ports is not None else ():
-            for axis in poi.axes:
-                aliases = (poi.derived(axis, "hat"), poi.derived(axis, "error"))
-                if name in aliases or (name == poi.name and axis == poi.axes[0]):
-                    return poi.channel(axis)
-        raise unknown_label(f"channel of {side}", name, names)
 
     def discretized(self, rate: float, *, delay: float = 0.0) -> StandardPlant:
         """Return the plant sampled at a rate: exact zero-order hold, mode by mode.
@@ -261,8 +89,6 @@ class StandardPlant(Partition, Value):
         FlexplantWarning
             When all elastic modes lie above half the rate.
         """
-        from .assembly import sampled
-
         return sampled(self, rate, delay)
 
     def weighted(
@@ -291,8 +117,6 @@ class StandardPlant(Partition, Value):
         ModelError
             When a weight is not one by one, or of another sampling time.
         """
-        from .weighting import weighted
-
         return weighted(self, z, w)
 
     def through(self, block: System) -> StandardPlant:
@@ -318,8 +142,6 @@ class StandardPlant(Partition, Value):
         ModelError
             When its sampling time differs.
         """
-        from .weighting import measured_through
-
         return measured_through(self, block)
 
     def with_ports(self, ports: Ports) -> StandardPlant:
@@ -332,9 +154,7 @@ class StandardPlant(Partition, Value):
         ModelError
             When the plant was not assembled from a structure.
         """
-        from .assembly import reassembled
-
-        return reassembled(self, ports)
+        return rebuilt(self, ports=ports)
 
     def at(self, poi: Place | Mapping[str, Place]) -> StandardPlant:
         """Return the plant with the POI moved: only its rows of C (and D12, if any) change.
@@ -350,9 +170,7 @@ class StandardPlant(Partition, Value):
         LabelError
             When a name is unknown, or the plant has several POIs and none is named.
         """
-        from .moving import moved
-
-        return self.with_ports(moved(self.ports, poi))
+        return self.with_ports(moved(self.assembled.ports, poi))
 
     def along(self, name: str, points: npt.ArrayLike) -> Along:
         """Return the rows of a POI (or the columns of a force) at many points at once.
@@ -378,8 +196,6 @@ class StandardPlant(Partition, Value):
         ModelError
             When the plant was not assembled from a structure, or more than B depends on the place.
         """
-        from .moving import along
-
         return along(self, name, points)
 
     def uncertain(
@@ -390,7 +206,7 @@ class StandardPlant(Partition, Value):
         modes: Sequence[int] | None = None,
         deviations: float = 2.0,
         neglected: Any = None,
-    ) -> UncertainPlant:
+    ) -> UncertainPlant[StandardPlant]:
         """Return the plant with the doubt of a fit opened as real Deltas on its modes.
 
         The covariance of the parameters goes to the modes by the eigenvalue sensitivities,
@@ -426,8 +242,6 @@ class StandardPlant(Partition, Value):
             When there is no covariance, the fit is of another model, or the doubt covers negative
             stiffness or damping.
         """
-        from .uncertainty.uncertain_plant import uncertain
-
         return uncertain(
             self,
             source,
@@ -443,15 +257,17 @@ class StandardPlant(Partition, Value):
 
     def check(self) -> AssumptionReport:
         """Return which standard assumptions hold, in physical words, rigid-body modes first."""
-        from .check import report
+        return self._report
 
-        return report(self)
+    @cached_property
+    def _report(self) -> AssumptionReport:
+        return AssumptionReport(self)
 
 
 def standard_plant(given: StandardPlant | System) -> StandardPlant:
     """Return a StandardPlant; of a system with labels when these tell w, u, z and y.
 
-    The one door of all functions that take a plant.
+    Called by all functions that take a plant.
 
     Raises
     ------
@@ -460,11 +276,4 @@ def standard_plant(given: StandardPlant | System) -> StandardPlant:
     ModelError
         When it is neither.
     """
-    if isinstance(given, StandardPlant):
-        return given
-    if isinstance(given, StateSpace) or hasattr(given, "input_labels"):
-        return StandardPlant.from_statespace(given)
-    raise ModelError(
-        f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports), or by "
-        f"{TYPE_THIS}."
-    )
+    return StandardPlant.of(given)

@@ -12,8 +12,9 @@ from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import short
-from .assembly import assemble_plant
 from .realisation import Structure
+from .rebuilding import rebuilt, sampled_like
+from .residual import modes_of
 from .standard import StandardPlant, standard_plant
 
 
@@ -44,8 +45,7 @@ def larger_plant(
     LabelError
         When the larger plant has other channels.
     """
-    plain = standard_plant(plant)
-    plain = plain.unweighted or plain
+    plain = standard_plant(plant).unweighted
     if larger is None:
         model = plain.model
         if not isinstance(model, ReducedModel) or model.truncated is None:
@@ -59,17 +59,12 @@ def larger_plant(
             f"larger must be a structure or a plant with more modes, got {short(given)}. Pass "
             "Modes, an FEModel, a ReducedModel or a StandardPlant, or leave it out."
         )
-    if plain.ports is None:
-        raise ModelError(
-            "this plant has no ports to assemble the larger model with: it was not assembled from "
-            "a structure. Pass larger= as a StandardPlant with the same channels."
-        )
-    return _sampled_like(plain, assemble_plant(larger, plain.ports))
+    return rebuilt(plain, realisation=modes_of(given))
 
 
 def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
     """Return the larger plant, sampled like the given one, after a check of its channels."""
-    larger = larger.unweighted or larger
+    larger = larger.unweighted
     for side in "wuzy":
         own, other = getattr(plant, side), getattr(larger, side)
         if own != other:
@@ -78,7 +73,7 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
                 f"{_listed(own)}. Assemble both with the same ports."
             )
     if plant.dt and not larger.dt:
-        return _sampled_like(plant, larger)
+        return sampled_like(plant, larger)
     same = bool(np.isclose(larger.dt, plant.dt, rtol=1e-9, atol=0.0))
     if not same or larger.delay != plant.delay:
         raise ModelError(
@@ -87,12 +82,6 @@ def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:
             "continuous, or sampled like the plant."
         )
     return larger
-
-
-def _sampled_like(plant: StandardPlant, continuous: StandardPlant) -> StandardPlant:
-    if not plant.dt:
-        return continuous
-    return continuous.discretized(1.0 / plant.dt, delay=plant.delay)
 
 
 def _listed(names: Any) -> str:

@@ -10,8 +10,8 @@ import scipy.linalg as la
 
 from ..lti.discretisation import block_diagonal
 from ..values import ComplexArray, FloatArray, Value
+from .partition import Partition
 from .ports import QUANTITIES
-from .standard import StandardPlant
 
 #: a mode reached or seen less than this, beside the channel's strongest mode, is called weak
 WEAK = 0.01
@@ -65,7 +65,7 @@ class ModeVisibility(Value):
         )
 
 
-def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
+def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     """Return the visibility of every elastic mode; none for a plant without a structure.
 
     Parameters
@@ -73,12 +73,11 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
     plant : StandardPlant
         Not weighted; of a sampled plant the continuous one is looked at.
     """
-    plant = plant.continuous or plant
-    if plant.realisation is None:
+    plant = plant.continuous
+    if not plant.is_assembled:
         return ()
-    g, n_rigid = plant.system, plant.n_rigid
-    count = sum(name.startswith("mode") for name in plant.realisation.names) // 2
-    pairs = plant.realisation.pairs[n_rigid:count]
+    g, n_rigid, count = plant.system, plant.n_rigid, plant.assembled.realisation.n_modes
+    pairs = plant.modal_blocks[n_rigid:count]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega
     swinging = _swinging(pairs)
@@ -96,7 +95,7 @@ def mode_visibility(plant: StandardPlant) -> tuple[ModeVisibility, ...]:
     for side in "wu":
         names = [n for n in getattr(plant, side) if np.any(g.B[:, g.input_index([n])])]
         sides[side] = names, np.abs(left.conj().T @ g.B[:, g.input_index(names)])
-    orders = {s.name: QUANTITIES.index(s.quantity) for s in plant.ports.y} if plant.ports else {}
+    orders = {s.name: QUANTITIES.index(s.quantity) for s in plant.assembled.ports.y}
     for side in "yz":
         names = [n for n in getattr(plant, side) if np.any(g.C[g.output_index([n])])]
         power = np.array([1 - orders.get(name, 0) for name in names])

@@ -11,10 +11,12 @@ from ..errors import ModelError, unknown_label
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import short
-from .standard import StandardPlant
+from .origin import Weighted
+from .partition import Partition
+from .wiring import P
 
 
-def weighted(plant: StandardPlant, z: Any, w: Any) -> StandardPlant:
+def weighted(plant: P, z: Any, w: Any) -> P:
     """Return ``W_z P W_w``; a weight None drops its channel."""
     z, w = _mapping(z, "z"), _mapping(w, "w")
     for side, weights in (("z", z), ("w", w)):
@@ -33,18 +35,12 @@ def weighted(plant: StandardPlant, z: Any, w: Any) -> StandardPlant:
         *(_weight(plant, z.get(name, 1.0), name) for name in keep_z), _through(plant, plant.y)
     )
     system = series(series(before, inner), after)
-    return StandardPlant(
-        system.replace(name=plant.system.name),
-        tuple(keep_w),
-        plant.u,
-        tuple(keep_z),
-        plant.y,
-        {},
-        ports=plant.ports,
-        realisation=plant.realisation,
-        delay=plant.delay,
-        unweighted=plant.unweighted or plant,
-        reading=plant.reading,
+    return plant.replace(
+        system=system.replace(name=plant.system.name),
+        w=tuple(keep_w),
+        z=tuple(keep_z),
+        asd={},
+        origin=Weighted(plant.unweighted, plant.origin.reading),
     )
 
 
@@ -59,37 +55,30 @@ def _mapping(weights: Any, side: str) -> dict[str, Any]:
     return dict(weights)
 
 
-def measured_through(plant: StandardPlant, block: System) -> StandardPlant:
+def measured_through(plant: P, block: System) -> P:
     """Return the plant with y read through a block."""
     g = as_statespace(block)
     inner = plant.system.select([*plant.z, *(plant.y[i] for i in _columns(plant, g))])
     block = g if g.n_states else g.replace(dt=plant.dt)
     after = append(_through(plant, plant.z), block)
-    if plant.reading is not None:
-        block = series(plant.reading.select(outputs=block.inputs), block)
-    return StandardPlant(
-        series(inner, after).replace(name=plant.system.name),
-        plant.w,
-        plant.u,
-        plant.z,
-        tuple(g.outputs),
-        {},
-        ports=plant.ports,
-        realisation=plant.realisation,
-        delay=plant.delay,
-        unweighted=plant.unweighted or plant,
-        reading=block,
+    if plant.origin.reading is not None:
+        block = series(plant.origin.reading.select(outputs=block.inputs), block)
+    return plant.replace(
+        system=series(inner, after).replace(name=plant.system.name),
+        y=tuple(g.outputs),
+        asd={},
+        origin=Weighted(plant.unweighted, block),
     )
 
 
-def _columns(plant: StandardPlant, g: StateSpace) -> list[int]:
+def _columns(plant: Partition, g: StateSpace) -> list[int]:
     for name in g.inputs:
         if name not in plant.y:
             raise unknown_label("channel of y", name, plant.y)
     return [plant.y.index(name) for name in g.inputs]
 
 
-def _weight(plant: StandardPlant, weight: Any, name: str) -> StateSpace:
+def _weight(plant: Partition, weight: Any, name: str) -> StateSpace:
     sys = as_statespace(weight)
     if len(sys.inputs) != 1 or len(sys.outputs) != 1:
         raise ModelError(
@@ -105,6 +94,6 @@ def _weight(plant: StandardPlant, weight: Any, name: str) -> StateSpace:
     return sys.replace(dt=plant.dt, inputs=[name], outputs=[name], states=states)
 
 
-def _through(plant: StandardPlant, names: tuple[str, ...]) -> StateSpace:
+def _through(plant: Partition, names: tuple[str, ...]) -> StateSpace:
     gain = as_statespace(np.eye(len(names)))
     return gain.replace(dt=plant.dt, inputs=names, outputs=names)

@@ -211,7 +211,7 @@ def _check_sampled(loop: ClosedLoop) -> None:
             "simulate runs sampled loops, this one is continuous: close the loop around "
             "plant.discretized(rate, delay=) with blocks designed on it."
         )
-    if plant.unweighted is not None:
+    if plant.is_weighted:
         raise AssumptionError(
             "the plant is weighted, so its z and w are not physical signals: close the loop "
             "around plant.unweighted with the same blocks."
@@ -302,11 +302,9 @@ def _noise(plant: StandardPlant, wanted: bool) -> _Noise:
             "it would have infinite variance. Give the disturbance a coloured spectrum, or sense "
             "a displacement or velocity."
         )
-    if white and plant.noise_factor is None:
-        _ = plant.process_noise  # says why it is not known
     columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
     deviation = np.array([asd[name] for name in sensors]) * np.sqrt(0.5 / plant.dt)
-    factor = plant.noise_factor if white and plant.noise_factor is not None else none
+    factor = plant.noise_factor if white else none
     return _Noise(factor, columns, deviation)
 
 

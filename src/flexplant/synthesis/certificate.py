@@ -73,7 +73,7 @@ def reached_norms(P: StandardPlant, K: StateSpace) -> dict[str, float]:
     `noises` (y1:noise) and `disturbances`, of z `efforts` (u1:effort) and `motions`. Empty for a
     plant that was not assembled from a structure.
     """
-    if P.ports is None:
+    if not P.is_assembled:
         return {}
     loop = lft(P.system, K)
     gain = frequency_response(loop, _sweep(loop)).data

@@ -90,7 +90,7 @@ def design_hinf(
         )
     if not plant.w or not plant.z or not plant.u or not plant.y:
         raise AssumptionError(f"H-infinity synthesis needs channels w, z, u and y, got {plant!r}.")
-    if plant.realisation is not None:  # it can name the rigid-body motion that is missed
+    if plant.is_assembled:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
     _require_reach(problem)

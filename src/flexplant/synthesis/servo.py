@@ -380,27 +380,28 @@ def _below_nyquist(freq: float, name: str, rate: float) -> None:
 
 
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
-    if plant.unweighted is not None:
+    if plant.is_weighted:
         raise ModelError(
             "the plant is weighted: a servo acts on physical channels. Use plant.unweighted."
         )
-    if plant.ports is None or not plant.ports.z:
+    ports = plant.assembled.ports
+    if not ports.z:
         raise AssumptionError(
             "a servo needs a plant with a POI, assembled from a structure: "
             "assemble_plant(model, ports)."
         )
-    if name is None and len(plant.ports.z) > 1:
-        names = ", ".join(poi.name for poi in plant.ports.z)
+    if name is None and len(ports.z) > 1:
+        names = ", ".join(poi.name for poi in ports.z)
         raise LabelError(
-            f"the plant has {len(plant.ports.z)} POIs ({names}): say which one the servo moves, "
-            f"such as poi={plant.ports.z[0].name!r}."
+            f"the plant has {len(ports.z)} POIs ({names}): say which one the servo moves, "
+            f"such as poi={ports.z[0].name!r}."
         )
-    return plant.ports.poi(name if name is not None else plant.ports.z[0].name)
+    return ports.poi(name if name is not None else ports.z[0].name)
 
 
 def _decoupling(plant: StandardPlant, poi: Poi, r: int) -> FloatArray:
     """Return T_u: accelerations of the POI's axes to actuator forces, of least norm."""
-    continuous = plant.continuous or plant
+    continuous = plant.continuous
     continuous.check().require(("stabilisable",), "a servo of the rigid body")
     gain = rigid_gain(plant, [poi.channel(axis) for axis in poi.axes], list(plant.u))
     size = np.linalg.norm(gain, axis=1, keepdims=True)

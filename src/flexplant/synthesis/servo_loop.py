@@ -14,7 +14,7 @@ from ..lti.grid import resonance_grid
 from ..lti.interconnection import connect
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
-from ..plant import Poi, StandardPlant
+from ..plant import Foreign, Poi, StandardPlant
 from ..values import ComplexArray, FloatArray
 from .servo_axis import Axis
 
@@ -130,11 +130,9 @@ def _stacked(system: StateSpace, grid: FloatArray) -> ComplexArray:
 
 def elastic(plant: StandardPlant) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes below 0.45 of the rate."""
-    if plant.realisation is None:
+    if not plant.is_assembled:
         return np.zeros(0)
-    names = plant.realisation.names
-    count = sum(name.startswith("mode") for name in names) // 2
-    pairs = plant.realisation.pairs[plant.n_rigid : count]
+    pairs = plant.modal_blocks[plant.n_rigid : plant.assembled.realisation.n_modes]
     freq = np.sqrt(np.abs(np.linalg.det(pairs))) / (2.0 * np.pi)
     return np.asarray(freq[freq * plant.dt < 0.45])
 
@@ -157,7 +155,7 @@ def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:
     rows = [*range(nz), *own, *(nz + i for i in kept)]
     y = (*(poi.derived(axis, "hat") for axis in poi.axes), *(plant.y[i] for i in kept))
     system = g.replace(C=g.C[rows], D=g.D[rows], outputs=[*plant.z, *y])
-    return StandardPlant(system, plant.w, plant.u, plant.z, y, {}, delay=plant.delay)
+    return StandardPlant(system, plant.w, plant.u, plant.z, y, {}, Foreign(delay=plant.delay))
 
 
 def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace | None:

@@ -32,8 +32,8 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
     whole = larger_plant(plant, larger)
     if whole is None:
         return None
-    plain = plant.unweighted or plant
-    before = [] if plant.reading is None else [plant.reading]
+    plain, reading = plant.unweighted, plant.origin.reading
+    before = [] if reading is None else [reading]
     with warnings.catch_warnings():  # one warning is enough, where the user called from
         warnings.simplefilter("ignore", FlexplantWarning)
         found = close_loop(plain, *before, *blocks, larger=whole).left_out
@@ -50,6 +50,6 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
 
 def unchecked(plant: StandardPlant) -> tuple[str, ...]:
     """Return a note that no modes left out are known, for a plant that may have left out some."""
-    if plant.realisation is None or isinstance(plant.model, FEModel):
+    if not plant.is_assembled or isinstance(plant.model, FEModel):
         return ()
     return ("modes left out of the plant: none known, none checked; larger= gives them",)

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...errors import AssumptionError, ModelError, unknown_label
+from ...errors import AssumptionError, unknown_label
 from ...lti.statespace import StateSpace
 from ...values import FloatArray, Value, name_list
-from ..dynamics import load_of
+from ..dynamics import load_of, static_gain
 from ..forces import Actuator
 from ..ports import Ports, Sensor, filter_of
 from ..realisation import ModalRealisation
@@ -101,19 +101,16 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
         When the plant was not assembled from a structure, or it is held.
     """
     plant = standard_plant(plant)
-    if plant.realisation is None or plant.ports is None:
-        raise ModelError(
-            "decoupling needs a plant assembled from a structure: assemble_plant(model, ports)."
-        )
-    body = rigid_body_of(plant.realisation)
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
+    body = rigid_body_of(realisation)
     wanted = body.axes if axes is None else name_list(axes, "axes")
     for axis in wanted:
         if axis not in body.axes:
             raise unknown_label("rigid-body axis", axis, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
-    sensors = [s for s in plant.ports.y if s.quantity == "displacement"]
-    see = _gains(sensors)[:, None] * _seen(plant.realisation, sensors, body)
-    push = (_gains(plant.ports.u)[:, None] * _pushed(plant.realisation, plant.ports, body)).T
+    sensors = [s for s in ports.y if s.quantity == "displacement"]
+    see = _gains(sensors)[:, None] * _seen(realisation, sensors, body)
+    push = (_gains(ports.u)[:, None] * _pushed(realisation, ports, body)).T
     length = _length(body)
     T_y = _left(see, length, pick)
     T_u = _left(push.T, 1.0 / length, pick).T
@@ -133,8 +130,7 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
 
 
 def _gains(ports: Sequence[Actuator | Sensor]) -> FloatArray:
-    found = [filter_of(port) for port in ports]
-    return np.array([1.0 if f is None else float(f.evaluated(0.0)[0, 0].real) for f in found])
+    return np.array([static_gain(filter_of(port)) for port in ports])
 
 
 def _seen(realisation: ModalRealisation, sensors: Sequence[Sensor], body: RigidBody) -> FloatArray:

@@ -11,9 +11,9 @@ import scipy.linalg as la
 from ...errors import AssumptionError, FlexplantError, unknown_label
 from ...values import FloatArray, IntArray
 from ..dynamics import load_of, poi_row, static_gain
-from ..ports import Ports, filter_of
+from ..partition import Partition
+from ..ports import filter_of
 from ..realisation import ModalRealisation
-from ..standard import StandardPlant
 from .rigid_body import inertia, rigid_body_of
 
 #: part of its kinetic energy that a suspension mode has in rigid-body motion, at least. Springs at
@@ -80,32 +80,17 @@ def carried(realisation: ModalRealisation) -> Carried:
     return Carried(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
 
 
-def structure_of(plant: StandardPlant) -> tuple[ModalRealisation, Ports]:
-    """Return a plant's modes and ports.
-
-    Raises
-    ------
-    AssumptionError
-        When it was not assembled from a structure.
-    """
-    if plant.realisation is None or plant.ports is None:
-        raise AssumptionError(
-            "this is for a plant assembled from a free or suspended structure: "
-            "assemble_plant(model, ports)."
-        )
-    return plant.realisation, plant.ports
-
-
-def carried_of(plant: StandardPlant) -> Carried:
+def carried_of(plant: Partition) -> Carried:
     """Return the rigid-body motions of a plant.
 
     Raises
     ------
+    ModelError
+        When it was not assembled from a structure.
     AssumptionError
-        When it was not assembled from a structure, or this is held.
+        When the structure is held.
     """
-    realisation, _ = structure_of(plant)
-    motions = carried(realisation)
+    motions = carried(plant.assembled.realisation)
     if not motions.modes.size:
         raise AssumptionError(
             "the plant has no rigid-body modes and no suspension modes: it is constrained. This "
@@ -127,9 +112,9 @@ def require_weak(motions: Carried, bandwidth: float, what: str) -> None:
         )
 
 
-def seen(plant: StandardPlant, motions: Carried, channels: Sequence[str]) -> FloatArray:
+def seen(plant: Partition, motions: Carried, channels: Sequence[str]) -> FloatArray:
     """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
-    realisation, ports = structure_of(plant)
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
     places = {
         poi.channel(axis): (1.0, poi_row(realisation, poi, axis))
         for poi in ports.z
@@ -147,7 +132,7 @@ def seen(plant: StandardPlant, motions: Carried, channels: Sequence[str]) -> Flo
     return np.array(rows).reshape(len(rows), motions.shapes.shape[1])
 
 
-def rigid_gain(plant: StandardPlant, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
+def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
     """Return the accelerations at outputs per force at inputs, of the rigid body alone.
 
     ``rows R m^-1 R' pushes'`` with R the rigid-body motions and m their mass; filters of the ports
@@ -171,7 +156,7 @@ def rigid_gain(plant: StandardPlant, outputs: Sequence[str], inputs: Sequence[st
     LabelError
         When a name is unknown.
     """
-    realisation, ports = structure_of(plant)
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
     motions = carried_of(plant)
     forces = {port.name: port for port in ports.forces}
     for name in inputs:

@@ -17,7 +17,7 @@ from ...values import Value, positive
 from ..forces import BaseAcceleration, OutputDisturbance
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant
-from .rigid_motion import Carried, carried_of, require_weak, rigid_gain, seen, structure_of
+from .rigid_motion import Carried, carried_of, require_weak, rigid_gain, seen
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
 #: the table in `stage_weights`)
@@ -52,7 +52,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
         When several POIs have a reference and none is named, or the named one has none.
     """
     plant, motions = _stage(plant)
-    ports = structure_of(plant)[1]
+    ports = plant.assembled.ports
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
     followed = ports.poi(_chosen([r.poi for r in ports.references], poi, "POI with a reference"))
@@ -203,7 +203,7 @@ def stage_weights(
         When a number is out of range.
     """
     plant, motions = _stage(plant)
-    ports = structure_of(plant)[1]
+    ports = plant.assembled.ports
     if not ports.z or not ports.u or not ports.y:
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
     scale = ports.poi(_chosen([port.name for port in ports.z], poi, "POI"))

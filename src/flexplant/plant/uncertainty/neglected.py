@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -11,9 +12,10 @@ from ...lti.frequency import default_freq, frequency_response
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, System
 from ...values import ComplexArray, FloatArray, Value
-from ..assembly import assemble_plant
+from ..partition import Partition
 from ..realisation import Structure
-from ..standard import StandardPlant, standard_plant
+from ..residual import modes_of
+from ..wiring import continuous_plant
 
 #: the weight lies this far above the largest difference found
 _MARGIN = 1.05
@@ -54,7 +56,7 @@ class NeglectedModes(Value):
 
 
 def neglected_modes(
-    plant: StandardPlant | System, larger: StandardPlant | System | Structure
+    plant: Partition | System, larger: Partition | System | Structure
 ) -> NeglectedModes:
     """Return a weight that bounds what a larger model has and a plant has not, from u to y.
 
@@ -81,15 +83,8 @@ def neglected_modes(
     CertificateError
         When the sweep finds a larger difference than the weight.
     """
-    plant = standard_plant(plant)
-    small = plant.continuous or plant
-    if hasattr(larger, "A"):
-        larger = standard_plant(larger)
-    if not isinstance(larger, StandardPlant):
-        if plant.ports is None:
-            raise ModelError("the plant has no ports to assemble the larger model with.")
-        larger = assemble_plant(larger, plant.ports)
-    big = larger.continuous or larger
+    small = Partition.of(plant).continuous
+    big = larger.continuous if isinstance(larger, Partition) else _assembled(larger, small)
     moved = _moved(small)
     if set(big.u) != set(small.u) or not set(moved) <= set(big.y):
         raise ModelError(f"the larger plant has other channels: {big.u} -> {big.y}.")
@@ -151,7 +146,14 @@ def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateS
     )  # fmt: skip
 
 
-def _moved(plant: StandardPlant) -> list[str]:
+def _assembled(larger: Any, plant: Partition) -> Partition:
+    """Return a larger model as a continuous plant: a structure gets the ports of the plant."""
+    if hasattr(larger, "A"):
+        return Partition.of(larger)
+    return continuous_plant(Partition, modes_of(larger), plant.assembled.ports)
+
+
+def _moved(plant: Partition) -> list[str]:
     """Return the outputs y that u moves: not references."""
     g = plant.Gyu
     seen = np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1)

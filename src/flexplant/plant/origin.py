@@ -1,0 +1,115 @@
+"""Where a plant came from: assembled from a structure, weighted, or made elsewhere."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value
+from .ports import Ports
+from .realisation import ModalRealisation
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Assembled(Value):
+    """What is known of a plant that was assembled from a structure.
+
+    Parameters
+    ----------
+    ports : Ports
+        Where the channels are.
+    realisation : ModalRealisation
+        The structure's modes.
+    physical : StateSpace
+        Forces to motions, before noise, references and efforts are wired to it.
+    noise_factor : (n, r) array, optional
+        G with G G' the covariance of x that disturbances add in one sample.
+    delay : float [samples]
+        Of the inputs u.
+    continuous : StandardPlant, optional
+        The plant before sampling.
+    """
+
+    ports: Ports
+    realisation: ModalRealisation
+    physical: StateSpace
+    noise_factor: FloatArray | None = None
+    delay: float = 0.0
+    continuous: Any = None
+
+    def __post_init__(self) -> None:
+        self._set(noise_factor=self.noise_factor)
+
+    def __repr__(self) -> str:
+        return f"<Assembled: {type(self.realisation.model).__name__}, {self.ports!r}>"
+
+    @property
+    def structure(self) -> Assembled:
+        """What is known of the structure: this value."""
+        return self
+
+    plain = property(lambda self: None, doc="The plant is not weighted.")
+    reading = property(lambda self: None, doc="No block stands before y.")
+
+
+@dataclass(frozen=True, eq=False)
+class Foreign(Value):
+    """What is known of a plant that was made elsewhere.
+
+    Parameters
+    ----------
+    noise_factor : (n, r) array, optional
+        G with G G' the covariance of x that disturbances add in one sample.
+    delay : float [samples]
+        Of the inputs u.
+    continuous : StandardPlant, optional
+        The plant before sampling.
+    """
+
+    noise_factor: FloatArray | None = None
+    delay: float = 0.0
+    continuous: Any = None
+
+    def __post_init__(self) -> None:
+        self._set(noise_factor=self.noise_factor)
+
+    structure = property(lambda self: None, doc="The plant has no structure.")
+    plain = property(lambda self: None, doc="The plant is not weighted.")
+    reading = property(lambda self: None, doc="No block stands before y.")
+
+
+@dataclass(frozen=True, eq=False)
+class Weighted(Value):
+    """A plant made from another one by `weighted` or `through`.
+
+    Parameters
+    ----------
+    plain : StandardPlant
+        The plant before weights and blocks; its structure and its delay are this plant's too.
+    reading : StateSpace, optional
+        The block of `through`: from `plain.y` to y.
+    """
+
+    plain: Any
+    reading: StateSpace | None = None
+
+    @property
+    def structure(self) -> Assembled | None:
+        """What is known of the structure of the plant before weights."""
+        found: Assembled | None = self.plain.origin.structure
+        return found
+
+    @property
+    def delay(self) -> float:
+        """Delay of the inputs u [samples]."""
+        return float(self.plain.delay)
+
+    continuous = property(lambda self: None, doc="Weights are of one sampling time.")
+    noise_factor = property(lambda self: None, doc="Not known in the states of the weights.")
+
+
+#: where a plant may have come from
+Origin: TypeAlias = "Assembled | Foreign | Weighted"
+#: nothing is known but the system
+ELSEWHERE = Foreign()

@@ -1,0 +1,214 @@
+"""Which modes that do not decay the channels of a plant reach and see: the test of Hautus."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..labels import DIRECTIONS
+from ..lti.statespace import StateSpace
+from ..reduction import ReducedModel
+from ..structure.rigid import rigid_motions
+from ..values import ComplexArray, FloatArray
+from .assumption import Assumption
+from .partition import Partition
+from .rank_conditions import evened
+
+#: a motion weaker than this beside the strongest one counts as absent
+_ABSENT = 1e-8
+#: a pole closer to the stability limit than this, relative to its size, counts as on it
+_AXIS = 1e-9
+#: findings of one kind that are written out
+_SHOWN = 3
+
+
+class _Case(NamedTuple):
+    """One question to the modes that do not decay by themselves."""
+
+    key: str
+    verb: str
+    names: list[str]
+    pushes: bool
+    remedy: str
+
+
+class _Pole(NamedTuple):
+    """A pole that does not decay, with bases (n, g) of its left and right eigenvectors."""
+
+    value: complex
+    left: ComplexArray
+    right: ComplexArray
+
+
+def reach_and_sight(plant: Partition) -> list[Assumption]:
+    """Ask which modes that do not decay w and u reach, and y and z see (Hautus)."""
+    bare = plant.unweighted.continuous
+    if not bare.is_assembled:  # states of a system made elsewhere have any units
+        bare = bare.replace(system=evened(bare.system))
+    poles = _undying(bare.system)
+    rigid = bare.n_rigid
+    found = []
+    for case in _cases(bare, poles):
+        texts = [text for pole in poles for text in _lacks(bare, pole, case)]
+        texts = list(dict.fromkeys([*texts, *_weights_without(plant, case.key)]))
+        listed = f"(channels: {', '.join(case.names) or 'none'})"
+        if texts:
+            more = len(texts) - _SHOWN
+            text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
+            found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
+        else:
+            count = sum(pole.left.shape[1] for pole in poles) - rigid
+            words = [f"all {rigid} rigid-body modes"] if rigid else []
+            words += [f"{count} other poles that are not stable"] if count else []
+            text = f"{' and '.join(words)}, by {len(case.names)} channels."
+            found.append(
+                Assumption(case.key, True, text if words else "every mode decays by itself.")
+            )
+    return found
+
+
+def _cases(plant: Partition, poles: list[_Pole]) -> list[_Case]:
+    g = plant.system
+    noisy = [name for name in plant.w if plant.asd.get(name, 0.0) > 0]
+    pushing = [n for n in (noisy or plant.w) if np.any(g.B[:, g.input_index([n])])]
+
+    def seeing(names: tuple[str, ...]) -> list[str]:
+        rows = g.C[g.output_index(names)]
+        sizes = [np.abs(_part(rows, pole.right)).max(axis=1, initial=0.0) for pole in poles]
+        return [n for i, n in enumerate(names) if any(size[i] > 0 for size in sizes)]
+
+    more = "Add a disturbance (with an asd) that does."
+    w = _Case("excited", "w does not excite", pushing, True, more)
+    more = "Add or move a displacement sensor."
+    y = _Case("detectable", "y does not see", seeing(plant.y), False, more)
+    more = "Add an axis to a POI, or another POI."
+    z = _Case("performance", "z does not see", seeing(plant.z), False, more)
+    u = _Case("stabilisable", "u does not reach", list(plant.u), True, "Add or move an actuator.")
+    return [w, y, z, u] if plant.is_assembled else [u, y]
+
+
+def _undying(g: StateSpace) -> list[_Pole]:
+    """Return the poles on or beyond the stability limit, upper half plane, each once."""
+    poles = g.poles()
+    margin = np.abs(poles) - 1 if g.dt else poles.real / np.maximum(np.abs(poles), 1.0)
+    size = max(float(np.linalg.norm(g.A, 2)), 1e-300) if poles.size else 1.0
+    near = 1e-7 * float(np.max(np.abs(poles), initial=1e-300))
+    found: list[_Pole] = []
+    for pole in poles[(margin > -_AXIS) & (poles.imag >= 0)]:
+        if any(abs(pole - other.value) < near for other in found):
+            continue
+        shifted = g.A - (pole if pole.imag else pole.real) * np.eye(g.n_states)
+        left, sizes, right = la.svd(shifted)
+        count = max(int(np.count_nonzero(sizes <= _ABSENT * size)), 1)
+        count = min(count, _most(g, complex(pole), near))
+        found.append(_Pole(complex(pole), left[:, -count:], right[-count:].conj().T))
+    return found
+
+
+def _most(g: StateSpace, pole: complex, near: float) -> int:
+    """Return how many eigenvectors a pole has at most: one in each 2 x 2 block [[a, b], [c, d]].
+
+    A filter that reads accelerations has rows far larger than those of the modes, beside which
+    more than the motions that are free looks like rounding.
+    """
+    if g.blocks is None:
+        return g.n_states
+    most, start = 0, 0
+    for n in g.blocks:
+        block = g.A[start : start + n, start : start + n]
+        if np.any(np.abs(np.linalg.eigvals(block) - pole) <= near):
+            most += 1 if n == 2 and np.any(block - block[0, 0] * np.eye(2)) else n
+        start += n
+    return max(most, 1)
+
+
+def _lacks(plant: Partition, pole: _Pole, case: _Case) -> list[str]:
+    """Return, in words, what the channels of a case have no part in at a pole."""
+    g = plant.system
+    basis = pole.left if case.pushes else pole.right
+    rigid = np.zeros(0, dtype=int)
+    if plant.n_rigid and not pole.value:
+        rigid = plant.modal_states[(1 if case.pushes else 0) : 2 * plant.n_rigid : 2]
+        if rigid.size == basis.shape[1]:  # one vector for each rigid-body mode
+            basis = basis @ np.linalg.inv(basis[rigid])
+    rows = g.B[:, g.input_index(case.names)].T if case.pushes else g.C[g.output_index(case.names)]
+    missing = _missing(_part(rows, basis).T)  # one column for each channel
+    if not missing.shape[1]:
+        return []
+    if rigid.size:
+        shapes = (basis @ missing)[rigid].real
+        return [f"{case.verb} the rigid-body {' and '.join(_described(plant, shapes))}"]
+    return [f"{case.verb} {_named(plant, pole.value)}, which does not decay"]
+
+
+def _part(rows: FloatArray, basis: ComplexArray) -> ComplexArray:
+    """Return rows @ basis, rounding set to zero: a channel without part has exactly none."""
+    product = np.asarray(rows @ basis, dtype=np.complex128)
+    product[np.abs(product) < 1e-12 * np.linalg.norm(rows, axis=1)[:, None]] = 0.0
+    return product
+
+
+def _named(plant: Partition, pole: complex) -> str:
+    """Return a pole as a mode and its frequency, or as a number."""
+    if plant.modal_blocks.size:
+        own = np.linalg.eigvals(plant.modal_blocks)
+        off = np.abs(own - pole).min(axis=1)
+        if off.min() < 1e-6 * abs(pole):
+            return f"mode {int(np.argmin(off)) + 1} ({abs(pole) / (2 * np.pi):.4g} Hz)"
+    return f"the pole {pole:.4g}"
+
+
+def _weights_without(plant: Partition, key: str) -> list[str]:
+    """Return which weights do not decay: no controller can reach or see their states."""
+    side = {"stabilisable": "w", "detectable": "z"}.get(key)
+    if side is None or not plant.is_weighted:
+        return []
+    g, texts = plant.system, []
+    for name in getattr(plant, side):
+        own = [i for i, state in enumerate(g.states) if f"{name}|" in state]
+        poles = np.linalg.eigvals(g.A[np.ix_(own, own)]) if own else np.zeros(0)
+        if np.any(np.abs(poles) >= 1 - _AXIS if g.dt else poles.real >= -_AXIS * np.abs(poles)):
+            what = "u does not reach" if side == "w" else "y does not see"
+            texts.append(f"{what} the weight of {name}, which does not decay (move its pole left)")
+    return texts
+
+
+def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
+    """Return the combinations (r, missing) that no channel has part in."""
+    sizes = np.linalg.norm(matrix, axis=0)
+    scaled = matrix[:, sizes > 0] / sizes[sizes > 0]
+    if not scaled.size:
+        return np.eye(matrix.shape[0], dtype=np.complex128)
+    U, s, _ = la.svd(scaled, full_matrices=True)
+    return np.asarray(U[:, np.count_nonzero(s > _ABSENT * s[0]) :])
+
+
+def _described(plant: Partition, combinations: FloatArray) -> list[str]:
+    """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
+    realisation = plant.assembled.realisation
+    dofs = realisation.model.dofs
+    shapes = realisation.outputs[:, 0 : 2 * plant.n_rigid : 2] @ combinations
+    if isinstance(realisation.model, ReducedModel):
+        motions = realisation.model.rigid_motions(realisation.model.full_dofs.xyz.mean(axis=0))
+    else:
+        motions = rigid_motions(dofs.replace(xyz=dofs.xyz - dofs.xyz.mean(axis=0)))
+    sizes = np.linalg.norm(motions, axis=0)
+    parts = (np.linalg.lstsq(motions, shapes, rcond=None)[0] * sizes[:, None]).T
+    # one axis for each motion that is missing, taken out of the others: none is said twice
+    for i in range(parts.shape[0]):
+        k, axis = np.unravel_index(int(np.argmax(np.abs(parts[i:]))), parts[i:].shape)
+        parts[[i, i + k]] = parts[[i + k, i]]
+        parts[i] /= parts[i, axis] or 1.0
+        others = np.arange(parts.shape[0]) != i
+        parts[others] -= np.outer(parts[others, axis], parts[i])
+    kinds = {True: "rotation", False: "translation"}
+    return [
+        " + ".join(
+            f"{kinds[name.startswith('r')]} {name}"
+            for name, share in zip(DIRECTIONS, np.abs(part) / np.abs(part).max(), strict=True)
+            if share > 0.05
+        )
+        for part in sorted(parts, key=lambda part: int(np.argmax(np.abs(part))))
+    ]
