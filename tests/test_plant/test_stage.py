@@ -96,7 +96,7 @@ def test_a_plant_made_elsewhere_is_refused():
     plant = sampled(some_modes())
     other = StandardPlant.from_statespace(plant.system, u=plant.u, y=plant.y)
     for call in (reference_errors, lambda p: stage_weights(p, 30.0)):
-        with pytest.raises(AssumptionError, match="assemble_plant"):
+        with pytest.raises(ModelError, match="assemble_plant"):
             call(other)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, cast
 
@@ -10,7 +10,11 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet, Place
+from ..structure.placed import Placed, missed
 from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
+
+#: relative: what complex shapes span less than this is rounding
+_TRUNCATED = 1e-9
 
 
 def _nothing() -> FloatArray:
@@ -18,7 +22,7 @@ def _nothing() -> FloatArray:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Modes(Value):
+class Modes(Placed, Value):
     """The first k modes of a structure, mass-normalised (paper, eq. (2), (3) and (5)).
 
     ``q = phi p`` with ``p'' + 2 Z Omega p' + Omega^2 p = phi^T f``. Modes are numbered from 1,
@@ -190,6 +194,37 @@ class Modes(Value):
             n_rigid=int(np.count_nonzero(chosen < self.n_rigid)),
             residual=self.residual[chosen] if self.residual.size else self.residual,
         )
+
+    @property
+    def orthonormal_basis(self) -> FloatArray:
+        """M-orthonormal real shapes B (n, b) that span those of the modes.
+
+        Complex modes tell M on their span by how they answer at once: ``B B' = sum Re(phi phi'
+        lambda / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes.
+        """
+        if not np.iscomplexobj(self.phi):
+            return np.real(self.basis)
+        phi, r = np.asarray(self.phi), self.n_rigid
+        rigid, elastic, poles = phi[:, :r].real, phi[:, r:], self.poles[r:]
+        Q = np.linalg.qr(np.hstack([rigid, elastic.real, elastic.imag]))[0]
+        inner = Q.T @ elastic
+        core = np.real((inner * (poles / (1j * poles.imag))) @ inner.T)
+        core = core + (Q.T @ rigid) @ (Q.T @ rigid).T
+        values, vectors = np.linalg.eigh(0.5 * (core + core.T))
+        kept = values > _TRUNCATED * values[-1]
+        return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
+
+    def inertia(self, motions: FloatArray) -> FloatArray:
+        """Return loads (n, r) with the modal forces of ``M motions``, motions the shapes make."""
+        # any load with these modal forces will do: B' f = c, where motions = B c
+        basis = self.orthonormal_basis
+        share = np.linalg.lstsq(basis, motions, rcond=None)[0]
+        return np.asarray(np.linalg.lstsq(basis.T, share, rcond=None)[0])
+
+    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the relative parts (6,) of the rigid-body motions that the shapes cannot make."""
+        wanted, basis = self.rigid_motions(about), self.orthonormal_basis
+        return missed(basis @ np.linalg.lstsq(basis, wanted, rcond=None)[0], wanted)
 
     def at(self, place: Place, direction: str = "z") -> FloatArray | ComplexArray:
         """Return the modes' motion (k,) at a place.

@@ -20,7 +20,7 @@ from .rigid.rigid_body import inertia_load
 def load_of(realisation: ModalRealisation, port: Any) -> FloatArray:
     """Return the load over the model's DOFs per unit of an actuator or disturbance."""
     if isinstance(port, BaseAcceleration):
-        return inertia_load(realisation, port.direction, tuple(port.about))
+        return inertia_load(realisation, port.direction, np.asarray(port.about))
     if isinstance(port, OutputDisturbance):
         return np.zeros(realisation.outputs.shape[0])
     return realisation.row(port.at, port.direction)

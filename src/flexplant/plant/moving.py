@@ -14,7 +14,6 @@ from ..values import FloatArray, Value, real_array
 from .forces import Actuator, Disturbance
 from .partition import Partition
 from .ports import Poi, Ports, filter_of
-from .realisation import ModalRealisation
 from .rebuilding import rebuilt
 
 
@@ -101,15 +100,6 @@ def _port(ports: Ports, name: str) -> Any:
     return found[0]
 
 
-def rows_along(realisation: ModalRealisation, points: FloatArray, direction: str) -> FloatArray:
-    """Return the rows (p, n) over the model's DOFs of the motion at many points."""
-    model: Any = realisation.model
-    full = getattr(model, "full_dofs", None)
-    if full is not None:
-        return np.asarray(full.rows(points, direction) @ model.T)
-    return np.asarray(model.dofs.rows(points, direction))
-
-
 def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
     g, realisation = plant.system, plant.assembled.realisation
     tracked = poi.name in [r.poi for r in plant.assembled.ports.references]
@@ -125,7 +115,7 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
             C[i], D[i] = there.C[at], there.D[at]
         return Along(poi.name, points, tuple(shown), C, D, np.zeros((points.shape[0], 0, 1)))
     for k, axis in enumerate(poi.axes):
-        rows = rows_along(realisation, points, axis)
+        rows = realisation.model.rows(points, axis)
         C[:, k, plant.modal_states] = realisation.motion(rows, 0)
     if tracked:
         C[:, -1] = -C[:, 0]
@@ -142,7 +132,7 @@ def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatAr
     g, realisation = plant.system, plant.assembled.realisation
     i = int(g.input_index([port.name])[0])
     B = np.zeros((points.shape[0], g.n_states, 1))
-    rows = rows_along(realisation, points, port.direction)
+    rows = realisation.model.rows(points, port.direction)
     B[:, plant.modal_states, 0] = rows @ realisation.inputs
     D = np.repeat(g.D[None, :, i : i + 1], points.shape[0], axis=0)
     accelerations = any(sensor.quantity == "acceleration" for sensor in plant.assembled.ports.y)

@@ -9,8 +9,6 @@ import scipy.linalg as la
 
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace
-from ..reduction import ReducedModel
-from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray
 from .assumption import Assumption
 from .partition import Partition
@@ -188,12 +186,9 @@ def _missing(matrix: ComplexArray | FloatArray) -> ComplexArray:
 def _described(plant: Partition, combinations: FloatArray) -> list[str]:
     """Return rigid-body combinations (r, missing) in words, `translation z`, `rotation rx`."""
     realisation = plant.assembled.realisation
-    dofs = realisation.model.dofs
+    model = realisation.model
     shapes = realisation.outputs[:, 0 : 2 * plant.n_rigid : 2] @ combinations
-    if isinstance(realisation.model, ReducedModel):
-        motions = realisation.model.rigid_motions(realisation.model.full_dofs.xyz.mean(axis=0))
-    else:
-        motions = rigid_motions(dofs.replace(xyz=dofs.xyz - dofs.xyz.mean(axis=0)))
+    motions = model.rigid_motions(model.full_dofs.xyz.mean(axis=0))
     sizes = np.linalg.norm(motions, axis=0)
     parts = (np.linalg.lstsq(motions, shapes, rcond=None)[0] * sizes[:, None]).T
     # one axis for each motion that is missing, taken out of the others: none is said twice

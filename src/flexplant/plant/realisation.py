@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -15,10 +14,8 @@ from ..modes import Modes, NormalForm
 from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form
 from ..reduction import ReducedModel
 from ..structure import FEModel
+from ..structure.placed import Structure as Structure
 from ..values import ComplexArray, FloatArray, Value
-
-#: what a plant can be assembled from
-Structure: TypeAlias = "FEModel | Modes | ReducedModel"
 
 #: a dense eigenproblem of more DOFs than this is refused: reduce first
 LARGEST_DENSE = 2500
@@ -101,9 +98,7 @@ class ModalRealisation(Value):
 
     def row(self, at: Place, direction: str) -> FloatArray:
         """Return the row over the model's DOFs for a place."""
-        if isinstance(self.model, ReducedModel):
-            return np.asarray(self.model.row(at, direction))
-        return np.asarray(self.model.dofs.row(at, direction))
+        return self.model.row(at, direction)
 
     def force(self, row: FloatArray) -> FloatArray:
         """Return the column (2 b,) of B for a unit force along a row of DOFs."""

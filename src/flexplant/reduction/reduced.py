@@ -13,6 +13,7 @@ from ..labels import DofSet, Place
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
 from ..structure import FEModel
+from ..structure.placed import missed
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
 from .bounds import ErrorBound
@@ -280,6 +281,20 @@ class ReducedModel(Value):
             When the place is unknown.
         """
         return np.asarray(self.full_dofs.row(at, direction) @ self.T)
+
+    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
+        """Return the rows (p, k) of the motion at many points (p, 3) [m]; see `row`."""
+        return np.asarray(self.full_dofs.rows(points, direction) @ self.T)
+
+    def inertia(self, motions: FloatArray) -> FloatArray:
+        """Return the loads (k, r) ``M* motions`` of motions (k, r)."""
+        return np.asarray(self.M @ motions)
+
+    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
+        full = self.full_dofs
+        wanted = rigid_motions(full.replace(xyz=full.xyz - list(about), interpolation=None))
+        return missed(self.T @ self.rigid_motions(about), wanted)
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.

@@ -18,6 +18,7 @@ from ..values import FloatArray, Matrix, Value, frozen, real_array
 from .attachments import HeldShape, Part, added_matrices, sum_of
 from .damping import Damping, ModalDamping, Rayleigh
 from .eigen import elastic_modes
+from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
 from .rigid import body_motions, rigid_body_basis
 from .units import units
@@ -31,7 +32,7 @@ _DENSE_DAMPING_LIMIT = 5000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class FEModel(Value):
+class FEModel(Placed, Value):
     """A linear structure ``M q'' + D q' + K q = f`` (paper, eq. (1)).
 
     Parameters
@@ -144,6 +145,14 @@ class FEModel(Value):
         motions = body_motions(self.M, self.K, self.dofs)
         motions.flags.writeable = False
         return motions
+
+    def inertia(self, motions: FloatArray) -> FloatArray:
+        """Return the loads (n, r) ``M motions`` of motions (n, r)."""
+        return np.asarray(self.M @ motions)
+
+    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
+        """Return zeros (6,): the DOFs can make every rigid-body motion, at some cost."""
+        return np.zeros(6)
 
     @property
     def mass(self) -> float:

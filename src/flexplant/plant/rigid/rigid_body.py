@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ...errors import ModelError
 from ...labels import DIRECTIONS
-from ...modes import Modes
-from ...reduction import ReducedModel
-from ...structure import FEModel
-from ...structure.rigid import rigid_motions
 from ...values import FloatArray, Value
 from ..realisation import ModalRealisation, Structure
 
 #: relative: a rigid-body motion that the shapes make up to this is one of theirs
 _SPANNED = 1e-7
-#: relative: what complex shapes span less than this is rounding
-_TRUNCATED = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,9 +40,7 @@ class RigidBody(Value):
         self._set(motions=self.motions, mass=self.mass, centre=self.centre)
 
 
-def inertia_load(
-    realisation: ModalRealisation, direction: str, about: Sequence[float]
-) -> FloatArray:
+def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:
     """Return the load (n,) ``-M r`` of a unit base acceleration.
 
     Raises
@@ -57,16 +48,14 @@ def inertia_load(
     ModelError
         When the model does not tell its inertia against this motion.
     """
-    model = realisation.model
-    motion = _motions(model, np.asarray(about))[:, DIRECTIONS.index(direction)]
+    model, axis = realisation.model, DIRECTIONS.index(direction)
+    motion = model.rigid_motions(about)[:, axis : axis + 1]
     if not np.any(motion):
         raise ModelError(
             f"a base acceleration along {direction!r} does not move this model: its DOFs are "
-            f"{', '.join(sorted(set(getattr(model, 'full_dofs', model.dofs).directions)))}."
+            f"{', '.join(sorted(set(model.full_dofs.directions)))}."
         )
-    if isinstance(model, FEModel):
-        return -np.asarray(model.M @ motion)
-    missed = _missed(model, motion[:, None], np.asarray(about), direction)
+    missed = model.missed_motions(about)[axis]
     if missed > _SPANNED:
         raise ModelError(
             f"the shapes of this {type(model).__name__} do not make the rigid-body motion "
@@ -74,16 +63,7 @@ def inertia_load(
             "acceleration is not known: it is held, or has springs that were there before its "
             "modes were solved. Pass the FEModel, or solve it free and suspend(model, springs)."
         )
-    return -inertia(model, motion[:, None])[:, 0]
-
-
-def inertia(model: Structure, motions: FloatArray) -> FloatArray:
-    """Return loads (n, r) with the modal forces of ``M motions``, motions that the shapes make."""
-    if isinstance(model, Modes):
-        # any load with these modal forces will do: basis' f = c, where r = basis c
-        basis = _real_basis(model)
-        return np.asarray(np.linalg.lstsq(basis.T, _share(basis, motions), rcond=None)[0])
-    return np.asarray(model.M @ motions)
+    return np.asarray(-model.inertia(motion)[:, 0])
 
 
 def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
@@ -95,31 +75,21 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
         When the structure cannot make any rigid-body motion.
     """
     model = realisation.model
-    origin = np.zeros(3)
-    everywhere = _motions(model, origin)
-    directions = (model.full_dofs if isinstance(model, ReducedModel) else model.dofs).directions
+    everywhere, missed = model.rigid_motions(), model.missed_motions()
     exists = [
         i
         for i, axis in enumerate(DIRECTIONS)
         if np.any(everywhere[:, i])
-        and (axis in directions or axis.startswith("r"))
-        and _missed(model, everywhere[:, i : i + 1], origin, axis) < _SPANNED
+        and (axis in model.full_dofs.directions or axis.startswith("r"))
+        and missed[i] < _SPANNED
     ]
     exists = _independent(everywhere, exists)
     if not exists:
         raise ModelError("this structure is held: it cannot move as a rigid body.")
-    mass = _mass(model, everywhere[:, exists])
     axes = tuple(DIRECTIONS[i] for i in exists)
-    centre = _centre(mass, axes)
-    motions = _motions(model, centre)[:, exists]
+    centre = _centre(_mass(model, everywhere[:, exists]), axes)
+    motions = model.rigid_motions(centre)[:, exists]
     return RigidBody(axes, motions, _mass(model, motions), centre)
-
-
-def _motions(model: Structure, about: FloatArray) -> FloatArray:
-    if isinstance(model, ReducedModel):
-        return model.rigid_motions(about)
-    dofs = model.dofs
-    return rigid_motions(dofs.replace(xyz=dofs.xyz - about, interpolation=None))
 
 
 def _independent(motions: FloatArray, exists: list[int]) -> list[int]:
@@ -132,48 +102,8 @@ def _independent(motions: FloatArray, exists: list[int]) -> list[int]:
     return kept
 
 
-def _missed(model: Structure, motion: FloatArray, about: FloatArray, axis: str) -> float:
-    """Return the relative part of a rigid-body motion that the model's shapes do not make."""
-    if isinstance(model, FEModel):
-        return 0.0  # all DOFs are there: any motion is possible, at some cost
-    if isinstance(model, ReducedModel):
-        full = model.full_dofs
-        whole = rigid_motions(full.replace(xyz=full.xyz - about, interpolation=None))
-        wanted = whole[:, DIRECTIONS.index(axis)]
-        return float(np.linalg.norm(model.T @ motion[:, 0] - wanted) / np.linalg.norm(wanted))
-    basis = _real_basis(model)
-    left = motion - basis @ _share(basis, motion)
-    return float(np.linalg.norm(left) / np.linalg.norm(motion))
-
-
-def _real_basis(model: Modes) -> FloatArray:
-    """Return M-orthonormal real shapes B that span those of the modes.
-
-    Complex modes tell M on their span by how they answer at once: ``B B' = sum Re(phi phi' lambda
-    / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes.
-    """
-    if not np.iscomplexobj(model.phi):
-        return np.real(model.basis)
-    phi, r = np.asarray(model.phi), model.n_rigid
-    rigid, elastic, poles = phi[:, :r].real, phi[:, r:], model.poles[r:]
-    Q = np.linalg.qr(np.hstack([rigid, elastic.real, elastic.imag]))[0]
-    inner = Q.T @ elastic
-    core = np.real((inner * (poles / (1j * poles.imag))) @ inner.T)
-    core = core + (Q.T @ rigid) @ (Q.T @ rigid).T
-    values, vectors = np.linalg.eigh(0.5 * (core + core.T))
-    kept = values > _TRUNCATED * values[-1]
-    return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
-
-
-def _share(basis: FloatArray, motions: FloatArray) -> FloatArray:
-    return np.asarray(np.linalg.lstsq(basis, motions, rcond=None)[0])
-
-
 def _mass(model: Structure, motions: FloatArray) -> FloatArray:
-    if isinstance(model, Modes):
-        share = _share(_real_basis(model), motions)
-        return np.asarray(share.T @ share)
-    return np.asarray(motions.T @ np.asarray(model.M @ motions))
+    return np.asarray(motions.T @ model.inertia(motions))
 
 
 def _centre(mass: FloatArray, axes: tuple[str, ...]) -> FloatArray:

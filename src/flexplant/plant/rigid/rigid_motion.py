@@ -14,7 +14,7 @@ from ..dynamics import load_of, poi_row, static_gain
 from ..partition import Partition
 from ..ports import filter_of
 from ..realisation import ModalRealisation
-from .rigid_body import inertia, rigid_body_of
+from .rigid_body import rigid_body_of
 
 #: part of its kinetic energy that a suspension mode has in rigid-body motion, at least. Springs at
 #: the corners of a plate that put it at 0.4 of its first elastic frequency leave more, a clamped
@@ -61,7 +61,7 @@ def carried(realisation: ModalRealisation) -> Carried:
         return free
     root = np.linalg.cholesky(body.mass)
     shapes = la.solve_triangular(root, body.motions.T, lower=True).T
-    load = inertia(realisation.model, shapes)
+    load = realisation.model.inertia(shapes)
     b = realisation.pairs.shape[0]
     see = (load.T @ realisation.outputs).reshape(-1, b, 2)
     push = (load.T @ realisation.inputs).reshape(-1, b, 2)

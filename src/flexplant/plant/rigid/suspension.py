@@ -127,7 +127,7 @@ def _untouched(stretch: FloatArray, rows: FloatArray) -> FloatArray:
 def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     import scipy.sparse as sp
 
-    rows = np.array([model.dofs.row(s.at, s.direction) for s in springs])
+    rows = np.array([model.row(s.at, s.direction) for s in springs])
     sparse = sp.csc_array(rows)
     K: Any = model.K
     D: Any = model.D
@@ -161,7 +161,7 @@ def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
     basis = np.real(modes.basis)
     omega, zeta = modes.basis_omega, modes.basis_zeta
     b = omega.size
-    rows = np.array([modes.dofs.row(s.at, s.direction) for s in springs]) @ basis
+    rows = np.array([modes.row(s.at, s.direction) for s in springs]) @ basis
     stiffness, damping = _matrices(rows, springs)
     free = np.zeros((b, 0))
     if modes.n_rigid:
