@@ -258,6 +258,8 @@ def _well_posed(loop: FloatArray) -> FloatArray:
     Only channels that depend on themselves can be ill-posed, whatever their units: each strongly
     connected part is judged after balancing.
     """
+    if not loop.any():
+        return np.eye(loop.shape[0])
     count, part = csgraph.connected_components(loop != 0, connection="strong")
     for i in range(count):
         inside = np.flatnonzero(part == i)

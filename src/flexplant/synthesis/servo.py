@@ -4,40 +4,23 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
-import numpy as np
-
-from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, SolverError
-from ..loop import ClosedLoop, close_loop
+from ..errors import FlexplantWarning, ModelError, SolverError
+from ..loop import ClosedLoop
 from ..loop.spill_over import growing_modes
-from ..lti.interconnection import append, lft, series
-from ..lti.statespace import StateSpace, as_statespace
-from ..plant import Poi, StandardPlant, larger_plant, standard_plant
-from ..plant.rigid.rigid_motion import carried_of, require_weak, rigid_gain
-from ..values import FloatArray, positive, real_array
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..plant.rigid.rigid_motion import require_weak
+from ..values import positive
 from .controller import Controller
-from .servo_axis import Axis, rigid_body, rigid_peak
-from .servo_loop import (
-    TARGET,
-    ServoLoop,
-    elastic,
-    estimates,
-    highest,
-    observer_system,
-    seeing,
-    servo_loop,
-)
+from .servo_axis import Axis
+from .servo_loop import TARGET
+from .servo_task import ServoTask, servo_task
 from .spill_over import unchecked
 
-#: bandwidths that `servo_bandwidth` tries from 0.19 of the rate down, before it halves intervals
-_TRIALS = 80
-#: steps of 1 % that it goes down from what the grid says
-_STEPS = 30
 
-
+@one_thread()
 def design_servo(
     plant: StandardPlant,
     *,
@@ -115,25 +98,27 @@ def design_servo(
     FlexplantWarning
         When the loop on the POI itself is unstable, or the modes left out make the loop unstable.
     """
-    plant, port = _stage(plant, poi)
-    rate = 1.0 / plant.dt
-    if positive(bandwidth, "bandwidth") >= 0.2 * rate:
+    task = servo_task(
+        plant,
+        poi=poi,
+        rolloff=rolloff,
+        integrator=integrator,
+        notches=notches,
+        observer=observer,
+        larger=larger,
+    )
+    if positive(bandwidth, "bandwidth") >= 0.2 * task.rate:
         raise ModelError(
-            f"bandwidth {bandwidth:g} Hz is not well below the rate, {rate:g} Hz: the lead needs "
-            f"room above it. Stay below {0.2 * rate:g} Hz, or raise the rate."
+            f"bandwidth {bandwidth:g} Hz is not well below the rate, {task.rate:g} Hz: the lead "
+            f"needs room above it. Stay below {0.2 * task.rate:g} Hz, or raise the rate."
         )
-    motions = carried_of(plant)
-    require_weak(motions, bandwidth, "a servo")
-    task = _task(plant, port, rolloff, integrator, notches, observer, larger)
-    axis = task.axis(float(bandwidth))
-    certificate = _certified(axis, task.plant.delay, np.unique(motions.freq))
-    plain = axis
-    if notches is None:
-        axis = task.loop.notched(axis, task.is_stable)
+    require_weak(task.motions, bandwidth, "a servo")
+    plain = task.axis(float(bandwidth))
+    certificate = task.certified(plain)
+    axis = task.notched(plain)
     if axis is not plain:
-        certificate = _certified(axis, task.plant.delay, np.unique(motions.freq))
-    system = task.controller(axis)
-    closed = task.closed(system)
+        certificate = task.certified(axis)
+    closed = task.closed(axis)
     certificate["spectral radius"] = closed.spectral_radius
     certificate["modulus margin"] = closed.modulus_margin
     left_out = closed.left_out
@@ -156,10 +141,10 @@ def design_servo(
             f"with the modes that the plant left out the servo's loop at {bandwidth:g} Hz is "
             f"{left_out.summary}. The machine has these modes. {advice}",
             FlexplantWarning,
-            stacklevel=2,
+            stacklevel=3,
         )
     return Controller(
-        system,
+        task.controller(axis),
         f"servo {bandwidth:g} Hz on {task.poi.name!r}",
         certificate=certificate,
         left_out=left_out,
@@ -167,6 +152,7 @@ def design_servo(
     )
 
 
+@one_thread()
 def servo_bandwidth(
     plant: StandardPlant,
     *,
@@ -206,143 +192,16 @@ def servo_bandwidth(
     """
     if positive(peak, "peak") <= 1.0:
         raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")
-    plant, port = _stage(plant, poi)
-    task = _task(plant, port, rolloff, integrator, notches, observer, larger)
-    return task.largest(float(peak))
-
-
-@dataclass(frozen=True)
-class _Task:
-    """What does not depend on the bandwidth."""
-
-    plant: StandardPlant
-    poi: Poi
-    decoupling: FloatArray
-    rolloff: float | None
-    integrator: float | None
-    notches: tuple[float, ...] | None
-    observer: StateSpace | None
-    larger: StandardPlant | None
-
-    @property
-    def rate(self) -> float:
-        return 1.0 / self.plant.dt
-
-    def axis(self, bandwidth: float) -> Axis:
-        rolloff = min(8.0 * bandwidth, 0.4 * self.rate) if self.rolloff is None else self.rolloff
-        slow = 0.1 * bandwidth if self.integrator is None else self.integrator
-        for name, freq in (("rolloff", rolloff), ("integrator", slow)):
-            _below_nyquist(freq, name, self.rate)
-        return Axis(bandwidth, float(rolloff), float(slow), self.notches or (), self.rate)
-
-    @cached_property
-    def loop(self) -> ServoLoop:
-        """Over frequency, with the modes left out where they are known."""
-        found = servo_loop(self.larger or self.plant, self.observer, self.poi, self.decoupling)
-        return found if self.larger is None else replace(found, modes=elastic(self.plant))
-
-    @cached_property
-    def _estimates(self) -> StateSpace:
-        return estimates(self.plant, self.observer, self.poi)
-
-    def is_stable(self, axis: Axis) -> bool:
-        system = self.controller(axis)
-        hats = self._estimates.outputs
-        return lft(self._estimates, system.select(inputs=hats)).is_stable
-
-    def controller(self, axis: Axis) -> StateSpace:
-        return _joined(self.plant, self.poi, axis.system, self.decoupling)
-
-    def closed(self, system: StateSpace) -> ClosedLoop:
-        """Return the loop that will run, without a warning of its own."""
-        plant, larger, blocks = self.plant, self.larger, [system]
-        if self.observer is None:
-            plant = seeing(plant, self.poi)
-            larger = None if larger is None else seeing(larger, self.poi)
-        else:
-            blocks = [self.observer, system]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FlexplantWarning)
-            return close_loop(plant, *blocks, larger=larger)
-
-    def largest(self, peak: float) -> float:
-        """Return the largest bandwidth that holds a peak of |S| at u.
-
-        Raises
-        ------
-        SolverError
-            When none does.
-        """
-        motions = carried_of(self.plant)
-        springs = np.unique(motions.freq)
-        bodies = [rigid_body(self.rate, self.plant.delay, float(f)) for f in springs]
-        slowest = max(3.0 * float(springs.max()) * (1 + 1e-9), 2e-4 * self.rate)
-
-        def notched(bandwidth: float) -> Axis:
-            axis = self.axis(bandwidth)
-            return axis if self.notches is not None else self.loop.notched(axis, self.is_stable)
-
-        def holds(bandwidth: float) -> bool:
-            if max(rigid_peak(body, self.axis(bandwidth)) for body in bodies) > peak:
-                return False
-            axis = notched(bandwidth)
-            return self.loop.peak(axis) <= peak and self.is_stable(axis)
-
-        def verified(bandwidth: float) -> bool:
-            closed = self.closed(self.controller(notched(bandwidth)))
-            checks = [(closed.is_stable, closed.modulus_margin)]
-            if closed.left_out is not None:
-                checks.append((closed.left_out.is_stable, closed.left_out.modulus_margin))
-            return all(stable and margin >= 1.0 / peak for stable, margin in checks)
-
-        trials = np.geomspace(0.19 * self.rate, slowest, _TRIALS)
-        found = highest(trials.tolist(), holds)
-        # the grid may miss the very top of a peak: a step down, by the exact margins
-        steps = () if found is None else found * 0.99 ** np.arange(_STEPS)
-        for reached in map(float, steps):
-            if verified(reached):
-                return reached
-        raise SolverError(
-            f"no bandwidth above {slowest:.3g} Hz holds |S| at u below "
-            f"{20 * np.log10(peak):.2g} dB: rate, delay, observer and modes leave too little "
-            "phase. Raise the rate, lower the delay, or move sensors and actuators."
-        )
-
-
-def _stage(given: StandardPlant, poi: str | None) -> tuple[StandardPlant, Poi]:
-    """Return a sampled plant and the POI that the servo moves."""
-    plant = standard_plant(given)
-    port = _poi(plant, poi)
-    if not plant.dt:
-        raise AssumptionError(
-            "a servo is designed at its sampling rate: pass plant.discretized(rate, delay=...)."
-        )
-    return plant, port
-
-
-def _task(
-    plant: StandardPlant,
-    port: Poi,
-    rolloff: float | None,
-    integrator: float | None,
-    notches: Sequence[float] | None,
-    observer: Any,
-    larger: Any,
-) -> _Task:
-    centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
-    for freq in centres or ():
-        _below_nyquist(freq, "notch", 1.0 / plant.dt)
-    motions = carried_of(plant)
-    return _Task(
+    task = servo_task(
         plant,
-        port,
-        _decoupling(plant, port, motions.modes.size),
-        rolloff,
-        integrator,
-        None if centres is None else tuple(centres),
-        observer_system(observer, plant, port),
-        larger_plant(plant, larger),
+        poi=poi,
+        rolloff=rolloff,
+        integrator=integrator,
+        notches=notches,
+        observer=observer,
+        larger=larger,
     )
+    return task.largest(float(peak))
 
 
 def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -> None:
@@ -358,99 +217,14 @@ def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -
     if observed:
         raise SolverError(text)
     warnings.warn(
-        f"{text} Pass observer= to check the loop that will run.", FlexplantWarning, stacklevel=3
+        f"{text} Pass observer= to check the loop that will run.", FlexplantWarning, stacklevel=4
     )
 
 
-def _notes(task: _Task, axis: Axis, checked: bool) -> tuple[str, ...]:
+def _notes(task: ServoTask, axis: Axis, checked: bool) -> tuple[str, ...]:
     notes = []
     if axis.notches:
         notes.append(f"notches at {', '.join(f'{f:.4g}' for f in axis.notches)} Hz")
     if task.observer is None:
         notes.append("certified on the POI itself: observer= certifies the loop that will run")
     return (*notes, *(() if checked else unchecked(task.plant)))
-
-
-def _below_nyquist(freq: float, name: str, rate: float) -> None:
-    if positive(freq, name) >= 0.5 * rate:
-        raise ModelError(
-            f"{name} {freq:g} Hz is not below half the rate, {0.5 * rate:g} Hz: sampled, it would "
-            "act at another frequency. Leave it out, lower it, or raise the rate."
-        )
-
-
-def _poi(plant: StandardPlant, name: str | None) -> Poi:
-    if plant.is_weighted:
-        raise ModelError(
-            "the plant is weighted: a servo acts on physical channels. Use plant.unweighted."
-        )
-    ports = plant.assembled.ports
-    if not ports.z:
-        raise AssumptionError(
-            "a servo needs a plant with a POI, assembled from a structure: "
-            "assemble_plant(model, ports)."
-        )
-    if name is None and len(ports.z) > 1:
-        names = ", ".join(poi.name for poi in ports.z)
-        raise LabelError(
-            f"the plant has {len(ports.z)} POIs ({names}): say which one the servo moves, "
-            f"such as poi={ports.z[0].name!r}."
-        )
-    return ports.poi(name if name is not None else ports.z[0].name)
-
-
-def _decoupling(plant: StandardPlant, poi: Poi, r: int) -> FloatArray:
-    """Return T_u: accelerations of the POI's axes to actuator forces, of least norm."""
-    continuous = plant.continuous
-    continuous.check().require(("stabilisable",), "a servo of the rigid body")
-    gain = rigid_gain(plant, [poi.channel(axis) for axis in poi.axes], list(plant.u))
-    size = np.linalg.norm(gain, axis=1, keepdims=True)
-    if len(poi.axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
-        raise AssumptionError(
-            f"POI {poi.name!r} has axes {poi.axes}, the plant {r} rigid-body modes: the servo "
-            "needs axes that span them, one each (for a plate z, rx, ry). Give the POI these axes."
-        )
-    return np.asarray(np.linalg.pinv(gain))
-
-
-def _certified(axis: Axis, delay: float, suspensions: FloatArray) -> dict[str, float]:
-    """Return radius and margin of the worst axis of the rigid body.
-
-    All axes have the same controller, so that the loop falls apart into those of the body's own
-    motions, whatever the axes: free ones (0 Hz) and suspension modes.
-    """
-    bodies = [rigid_body(axis.rate, delay, float(freq)) for freq in suspensions]
-    radius = max(float(np.max(np.abs(lft(body, axis.system).poles()))) for body in bodies)
-    if not radius < 1.0:
-        raise SolverError(
-            f"the rigid-body loop at {axis.bandwidth:g} Hz is unstable (spectral radius "
-            f"{radius:.6f}): rate {axis.rate:g} Hz and a delay of {delay:g} samples leave too "
-            "little phase. Lower the bandwidth or the delay, or raise the rate or the roll-off."
-        )
-    margin = 1.0 / max(rigid_peak(body, axis) for body in bodies)
-    return {"rigid-body spectral radius": radius, "rigid-body modulus margin": margin}
-
-
-def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:
-    """Return [ref, hats] -> u: errors, one controller an axis, decoupling."""
-    first = poi.axes[0]
-    reference = poi.derived(first, "ref")
-    inputs = [reference] if reference in plant.y else []
-    hats = [poi.derived(name, "hat") for name in poi.axes]
-    errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
-    errors[0, : len(inputs)] = 1.0
-    comparison = as_statespace(errors).replace(
-        dt=plant.dt, inputs=[*inputs, *hats], outputs=[f"{name}:e" for name in hats]
-    )
-    bank = append(
-        *(
-            axis.replace(
-                inputs=[f"{name}:e"],
-                outputs=[f"{name}:a"],
-                states=[f"{name}|{state}" for state in axis.states],
-            )
-            for name in hats
-        )
-    )
-    forces = as_statespace(decoupling).replace(dt=plant.dt, inputs=bank.outputs, outputs=plant.u)
-    return series(series(comparison, bank), forces).replace(name="servo", blocks=None)

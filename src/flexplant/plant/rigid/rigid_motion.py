@@ -156,8 +156,14 @@ def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) 
     LabelError
         When a name is unknown.
     """
+    return gain_of(plant, carried_of(plant), outputs, inputs)
+
+
+def gain_of(
+    plant: Partition, motions: Carried, outputs: Sequence[str], inputs: Sequence[str]
+) -> FloatArray:
+    """Return `rigid_gain` where the motions of the plant are known."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    motions = carried_of(plant)
     forces = {port.name: port for port in ports.forces}
     for name in inputs:
         if name not in forces:

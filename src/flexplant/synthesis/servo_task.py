@@ -1,0 +1,289 @@
+"""The task of a servo, whatever its bandwidth: plant, POI, rigid-body motions and observer."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cache, cached_property
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, SolverError
+from ..loop import ClosedLoop, close_loop
+from ..lti.interconnection import lft
+from ..lti.statespace import StateSpace
+from ..plant import Poi, StandardPlant, larger_plant, standard_plant
+from ..plant.rigid.rigid_motion import Carried, carried_of, gain_of
+from ..values import FloatArray, positive, real_array
+from .servo_axis import Axis, rigid_body, rigid_peak
+from .servo_loop import (
+    ServoLoop,
+    elastic,
+    estimates,
+    highest,
+    observer_system,
+    seeing,
+    servo_loop,
+)
+
+#: bandwidths that `ServoTask.largest` tries from 0.19 of the rate down, before it halves intervals
+_TRIALS = 80
+#: steps of 1 % that it goes down from what the grid says
+_STEPS = 30
+
+
+@dataclass(frozen=True)
+class ServoTask:
+    """What does not depend on the bandwidth.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled.
+    poi : Poi
+        What is moved.
+    motions : Carried
+        The plant's rigid-body motions, free or on springs.
+    rolloff, integrator, notches
+        As for `design_servo`.
+    observer : StateSpace, optional
+        Gives the estimates.
+    larger : StandardPlant, optional
+        The plant with the modes left out.
+    """
+
+    plant: StandardPlant
+    poi: Poi
+    motions: Carried
+    rolloff: float | None
+    integrator: float | None
+    notches: tuple[float, ...] | None
+    observer: StateSpace | None
+    larger: StandardPlant | None
+
+    @property
+    def rate(self) -> float:
+        """Sampling rate [Hz]."""
+        return 1.0 / self.plant.dt
+
+    def axis(self, bandwidth: float) -> Axis:
+        """Return the controller of one axis, with the notches that were given."""
+        rolloff = min(8.0 * bandwidth, 0.4 * self.rate) if self.rolloff is None else self.rolloff
+        slow = 0.1 * bandwidth if self.integrator is None else self.integrator
+        for name, freq in (("rolloff", rolloff), ("integrator", slow)):
+            _below_nyquist(freq, name, self.rate)
+        return Axis(bandwidth, float(rolloff), float(slow), self.notches or (), self.rate)
+
+    @cached_property
+    def decoupling(self) -> FloatArray:
+        """T_u (m, r): accelerations of the POI's axes to actuator forces, of least norm.
+
+        Raises
+        ------
+        AssumptionError
+            When the axes or actuators do not span the rigid-body motions.
+        """
+        plant, axes, r = self.plant, self.poi.axes, self.motions.modes.size
+        plant.continuous.check().require(("stabilisable",), "a servo of the rigid body")
+        gain = gain_of(plant, self.motions, [self.poi.channel(axis) for axis in axes], plant.u)
+        size = np.linalg.norm(gain, axis=1, keepdims=True)
+        if len(axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
+            raise AssumptionError(
+                f"POI {self.poi.name!r} has axes {axes}, the plant {r} rigid-body modes: the servo "
+                "needs axes that span them, one each (for a plate z, rx, ry). Give the POI these."
+            )
+        return np.asarray(np.linalg.pinv(gain))
+
+    @cached_property
+    def loop(self) -> ServoLoop:
+        """Over frequency, with the modes left out where they are known."""
+        found = servo_loop(self.larger or self.plant, self.observer, self.poi, self.decoupling)
+        return found if self.larger is None else replace(found, modes=elastic(self.plant))
+
+    @cached_property
+    def _estimates(self) -> StateSpace:
+        return estimates(self.plant, self.observer, self.poi)
+
+    def notched(self, axis: Axis) -> Axis:
+        """Return the axis with notches where they serve, unless they were given."""
+        return axis if self.notches is not None else self.loop.notched(axis, self.is_stable)
+
+    @cached_property
+    def controller(self) -> Callable[[Axis], StateSpace]:
+        """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
+        return cache(lambda axis: _joined(self.plant, self.poi, axis.system, self.decoupling))
+
+    def is_stable(self, axis: Axis) -> bool:
+        """Return whether the loop is stable with the modes that the plant has."""
+        hats = self._estimates.outputs
+        return lft(self._estimates, self.controller(axis).select(inputs=hats)).is_stable
+
+    def closed(self, axis: Axis) -> ClosedLoop:
+        """Return the loop that will run, without a warning of its own."""
+        plant, larger, blocks = self.plant, self.larger, [self.controller(axis)]
+        if self.observer is None:
+            plant = seeing(plant, self.poi)
+            larger = None if larger is None else seeing(larger, self.poi)
+        else:
+            blocks = [self.observer, *blocks]
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", FlexplantWarning)
+            return close_loop(plant, *blocks, larger=larger)
+
+    @cached_property
+    def _bodies(self) -> list[StateSpace]:
+        """The motions of the rigid body, each as a system of its own."""
+        free = np.unique(self.motions.freq)
+        return [rigid_body(self.rate, self.plant.delay, float(f)) for f in free]
+
+    def certified(self, axis: Axis) -> dict[str, float]:
+        """Return radius and margin of the worst axis of the rigid body.
+
+        All axes have the same controller, so that the loop falls apart into those of the body's own
+        motions, whatever the axes: free ones (0 Hz) and suspension modes.
+
+        Raises
+        ------
+        SolverError
+            When it is unstable.
+        """
+        radius = max(np.abs(lft(body, axis.system).poles()).max() for body in self._bodies)
+        if not radius < 1.0:
+            raise SolverError(
+                f"the rigid-body loop at {axis.bandwidth:g} Hz is unstable (spectral radius "
+                f"{radius:.6f}): rate {axis.rate:g} Hz and a delay of {self.plant.delay:g} samples "
+                "leave too little phase. Lower the bandwidth or the delay, or raise the rate or "
+                "the roll-off."
+            )
+        margin = 1.0 / max(rigid_peak(body, axis) for body in self._bodies)
+        return {
+            "rigid-body spectral radius": float(radius),
+            "rigid-body modulus margin": margin,
+        }
+
+    def largest(self, peak: float) -> float:
+        """Return the largest bandwidth that holds a peak of |S| at u.
+
+        Raises
+        ------
+        SolverError
+            When none does.
+        """
+        slowest = max(3.0 * float(self.motions.freq.max()) * (1 + 1e-9), 2e-4 * self.rate)
+
+        def holds(bandwidth: float) -> bool:
+            axis = self.axis(bandwidth)
+            if max(rigid_peak(body, axis) for body in self._bodies) > peak:
+                return False
+            axis = self.notched(axis)
+            return self.loop.peak(axis) <= peak and self.is_stable(axis)
+
+        def verified(bandwidth: float) -> bool:
+            closed = self.closed(self.notched(self.axis(bandwidth)))
+            checks = [(closed.is_stable, closed.modulus_margin)]
+            if closed.left_out is not None:
+                checks.append((closed.left_out.is_stable, closed.left_out.modulus_margin))
+            return all(stable and margin >= 1.0 / peak for stable, margin in checks)
+
+        trials = np.geomspace(0.19 * self.rate, slowest, _TRIALS)
+        found = highest(trials.tolist(), holds)
+        # the grid may miss the very top of a peak: a step down, by the exact margins
+        steps = () if found is None else found * 0.99 ** np.arange(_STEPS)
+        for reached in map(float, steps):
+            if verified(reached):
+                return reached
+        raise SolverError(
+            f"no bandwidth above {slowest:.3g} Hz holds |S| at u below "
+            f"{20 * np.log10(peak):.2g} dB: rate, delay, observer and modes leave too little "
+            "phase. Raise the rate, lower the delay, or move sensors and actuators."
+        )
+
+
+def servo_task(
+    given: StandardPlant,
+    *,
+    poi: str | None,
+    rolloff: float | None,
+    integrator: float | None,
+    notches: Sequence[float] | None,
+    observer: Any,
+    larger: Any,
+) -> ServoTask:
+    """Return the task of a servo; parameters as for `design_servo`.
+
+    Raises
+    ------
+    AssumptionError, LabelError, ModelError
+        As for `design_servo`.
+    """
+    plant = standard_plant(given)
+    port = _poi(plant, poi)
+    if not plant.dt:
+        raise AssumptionError(
+            "a servo is designed at its sampling rate: pass plant.discretized(rate, delay=...)."
+        )
+    centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
+    for freq in centres or ():
+        _below_nyquist(freq, "notch", 1.0 / plant.dt)
+    motions = carried_of(plant)
+    return ServoTask(
+        plant,
+        port,
+        motions,
+        rolloff,
+        integrator,
+        None if centres is None else tuple(centres),
+        observer_system(observer, plant, port),
+        larger_plant(plant, larger),
+    )
+
+
+def _below_nyquist(freq: float, name: str, rate: float) -> None:
+    if positive(freq, name) >= 0.5 * rate:
+        raise ModelError(
+            f"{name} {freq:g} Hz is not below half the rate, {0.5 * rate:g} Hz: sampled, it would "
+            "act at another frequency. Leave it out, lower it, or raise the rate."
+        )
+
+
+def _poi(plant: StandardPlant, name: str | None) -> Poi:
+    if plant.is_weighted:
+        raise ModelError(
+            "the plant is weighted: a servo acts on physical channels. Use plant.unweighted."
+        )
+    ports = plant.assembled.ports
+    if not ports.z:
+        raise AssumptionError(
+            "a servo needs a plant with a POI, assembled from a structure: "
+            "assemble_plant(model, ports)."
+        )
+    if name is None and len(ports.z) > 1:
+        names = ", ".join(poi.name for poi in ports.z)
+        raise LabelError(
+            f"the plant has {len(ports.z)} POIs ({names}): say which one the servo moves, "
+            f"such as poi={ports.z[0].name!r}."
+        )
+    return ports.poi(name if name is not None else ports.z[0].name)
+
+
+def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:
+    """Return [ref, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
+    reference = poi.derived(poi.axes[0], "ref")
+    inputs = [reference] if reference in plant.y else []
+    hats = [poi.derived(name, "hat") for name in poi.axes]
+    errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
+    errors[0, : len(inputs)] = 1.0
+    each = np.eye(len(hats))
+    return StateSpace(
+        np.kron(each, axis.A),
+        np.kron(each, axis.B) @ errors,
+        decoupling @ np.kron(each, axis.C),
+        decoupling @ np.kron(each, axis.D) @ errors,
+        plant.dt,
+        inputs=[*inputs, *hats],
+        outputs=plant.u,
+        states=[f"{name}|{state}" for name in hats for state in axis.states],
+        name="servo",
+    )
