@@ -1,4 +1,4 @@
-"""Profiles of hypothesis, a backend without windows, and the oracles on the path."""
+"""Profiles of hypothesis, a backend without windows, oracles on the path, a rule on tolerances."""
 
 import os
 import sys
@@ -14,6 +14,11 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 
 # oracles and small machines live here; tests in the folders below import them by name
 sys.path.insert(0, str(Path(__file__).parent))
+
+# before the tests are imported
+from tolerances import guard
+
+guard()
 
 settings.register_profile(
     "dev",

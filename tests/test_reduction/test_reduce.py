@@ -133,9 +133,15 @@ def test_rows_and_expansion(plate):
     both = model.expand(q + 2j * q)
     np.testing.assert_allclose(both, full * (1 + 2j))
     found = model.modes()
-    np.testing.assert_allclose(
-        np.abs(found.at(Z8)), np.abs(modes.basis[plate.dofs.index(Z8)]), atol=1
-    )
+    # of repeated modes any basis may come: the sum of their squares is theirs alone
+    omega = modes.basis_omega
+    group = np.cumsum(np.diff(omega, prepend=0.0) > 1e-6 * omega)
+    squares = [
+        np.bincount(group, weights=shape**2)
+        for shape in (found.at(Z8), modes.basis[modes.dofs.index(Z8)])
+    ]
+    assert len(squares[0]) < 20
+    np.testing.assert_allclose(*squares, atol=1e-9 * squares[1].max())
 
 
 def test_complex_modes_after_a_damper(plate):

@@ -81,6 +81,8 @@ def test_one_element_plate():
 )
 def test_patch_of_constant_curvature_stores_the_exact_energy(c, size, elements):
     t, E, nu = 0.01, 70e9, 0.3
+    # curvatures of order one, however small those drawn
+    c[3:] = np.array(c[3:]) / (np.abs(c[3:]).max() or 1.0)
     model = kirchhoff_plate(
         size=size, thickness=t, elements=elements, density=2700, youngs_modulus=E, poisson_ratio=nu
     )
@@ -151,17 +153,19 @@ def test_interpolation_is_exact_at_nodes():
 
 @given(
     c=st.lists(st.floats(-1, 1), min_size=6, max_size=6),
-    place=st.tuples(st.floats(0, 1), st.floats(0, 1)),
+    place=st.tuples(st.integers(0, 1000), st.integers(0, 1000)),
     elements=st.tuples(st.integers(1, 6), st.integers(1, 6)),
 )
 def test_interpolation_reproduces_quadratic_fields(c, place, elements):
     size = (0.6, 0.4)
     shape = PlateShape(size, 0.01, elements)
-    point = np.array([place[0] * size[0], place[1] * size[1], 0.0])
+    # thousandths: on a line of nodes or far from it, not within the 1e-9 that count as on it
+    point = np.array([place[0] * size[0] / 1000, place[1] * size[1] / 1000, 0.0])
+    c = np.array(c) / (np.abs(c).max() or 1.0)
     q = quadratic(oracle.nodes(*elements, size=size), c).ravel()
     exact = quadratic([point[:2]], c)[0]
-    for direction, value in zip(("z", "rx", "ry"), exact, strict=True):
-        assert shape.row(point, direction) @ q == pytest.approx(value, abs=1e-11)
+    found = [shape.row(point, direction) @ q for direction in ("z", "rx", "ry")]
+    assert np.abs(found - exact).max() <= 1e-11 * np.abs(q).max()
 
 
 def test_interpolation_inside_an_element_is_that_of_the_oracle(plate):
