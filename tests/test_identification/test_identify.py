@@ -16,7 +16,7 @@ from flexplant.identification import (
     stabilisation_diagram,
 )
 from flexplant.identification.pole_split import separated
-from flexplant.identification.refine import Lines, _Projected, refined
+from flexplant.identification.refine import LEAST, Lines, _Projected, refined
 from flexplant.identification.residual_peaks import completed, unexplained
 from flexplant.lti import Frf
 from flexplant.store import load
@@ -208,6 +208,33 @@ def test_no_pole_is_lost_in_silence_and_the_doubt_is_honest(known, seeds):
     assert 0.8 < rms < 1.25
     assert np.abs(z).max() < 4.5
     assert alarms <= 0.02 * len(seeds)
+
+
+def test_refined_poles_stay_stable():
+    """An unstable pole below the band is held on the axis, and the others are the best beside it.
+
+    The oracle fits residues by lstsq at given poles and moves each pole both ways.
+    """
+    freq = np.arange(80.0, 160.0, 0.25)
+    s = 2j * np.pi * freq
+    truth = pole([70.0, 130.0], [-0.01, 0.01])  # the first one grows
+    H = sum(1e3 / (s - p) + 1e3 / (s - p.conjugate()) for p in truth)
+    lines = Lines(freq, H[None, None], np.ones((1, 1, freq.size)), 0, 0, None)
+    start = pole([70.5, 130.2], [0.01, 0.02])
+    found = refined(lines, start, np.ones((1, 2), complex), steps=100).poles
+
+    def cost(poles):
+        columns = [1j**k / (s - p) + (-1j) ** k / (s - p.conj()) for p in poles for k in (0, 1)]
+        basis = np.array([np.concatenate([c.real, c.imag]) for c in columns]).T
+        goal = np.concatenate([H.real, H.imag])
+        return np.sum((goal - basis @ np.linalg.lstsq(basis, goal)[0]) ** 2)
+
+    assert found.real == pytest.approx([-LEAST * found[0].imag, found[1].real], rel=1e-12, abs=0)
+    least = cost(found)
+    for step in (1.0, -1.0, 1.0j, -1.0j):
+        for k in range(2):
+            worse = cost(found + 0.01 * step * np.eye(2)[k]) > least
+            assert worse == (k == 1 or step != 1.0), (k, step)
 
 
 def test_without_noise_nothing_is_warned_of():

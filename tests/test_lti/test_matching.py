@@ -124,3 +124,14 @@ def test_refusals():
         matched("filter", RATE)
     gain = StateSpace([], [], [], [[3.0]])
     assert matched(gain, RATE).dt == 1 / RATE
+
+
+def test_a_filter_without_response_is_refused():
+    """Zero in its matrices, or with an input whose states the output does not see."""
+    lag = StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
+    with pytest.raises(ModelError, match="is zero: it has no zeros"):
+        finite_zeros(lag.replace(B=[[0.0]]))
+    assert finite_zeros(lag.replace(B=[[0.0]], D=[[1.0]])) == pytest.approx([-1.0])
+    apart = StateSpace([[-1.0, 0.0], [0.0, -2.0]], [[1.0], [0.0]], [[0.0, 1.0]], [[0.0]])
+    with pytest.raises(ModelError, match="its input does not reach its output"):
+        finite_zeros(apart)

@@ -67,6 +67,10 @@ def test_refusals():
     plant = plant_of(reduce(MODES, ModalTruncation(9)))
     with pytest.raises(ModelError, match=r"delay 1, the plant .* and 1\.5"):
         larger_plant(plant, plant_of(MODES, delay=1))
+    slow = assemble_plant(MODES, ports()).discretized(5e3, delay=1.5)
+    assert slow.dt != plant.dt
+    with pytest.raises(ModelError, match="could not be compared"):
+        larger_plant(plant, slow)
     other = assemble_plant(MODES, ports().replace(y=ports().y[:3]))
     with pytest.raises(LabelError, match="other channels in w"):
         larger_plant(plant, other)

@@ -493,6 +493,24 @@ def test_validation_on_unused_data(chain):
         split(StaticCompliance(1.0, "1:z", "2:z"))
 
 
+def test_validation_from_a_start(chain):
+    """Before is at the start, not at zero; the way from there leaves K positive definite."""
+
+    def compliance(k, i):
+        return np.linalg.inv(chain.K + np.diag([0.0, k, 0.0, 0.0]))[i, i]
+
+    lowest = -1.0 / compliance(0.0, 1)  # K is singular there
+    start, truth, std = 0.6 * lowest, 0.3 * lowest, 1e-6
+    one, other = (
+        StaticCompliance(compliance(truth, i), *2 * [f"{i + 1}:z"], std=std) for i in (1, 2)
+    )
+    found = validate(chain, [AddedStiffness("2:z")], [one], [other], start=[start])
+    for side, i in ((found.fitted, 1), (found.unused, 2)):
+        expected = abs(compliance(truth, i) - compliance(start, i)) / std
+        assert side[0] == pytest.approx(expected, rel=1e-9, abs=0)
+        assert side[1] < 1e-6 * expected
+
+
 def test_correlation_before_and_after(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     poles = measured(parts)
