@@ -134,6 +134,8 @@ from .reduction import reduce as reduce
 from .reduction import select_dofs as select_dofs
 from .simulation import Response as Response
 from .simulation import SetPoint as SetPoint
+from .simulation import compare_estimators as compare_estimators
+from .simulation import reading_along as reading_along
 from .simulation import setpoint as setpoint
 from .simulation import simulate as simulate
 from .sparse import Pardiso as Pardiso

@@ -76,6 +76,9 @@ def made():
     yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
     response = fx.simulate(loop, reference=point, duration=0.05, rng=1)
+    along = fx.close_loop(sampled, static, servo, *fx.reading_along({"static": static}))
+    runs = fx.simulate(along, duration=0.01, rng=1, runs=2)
+    yield fx.compare_estimators({"static": static}, runs, "die:z")
     candidates = [fx.Sensor(f"c{i}", at=p, asd=1e-12) for i, p in enumerate([*CORNERS, Z8])]
     small = fx.assemble_plant(some_modes(count=8, attached=False), ports()).discretized(RATE)
     sensors = fx.place_sensors(small, candidates=candidates, count=4)

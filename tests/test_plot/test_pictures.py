@@ -11,7 +11,7 @@ import flexplant as fx
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import Frf
 from flexplant.simulation import Response
-from stages import CORNERS, INSET, Z8, L, fitted, ports, reduced, some_modes
+from stages import CORNERS, INSET, Z8, L, fitted, ports, reduced, sampled, some_modes
 
 POLES = np.array([-28.569 + 2883.567j, -39.451 + 3983.308j])
 
@@ -67,6 +67,16 @@ def test_sensitivity():
     levels = {line.get_ydata()[0] for line in ax.get_lines()[1:]}
     assert levels == {0.0, 6.0}
     assert ink(ax) > 0.005
+
+
+def test_sensitivity_of_a_loop():
+    plant = sampled(reduced())
+    loop = fx.close_loop(plant, fx.design_static(plant), fx.design_servo(plant, bandwidth=30.0))
+    (line, *_) = fx.plot.sensitivity({"servo": loop}).get_lines()
+    S = loop.frequency_response(line.get_xdata())["die:error", "die:ref"]
+    np.testing.assert_allclose(line.get_ydata(), 20 * np.log10(np.abs(S)), rtol=1e-6, atol=1e-6)
+    row = fx.compare_loops({"servo": loop})["servo"]
+    assert line.get_ydata().max() == pytest.approx(20 * np.log10(row.peak))
 
 
 def run_of(errors):

@@ -103,6 +103,20 @@ def test_the_interval_of_the_rms_covers_the_truth():
         run.rms_interval("e", level=95)
 
 
+def test_exposure_is_the_worst_window_after_a_time():
+    rng = np.random.default_rng(8)
+    data = rng.standard_normal((2, 1, 400))
+    data[0, 0, 50] = 300.0  # before the start
+    run = Response(np.arange(400) * 1e-3, data, ["e"])
+    late = run.time >= 0.1
+    average, deviation = run.moving_average("e", window=0.02), run.moving_std("e", window=0.02)
+    found = run.exposure("e", window=0.02, start=0.1)
+    assert found == (np.abs(average[:, late]).max(), deviation[:, late].max())
+    assert run.exposure("e", window=0.02)[0] > 10 * found[0]
+    with pytest.raises(ModelError, match="leaves nothing"):
+        run.exposure("e", start=1.0)
+
+
 def test_is_a_mapping_and_a_value(tmp_path):
     run = response([1.0, 2.0, 3.0])
     assert list(run) == ["e"] and "e" in run and len(run) == 1

@@ -129,7 +129,7 @@ def compare_loops(
                 "the same Ports, or name the channels: reference=, error=."
             )
     curves = {
-        name: _sensitivity(loop, *pair) if pair and loop.is_stable else None
+        name: error_sensitivity(loop, *pair) if pair and loop.is_stable else None
         for name, loop in loops.items()
     }
     reached = {name: _bandwidth(curve) for name, curve in curves.items()}
@@ -151,8 +151,31 @@ def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tup
     return reference, error if error is not None else f"{reference.removesuffix(':ref')}:error"
 
 
-def _sensitivity(loop: ClosedLoop, reference: str, error: str) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies and |S|, refined where it is largest."""
+def error_sensitivity(
+    loop: ClosedLoop, reference: str | None = None, error: str | None = None
+) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies [Hz] and |S| from the reference to the error, refined where it is largest.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        Stable.
+    reference, error : str, optional
+        As for `compare_loops`.
+
+    Raises
+    ------
+    LabelError
+        When the loop lacks the channels.
+    """
+    if reference is None or error is None:
+        pair = _channels(loop, reference, error)
+        if not pair:
+            raise LabelError(
+                "the loop has no reference, so no sensitivity from it to an error: add "
+                "Reference(...) to the ports, or name the channels."
+            )
+        reference, error = pair
     gain = loop.gain(reference, error)
     return climbed(lambda freq: np.abs(gain(freq)[0, 0]), loop.broken.grid, 4)
 

@@ -8,6 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
+from ..loop import ClosedLoop
+from ..loop.comparison import error_sensitivity
 from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray, short
 from ._axes import CYCLE, axes, finish
@@ -91,7 +93,7 @@ def _decibel(values: ComplexArray) -> FloatArray:
 
 
 def sensitivity(
-    curves: Mapping[str, tuple[FloatArray, FloatArray]],
+    curves: Mapping[str, ClosedLoop | tuple[FloatArray, FloatArray]],
     *,
     colors: Mapping[str, str] | None = None,
     dashed: Collection[str] = (),
@@ -101,8 +103,8 @@ def sensitivity(
 
     Parameters
     ----------
-    curves : mapping {label: (freq [Hz], size)}
-        What to compare.
+    curves : mapping {label: ClosedLoop, or (freq [Hz], size)}
+        What to compare; of a loop |S| from its reference to the error at the POI.
     colors : mapping {label: color}, optional
         Of some lines.
     dashed : collection of str
@@ -125,7 +127,8 @@ def sensitivity(
             "{'model': (freq, size)}."
         )
     ax = axes(ax, figsize=(8.0, 4.5))
-    for i, (label, (freq, size)) in enumerate(curves.items()):
+    for i, (label, curve) in enumerate(curves.items()):
+        freq, size = error_sensitivity(curve) if isinstance(curve, ClosedLoop) else curve
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
         style = "--" if label in dashed else "-"
         ax.semilogx(freq, 20.0 * np.log10(size), style, color=color, label=label)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
@@ -249,6 +250,36 @@ class Response(Value, Mapping[str, FloatArray]):
         """
         return self._moments(channel, window)[1]
 
+    def exposure(
+        self, channel: str, *, window: float = 5e-3, start: float = 0.0
+    ) -> tuple[float, float]:
+        """Return the largest |MA| and the largest MSD of a channel after a time, over all runs.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        window : float [s]
+            Exposure time of a point, as for `moving_average`.
+        start : float [s]
+            Windows centred before this time are left out: the move and its settling.
+
+        Returns
+        -------
+        tuple of float
+            MA and MSD, in the channel's unit.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When the window does not fit the record, or nothing is left after `start`.
+        """
+        late = self._late(start)
+        average, deviation = self._moments(channel, window)
+        return float(np.abs(average[..., late]).max()), float(deviation[..., late].max())
+
     def to_sep005(self) -> list[dict[str, object]]:
         """Return the channels of a single run as SDyPy's time series (SEP 5).
 
@@ -273,8 +304,10 @@ class Response(Value, Mapping[str, FloatArray]):
         ]
 
     def _from(self, channel: str, start: float) -> FloatArray:
+        return self[channel][..., self._late(start)]
+
+    def _late(self, start: float) -> npt.NDArray[np.bool_]:
         first = float(real_array(start, "start", ()))
-        signal = self[channel]
         # half a sample of slack: start=0.1 means the sample at 0.1 s, however that was rounded
         keep = self.time >= first - 0.5 * self.dt
         if not np.any(keep):
@@ -282,7 +315,7 @@ class Response(Value, Mapping[str, FloatArray]):
                 f"start={first:g} s leaves nothing: the response ends at {self.time[-1]:g} s. "
                 "Choose an earlier start, or simulate for longer."
             )
-        return signal[..., keep]
+        return keep
 
     def _moments(self, channel: str, window: float) -> tuple[FloatArray, FloatArray]:
         signal = self[channel]

@@ -1,0 +1,153 @@
+"""Several estimators of one POI side by side: what each predicts, and what a machine has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..estimation import KalmanEstimator, StaticEstimator
+from ..estimation.channels import estimates, poi_channels, row_of
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value, short
+from .response import Response
+
+Estimator = KalmanEstimator | StaticEstimator
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class EstimatorComparison(Value):
+    """Predicted and measured rms errors of several estimators; prints as a table.
+
+    Parameters
+    ----------
+    channel : str
+        The motion that is estimated.
+    names : sequence of str
+        Of the estimators.
+    errors : (n, 4) array [m or rad]
+        Predicted, measured, and the ends of the confidence interval of what was measured.
+    level : float
+        Of the interval.
+    """
+
+    channel: str
+    names: tuple[str, ...]
+    errors: FloatArray
+    level: float
+
+    def __post_init__(self) -> None:
+        self._set(names=tuple(self.names), errors=self.errors)
+
+    def __getitem__(self, name: str) -> FloatArray:
+        if name not in self.names:
+            raise unknown_label("estimator", name, self.names)
+        found: FloatArray = self.errors[self.names.index(name)]
+        return found
+
+    def __repr__(self) -> str:
+        turning = self.channel.rpartition(":")[2].startswith("r")
+        unit = "nrad" if turning else "nm"
+        width = max(map(len, self.names)) + 2
+        lines = [f"rms error of the estimate of {self.channel} [{unit}]"]
+        lines.append(f"{'':{width}s}{'predicted':>10s}{'measured':>10s}  {self.level:.0%} interval")
+        for name, (predicted, measured, low, high) in zip(
+            self.names, 1e9 * self.errors, strict=True
+        ):
+            lines.append(
+                f"{name:{width}s}{predicted:10.3f}{measured:10.3f}  {low:.3f} to {high:.3f}"
+            )
+        return "\n".join(lines)
+
+
+def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
+    """Return the estimators as blocks that read along in a loop: their outputs drive nothing.
+
+    Parameters
+    ----------
+    designs : mapping {name: KalmanEstimator or StaticEstimator}
+        Each estimate gets the name of its design in front: `updated|die:hat`.
+
+    Returns
+    -------
+    tuple of StateSpace
+        For `close_loop` or `simulate`, beside the blocks that control.
+
+    Raises
+    ------
+    ModelError
+        When there is no mapping of estimators.
+    """
+    _check(designs)
+    return tuple(
+        design.system.renamed(outputs={hat: f"{name}|{hat}" for hat in design.system.outputs})
+        for name, design in designs.items()
+    )
+
+
+def compare_estimators(
+    designs: Mapping[str, Estimator],
+    run: Response,
+    channel: str,
+    *,
+    start: float = 0.0,
+    level: float = 0.95,
+) -> EstimatorComparison:
+    """Return what estimators predict of their own error beside what runs of a machine show.
+
+    Parameters
+    ----------
+    designs : mapping {name: KalmanEstimator or StaticEstimator}
+        As given to `reading_along`.
+    run : Response
+        Several runs of a loop in which they read along, with the POI's motion.
+    channel : str
+        The motion at the POI, `die:z`.
+    start : float [s]
+        Samples before this time are left out: transients.
+    level : float
+        Of the confidence intervals (`Response.rms_interval`).
+
+    Returns
+    -------
+    EstimatorComparison
+
+    Raises
+    ------
+    ModelError
+        When there is no mapping of estimators, or there is only one run.
+    LabelError
+        When the run lacks the motion or an estimate of it.
+    """
+    _check(designs)
+    if not isinstance(run, Response):
+        raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+    rows = []
+    for name, design in designs.items():
+        channels = poi_channels(design.plant)
+        hat = f"{name}|{estimates(channels)[row_of(channels, channel)]}"
+        for wanted in (channel, hat):
+            if wanted not in run:
+                raise LabelError(
+                    f"{unknown_label('channel', wanted, list(run))} Estimators read along in a "
+                    "loop as blocks: close_loop(plant, *blocks, *reading_along(designs))."
+                )
+        error = run[channel] - run[hat]
+        seen = run.replace(data=error[..., None, :], names=["error"], units={})
+        rows.append((design.rms(channel), *seen.rms_interval("error", start=start, level=level)))
+    return EstimatorComparison(channel, tuple(designs), np.array(rows), level)
+
+
+def _check(designs: Mapping[str, Estimator]) -> None:
+    if not isinstance(designs, Mapping) or not designs:
+        raise ModelError(
+            f"need a mapping of names to estimators, got {short(designs)}. Type "
+            "{'updated': design_kalman(plant)}."
+        )
+    wrong = [found for found in designs.values() if not isinstance(found, Estimator)]
+    if wrong:
+        raise ModelError(
+            f"need estimators, got {short(wrong[0])}. Use design_kalman or design_static."
+        )
