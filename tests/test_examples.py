@@ -1,58 +1,79 @@
-"""The paper's story runs, and its numbers are those of independent oracles or of the notes."""
+"""The two stories of the paper's plate run, their claims are true, and can become untrue."""
 
 import importlib
 import json
-import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from matplotlib import image
 from PIL import Image
-from scipy import stats
 
 import flexplant as fx
 from oracles_plant import machine
 from oracles_structure import elastic_receptance, plate_matrices, undamped
 from oracles_structure import poles as dense_poles
 
-FILE = Path(__file__).parents[1] / "examples" / "wafer_stage.py"
-FIGURES = ("figure_03", "figure_04", "figure_05", "figure_06", "figure_07", "figure_08")
-FIGURES += ("figure_09", "figure_10", "figure_11", "closed_loop")
-#: nm rms at 1e-3 N/sqrt(Hz), static, not updated, updated: closed forms, pinned in test_testbeds
-PINS = {0.01: (1.845, 0.8282, 0.6395), 0.001: (5.834, 2.297, 1.559)}
+EXAMPLES = Path(__file__).parents[1] / "examples"
+#: nm rms at 1e-3 N/sqrt(Hz) on the machine, closed forms of test_testbeds: static and the filter
+#: that does not know the modes left out
+PINS = {0.01: (1.845, 0.6395), 0.001: (5.834, 1.559)}
 
 pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module")
-def example():
-    # by its own name, from the path: processes that help it import it again
+def examples():
+    # by their own names, from the path: processes that help them import them again
     with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(FILE.parent))
-        yield importlib.import_module("wafer_stage")
+        patch.syspath_prepend(str(EXAMPLES))
+        yield importlib.import_module("wafer_stage"), importlib.import_module("paper_plate")
 
 
 @pytest.fixture(scope="module")
-def result(example):
-    return example.main()
+def stage(examples):
+    return examples[0]
 
 
-def test_the_plate(example):
+@pytest.fixture(scope="module")
+def result(stage):
+    return stage.main()
+
+
+@pytest.fixture(scope="module")
+def paper(examples):
+    return examples[1].main()
+
+
+def drawn_well(path):
+    """A picture is not blank, not small, and has colour."""
+    pixels = image.imread(path)[:, :, :3]
+    assert pixels.std() > 0.02, f"{path.name} is blank"
+    assert min(pixels.shape[:2]) > 300
+    coloured = pixels.max(axis=2) - pixels.min(axis=2) > 0.2
+    assert coloured.mean() > 5e-4 or path.stem.endswith("reduced"), f"{path.name} has no curve"
+
+
+def test_stories_are_short():
+    for path in EXAMPLES.glob("*.py"):
+        assert len(path.read_text(encoding="utf-8").splitlines()) <= 265, path.name
+    lines = (EXAMPLES / "wafer_stage.py").read_text(encoding="utf-8").splitlines()
+    assert len(lines) <= 250
+
+
+def test_the_plate(stage):
     # oracle: dense eigenvalues of matrices by Gauss points; notes.md
     M, K = plate_matrices(8, 8)
-    found = fx.solve_modes(example.plate, count=24).freq
+    found = fx.solve_modes(stage.plate, count=24).freq
     np.testing.assert_allclose(found[3:], undamped(M, K)[0][3:24] / (2 * np.pi), rtol=1e-8)
     np.testing.assert_allclose(found[3:8], [245.754, 359.312, 463.131, 640.083, 640.083], rtol=1e-5)
     assert np.array_equal(found[:3], np.zeros(3))
-    thick = undamped(*plate_matrices(8, 8, thickness=0.0272 * 1.01))[0][3] / (2 * np.pi)
-    assert abs(thick / found[3] - 1) > 5e-3
-    assert example.z8 == "23:z"
+    assert stage.z8 == "23:z"
 
 
-def test_the_reduction(example, result):
+def test_the_reduction(stage, paper):
     """Corner FRF to mode 20 at 1 %: notes.md's 7 % and 0.5 %, against all modes of the oracle."""
-    modal, attached = result["frf_error"]
+    modal, attached = paper["frf_error"]
     assert modal <= 0.07
     assert attached == pytest.approx(0.0040, abs=1e-4)
     M, K = plate_matrices(8, 8)
@@ -65,129 +86,115 @@ def test_the_reduction(example, result):
     kept = (shape / (w**2 - s**2 + 0.02j * w * s)).sum(axis=1)
     assert modal == pytest.approx(np.abs(kept - full).max() / static, rel=1e-3)
     for zeta in (0.01, 0.001):
-        poles = result["cases"][zeta]["nominal"].modes().poles
+        poles = stage.reduced(zeta).modes().poles
         assert np.array_equal(poles[:3], np.zeros(3))
         wanted = omega[3:24] * (-zeta + 1j * np.sqrt(1 - zeta**2))
         # repeated pairs come in any order, so by size
         np.testing.assert_allclose(np.abs(poles[3:24]), np.abs(wanted), rtol=1e-8)
-        own = fx.solve_modes(example.plate, count=24, damping=fx.ModalDamping(zeta)).poles[3:]
-        np.testing.assert_allclose(poles[3:24], own, rtol=1e-11)
 
 
-def test_the_update(result):
+def test_the_update(stage, result, paper):
     for zeta, limit in ((0.01, 3e-3), (0.001, 3e-4)):
-        case = result["cases"][zeta]
-        wanted = dense_poles(*machine(zeta, mass=0.5))[2:4]
-        np.testing.assert_allclose(case["measured"].poles, wanted, rtol=1e-7)
-        mass, damping = case["fit"].values
+        fit = result["cases"][zeta]["fit"]
+        mass, damping = fit.values
         assert mass == pytest.approx(0.5, abs=1e-6)
         assert abs(damping) < limit
-        assert case["modal"].values[0] == pytest.approx(0.5035, abs=5e-5)
-        assert case["modal"].values[1] == pytest.approx(-21.0 * zeta, rel=0.02)
-        assert len(case["fit"].history) <= 5
-        assert case["fit"].converged
+        assert len(fit.history) <= 5
+        assert fit.converged
+        wanted = dense_poles(*machine(zeta, mass=0.5))[2:4]
+        measured = fx.testbeds.wafer_stage(damping=zeta).poles([6, 7])
+        np.testing.assert_allclose(measured.poles, wanted, rtol=1e-7)
+    assert paper["fit"].values[0] == pytest.approx(0.5, abs=1e-6)
+    assert paper["modal"].values[0] == pytest.approx(0.5035, abs=5e-5)
+    assert paper["modal"].values[1] == pytest.approx(-0.21, rel=0.02)
 
 
-def test_what_the_update_buys(result):
-    """0.1 %, 1e-3 N/sqrt(Hz), 0.1 nm: (c) beats (b) by 1.3, (b) beats (a) by 2, by runs.
-
-    The closed forms of the same loops are pinned in test_testbeds.
-    """
-    errors = result["cases"][0.001]["errors"]
-    assert tuple(errors) == (1e-4, 1e-3, 1e-2)
-    static, nominal, updated = (rms for _, rms, _ in errors[1e-3].values())
-    assert nominal >= 1.3 * updated
-    assert static >= 2 * nominal
-    for zeta, wanted in PINS.items():
-        for (_, rms, half), pin in zip(
-            result["cases"][zeta]["errors"][1e-3].values(), wanted, strict=True
-        ):
-            assert abs(1e9 * rms - pin) < 2e9 * half
-    predicted = errors[1e-3]["updated"][0]
-    assert predicted == pytest.approx(0.305e-9, rel=2e-2)  # notes.md
-
-
-@pytest.mark.parametrize("zeta", [0.01, 0.001])
-def test_the_runs_scatter_as_they_should(example, result, zeta):
-    """Limits from the correlation time, at 99.9 %: mode 6 rings at the POI for 1 / decay seconds.
-
-    The mean square of a resonance over a time T has the relative variance 1 / (decay T), so
-    2 decay T degrees of freedom; what the filters err dies out no slower.
-    """
-    decay = -dense_poles(*machine(zeta, mass=0.5))[2].real
-    seconds, seeds = example.MEASURE, example.SEEDS
-    freedom = 2 * decay * seconds * seeds
-    low, high = np.sqrt(stats.chi2.ppf([5e-4, 1 - 5e-4], freedom) / freedom)
-    # of the interval's half width: Student's factor, times a spread between seeds that scatters
-    unit = stats.t.ppf(0.975, seeds - 1) / np.sqrt(decay * seconds * seeds) / 2
-    least, most = unit * np.sqrt(stats.chi2.ppf([5e-4, 1 - 5e-4], seeds - 1) / (seeds - 1))
-    found = result["cases"][zeta]["errors"][1e-3]
-    for (name, (_, rms, half)), pin in zip(found.items(), PINS[zeta], strict=True):
-        assert low < 1e9 * rms / pin < high, name
-        assert half / rms < most / low, name
-    assert found["static"][2] / found["static"][1] > least / high
+def test_predicted_errors_are_those_of_the_machine(result):
+    """Within 5 % where modes left out are counted; far off where they are not."""
+    for zeta, case in result["cases"].items():
+        for errors in case["errors"].values():
+            predicted, measured, low, high = errors["updated, all modes"]
+            assert abs(predicted / measured - 1) < 0.05
+            assert low < measured < high
+        errors = case["errors"][1e-3]
+        for name, pin in zip(("geometry alone", "updated, 24 modes"), PINS[zeta], strict=True):
+            _, measured, low, high = errors[name]
+            assert abs(1e9 * measured - pin) < 1e9 * (high - low)
+    light = result["cases"][0.001]["errors"][1e-3]
+    assert light["updated, 24 modes"][0] == pytest.approx(0.305e-9, rel=2e-2, abs=0)  # notes.md
+    assert light["updated, 24 modes"][1] > 4 * light["updated, 24 modes"][0]
+    assert light["updated, all modes"][1] < 0.6 * light["updated, 24 modes"][1]
 
 
 def test_every_row_has_noise_of_its_own(result):
     """With shared seeds the static error would scale with the force to all digits."""
     for case in result["cases"].values():
         predicted, measured = (
-            [errors["static"][i] for errors in case["errors"].values()] for i in (0, 1)
+            [errors["geometry alone"][i] for errors in case["errors"].values()] for i in (0, 1)
         )
         assert predicted[2] / predicted[1] == pytest.approx(10.0, rel=1e-2)
         assert abs(measured[2] / measured[1] / 10.0 - 1) > 1e-3
-    one, other = (case["errors"][1e-3]["nominal"][1] for case in result["cases"].values())
-    assert one != other
 
 
 def test_the_closed_loops(result):
-    """The servo: |S| at u below 6 dB on model and machine; pinned densely in test_testbeds."""
-    for case in result["cases"].values():
-        loop = case["loops"]["servo"]
-        for where in ("on model", "on machine"):
-            assert loop[where].spectral_radius < 1
-            assert 3.0 < -20 * np.log10(loop[where].modulus_margin) < 6.0
-        run = loop["run"]
-        assert run["die:ref"][-1] == pytest.approx(100e-6)
-        np.testing.assert_allclose(run["die:error"], run["die:ref"] - run["die:z"], atol=1e-18)
-        assert 0 < loop["MA"] < 50e-9
-        assert 0 < loop["MSD"] < 20e-9
+    """0.1 %: unstable when designed on the drawing, 85 Hz and 7.3 dB on the updated model."""
+    table = result["cases"][0.001]["table"]
+    drawing, held = table["H-infinity, drawing"], table["H-infinity, updated"]
+    assert drawing.decay == pytest.approx(1.000397, abs=3e-5)
+    assert held.bandwidth == pytest.approx(84.9, abs=1.0)
+    assert -20 * np.log10(held.margin) == pytest.approx(7.3, abs=0.2)
+    servo = table["best servo, updated"]
+    assert -20 * np.log10(servo.margin) < 6.1
+    assert all(row.stable for row in result["cases"][0.01]["table"].rows.values())
+    loops = result["cases"][0.001]["loops"]
+    assert loops["H-infinity, drawing"]["model"].is_stable  # the drawing does not show it
+    assert 1e9 * loops["H-infinity, updated"]["exposure"][0] == pytest.approx(6.5, rel=0.1)
+    assert 1e9 * loops["best servo, updated"]["exposure"][0] > 12.0
 
 
-def test_the_h_infinity_designs(example, result):
-    for case in result["cases"].values():
-        loop = case["loops"]["H-infinity"]
-        assert loop["blocks"][-1].gamma == pytest.approx(0.983, rel=1e-2)
-        for where in ("on model", "on machine"):
-            assert loop[where].spectral_radius < 1
-            assert 30.0 < example.reached(loop["S"][where]) < 37.0
+def test_the_example_stops_when_a_claim_is_untrue(stage, result, monkeypatch):
+    light = result["cases"][0.001]
+    table = light["table"].replace(rows=dict(reversed(light["table"].rows.items())))
+    found = stage.claims({**result["cases"], 0.001: {**light, "table": table}})
+    assert [not holds for holds in found.values()] == [False, False, True, True, False, False]
+    hopeful = light["errors"][1e-3].replace(
+        errors=2.0 * light["errors"][1e-3].errors[:, [0, 0, 2, 3]]
+    )
+    found = stage.claims(
+        {**result["cases"], 0.001: {**light, "errors": {**light["errors"], 1e-3: hopeful}}}
+    )
+    assert not all(found.values())
+    monkeypatch.setattr(stage, "study", lambda damping: result["cases"][damping])
+    monkeypatch.setattr(stage, "claims", lambda cases: {"pigs fly": False})
+    monkeypatch.setattr(stage, "ProcessPoolExecutor", Here)
+    with pytest.raises(RuntimeError, match="no longer true: pigs fly"):
+        stage.main()
 
 
-def test_the_example_fails_when_the_design_is_not_worth_it(example):
-    plant = example.study(0.01, ())["plant"]
-    comparison, weights = fx.reference_errors(plant), fx.stage_weights(plant, 30.0)
-    weighted = plant.through(comparison).weighted(z=weights.z, w=weights.w)
-    nothing = example.doing_nothing(weighted)
-    assert 2 * 0.98 < nothing < np.inf
-    with pytest.raises(RuntimeError, match="doing nothing scores"):
-        example.require_worth(nothing, 0.51 * nothing)
-    example.require_worth(nothing, 0.49 * nothing)
-    freq = np.array([10.0, 29.0, 40.0])
-    with pytest.raises(RuntimeError, match="lost below 30 Hz on machine"):
-        example.require_bandwidth({"on machine": (freq, np.array([0.1, 1.1, 1.2]))})
-    example.require_bandwidth({"on machine": (freq, np.array([0.1, 0.9, 1.2]))})
+class Here:
+    """An executor without processes."""
+
+    def __init__(self, _):
+        self.map = map
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        return False
 
 
-def test_the_placement(result):
-    found = result["placement"]
-    assert np.sqrt(found["every"].values[0]) == pytest.approx(0.1214e-9, rel=5e-3)
-    assert found["best"].value == pytest.approx(found["every"].values[0], rel=1e-9, abs=0.0)
-    np.testing.assert_allclose(found["fifth"].best, [0.3, 0.3, 0.0], atol=1e-9)
+def test_the_map_leaves_out_the_die(stage, result):
+    points = result["placement"].points
+    assert np.hypot(points[:, 0] - 0.3, points[:, 1] - 0.3).min() >= 0.12
+    x, y, _ = result["placement"].best
+    assert min(abs(x - 0.3), abs(y - 0.3)) < 1e-9  # on a centre line, by symmetry
+    assert max(abs(x - 0.3), abs(y - 0.3)) == pytest.approx(0.15)
 
 
-def test_the_table_has_the_papers_column(example, result):
-    lines = "\n".join(["", *example.model_table(result)]).splitlines()
-    assert lines[1].split()[-2:] == ["flexplant", "paper"]
+def test_the_papers_column(examples, paper):
+    lines = examples[1].table(paper).splitlines()
+    assert lines[0].split()[-2:] == ["flexplant", "paper"]
 
     def row(start):
         return next(line for line in lines if line.startswith(start)).split()
@@ -196,59 +203,56 @@ def test_the_table_has_the_papers_column(example, result):
     assert row("mode 6 before")[-2:] == ["463.131", "461"]
     assert row("mode 6 after")[-1] == "455"
     assert row("added mass, with")[-2:] == ["0.500000", "0.5"]
-    assert row("added mass, modes")[-2:] == ["0.503535", "0.5"]
-    ours, paper = ["-28.57", "2883.6i"], ["-28.5", "2870i"]
-    assert [w for w in row("measured lambda_12")[-6:] if w not in "+-"] == [*ours, *paper]
-    ours, paper = ["-39.45", "3983.3i"], ["-39.3", "3970i"]
-    assert [w for w in row("measured lambda_14")[-6:] if w not in "+-"] == [*ours, *paper]
-    study = [
-        line
-        for line in example.estimation_table(result)
-        if re.match(r"\s+[01]\.[01]%\s+1e-0[234]", line)
-    ]
-    assert len(study) == 6
-    assert all(line.count("+-") == 3 for line in study)
+    assert row("added mass, 24 modes")[-2:] == ["0.503535", "0.5"]
+    ours, printed = ["-28.57", "2883.6i"], ["-28.5", "2870i"]
+    assert [w for w in row("measured lambda_12")[-6:] if w not in "+-"] == [*ours, *printed]
+    ours, printed = ["-39.45", "3983.3i"], ["-39.3", "3970i"]
+    assert [w for w in row("measured lambda_14")[-6:] if w not in "+-"] == [*ours, *printed]
 
 
-def test_all_of_the_table(example, result):
-    lines = example.table(result).splitlines()
-    margins = [line for line in lines if "on machine" in line and " dB" in line]
-    assert len(margins) >= 2
-    assert sum("on model" in line for line in lines) == len(margins)
-    assert max(map(len, lines)) < 120
-    assert any(
-        "0.1%  |S| of H-infinity is largest at 459 Hz on the machine: 6.7" in x for x in lines
-    )
-    assert len(lines) < 60
+def test_the_table(stage, result):
+    text = stage.table(result)
+    assert max(map(len, text.splitlines())) < 110
+    assert text.count("95% interval") == 6
+    assert text.count("max |S| at u") == 2
+    assert "NO (1.0003" in text
+    assert all(claim in text for claim in result["claims"])
 
 
-def check_the_readmes_picture(example, result, drawn):
-    """The committed picture shows this run: its numbers, and pixel by pixel where they can be."""
-    advice = "it shows another run: copy examples/out/closed_loop.png to examples/wafer_stage.png"
-    with Image.open(FILE.with_suffix(".png")) as old, Image.open(drawn) as new:
-        assert "Comment" in old.text, advice
-        shown = json.loads(old.text["Comment"])
-        now = example.shown_numbers(result["cases"][0.01]["loops"])
-        assert json.loads(new.text["Comment"]) == now
-        assert list(shown) == list(now), advice
-        for name, points in now.items():
-            size = np.abs(points).max()
-            np.testing.assert_allclose(
-                shown[name], points, rtol=0, atol=1e-3 * size, err_msg=advice
-            )
+def test_the_pictures(examples, result, paper, tmp_path):
+    stage, plate = examples
+    drawn = stage.picture(result, tmp_path)
+    drawn_well(drawn)
+    figures = plate.pictures(paper, tmp_path)
+    assert [path.name[:9] for path in figures] == [f"figure_{i:02d}" for i in range(3, 12)]
+    for path in figures:
+        drawn_well(path)
+    check_the_readmes_picture(drawn)
+
+
+def test_the_readme_says_what_the_run_says(result):
+    text = (EXAMPLES.parent / "README.md").read_text(encoding="utf-8")
+    case = result["cases"][0.001]
+    alone = 1e9 * case["errors"][1e-3]["updated, 24 modes"]
+    held = case["table"]["H-infinity, updated"]
+    ma = [1e9 * case["loops"][name]["exposure"][0] for name in case["loops"]]
+    rows = [e["updated, all modes"] for c in result["cases"].values() for e in c["errors"].values()]
+    off = 100 * max(abs(row[0] / row[1] - 1) for row in rows)
+    for said in (
+        f"within {off:.1f} %",
+        f"{alone[0]:.2f} nm are predicted where the machine has {alone[1]:.2f} nm",
+        f"|S| < 1 up to {held.bandwidth:.0f} Hz and at most {-20 * np.log10(held.margin):.1f} dB",
+        f"at most {ma[2]:.1f} nm, the best servo's {ma[1]:.1f} nm",
+    ):
+        assert said in text
+
+
+def check_the_readmes_picture(drawn):
+    """The committed picture shows this run: its claims, and pixel by pixel where they can be."""
+    advice = "it shows another run: copy examples/out/wafer_stage.png to examples/wafer_stage.png"
+    with Image.open(EXAMPLES / "wafer_stage.png") as old, Image.open(drawn) as new:
+        assert json.loads(old.text["Comment"]) == json.loads(new.text["Comment"]), advice
         if old.text["Software"] == new.text["Software"]:  # the same release of matplotlib
             pixels = [np.asarray(one.convert("L"), float) / 255 for one in (old, new)]
             assert pixels[0].shape == pixels[1].shape, advice
-            assert np.abs(pixels[0] - pixels[1]).mean() < 1e-3, advice
-
-
-def test_the_pictures(example, result, tmp_path):
-    drawn = example.pictures(result, tmp_path / "out")
-    check_the_readmes_picture(example, result, tmp_path / "out" / "closed_loop.png")
-    assert [any(path.name.startswith(name) for path in drawn) for name in FIGURES] == [True] * 10
-    for path in drawn:
-        pixels = image.imread(path)[:, :, :3]
-        assert pixels.std() > 0.02, f"{path.name} is blank"
-        assert min(pixels.shape[:2]) > 300
-        coloured = pixels.max(axis=2) - pixels.min(axis=2) > 0.2
-        assert coloured.mean() > 1e-3, f"{path.name} has no curve"
+            assert np.abs(pixels[0] - pixels[1]).mean() < 5e-3, advice

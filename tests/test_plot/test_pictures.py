@@ -10,7 +10,7 @@ from matplotlib import image
 import flexplant as fx
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import Frf
-from flexplant.simulation import Response
+from flexplant.simulation import EstimatorComparison, Response
 from stages import CORNERS, INSET, Z8, L, fitted, ports, reduced, sampled, some_modes
 
 POLES = np.array([-28.569 + 2883.567j, -39.451 + 3983.308j])
@@ -263,8 +263,15 @@ def test_predictions_beside_what_was_found():
     assert ax.get_xlabel() == "rms error [nm]"
     assert texts(ax) == {"predicted by the design", "on the machine, 95 %"}
     assert ink(ax) > 0.005
-    with pytest.raises(ModelError, match="mapping of designs"):
-        fx.plot.predictions([1.0])
+    values = np.array([rows["honest"][0], rows["hopeful"][0]])
+    cases = [EstimatorComparison("die:z", ("a", "b"), k * values, 0.95) for k in (1.0, 3.0)]
+    ax = fx.plot.predictions(cases)
+    diamonds = [line for line in ax.get_lines() if line.get_marker() == "D"]
+    np.testing.assert_allclose(diamonds[0].get_xdata(), [2.0, 6.0])
+    assert ax.get_xlabel() == "rms error of die:z [nm]"
+    for wrong in ([1.0], [], {}):
+        with pytest.raises(ModelError, match="mapping of designs"):
+            fx.plot.predictions(wrong)
     with pytest.raises(ShapeError, match="hopeful"):
         fx.plot.predictions({"hopeful": [(1.0, 2.0)]})
     with pytest.raises(ModelError, match="positive"):

@@ -10,12 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from ..errors import ModelError
+from ..simulation import EstimatorComparison
 from ..values import FloatArray, real_array, short
 from ._axes import CYCLE, MEASURED, axes, finish, scale
 
 
 def predictions(
-    rows: Mapping[str, npt.ArrayLike],
+    rows: Mapping[str, npt.ArrayLike] | Sequence[EstimatorComparison],
     *,
     colors: Mapping[str, str] | None = None,
     unit: str = "m",
@@ -25,9 +26,9 @@ def predictions(
 
     Parameters
     ----------
-    rows : mapping {design: (k, 4) array}
-        For each of k cases the predicted rms error, the one found, and the ends of its confidence
-        interval (`Response.rms_interval`).
+    rows : sequence of EstimatorComparison, or mapping {design: (k, 4) array}
+        Comparisons of the same estimators in k cases; or for each design and case the predicted
+        rms error, the one found, and the ends of its confidence interval.
     colors : mapping {design: color}, optional
         Of the diamonds.
     unit : str
@@ -47,10 +48,14 @@ def predictions(
     ShapeError
         When a row has not four columns.
     """
+    title = ""
+    if isinstance(rows, Sequence) and all(isinstance(c, EstimatorComparison) for c in rows):
+        title = f" of {rows[0].channel}" if rows else ""
+        rows = {name: [case[name] for case in rows] for name in (rows[0].names if rows else ())}
     if not isinstance(rows, Mapping) or not rows:
         raise ModelError(
             f"need a mapping of designs to errors, got {short(rows)}. Type "
-            "{'updated': [(predicted, found, lower, upper)]}."
+            "[comparison] or {'updated': [(predicted, found, lower, upper)]}."
         )
     tables = {name: real_array(row, f"errors of {name!r}", (None, 4)) for name, row in rows.items()}
     if any(np.any(table[:, :2] <= 0) for table in tables.values()):
@@ -67,7 +72,7 @@ def predictions(
     ax.legend(
         handles=_legend(), frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2
     )
-    return finish(ax, x=f"rms error [{prefix}{unit}]", y="")
+    return finish(ax, x=f"rms error{title} [{prefix}{unit}]", y="")
 
 
 def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:

@@ -108,7 +108,7 @@ def sensitivity(
     colors : mapping {label: color}, optional
         Of some lines.
     dashed : collection of str
-        Labels of lines to dash, so that equal ones show.
+        Labels of lines to draw thin and dashed, so that they show on equal ones.
     ax : Axes, optional
         Where to draw.
 
@@ -130,8 +130,9 @@ def sensitivity(
     for i, (label, curve) in enumerate(curves.items()):
         freq, size = error_sensitivity(curve) if isinstance(curve, ClosedLoop) else curve
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
-        style = "--" if label in dashed else "-"
-        ax.semilogx(freq, 20.0 * np.log10(size), style, color=color, label=label)
+        thin = label in dashed
+        line = {"linestyle": "--", "linewidth": 1.0} if thin else {"linewidth": 2.2, "alpha": 0.8}
+        ax.semilogx(freq, 20.0 * np.log10(size), color=color, label=label, **line)
     for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color="0.4", linestyle=style, linewidth=0.8)
     ax.legend(frameon=False)

@@ -46,7 +46,7 @@ def response(
     unit : str, optional
         SI unit of channels that have none in `run.units`. A prefix is chosen in each panel.
     label : str, optional
-        Put before the channels' names, to compare runs in one axes.
+        Put before the channels' names, or in place of a single one, to compare runs in one axes.
     color : str, optional
         Of the lines; a cycle when not given.
     span : (start, end) [s], optional
@@ -92,6 +92,12 @@ def response(
     return drawn[0]
 
 
+def _label(label: str | None, name: str, names: Sequence[str]) -> str:
+    if label is None:
+        return name
+    return label if len(names) == 1 else f"{label}: {name}"
+
+
 def _part(run: Response, span: tuple[float, float]) -> Response:
     """Return the samples of a run within a span of time."""
     start, end = real_array(span, "span", (2,)).tolist()
@@ -123,7 +129,7 @@ def _panel(
             run.time,
             signal / factor,
             color=color or CYCLE[names.index(name) % len(CYCLE)],
-            label=name if label is None else f"{label}: {name}",
+            label=_label(label, name, names),
             linewidth=0.8,
         )
     ax.legend(frameon=False, loc="upper right")
