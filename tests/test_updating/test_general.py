@@ -407,7 +407,7 @@ def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     # told apart by little: said with names
     assert found.alike == (hidden,)
     assert set(found.rivals) == images
-    assert "told by less than 1% of the data from: mass at" in repr(found)
+    assert "differs by less than 1% of the data from: mass at" in repr(found)
     assert all(name in repr(found) for name in images)
     rows = found.table.splitlines()
     assert rows[1].startswith(hidden)
@@ -446,7 +446,8 @@ def test_localisation_beside_a_wrong_stiffness(plate):
     assert found.nuisance == ("stiffness",)
     assert found.nuisance_values[0] == pytest.approx(0.02, rel=2e-3)
     assert "beside stiffness = 0.0" in repr(found)
-    alone = localise(rom, data, masses, most=1)
+    with pytest.warns(FlexplantWarning, match=r"leaves more than noise.*nuisance="):
+        alone = localise(rom, data, masses, most=1)
     assert alone.chosen != (plate.z8,) or abs(alone.chosen_values[0] - 0.5) > 0.1
     with pytest.raises(ModelError, match="at once"):
         localise(rom, data, masses, nuisance=masses[:1])
@@ -533,6 +534,35 @@ def test_four_corner_sensors_do_not_pair_distant_modes(plate):
     poles = MeasuredModes((1j - 0.01) * omega, modes=range(4, 14))
     seen = correlate(rom, [ModeShapes(poles, phi[rows, 3:13], corners)])
     assert np.abs(seen.freq_error).max() < 0.01
+    # by the oracle's own shapes: which of them the corners see alike
+    unit = phi[rows, 3:13] / np.linalg.norm(phi[rows, 3:13], axis=0)
+    alike = np.abs(unit.T @ unit) ** 2 > 0.9
+    for group in seen.alike:
+        assert alike[np.ix_(np.array(group) - 4, np.array(group) - 4)].all()
+    together = sum(len(group) * (len(group) - 1) for group in seen.alike)
+    assert together == np.count_nonzero(alike) - 10
+    assert together > 0
+    assert f"cannot tell apart the shapes of modes {seen.alike[0][0]}, " in repr(seen)
+    everywhere = [plate.model.dofs.index(label) for label in plate.grid]
+    seen = correlate(rom, [ModeShapes(poles, phi[everywhere, 3:13], plate.grid)])
+    assert seen.alike == ()
+    assert "tell apart" not in repr(seen)
+
+
+def test_a_fit_and_its_correlation_pair_alike(plate):
+    """Shapes at four corners: the modes that the fit compares are those that are shown."""
+    rom = plate.reduced(0.01, False)
+    omega2, phi = oracle.la.eigh(1.05 * oracle.plate()[1], oracle.plate()[0])
+    corners = [plate.model.dofs.nearest((x, y, 0.0), "z") for x in (0.0, 0.6) for y in (0.0, 0.6)]
+    rows = [plate.model.dofs.index(label) for label in corners]
+    poles = MeasuredModes((1j - 0.01) * np.sqrt(omega2[3:9]), modes=range(4, 10))
+    shapes = ModeShapes(poles, phi[rows, 3:9], corners)
+    unknown = [MatrixParameter("E", dK=plate.model.K)]
+    fit = update(rom, unknown, [Eigenvalues(poles), shapes], start=[0.0])
+    assert fit.values[0] == pytest.approx(0.05, rel=5e-3)
+    before = correlate(rom, [Eigenvalues(poles), shapes])
+    pairs = np.abs(fit.history.eigenvalues[0]) / np.abs(poles.poles) - 1
+    np.testing.assert_allclose(pairs, before.freq_error, rtol=0, atol=1e-12)
 
 
 def test_criteria_by_hand():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import oracles_updating as oracle
+from flexplant.errors import FlexplantWarning
 from flexplant.identification import MeasuredModes
 from flexplant.modes import solve_modes
 from flexplant.reduction import DesiredDofs, reduce
@@ -70,6 +71,7 @@ def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
     grid = plate.grid
     data = measured(uneven, {grid[7]: 0.3, grid[18]: 0.4}, seed=0)
     few = [AddedMass(label, name=label) for label in (grid[0], grid[4], grid[20])]
-    found = localise(uneven, data, few, most=2)
+    with pytest.warns(FlexplantWarning, match=r"more than noise: chi-square.*It fits worst mode"):
+        found = localise(uneven, data, few, most=2)
     assert found.p_value < 1e-4
     assert "MORE THAN NOISE IS LEFT" in repr(found)

@@ -127,7 +127,12 @@ def _mac(ax: Axes, seen: Correlation, name: str) -> None:
     labels = [str(number) for number in seen.modes]
     ax.set_xticks(place, labels)
     ax.set_yticks(place, labels)
-    ax.set(xlabel="mode of the model", ylabel="measured mode", title=name.replace("mac", "MAC"))
+    title = name.replace("mac", "MAC")
+    if seen.alike:
+        shown = "; ".join(", ".join(map(str, group)) for group in seen.alike[:3])
+        more = "; ..." if len(seen.alike) > 3 else ""
+        title += f"\nthe sensors cannot tell apart {shown}{more}"
+    ax.set(xlabel="mode of the model", ylabel="measured mode", title=title)
 
 
 def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -89,7 +90,7 @@ def paired(
                 cross[np.ix_(members, found)],
                 other_gram[np.ix_(found, found)],
             )
-    return ModePairs(partner, mac, _groups(clusters, np.abs(gram) ** 2 / np.outer(size, size)))
+    return ModePairs(partner, mac, groups_alike(np.abs(gram) ** 2 / np.outer(size, size), clusters))
 
 
 def _assigned(
@@ -154,9 +155,17 @@ def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
     return cosines
 
 
-def _groups(clusters: list[IntArray], alike: FloatArray) -> IntArray:
-    """Return for each mode the first one whose shape cannot be told from its own."""
-    group = np.zeros(len(alike), dtype=np.int64)
+def groups_alike(alike: FloatArray, clusters: Sequence[IntArray] = ()) -> IntArray:
+    """Return for each mode the first one whose shape cannot be told from its own.
+
+    Parameters
+    ----------
+    alike : (m, m) array
+        MAC of a model's modes with each other, as far as their shapes are known.
+    clusters : sequence of arrays of int
+        Modes that belong together whatever their MAC.
+    """
+    group = np.arange(len(alike), dtype=np.int64)
     for members in clusters:
         group[members] = members[0]
     for i, j in np.argwhere(np.triu(alike > ALIKE, 1)).tolist():

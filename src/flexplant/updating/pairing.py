@@ -1,4 +1,4 @@
-"""Which mode of the changed model is which of the one before: by shape, close modes by order."""
+"""Which mode is which: of a changed model by shape, of a measurement by shape and frequency."""
 
 from __future__ import annotations
 
@@ -11,6 +11,8 @@ from .family import groups
 CLUSTER = 0.02
 #: MAC below which two shapes of a cluster have nothing of each other
 FOREIGN = 1e-4
+#: part of the MAC that a frequency ratio of e counts for: few sensors see many modes alike
+NEARNESS = 1.0
 
 
 def mac(X: ComplexArray, Y: ComplexArray) -> FloatArray:
@@ -51,6 +53,26 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
         members = np.array([i for i in cluster if found[i] >= 0], dtype=np.int64)
         found[members] = _inside(shapes, members, found[members])
     return found
+
+
+def measured_pairs(
+    psi: ComplexArray, psi_poles: ComplexArray, X: ComplexArray, poles: ComplexArray
+) -> IntArray:
+    """Return for each measured mode the column of the model's, one to one.
+
+    Minimises the sum of ``1 - MAC + |ln(f_j / f_i)|`` over the pairs.
+
+    Parameters
+    ----------
+    psi, X : (k, m), (k, m') complex arrays
+        Measured shapes and those of the model at the same places.
+    psi_poles, poles : (m,), (m',) complex arrays
+        Their eigenvalues.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    far = np.abs(np.log(np.abs(poles) / np.abs(psi_poles)[:, None]))
+    return np.asarray(linear_sum_assignment(NEARNESS * far - mac(psi, X))[1], dtype=np.int64)
 
 
 def _inside(shapes: FloatArray, old: IntArray, new: IntArray) -> IntArray:

@@ -10,14 +10,16 @@ import numpy as np
 
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
+from ...reduction.mode_pairs import groups_alike
 from ...values import ComplexArray, FloatArray, Value, short
 from ..pairing import mac as _mac
+from ..point_model import Point
 from ..residuals.frf_residual import FrfResidual
 from ..residuals.mode_shapes import ModeShapes
 from ..search import Objective, checked_residuals
 
-#: a distance in ln(frequency) that outweighs any MAC: few sensors see many modes alike
-APART = 0.3
+#: groups of modes in a repr
+SHOWN = 4
 
 
 def mac(X: Any, Y: Any) -> FloatArray:
@@ -125,6 +127,10 @@ class Correlation(Value):
         Of the responses; empty without.
     fdac : (n_freq, n_freq) array
         Of the responses; empty without.
+    alike : sequence of groups of int
+        Numbers of the model's modes, in the measured range, whose shapes the sensors cannot tell
+        apart (a MAC above 0.9 with each other there): they are paired by frequency, and a high MAC
+        does not say which of a group was measured.
     """
 
     modes: tuple[int, ...]
@@ -133,6 +139,7 @@ class Correlation(Value):
     mac: FloatArray
     frac: FloatArray
     fdac: FloatArray
+    alike: tuple[tuple[int, ...], ...] = ()
 
     def __post_init__(self) -> None:
         self._set(
@@ -141,6 +148,7 @@ class Correlation(Value):
             mac=self.mac,
             frac=self.frac,
             fdac=self.fdac,
+            alike=tuple(tuple(int(n) for n in group) for group in self.alike),
         )
 
     def __repr__(self) -> str:
@@ -151,7 +159,12 @@ class Correlation(Value):
             parts.append(f"least MAC {np.diag(self.mac).min():.4f}")
         if self.frac.size:
             parts.append(f"least FRAC {self.frac.min():.4f}")
-        return f"<Correlation: {', '.join(parts) or 'nothing compared'}>"
+        text = f"<Correlation: {', '.join(parts) or 'nothing compared'}"
+        if self.alike:
+            text += "\n  the sensors cannot tell apart the shapes of modes "
+            text += "; ".join(", ".join(map(str, group)) for group in self.alike[:SHOWN])
+            text += "; ..." if len(self.alike) > SHOWN else ""
+        return text + ">"
 
 
 def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
@@ -180,17 +193,18 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
     found = poles
     modes: tuple[int, ...] = ()
     shapes = responses = spectrum = np.zeros((0, 0))
+    alike: tuple[tuple[int, ...], ...] = ()
     for residual, bound in zip(listed, objective.bounds, strict=True):
         tied: Any = bound
         measured = getattr(residual, "measured", None)
         if isinstance(measured, MeasuredModes):
             modes, poles = measured.modes or (), measured.poles
             columns = point.columns(modes)
-            if isinstance(residual, ModeShapes) and residual.assign:
-                columns = _paired(residual, tied.rows @ point.eigen.X, point.eigen.poles)
             found = point.eigen.poles[columns]
             if isinstance(residual, ModeShapes):
-                shapes = mac(residual.shapes, tied.rows @ point.eigen.X[:, columns])
+                seen = tied.rows @ point.eigen.X
+                shapes = mac(residual.shapes, seen[:, columns])
+                alike = _alike(seen, point, columns)
         if isinstance(residual, FrfResidual):
             H = tied.responses(point)
             responses = frac(np.moveaxis(tied.data, 0, 2), np.moveaxis(H, 0, 2))
@@ -202,16 +216,17 @@ def correlate(model: Any, residuals: Sequence[Any]) -> Correlation:
         mac=shapes,
         frac=responses,
         fdac=spectrum,
+        alike=alike,
     )
 
 
-def _paired(residual: ModeShapes, X: ComplexArray, poles: ComplexArray) -> list[int]:
-    """Return the mode of the model for each measured one: by MAC and by frequency, one to one."""
-    from scipy.optimize import linear_sum_assignment
-
-    far = np.abs(np.log(np.abs(poles) / np.abs(residual.measured.poles)[:, None]))
-    score = _mac(np.asarray(residual.shapes, dtype=np.complex128), X)
-    return [int(i) for i in linear_sum_assignment(far / APART - score)[1]]
+def _alike(seen: ComplexArray, point: Point, columns: list[int]) -> tuple[tuple[int, ...], ...]:
+    """Return the numbers of modes in the range of those compared that look alike at the sensors."""
+    inside = np.arange(min(columns), max(columns) + 1)
+    inside = inside[(point.labels[inside] > 0) & np.any(seen[:, inside] != 0, axis=0)]
+    group, numbers = groups_alike(_mac(seen[:, inside], seen[:, inside])), point.labels[inside]
+    found = [np.sort(numbers[group == first]).tolist() for first in np.unique(group)]
+    return tuple(tuple(members) for members in found if len(members) > 1)
 
 
 def _shapes(value: Any, name: str) -> ComplexArray:

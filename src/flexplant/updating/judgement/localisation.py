@@ -146,7 +146,7 @@ class Localisation(Value):
             text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {_shown(self.alike)}"
         rivals = [name for name in self.rivals if len(self.alike) < 2 or name not in self.alike]
         if rivals and self.chosen:
-            text += f"\n  told by less than {NEAR:.0%} of the data from: {_shown(rivals)}"
+            text += f"\n  differs by less than {NEAR:.0%} of the data from: {_shown(rivals)}"
         if is_bad(self.p_value):
             text += f"\n  MORE THAN NOISE IS LEFT: chi2 {self.chi2:.4g} for {self.dof} dof"
         return text + ">"

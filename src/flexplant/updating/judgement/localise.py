@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ...errors import ModelError
+from ...errors import FlexplantWarning, ModelError
 from ...values import FloatArray
 from ...values import whole as counted
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters
+from .goodness import is_bad
 from .localisation import Localisation
 from .subsets import Subsets
 
@@ -62,6 +64,11 @@ def localise(
     Localisation
         Its repr says when the chosen subset leaves more than noise (`p_value`).
 
+    Warns
+    -----
+    FlexplantWarning
+        When the chosen subset leaves more than noise does in one of 10 000 cases.
+
     Raises
     ------
     ModelError, LabelError
@@ -93,9 +100,10 @@ def localise(
     values, score, criterion = _singles(fits, screen)
     ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
     best = fits.best(ranked, most)
-    p = np.asarray((fits.fit(best) or (np.zeros(0), 0.0))[0])
+    fit = fits.fit(best)
+    p = np.zeros(0) if fit is None else fit.p
     chi2, dof = fits.chi2(best)
-    return Localisation(
+    found = Localisation(
         candidates=tuple(q.name for q in listed),
         values=values,
         score=score,
@@ -109,11 +117,25 @@ def localise(
         chi2=chi2,
         dof=dof,
     )
+    if fit is not None and is_bad(found.p_value):
+        full = len(best) >= most
+        warnings.warn(
+            f"{' and '.join(found.chosen) or 'no change'}, the best that {len(listed)} candidates "
+            f"give, {'leave' if len(best) > 1 else 'leaves'} more than noise: chi-square "
+            f"{chi2:.4g} for {dof} degrees of freedom. It fits worst {fit.worst}. Something else "
+            "differs between model and machine, or the noise is understated: give "
+            f"{'most= more, ' if full else ''}candidates at other places or of another kind, "
+            "or what is wrong everywhere as nuisance=.",
+            FlexplantWarning,
+            stacklevel=2,
+        )
+    return found
 
 
 def _singles(fits: Subsets, screen: int) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return value, share explained and criterion of each candidate alone."""
-    error = (fits.fit(()) or (np.zeros(0), 0.0))[1]
+    nothing = fits.fit(())
+    error = 0.0 if nothing is None else nothing.error
     explained = fits.explained(())
     values, score = np.full(fits.count, np.nan), explained / error
     criterion = np.full(fits.count, np.inf)
@@ -121,7 +143,7 @@ def _singles(fits: Subsets, screen: int) -> tuple[FloatArray, FloatArray, FloatA
         found = fits.fit((i,))
         score[i] = 0.0
         if found is not None:
-            values[i], score[i] = found[0][0], 1 - found[1] / error
+            values[i], score[i] = found.p[0], 1 - found.error / error
             criterion[i] = fits.score((i,))
     for i in np.argsort(-explained)[screen:].tolist():
         # known to first order only: never better than what was fitted exactly

@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from math import comb, log
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import ModelError, SolverError
 from ...values import FloatArray
-from ..search import Objective, SearchEnd, TrustRegion
+from ..search import Objective, TrustRegion
 from ..search.lasso import bic
-from .goodness import chance, is_bad
+from .goodness import chance, chi_square, is_bad, worst
 
 #: best subsets of each size that grow
 BEAM = 3
@@ -22,6 +22,18 @@ JOIN = 6
 ROUNDS = 4
 
 Subset = tuple[int, ...]
+
+
+class SubsetFit(NamedTuple):
+    """The exact fit of a subset: its values (those of the nuisance last) and what it leaves."""
+
+    p: FloatArray
+    #: sum of squares of the residuals
+    error: float
+    #: the same in units of the noise and its correlation, None where that is not known
+    chi2: float | None
+    #: the residuals that fit worst, in words
+    worst: str
 
 
 class Subsets:
@@ -41,25 +53,23 @@ class Subsets:
         self.whole, self.residuals, self.count = whole, residuals, count
         self.beside = list(range(count, len(whole.parameters)))
         self.start = whole.default_start
-        self.done: dict[Subset, tuple[FloatArray, float] | None] = {}
+        self.done: dict[Subset, SubsetFit | None] = {}
         #: the points each fit went through
         self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.beside]]}
         if self.beside:
-            self.ways[()] = self._search([]).trail.p
+            self.done[()] = self._fitted(())
             self.start = self.start.copy()
             self.start[self.beside] = self.ways[()][-1]
         point = whole.begin(self.start)
-        r = whole.values(point)
-        self.done[()] = self.start[self.beside], float(r @ r)
-        self.rows = r.size
+        self.rows = whole.values(point).size
+        if not self.beside:
+            self.done[()] = _left(whole, self.start[:0], whole.default_start)
 
-    def fit(self, subset: Subset) -> tuple[FloatArray, float] | None:
-        """Return values (those of the nuisance last) and error, None when it cannot be fitted."""
+    def fit(self, subset: Subset) -> SubsetFit | None:
+        """Return the fit of a subset, None when it cannot be fitted."""
         if subset not in self.done:
             try:
-                found = self._search([*subset])
-                self.done[subset] = found.p, 2 * found.cost
-                self.ways[subset] = found.trail.p
+                self.done[subset] = self._fitted(subset)
             except (ModelError, SolverError):
                 self.done[subset] = None
         return self.done[subset]
@@ -69,14 +79,15 @@ class Subsets:
         found, k, c = self.fit(subset), len(subset), self.count
         if found is None:
             return np.inf
-        choices = log(comb(c, k))
-        return bic(found[1], self.rows, k + len(self.beside), self.whole.noisy) + 2 * choices
+        known = found.chi2 is not None
+        misfit = found.error if found.chi2 is None else found.chi2
+        return bic(misfit, self.rows, k + len(self.beside), known) + 2 * log(comb(c, k))
 
     def chi2(self, subset: Subset) -> tuple[float | None, int]:
         """Return what a subset leaves (None where the noise is not known) and its freedom."""
         found = self.fit(subset)
         dof = self.rows - len(subset) - len(self.beside)
-        return (found[1] if found is not None and self.whole.noisy else None), dof
+        return (None if found is None else found.chi2), dof
 
     def best(self, singles: Iterable[int], most: int) -> Subset:
         """Return the subset of up to `most` candidates with the least extended BIC.
@@ -98,7 +109,7 @@ class Subsets:
             better = self.score(ranked[0]) < self.score(best)
             best = ranked[0] if better else best
             # more are worth a try while something is gained, or missing
-            if not better and not is_bad(chance(*self.chi2(best))) and self.whole.noisy:
+            if not better and self.whole.noise_known and not is_bad(chance(*self.chi2(best))):
                 break
             grown: set[Subset] = {
                 tuple(sorted((*subset, i))) for subset in ranked for i in self._joining(subset)
@@ -192,11 +203,21 @@ class Subsets:
         parameters = [self.whole.parameters[i] for i in picked]
         return Objective(family.model, parameters, self.residuals, prior=False, family=family)
 
-    def _search(self, subset: list[int]) -> SearchEnd:
+    def _fitted(self, subset: Subset) -> SubsetFit:
         picked = [*subset, *self.beside]
-        return TrustRegion().search(
-            self._objective(picked), self.start[picked], most=50, tolerance=1e-8
-        )
+        objective = self._objective(picked)
+        found = TrustRegion().search(objective, self.start[picked], most=50, tolerance=1e-8)
+        self.ways[subset] = found.trail.p
+        return _left(objective, found.p, found.p)
+
+
+def _left(objective: Objective, values: FloatArray, p: FloatArray) -> SubsetFit:
+    """Return what the model at `p` leaves; `values` are those parameters that were fitted."""
+    point = objective.at(p)
+    r = objective.values(point)
+    fitted = np.full(p.size, bool(values.size))
+    chi2, _ = chi_square(objective, point, fitted)
+    return SubsetFit(values, float(r @ r), chi2, worst(objective, point))
 
 
 def _share(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:

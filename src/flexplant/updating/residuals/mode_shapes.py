@@ -14,13 +14,10 @@ from ...identification import MeasuredModes
 from ...labels import Place
 from ...values import ComplexArray, FloatArray, flag, real_array, short, whole
 from ..family import Family, groups
-from ..pairing import CLUSTER, mac
+from ..pairing import CLUSTER, measured_pairs
 from ..parameters.added import checked_direction, checked_place
 from ..point_model import Point
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
-
-#: of MAC that a distance of one in ln(frequency) outweighs when modes are assigned
-NEARNESS = 0.3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,7 +28,8 @@ class ModeShapes(Residual):
     model's shape explains (the maximum-likelihood residual with the factor as a nuisance;
     ``|r|^2 = (1 - MAC) |psi|^2``). Modes whose measured poles are closer than 2 % are compared
     with the subspace of their cluster, which does not turn. While fitting, the model's modes are
-    assigned to the measured ones by MAC, the nearer in frequency where few places tell no more.
+    assigned to the measured ones by MAC and frequency: the nearest of those that look alike at
+    few places.
 
     Parameters
     ----------
@@ -197,16 +195,14 @@ class _BoundShapes(Bound):
         return f"the shape of mode {self.own[self._order[row // self._rows_each]]}"
 
     def assigned(self, point: Point) -> Point:
-        from scipy.optimize import linear_sum_assignment
-
         if not self.assign:
             return point
-        score = mac(self.psi.astype(complex), self.rows @ point.eigen.X)
-        # at few places many modes look alike: the nearest of those
-        far = np.log(np.abs(point.eigen.poles) / np.abs(self.poles)[:, None]) ** 2
-        measured, columns = linear_sum_assignment(NEARNESS * far - score)
+        eigen = point.eigen
+        columns = measured_pairs(
+            self.psi.astype(complex), self.poles, self.rows @ eigen.X, eigen.poles
+        )
         labels = point.labels.copy()
-        for i, column in zip(measured.tolist(), columns.tolist(), strict=True):
+        for i, column in enumerate(columns.tolist()):
             here = np.flatnonzero(labels == self.own[i])
             if here.size and here[0] != column:
                 labels[here[0]], labels[column] = labels[column], labels[here[0]]
