@@ -42,7 +42,7 @@ def test_no_member_of_a_repeated_pair_is_missing(structure, seed):
     rng = np.random.default_rng(seed)
     factor = stiffness_factor(model)
     count = int(rng.integers(2, 40))
-    lanczos = BlockLanczos(factor.solve, model.M, model.rigid_body, want=count, seed=seed)
+    lanczos = BlockLanczos(factor.solve, model.M, model.rigid_body, want=count, rng=seed)
     theta, _ = lanczos.lowest(count)
     np.testing.assert_allclose(factor.sigma + 1 / theta, expected[:count], rtol=1e-7)
 
@@ -58,7 +58,7 @@ def test_none_is_missing_in_many_runs(structure):
         assert certificate["counted"] == certificate["found"] == below + model.rigid_body.shape[1]
     factor = stiffness_factor(model)
     for seed in range(40):
-        lanczos = BlockLanczos(factor.solve, model.M, model.rigid_body, want=20, seed=seed)
+        lanczos = BlockLanczos(factor.solve, model.M, model.rigid_body, want=20, rng=seed)
         theta, _ = lanczos.lowest(20)
         np.testing.assert_allclose(factor.sigma + 1 / theta, expected[:20], rtol=1e-7)
 

@@ -250,9 +250,9 @@ def test_laplace_and_ensemble_draws_agree(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 0.005))]
     fit = update(chain, MASS, residuals, method=TrustRegion())
-    draws = fit.sample(4000, seed=1)
+    draws = fit.sample(4000, rng=1)
     np.testing.assert_allclose(np.cov(draws.T), fit.covariance, rtol=0.15, atol=3e-6)
-    chainwise = sample_posterior(chain, MASS, residuals, fit, steps=150, seed=2)
+    chainwise = sample_posterior(chain, MASS, residuals, fit, steps=150, rng=2)
     assert 0.2 < chainwise.acceptance < 0.9
     assert np.all(np.abs(chainwise.mean - fit.values) < 0.4 * fit.std)
     np.testing.assert_allclose(np.sqrt(np.diag(chainwise.covariance)), fit.std, rtol=0.3)
@@ -267,7 +267,7 @@ def test_several_starts_keep_the_best(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     inside = [AddedMass("2:z", bounds=(-1.5, 3.0)), AddedMass("3:z", bounds=(-1.2, 3.0))]
     residuals = [Eigenvalues(measured(parts))]
-    fit = update(chain, inside, residuals, starts=4, seed=3)
+    fit = update(chain, inside, residuals, starts=4, rng=3)
     np.testing.assert_allclose(fit.values, [0.3, 0.2], rtol=1e-6)
     assert fit.starts.begin.shape == (4, 2)
     assert fit.starts.cost.min() < 1e-10
@@ -476,7 +476,7 @@ def test_localisation_says_when_nothing_changed(chain):
 def test_validation_on_unused_data(chain):
     parts = changed(chain, mass=[(1, 0.03), (2, 0.02)])
     frf = responses(parts, np.linspace(0.4, 3.2, 30), [0, 2])
-    first, rest = split(FrfResidual(frf), share=0.5, seed=1)
+    first, rest = split(FrfResidual(frf), share=0.5, rng=1)
     assert sorted([*first.lines, *rest.lines]) == list(range(30))
     good = validate(chain, MASS, [first], [rest])
     assert good.helped

@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..sparse.factor import by_rows
-from ..values import FloatArray, Matrix
+from ..values import FloatArray, Matrix, Rng
 
 #: vectors that are solved for at a time
 BLOCK = 12
@@ -46,8 +46,8 @@ class BlockLanczos:
         M-orthonormal vectors, modes already known: deflated.
     want : int
         About how many modes will be asked for.
-    seed : int
-        Of the starting block: the same seed gives the same answer.
+    rng : int, SeedSequence or Generator
+        Of the starting block: the same one gives the same answer.
     start : (n, s) array, optional
         Shapes like those of the lowest modes, in the starting block.
     """
@@ -59,7 +59,7 @@ class BlockLanczos:
         locked: FloatArray,
         *,
         want: int,
-        seed: int = 0,
+        rng: Rng = 0,
         block: int = BLOCK,
         start: FloatArray | None = None,
     ) -> None:
@@ -67,7 +67,7 @@ class BlockLanczos:
         self._M = by_rows(M)
         n, self._r = locked.shape
         self._block = min(block, n - self._r)
-        self._rng = np.random.default_rng(seed)
+        self._rng = np.random.default_rng(rng)
         self._reserve(want)
         # rows: locked vectors, then the basis; only touched rows take memory
         self._V = np.empty((self._capacity, n))

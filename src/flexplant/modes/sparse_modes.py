@@ -13,7 +13,7 @@ from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import absolute, rayleigh_ritz, rounding_of
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
-from ..values import FloatArray
+from ..values import FloatArray, Rng
 from .lanczos import FOUND, BlockLanczos
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
 
@@ -138,7 +138,7 @@ def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
 
 
 def _search(
-    model: FEModel, factor: StiffnessFactor, locked: FloatArray, want: int, seed: int
+    model: FEModel, factor: StiffnessFactor, locked: FloatArray, want: int, rng: Rng
 ) -> FloatArray:
     """Return shapes (n, want) beside the locked ones, residuals down to rounding.
 
@@ -146,10 +146,10 @@ def _search(
     """
     held = model.body_motions
     start = None if locked.shape[1] >= held.shape[1] else held
-    found = _searched(model, factor, locked, want, seed, start)
+    found = _searched(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
         beside = np.hstack([locked, found])
-        more = _searched(model, factor, beside, want - found.shape[1], seed, None)
+        more = _searched(model, factor, beside, want - found.shape[1], rng, None)
         if not more.shape[1]:
             break
         found = np.hstack([found, more])
@@ -161,11 +161,11 @@ def _searched(
     factor: StiffnessFactor,
     locked: FloatArray,
     want: int,
-    seed: int,
+    rng: Rng,
     start: FloatArray | None,
 ) -> FloatArray:
     """Return up to `want` shapes of one search."""
-    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, seed=seed, start=start)
+    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, rng=rng, start=start)
     extra = min(_EXTRA, want - 1)
     mass, stiffness = by_rows(model.M), by_rows(model.K)
     deflated = np.asarray(mass @ locked)

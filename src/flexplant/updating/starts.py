@@ -7,13 +7,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, ShapeError
-from ..values import FloatArray, generator, real_array, short
+from ..values import FloatArray, Rng, generator, real_array, short
 from .search import Objective, SearchEnd
 from .sensitivities import checked_values
 from .update_result import Starts
 
 
-def all_starts(objective: Objective, start: Any, starts: Any, seed: int) -> list[FloatArray]:
+def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[FloatArray]:
     """Return the start and the others: those given, or a Latin hypercube in bounds or priors."""
     first = objective.default_start
     if start is not None:
@@ -24,7 +24,7 @@ def all_starts(objective: Objective, start: Any, starts: Any, seed: int) -> list
     if np.ndim(starts) == 0:
         if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
             raise ModelError(f"starts must be whole or values, got {short(starts)}. Pass 20, say.")
-        return [first, *_drawn(objective, int(starts) - 1, seed)]
+        return [first, *_drawn(objective, int(starts) - 1, rng)]
     values = real_array(starts, "starts")
     if values.ndim != 2 or values.shape[1] != first.size or not values.shape[0]:
         raise ShapeError(f"starts must have shape (any, {first.size}), got {values.shape}.")
@@ -45,7 +45,7 @@ def summary(begins: list[FloatArray], ends: list[SearchEnd | None]) -> Starts | 
     )
 
 
-def _drawn(objective: Objective, count: int, seed: int) -> FloatArray:
+def _drawn(objective: Objective, count: int, rng: Rng) -> FloatArray:
     from scipy.stats import qmc
 
     low = np.where(objective.has_prior, objective.prior_mean - 2 * objective.prior_std, -np.inf)
@@ -61,7 +61,7 @@ def _drawn(objective: Objective, count: int, seed: int) -> FloatArray:
             f"starts of {', '.join(open_)} cannot be drawn: give them bounds= or prior=, or "
             "give starts as values."
         )
-    drawn = qmc.LatinHypercube(low.size, rng=generator(seed, "seed")).random(count)
+    drawn = qmc.LatinHypercube(low.size, rng=generator(rng)).random(count)
     return np.asarray(low + (high - low) * drawn, dtype=np.float64)
 
 

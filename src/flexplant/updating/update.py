@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantError, FlexplantWarning, ModelError, SolverError
-from ..values import FloatArray, flag, positive, seed_sequence
+from ..values import FloatArray, Rng, flag, generator, positive
 from .approach import approached
 from .judgement.covariance import covariance
 from .judgement.goodness import chi_square, is_bad, worst
@@ -36,7 +36,7 @@ def update(
     method: UpdateMethod | None = None,
     start: Sequence[float] | FloatArray | None = None,
     starts: int | FloatArray | None = None,
-    seed: int = 0,
+    rng: Rng = 0,
     prior: bool = True,
     max_iterations: int | None = None,
     tolerance: float = 1e-10,
@@ -77,7 +77,7 @@ def update(
     starts : int or (s, q) array, optional
         Search from several starts, drawn between the bounds (or from the priors), and keep
         the best; `start` is one of them.
-    seed : int
+    rng : int, SeedSequence or Generator
         For drawn starts.
     prior : bool
         Whether priors take part. A parameter with two finite bounds and no prior has one from
@@ -125,7 +125,7 @@ def update(
     if max_iterations is not None:
         _checked_count(max_iterations)
     enough = positive(tolerance, "tolerance")
-    seed_sequence(seed, "seed")
+    rng = generator(rng)
     takes_part = flag(prior, "prior")
     bounded = any(getattr(q, "bounds", None) is not None for q in listed)
     known = any(getattr(q, "prior", None) is not None for q in listed)
@@ -140,7 +140,7 @@ def update(
     if plain and method.weighs_poles:
         given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))
     objective = Objective(model, listed, given, prior=takes_part)
-    begins = all_starts(objective, start, starts, seed)
+    begins = all_starts(objective, start, starts, rng)
     cold = start is None and starts is None and not method.penalised
     try:
         before = _approach(objective, begins[0], max_iterations, enough) if cold else None

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import ModelError, unknown_label
 from ..modes import Modes, solve_modes
-from ..values import ComplexArray, FloatArray, Value, generator, positive, short
+from ..values import ComplexArray, FloatArray, Rng, Value, generator, positive, short
 from .judgement.goodness import chance
 from .parameters.added import AddedMass, Parameter
 from .updated_model import applied
@@ -223,7 +223,7 @@ class UpdateResult(Value):
         half = float(ndtri((1 + share) / 2)) * std
         return np.column_stack([self.values - half, self.values + half])
 
-    def sample(self, count: int, *, seed: int = 0) -> FloatArray:
+    def sample(self, count: int, *, rng: Rng = 0) -> FloatArray:
         """Return draws (count, q) from Laplace's approximation of the posterior.
 
         Normal with mean `values` and `covariance`.
@@ -236,7 +236,7 @@ class UpdateResult(Value):
         std = self._known_std()
         if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
             raise ModelError(f"count must be a whole number from 1, got {count!r}.")
-        white = generator(seed, "seed").standard_normal((int(count), std.size))
+        white = generator(rng).standard_normal((int(count), std.size))
         values, vectors = np.linalg.eigh(np.asarray(self.covariance) / np.outer(std, std))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(self.values + (white @ root.T) * std, dtype=np.float64)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError
-from ...values import FloatArray, Value, generator
+from ...values import FloatArray, Rng, Value, generator
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters
@@ -84,7 +84,7 @@ def sample_posterior(
     steps: int = 400,
     walkers: int | None = None,
     discard: float = 0.3,
-    seed: int = 0,
+    rng: Rng = 0,
 ) -> Posterior:
     """Draw from the posterior ``exp(-1/2 |r(p)|^2)`` (with priors, inside bounds).
 
@@ -103,7 +103,7 @@ def sample_posterior(
         Even, twice the number of parameters at least; four times (at least 10) if not given.
     discard : float
         Share of the first steps left out.
-    seed : int
+    rng : int, SeedSequence or Generator
         Of all random numbers.
 
     Returns
@@ -132,7 +132,7 @@ def sample_posterior(
             f"{count} walkers and {steps} steps: walkers must be even and at least "
             f"{max(4, 2 * q)}, steps 2, discard between 0 and 1."
         )
-    rng = generator(seed, "seed")
+    draws = generator(rng)
     objective.begin(fit.history.parameters[0])
     for p in fit.history.parameters[1:]:
         objective.at(p, refer=True)
@@ -147,7 +147,7 @@ def sample_posterior(
             return -np.inf
         return -0.5 * float(r @ r)
 
-    begin = np.clip(fit.sample(count, seed=seed), objective.lower, objective.upper)
+    begin = np.clip(fit.sample(count, rng=rng), objective.lower, objective.upper)
     height = np.array([density(p) for p in begin])
     begin[~np.isfinite(height)] = fit.values
     height = np.array([density(p) for p in begin])
@@ -156,13 +156,13 @@ def sample_posterior(
     for step in range(steps):
         for move in (np.arange(half), np.arange(half, count)):
             other = np.setdiff1d(np.arange(count), move)
-            z = ((STRETCH - 1) * rng.random(half) + 1) ** 2 / STRETCH
-            partner = begin[rng.choice(other, half)]
+            z = ((STRETCH - 1) * draws.random(half) + 1) ** 2 / STRETCH
+            partner = begin[draws.choice(other, half)]
             trial = partner + z[:, None] * (begin[move] - partner)
             reached = np.array([density(p) for p in trial])
             with np.errstate(invalid="ignore"):
                 odds = (q - 1) * np.log(z) + reached - height[move]
-            take = np.log(rng.random(half)) < odds
+            take = np.log(draws.random(half)) < odds
             begin[move[take]], height[move[take]] = trial[take], reached[take]
             accepted += int(take.sum())
         if step >= discard * steps:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError
-from ...values import FloatArray, Value, generator, positive
+from ...values import FloatArray, Rng, Value, generator, positive
 from ..parameters.added import Parameter
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
@@ -66,7 +66,7 @@ def validate(
     method: UpdateMethod | None = None,
     start: Sequence[float] | FloatArray | None = None,
     starts: int | FloatArray | None = None,
-    seed: int = 0,
+    rng: Rng = 0,
     prior: bool = True,
 ) -> Validation:
     """Update with some data and report the error on others.
@@ -82,7 +82,7 @@ def validate(
         does `split`.
     unused : sequence of Residual
         To judge by.
-    method, start, starts, seed, prior
+    method, start, starts, rng, prior
         Of `update`.
 
     Returns
@@ -103,7 +103,7 @@ def validate(
         method=method,
         start=start,
         starts=starts,
-        seed=seed,
+        rng=rng,
         prior=prior,
     )
     begin = np.asarray(fit.history.parameters[0], dtype=np.float64)
@@ -116,7 +116,7 @@ def validate(
     )
 
 
-def split(residual: Any, *, share: float = 0.5, seed: int = 0) -> tuple[Any, Any]:
+def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]:
     """Return two residuals of a measurement: a random share of its modes or lines to fit, the rest.
 
     Parameters
@@ -125,7 +125,7 @@ def split(residual: Any, *, share: float = 0.5, seed: int = 0) -> tuple[Any, Any
         To take apart.
     share : float
         To fit, between 0 and 1.
-    seed : int
+    rng : int, SeedSequence or Generator
         For the choice.
 
     Raises
@@ -148,7 +148,7 @@ def split(residual: Any, *, share: float = 0.5, seed: int = 0) -> tuple[Any, Any
     count = round(share * items.size)
     if not 0 < count < items.size:
         raise ModelError(f"a share of {share:g} of {items.size} leaves one side empty.")
-    order = generator(seed, "seed").permutation(items.size)
+    order = generator(rng).permutation(items.size)
     chosen: Any = residual
     first, rest = np.sort(items[order[:count]]), np.sort(items[order[count:]])
     return chosen.select(first.tolist()), chosen.select(rest.tolist())
