@@ -10,10 +10,24 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 import flexplant
+import machines
+import stages
 from flexplant.errors import ModelError
-from flexplant.lti import doubling, norms, responses
+from flexplant.estimation import kalman
+from flexplant.lti import (
+    balanced,
+    balancing,
+    controllability_gramian,
+    doubling,
+    lyapunov,
+    norms,
+    responses,
+    solve_lyapunov,
+    solve_stein,
+)
 from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
+from flexplant.synthesis import hinf, servo
 
 
 def square(item):
@@ -197,6 +211,13 @@ def test_the_name_is_the_module():
     assert "parallel" in vars(flexplant.lti)
 
 
+def loaded(g):
+    """Return a plant with a disturbance at u, noise on y and the effort in z."""
+    B, C = np.hstack([g.B, 0 * g.B, g.B]), np.vstack([g.C, 0 * g.C, g.C])
+    D = [[0, 0, 0], [0, 0, 1], [0, 1, 0]]
+    return flexplant.StateSpace(g.A, B, C, D, inputs=["w", "n", "u"], outputs=["z", "e", "y"])
+
+
 @pytest.mark.parametrize(
     ("module", "inner", "call"),
     [
@@ -205,6 +226,17 @@ def test_the_name_is_the_module():
         (norms, "_searched", flexplant.hinf_norm),
         (norms, "controllability_gramian", flexplant.h2_norm),
         (doubling, "_doubling", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
+        (lyapunov, "symmetric", lambda g: solve_lyapunov(g.A, np.eye(2))),
+        (lyapunov, "symmetric", lambda g: solve_stein(0.1 * g.A, np.eye(2))),
+        (lyapunov, "is_block_diagonal", controllability_gramian),
+        (balancing, "split_stable", lambda g: balanced(g, order=1)),
+        (kalman, "_designed", lambda g: flexplant.design_kalman(machines.stage())),
+        (
+            servo,
+            "servo_task",
+            lambda g: flexplant.design_servo(stages.sampled(stages.reduced()), bandwidth=20.0),
+        ),
+        (hinf, "certified_norm", lambda g: flexplant.design_hinf(loaded(g), u=["u"], y=["y"])),
     ],
 )
 def test_dense_loops_run_on_one_thread(monkeypatch, module, inner, call):

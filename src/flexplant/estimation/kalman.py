@@ -17,6 +17,7 @@ from ..errors import (
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
+from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.channel_units import plant_units
 from ..plant.realisation import Structure
@@ -173,6 +174,7 @@ class KalmanEstimator(Value):
         return twin
 
 
+@one_thread()
 def design_kalman(
     plant: StandardPlant | System, larger: StandardPlant | Structure | None = None
 ) -> KalmanEstimator:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import ModelError, SolverError
+from ..parallel import one_thread
 from ..values import FloatArray, Value, positive
 from .factors import compressed, controllability_factor, observability_factor
 from .interconnection import parallel, series
@@ -59,6 +60,7 @@ class BalancedReduction(Value):
         )
 
 
+@one_thread()
 def balanced(
     sys: System,
     *,

@@ -6,6 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
+from ..parallel import one_thread
 from ..values import FloatArray, real_array
 from .scaling import even_scale
 from .statespace import StateSpace, System, as_statespace, is_block_diagonal
@@ -16,6 +17,7 @@ DOUBLINGS = 60
 TOLERANCE = 1e-10
 
 
+@one_thread()
 def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Stein (discrete Lyapunov) equation ``X = A X A' + Q``.
 
@@ -66,6 +68,7 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     return X * d * d[:, None]
 
 
+@one_thread()
 def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     """Return X of the Lyapunov equation ``A X + X A' + Q = 0``.
 
@@ -152,6 +155,7 @@ def observability_gramian(sys: System) -> FloatArray:
     return _gramian(g, g.A.T, g.C.T)
 
 
+@one_thread()
 def _gramian(g: StateSpace, A: FloatArray, B: FloatArray) -> FloatArray:
     if g.n_states and not g.is_stable:
         raise SolverError(

@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
+from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import short
 from .certificate import certified_norm, reached_norms
@@ -19,6 +20,7 @@ from .riccati import Riccati
 from .spill_over import spill_over, unchecked
 
 
+@one_thread()
 def design_hinf(
     plant: StandardPlant | System,
     method: SynthesisMethod | None = None,

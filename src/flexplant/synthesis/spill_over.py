@@ -43,7 +43,7 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
             "these modes: ask for less bandwidth, keep them in the plant, or weight the efforts "
             "(or roll the controller off) before them.",
             FlexplantWarning,
-            stacklevel=3,
+            stacklevel=4,
         )
     return found
 
