@@ -8,10 +8,10 @@ import numpy as np
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray
-from .family import Eigen, Family, repeated_groups
+from .family import Eigen, repeated_groups
 from .point_model import Point
 from .residuals.eigenvalues import BoundEigenvalues
-from .sensitivities import split
+from .sensitivities import GroupDerivatives, group_derivatives, split
 
 #: a parameter's effect below this share of what it could have is rounding
 UNSEEN = 1e-9
@@ -68,8 +68,9 @@ def _best_split(
     gap = data.target - poles
     scale = family.strength(float(np.median(np.abs(data.target))))
     best = (np.inf, S, point.eigen)
+    groups = group_derivatives(family, point.eigen)
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
-        S, eigen = _along(family, point.eigen, columns, S, way)
+        S, eigen = _along(groups, point.eigen, columns, S, way)
         # rounding in the row of a vector that stays would ask for a step without bounds
         felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
         scaled, *_ = np.linalg.lstsq(
@@ -77,7 +78,7 @@ def _best_split(
         )
         step = scaled / scale
         if np.any(step):
-            S, eigen = _along(family, point.eigen, columns, S, step)
+            S, eigen = _along(groups, point.eigen, columns, S, step)
         left = float(np.sum(data.whitened(gap - S @ step) ** 2))
         if left < best[0]:
             best = (left, S, eigen)
@@ -85,9 +86,13 @@ def _best_split(
 
 
 def _along(
-    family: Family, eigen: Eigen, columns: list[int], S: ComplexArray, direction: FloatArray
+    groups: GroupDerivatives,
+    eigen: Eigen,
+    columns: list[int],
+    S: ComplexArray,
+    direction: FloatArray,
 ) -> tuple[ComplexArray, Eigen]:
     """Return S with the rows of repeated modes as they split along a direction, and the modes."""
-    rotation = split(family, eigen, direction)
+    rotation = split(groups, eigen, direction)
     rows = [rotation.sensitivity.get(c, row) for c, row in zip(columns, S, strict=True)]
     return np.array(rows), rotation.eigen

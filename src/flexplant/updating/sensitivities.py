@@ -23,14 +23,25 @@ class Rotation(NamedTuple):
     sensitivity: dict[int, ComplexArray]
 
 
-def split(family: Family, eigen: Eigen, direction: FloatArray) -> Rotation:
+#: columns of exactly repeated modes and their group derivative G (q, s, s)
+GroupDerivatives = Sequence[tuple[list[int], ComplexArray]]
+
+
+def group_derivatives(family: Family, eigen: Eigen) -> GroupDerivatives:
+    """Return G of every group of exactly repeated modes: the same for all directions."""
+    return [
+        (columns, family.group_derivative(eigen, columns))
+        for columns in repeated_groups(eigen.poles)
+    ]
+
+
+def split(groups: GroupDerivatives, eigen: Eigen, direction: FloatArray) -> Rotation:
     """Return exactly repeated modes turned to the eigenvectors of their derivative.
 
     Along `direction`; the modes of a group come in the order of the frequencies they move to.
     """
     rows: dict[int, ComplexArray] = {}
-    for columns in repeated_groups(eigen.poles):
-        G = family.group_derivative(eigen, columns)
+    for columns, G in groups:
         moved, Q = la.eig(np.tensordot(direction, G, axes=1))
         Q = Q[:, np.lexsort((moved.real, moved.imag))]
         eigen = eigen.rotated(columns, Q)
@@ -110,7 +121,7 @@ def eigenvalue_sensitivities(
     numbers = range(eigen.n_rigid + 1, eigen.n_rigid + eigen.poles.size + 1)
     columns = mode_columns(numbers if modes is None else modes, eigen)
     growing = 1 / _nonzero(family.strength(float(np.abs(eigen.poles[0]))))
-    rotation = split(family, eigen, growing)
+    rotation = split(group_derivatives(family, eigen), eigen, growing)
     S = family.sensitivity(rotation.eigen, columns)
     for group in repeated_groups(eigen.poles):
         if set(group) & set(columns):
