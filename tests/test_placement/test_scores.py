@@ -33,6 +33,7 @@ def first_place(plant):
     return float(plant.assembled.ports.y[0].at[0])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [4, 5])
 def test_sensor_scores_are_those_of_the_recursion(make, seed):
     plant, sensors, _ = make(seed)

@@ -114,6 +114,7 @@ def test_a_servo_that_cannot_run_is_refused_with_the_bandwidth_that_can():
             design_servo(plant, bandwidth=bandwidth, observer=observer, notches=())
 
 
+@pytest.mark.slow
 def test_one_flipped_sign_is_unstable():
     plant, _, kalman = updated()
     servo = design_servo(plant, bandwidth=50.0, observer=kalman)

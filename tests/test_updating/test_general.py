@@ -380,6 +380,7 @@ def test_identifiability_names_what_is_missing(chain, plate):
     assert identifiability(rom, two, [pair.select([6]), Eigenvalues(told)]).rank > first.rank
 
 
+@pytest.mark.slow
 def test_localisation_finds_z8_up_to_the_plates_symmetry(plate):
     M, K = oracle.plate()
     D = oracle.modal_damping(M, K, 0.01)
