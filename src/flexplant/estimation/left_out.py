@@ -11,7 +11,7 @@ from ..errors import ModelError
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.dynamics import structure_system
-from ..plant.ports import Ports, filter_of
+from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
 from ..plant.rebuilding import with_flexibility
 from ..reduction import ReducedModel
@@ -99,7 +99,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     flexibility = all_modes.static[others].sum(axis=0) - kept_static[stand_ins].sum(axis=0)
     flexibility[:, np.logical_not(_may_follow(plant, ports))] = 0.0
     # an acceleration has no static part: what modes answer at once they take back at rest
-    moving = [i for i, sensor in enumerate(ports.y) if sensor.quantity == "acceleration"]
+    moving = [i for i, sensor in enumerate(ports.y) if sensor.order == 2]
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
     covariance = _covariance(all_modes, others, others_own.ports)
     nz = covariance.shape[0] - len(ports.y)
@@ -184,7 +184,7 @@ def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
     it is computed from y.
     """
     late = {port.name: plant.delay + port.delay / plant.dt > 0 for port in ports.u}
-    parts = [(port.name, filter_of(port)) for port in ports.forces]
+    parts = [(port.name, port.filter) for port in ports.forces]
     return np.array(
         [late.get(name, False) or (f is not None and not np.any(f.D)) for name, f in parts]
     )
@@ -205,15 +205,15 @@ def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
     turn = np.where(poles.imag >= 0, omega, -omega)
     first = see.shape[0] - len(ports.y)
     for row, sensor in enumerate(ports.y, first):
-        see[row] *= np.exp(-turn * sensor.delay) * _gain(filter_of(sensor), turn)
+        see[row] *= np.exp(-turn * sensor.delay) * _gain(sensor.filter, turn)
     X = -(drive @ drive.conj().T) / np.add.outer(poles, poles.conj())
     return np.asarray(np.real(see @ X @ see.conj().T))
 
 
 def _density(port: Any, omega: ComplexArray) -> FloatArray:
     """Return the root of a disturbance's two-sided density at frequencies."""
-    asd = float(getattr(port, "asd", 0.0))
-    shape = filter_of(port)
+    asd = port.asd
+    shape = port.filter
     if shape is None:
         return np.full(omega.size, asd / np.sqrt(2.0))
     return np.asarray(asd / np.sqrt(2.0) * np.abs(_gain(shape, omega)))

@@ -121,8 +121,8 @@ def design_static(
     plant = checked_plant(plant)
     ports = plant.assembled.ports
     motions = carried_of(plant)
-    kinds = {s.name: s.quantity for s in ports.y}
-    used = [name for name in sensors(plant) if kinds.get(name) == "displacement"]
+    orders = {s.name: s.order for s in ports.y}
+    used = [name for name in sensors(plant) if orders.get(name) == 0]
     channels = poi_channels(plant)
     R_y, R_z = seen(plant, motions, used), seen(plant, motions, channels)
     gain = R_z @ np.linalg.pinv(R_y, rcond=_MISSED)

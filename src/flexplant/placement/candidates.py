@@ -6,13 +6,14 @@ from collections.abc import Iterable, Sequence
 from typing import Any, Literal, TypeAlias
 
 from ..errors import LabelError, ModelError, unknown_label
-from ..plant import Actuator, Sensor, StandardPlant, standard_plant
+from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
 from ..values import short
 
-Port: TypeAlias = "Sensor | Actuator"
+Port: TypeAlias = "SensorPort | Actuator"
 Side: TypeAlias = Literal["y", "u"]
 
-KIND: dict[str, type[Any]] = {"y": Sensor, "u": Actuator}
+_NAME = {"y": "Sensor", "u": "Actuator"}
+KIND: dict[str, type[Any]] = {"y": SensorPort, "u": Actuator}
 
 
 def checked_plant(plant: StandardPlant) -> None:
@@ -45,7 +46,7 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
     """
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ModelError(
-            f"candidates are a list of {KIND[side].__name__}s or names, got {short(given)}. "
+            f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "
             "Put them in a list."
         )
     own: dict[str, Port] = {p.name: p for p in getattr(plant.assembled.ports, side)}
@@ -55,11 +56,11 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
         if isinstance(item, str):
             port = found.get(item) or own.get(item)
             if port is None:
-                raise unknown_label(KIND[side].__name__.lower(), item, [*own, *found])
+                raise unknown_label(_NAME[side].lower(), item, [*own, *found])
         if not isinstance(port, KIND[side]):
             raise ModelError(
-                f"candidates are {KIND[side].__name__}s or names of the plant's, got "
-                f"{short(port)}. Pass {KIND[side].__name__}(name, at=...)."
+                f"candidates are {_NAME[side]}s or names of the plant's, got "
+                f"{short(port)}. Pass {_NAME[side]}(name, at=...)."
             )
         other = found.setdefault(port.name, port)
         if other is not port and other._fields() != port._fields():

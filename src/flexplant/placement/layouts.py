@@ -11,8 +11,7 @@ import numpy as np
 
 from ..errors import AssumptionError, CertificateError
 from ..parallel import mapped
-from ..plant import Assumption, Sensor, StandardPlant, assemble_plant
-from ..plant.ports import QUANTITIES
+from ..plant import Assumption, SensorPort, StandardPlant, assemble_plant
 from ..values import FloatArray
 from .candidates import Port, Side, checked_plant, with_side
 from .criterion import Criterion, OnPlant, Scorer, as_criterion
@@ -156,11 +155,9 @@ def _rigid(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
     realisation = plant.assembled.realisation
     rows = np.zeros((len(candidates), realisation.n_rigid))
     for i, port in enumerate(candidates):
-        row = realisation.row(port.at, port.direction)
-        if isinstance(port, Sensor):
-            motion = realisation.motion(row, QUANTITIES.index(port.quantity))
-            rows[i] = motion[0 : 2 * realisation.n_rigid : 2]
+        if isinstance(port, SensorPort):
+            rows[i] = port.see(realisation).row[0 : 2 * realisation.n_rigid : 2]
         else:
-            rows[i] = realisation.force(row)[1 : 2 * realisation.n_rigid : 2]
+            rows[i] = realisation.force(port.push(realisation))[1 : 2 * realisation.n_rigid : 2]
     sizes = np.linalg.norm(rows, axis=1, keepdims=True)
     return np.asarray(rows / np.where(sizes > 0, sizes, 1.0))

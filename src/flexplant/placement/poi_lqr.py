@@ -126,7 +126,7 @@ class PoiLqr(Criterion):
             constant += float(np.sum((rows @ noise) ** 2))
             noise = A @ noise
         constant += float(np.sum((rows @ noise) ** 2))
-        B = [realisation.force(realisation.row(c.at, c.direction)) for c in candidates]
+        B = [realisation.force(c.push(realisation)) for c in candidates]
         late = discretized(
             StateSpace(
                 realisation.A,

@@ -10,8 +10,7 @@ import numpy as np
 
 from ..errors import AssumptionError
 from ..estimation import design_kalman
-from ..plant import Disturbance, StandardPlant
-from ..plant.ports import QUANTITIES
+from ..plant import StandardPlant
 from .criterion import Criterion, Scorer
 from .poi_axes import Axes, bare, checked_axes, factors_of, plain, shown, structure_part
 from .quadratic import quadratic
@@ -80,15 +79,13 @@ class PoiVariance(Criterion):
                 "them without limit. Give Sensor(..., asd=) what the data sheet says."
             )
         # noise that is shaped first does not arrive at once
-        loud = [d for d in ports.w if isinstance(d, Disturbance) and d.asd > 0 and bare(d)]
-        B = [realisation.force(realisation.row(d.at, d.direction)) for d in loud]
+        loud = [port.push(realisation) for port in ports.w if port.asd > 0 and bare(port)]
         for sensor in candidates:
-            row = realisation.row(sensor.at, sensor.direction)
-            if sensor.quantity == "acceleration" and np.any(np.dot(B, realisation.motion(row, 1))):
+            if np.any(np.dot(loud, sensor.see(realisation).direct)):
                 raise AssumptionError(
-                    f"white noise of a disturbance reaches {sensor.name!r} (an acceleration) at "
-                    "once, so a sample of it would have infinite variance. Measure displacement "
-                    "or velocity, or shape the disturbance."
+                    f"white noise of a disturbance reaches {sensor.name!r} at once "
+                    "(an acceleration, say), so a sample of it would have infinite variance. "
+                    "Measure displacement or velocity, or shape the disturbance."
                 )
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
@@ -103,7 +100,5 @@ class PoiVariance(Criterion):
         realisation = plant.assembled.realisation
         items = np.zeros((len(candidates), A.shape[0]))
         for i, sensor in enumerate(candidates):
-            row = realisation.row(sensor.at, sensor.direction)
-            seen = realisation.motion(row, QUANTITIES.index(sensor.quantity))
-            items[i] = seen / np.sqrt(0.5 * sensor.asd**2 / plant.dt)
+            items[i] = sensor.see(realisation).row / np.sqrt(0.5 * sensor.asd**2 / plant.dt)
         return quadratic(A.T, noise @ noise.T, rows, items)

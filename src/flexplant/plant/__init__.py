@@ -11,10 +11,11 @@ from .moving import Along as Along
 from .origin import Assembled as Assembled
 from .origin import Foreign as Foreign
 from .origin import Weighted as Weighted
-from .ports import Poi as Poi
+from .port import ForcePort as ForcePort
+from .port import Seen as Seen
+from .port import SensorPort as SensorPort
 from .ports import Ports as Ports
 from .ports import Reference as Reference
-from .ports import Sensor as Sensor
 from .residual import FastStates as FastStates
 from .residual import Feedthrough as Feedthrough
 from .rigid.decoupling import Decoupling as Decoupling
@@ -24,6 +25,8 @@ from .rigid.stage import reference_errors as reference_errors
 from .rigid.stage import stage_weights as stage_weights
 from .rigid.suspension import GroundSpring as GroundSpring
 from .rigid.suspension import suspend as suspend
+from .sensors import Poi as Poi
+from .sensors import Sensor as Sensor
 from .standard import StandardPlant as StandardPlant
 from .standard import standard_plant as standard_plant
 from .truncation import larger_plant as larger_plant

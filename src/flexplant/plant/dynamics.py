@@ -2,36 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 
 from ..errors import ModelError
-from ..labels import Place
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, as_statespace
-from ..values import FloatArray
-from .forces import BaseAcceleration, OutputDisturbance
-from .ports import QUANTITIES, Poi, Ports, filter_of
+from .ports import Ports
 from .realisation import ModalRealisation
-from .rigid.rigid_body import inertia_load
-
-
-def load_of(realisation: ModalRealisation, port: Any) -> FloatArray:
-    """Return the load over the model's DOFs per unit of an actuator or disturbance."""
-    if isinstance(port, BaseAcceleration):
-        return inertia_load(realisation, port.direction, np.asarray(port.about))
-    if isinstance(port, OutputDisturbance):
-        return np.zeros(realisation.outputs.shape[0])
-    return realisation.row(port.at, port.direction)
-
-
-def poi_row(realisation: ModalRealisation, poi: Poi, axis: str) -> FloatArray:
-    """Return the row over the model's DOFs of one axis of a POI."""
-    at: Place = poi.at
-    if isinstance(at, str):
-        at = f"{at.split(':')[0]}:{axis}"
-    return realisation.row(at, axis)
 
 
 def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
@@ -46,39 +23,28 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
         raise ModelError(
             f"a plant needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
         )
-    push = np.array([load_of(realisation, port) for port in ports.forces])
-    B = np.array([realisation.force(row) for row in push]).T
-    motions = [(poi_row(realisation, poi, axis), 0) for poi in ports.z for axis in poi.axes]
-    motions += [(realisation.row(s.at, s.direction), QUANTITIES.index(s.quantity)) for s in ports.y]
-    C = np.array([realisation.motion(row, derivative) for row, derivative in motions])
-    D = np.array([_direct(realisation, row, derivative, push, B) for row, derivative in motions])
-    outputs = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
-    outputs += [sensor.name for sensor in ports.y]
+    push = np.array([port.push(realisation) for port in ports.forces])
+    B = np.array([realisation.force(load) for load in push]).T
+    motions = {
+        poi.channel(axis): poi.see(realisation, axis) for poi in ports.z for axis in poi.axes
+    }
+    measured = [sensor.see(realisation) for sensor in ports.y]
+    found = [*motions.values(), *measured]
+    C, D = np.array([one.row for one in found]), np.array([push @ one.direct for one in found])
+    sensors = [sensor.name for sensor in ports.y]
     for column, port in enumerate(ports.forces):
-        if isinstance(port, OutputDisturbance):
-            D[outputs.index(port.sensor, len(outputs) - len(ports.y)), column] = 1.0
+        if port.added_to is not None:
+            D[len(motions) + sensors.index(port.added_to), column] = 1.0
     return StateSpace(
         realisation.A,
         B,
         C,
         D,
         inputs=[port.name for port in ports.forces],
-        outputs=outputs,
+        outputs=[*motions, *sensors],
         states=realisation.names,
         blocks=realisation.blocks,
     )
-
-
-def _direct(
-    realisation: ModalRealisation, row: FloatArray, derivative: int, push: FloatArray, B: FloatArray
-) -> FloatArray:
-    """Return the part (m,) of a motion that follows the forces at once."""
-    if derivative == 0:
-        return np.asarray(realisation.at_once(row[None], push)[0])
-    if derivative == 1:
-        return np.zeros(B.shape[1])
-    # an acceleration follows a force at once: d2q/dt2 = S A A x + S A N' f
-    return np.asarray(realisation.motion(row, 1) @ B)
 
 
 def with_filters(structure: StateSpace, ports: Ports) -> StateSpace:
@@ -87,10 +53,10 @@ def with_filters(structure: StateSpace, ports: Ports) -> StateSpace:
     States are those of the sensors' filters, the structure's, those of the forces' filters: what
     drives stands behind what is driven, so that A is block upper triangular.
     """
-    before = [_named(filter_of(port), port.name) for port in ports.forces]
+    before = [_named(port.filter, port.name) for port in ports.forces]
     seen = structure.outputs[: len(structure.outputs) - len(ports.y)]
     after = [_named(None, name) for name in seen]
-    after += [_named(filter_of(sensor), sensor.name) for sensor in ports.y]
+    after += [_named(sensor.filter, sensor.name) for sensor in ports.y]
     system = structure
     if any(part.n_states for part in before):
         system = series(append(*before), system)
@@ -104,9 +70,9 @@ def with_filters(structure: StateSpace, ports: Ports) -> StateSpace:
 
 def with_gains(structure: StateSpace, ports: Ports) -> StateSpace:
     """Return the structure with the static gains of its ports' filters in place of these."""
-    push = np.array([static_gain(filter_of(port)) for port in ports.forces])
+    push = np.array([static_gain(port.filter) for port in ports.forces])
     others = len(structure.outputs) - len(ports.y)
-    see = np.array([1.0] * others + [static_gain(filter_of(sensor)) for sensor in ports.y])
+    see = np.array([1.0] * others + [static_gain(sensor.filter) for sensor in ports.y])
     return structure.replace(
         B=structure.B * push,
         C=see[:, None] * structure.C,

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
+
+import numpy as np
 
 from ..labels import Place
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, positive, real_array
+from ..values import FloatArray, positive, real_array
+from .port import ForcePort, force_unit, motion_unit
 from .port_checks import checked_direction, checked_filter, checked_name, checked_place
+from .realisation import ModalRealisation
+from .rigid.rigid_body import inertia_load
 
 
 @dataclass(frozen=True, eq=False)
-class Disturbance(Value):
+class Disturbance(ForcePort):
     """A force (or moment) from outside, in w.
 
     Parameters
@@ -49,9 +55,18 @@ class Disturbance(Value):
             shape=checked_filter(self.name, "shape", self.shape),
         )
 
+    @property
+    def unit(self) -> str | None:
+        """N or N m; None for a sum of forces and moments."""
+        return force_unit(self.at, self.direction)
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the load (n,) over the model's DOFs of a unit force."""
+        return realisation.row(self.at, self.direction)
+
 
 @dataclass(frozen=True, eq=False)
-class BaseAcceleration(Value):
+class BaseAcceleration(ForcePort):
     """An acceleration of the floor (or frame) under the whole structure, in w.
 
     All motions are then relative to the base, and the structure feels ``-M r a``, r its rigid-body
@@ -99,9 +114,18 @@ class BaseAcceleration(Value):
             about=tuple(about.tolist()),
         )
 
+    @property
+    def unit(self) -> str | None:
+        """m/s^2 or rad/s^2."""
+        return motion_unit({}, self.direction, 2)
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the load (n,) ``-M r`` over the model's DOFs of a unit acceleration."""
+        return inertia_load(realisation, self.direction, np.asarray(self.about))
+
 
 @dataclass(frozen=True, eq=False)
-class OutputDisturbance(Value):
+class OutputDisturbance(ForcePort):
     """Something added to what one sensor measures, before the sensor's own dynamics; in w.
 
     White noise here needs a sensor with `dynamics` that roll off (an anti-alias filter, say), or a
@@ -137,9 +161,18 @@ class OutputDisturbance(Value):
             shape=checked_filter(self.name, "shape", self.shape),
         )
 
+    @property
+    def added_to(self) -> str:
+        """The sensor that it is added to."""
+        return self.sensor
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return no load (n,): it does not act on the structure."""
+        return np.zeros(realisation.outputs.shape[0])
+
 
 @dataclass(frozen=True, eq=False)
-class Actuator(Value):
+class Actuator(ForcePort):
     """A force (or moment) that the controller commands, in u.
 
     Parameters
@@ -163,6 +196,7 @@ class Actuator(Value):
         For a bad name, place, direction, dynamics or a negative delay.
     """
 
+    home: ClassVar = "u"
     name: str
     at: Place
     direction: str = "z"
@@ -177,3 +211,17 @@ class Actuator(Value):
             dynamics=checked_filter(self.name, "dynamics", self.dynamics),
             delay=positive(self.delay, f"delay of {self.name!r}", zero=True),
         )
+
+    @property
+    def filter(self) -> StateSpace | None:
+        """Amplifier and motor."""
+        return self.dynamics
+
+    @property
+    def unit(self) -> str | None:
+        """N or N m; None for a sum of forces and moments."""
+        return force_unit(self.at, self.direction)
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the load (n,) over the model's DOFs of a unit force."""
+        return realisation.row(self.at, self.direction)

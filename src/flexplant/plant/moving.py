@@ -13,7 +13,7 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..values import FloatArray, Value, real_array
 from .forces import Actuator, Disturbance
 from .partition import Partition
-from .ports import Poi, Ports, filter_of
+from .ports import Poi, Ports
 from .rebuilding import rebuilt
 
 
@@ -88,10 +88,10 @@ def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
 
 def _port(ports: Ports, name: str) -> Any:
     pois = [poi for poi in ports.z if poi.name == name]
-    others = [port for port in (*ports.forces, *ports.y) if port.name == name]
+    others = [port for port in ports.physical if port.name == name]
     found = pois or others
     if not found:
-        known = [port.name for port in (*ports.z, *ports.forces, *ports.y)]
+        known = [port.name for port in (*ports.z, *ports.physical)]
         raise unknown_label("POI", name, known)
     if len(found) > 1:
         raise LabelError(f"{name!r} names an input and a sensor: rename one to move the other.")
@@ -123,7 +123,7 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
 
 
 def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatArray) -> Along:
-    if plant.dt or filter_of(port) is not None:
+    if plant.dt or port.filter is not None:
         raise ModelError(
             f"the place of {port.name!r} acts through a filter, a hold or a delay, so that more "
             "than a column of B depends on it. Use plant.continuous.along for a force without "
@@ -135,8 +135,8 @@ def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatAr
     rows = realisation.model.rows(points, port.direction)
     B[:, plant.modal_states, 0] = rows @ realisation.inputs
     D = np.repeat(g.D[None, :, i : i + 1], points.shape[0], axis=0)
-    accelerations = any(sensor.quantity == "acceleration" for sensor in plant.assembled.ports.y)
-    if accelerations or realisation.static_inputs is not None:
+    at_once = any(np.any(one.see(realisation).direct) for one in plant.assembled.ports.y)
+    if at_once or realisation.static_inputs is not None:
         for k, point in enumerate(points):
             D[k] = _elsewhere(plant, port.name, point).system.D[:, i : i + 1]
     return Along(port.name, points, (port.name,), np.zeros((points.shape[0], 0, g.n_states)), D, B)

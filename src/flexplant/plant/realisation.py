@@ -116,14 +116,14 @@ class ModalRealisation(Value):
             C[:, :, 0, 1] -= slowed
         return C.reshape(*np.shape(row)[:-1], -1)
 
-    def at_once(self, see: FloatArray, push: FloatArray) -> FloatArray:
-        """Return the displacements (p, m) along rows (p, n) that forces along (m, n) cause at once.
+    def at_once(self, row: FloatArray) -> FloatArray:
+        """Return the displacement along a row (n,) that unit forces at the DOFs (n,) cause at once.
 
         Zero unless modes were replaced by their flexibility.
         """
         if self.static_outputs is None or self.static_inputs is None:
-            return np.zeros((see.shape[0], push.shape[0]))
-        return np.asarray((see @ self.static_outputs) @ (push @ self.static_inputs).T)
+            return np.zeros(row.size)
+        return np.asarray(self.static_inputs @ (row @ self.static_outputs))
 
 
 def realised(model: Structure | ModalRealisation) -> ModalRealisation:

@@ -11,7 +11,6 @@ import scipy.linalg as la
 from ..lti.discretisation import block_diagonal
 from ..values import ComplexArray, FloatArray, Value
 from .partition import Partition
-from .ports import QUANTITIES
 
 #: a mode reached or seen less than this, beside the channel's strongest mode, is called weak
 WEAK = 0.01
@@ -95,7 +94,7 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     for side in "wu":
         names = [n for n in getattr(plant, side) if np.any(g.B[:, g.input_index([n])])]
         sides[side] = names, np.abs(left.conj().T @ g.B[:, g.input_index(names)])
-    orders = {s.name: QUANTITIES.index(s.quantity) for s in plant.assembled.ports.y}
+    orders = {s.name: s.order for s in plant.assembled.ports.y}
     for side in "yz":
         names = [n for n in getattr(plant, side) if np.any(g.C[g.output_index([n])])]
         power = np.array([1 - orders.get(name, 0) for name in names])

@@ -10,9 +10,10 @@ import numpy as np
 from ...errors import AssumptionError, unknown_label
 from ...lti.statespace import StateSpace
 from ...values import FloatArray, Value, name_list
-from ..dynamics import load_of, static_gain
+from ..dynamics import static_gain
 from ..forces import Actuator
-from ..ports import Ports, Sensor, filter_of
+from ..port import SensorPort
+from ..ports import Ports
 from ..realisation import ModalRealisation
 from ..standard import StandardPlant, standard_plant
 from .rigid_body import RigidBody, rigid_body_of
@@ -108,7 +109,7 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
         if axis not in body.axes:
             raise unknown_label("rigid-body axis", axis, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
-    sensors = [s for s in ports.y if s.quantity == "displacement"]
+    sensors = [s for s in ports.y if s.order == 0]
     see = _gains(sensors)[:, None] * _seen(realisation, sensors, body)
     push = (_gains(ports.u)[:, None] * _pushed(realisation, ports, body)).T
     length = _length(body)
@@ -129,19 +130,21 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     )
 
 
-def _gains(ports: Sequence[Actuator | Sensor]) -> FloatArray:
-    return np.array([static_gain(filter_of(port)) for port in ports])
+def _gains(ports: Sequence[Actuator | SensorPort]) -> FloatArray:
+    return np.array([static_gain(port.filter) for port in ports])
 
 
-def _seen(realisation: ModalRealisation, sensors: Sequence[Sensor], body: RigidBody) -> FloatArray:
+def _seen(
+    realisation: ModalRealisation, sensors: Sequence[SensorPort], body: RigidBody
+) -> FloatArray:
     """Return what each sensor (ny, r) shows of the rigid-body motions."""
-    rows = [realisation.row(s.at, s.direction) @ body.motions for s in sensors]
+    rows = [s.row(realisation) @ body.motions for s in sensors]
     return np.array(rows).reshape(-1, len(body.axes))
 
 
 def _pushed(realisation: ModalRealisation, ports: Ports, body: RigidBody) -> FloatArray:
     """Return the forces and moments (nu, r) of each actuator at the centre of gravity."""
-    rows = [load_of(realisation, port) @ body.motions for port in ports.u]
+    rows = [port.push(realisation) @ body.motions for port in ports.u]
     return np.array(rows).reshape(-1, len(body.axes))
 
 

@@ -10,9 +10,8 @@ import scipy.linalg as la
 
 from ...errors import AssumptionError, FlexplantError, unknown_label
 from ...values import FloatArray, IntArray
-from ..dynamics import load_of, poi_row, static_gain
+from ..dynamics import static_gain
 from ..partition import Partition
-from ..ports import filter_of
 from ..realisation import ModalRealisation
 from .rigid_body import rigid_body_of
 
@@ -116,15 +115,15 @@ def seen(plant: Partition, motions: Carried, channels: Sequence[str]) -> FloatAr
     """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     places = {
-        poi.channel(axis): (1.0, poi_row(realisation, poi, axis))
+        poi.channel(axis): (1.0, poi.row(realisation, axis))
         for poi in ports.z
         for axis in poi.axes
         if poi.channel(axis) in channels
     }
     for s in ports.y:
         if s.name in channels:
-            gain = static_gain(filter_of(s)) if s.quantity == "displacement" else 0.0
-            places[s.name] = (gain, realisation.row(s.at, s.direction))
+            gain = static_gain(s.filter) if s.order == 0 else 0.0
+            places[s.name] = (gain, s.row(realisation))
     for name in channels:
         if name not in places:
             raise unknown_label("motion of a POI or a sensor", name, list(places))
@@ -168,8 +167,6 @@ def gain_of(
     for name in inputs:
         if name not in forces:
             raise unknown_label("force", name, list(forces))
-    loads = [
-        static_gain(filter_of(forces[name])) * load_of(realisation, forces[name]) for name in inputs
-    ]
+    loads = [static_gain(forces[name].filter) * forces[name].push(realisation) for name in inputs]
     push = np.array(loads).reshape(len(loads), -1) @ motions.shapes
     return np.asarray(seen(plant, motions, outputs) @ push.T)

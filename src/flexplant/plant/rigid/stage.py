@@ -14,7 +14,7 @@ from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
 from ...lti.weights import inverse_sensitivity, leadlag
 from ...values import Value, positive
-from ..forces import BaseAcceleration, OutputDisturbance
+from ..forces import BaseAcceleration
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant
 from .rigid_motion import Carried, carried_of, require_weak, rigid_gain, seen
@@ -56,7 +56,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     if not ports.references:
         raise AssumptionError("the plant has no reference: add Reference(...) to the ports.")
     followed = ports.poi(_chosen([r.poi for r in ports.references], poi, "POI with a reference"))
-    sensors = [s.name for s in ports.y if s.quantity == "displacement"]
+    sensors = [s.name for s in ports.y if s.order == 0]
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
         raise AssumptionError(
@@ -240,7 +240,7 @@ def stage_weights(
     z |= {f"{port.name}:effort": _sampled(rolloff, plant) for port in ports.u}
     w: dict[str, Any] = {}
     for port in ports.w:
-        if isinstance(port, OutputDisturbance):
+        if port.added_to is not None:
             w[port.name] = positive(noise, "noise")
         elif isinstance(port, BaseAcceleration):
             turned = 1.0 / arm if port.direction.startswith("r") else 1.0

@@ -1,0 +1,146 @@
+"""What every port of a machine has: the bases that a new kind of force or sensor derives from."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import ClassVar, Literal, NamedTuple, TypeAlias
+
+import numpy as np
+
+from ..labels import Place
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value
+from .realisation import ModalRealisation
+
+Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
+#: in the order of their time derivatives
+QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
+
+
+class Seen(NamedTuple):
+    """What a channel measures: ``row x + direct f``.
+
+    Parameters
+    ----------
+    row : (2 b,) array
+        Over the states of the modes.
+    direct : (n,) array
+        Over loads at the model's DOFs: what follows a force at once.
+    """
+
+    row: FloatArray
+    direct: FloatArray
+
+
+def seen(realisation: ModalRealisation, row: FloatArray, order: int = 0) -> Seen:
+    """Return how the time derivative of some order of a displacement (a row over DOFs) is seen."""
+    if order == 0:
+        return Seen(realisation.motion(row, 0), realisation.at_once(row))
+    direct = np.zeros(row.size)
+    if order == 2:  # an acceleration follows a force at once: d2q/dt2 = S A A x + S A N' f
+        direct = realisation.inputs @ realisation.motion(row, 1)
+    return Seen(realisation.motion(row, order), direct)
+
+
+class ForcePort(Value):
+    """A port in w or u. A new kind has a `name`, and says by `push` where it acts."""
+
+    #: the side of Ports that holds it
+    home: ClassVar = "w"
+    name: str
+    direction: str
+    asd: float = 0.0
+
+    @property
+    def filter(self) -> StateSpace | None:
+        """The system between the channel and the structure."""
+        found: StateSpace | None = getattr(self, "shape", None)
+        return found
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the channel; None where it has none."""
+        return None
+
+    @property
+    def added_to(self) -> str | None:
+        """The sensor that it is added to, for what does not act on the structure."""
+        return None
+
+    def push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the load (n,) over the model's DOFs per unit of the channel."""
+        raise NotImplementedError
+
+
+class SensorPort(Value):
+    """A port in y. A new kind has the fields below, and says by `row` or `see` what it measures.
+
+    By `row`, a displacement: that of a point beside another, say; with a `quantity` also its
+    velocity or acceleration. By `see`, anything else that is linear in states and forces.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name.
+    at : str, (3,) array [m] or mapping
+        Where it is drawn, and what `StandardPlant.at` moves.
+    asd : float
+        One-sided amplitude spectral density of its white noise.
+    dynamics : StateSpace, optional
+        Sensor and anti-alias filter.
+    delay : float [s]
+        Of the signal.
+    """
+
+    home: ClassVar = "y"
+    name: str
+    at: Place
+    asd: float = 0.0
+    dynamics: StateSpace | None = None
+    delay: float = 0.0
+    quantity: Quantity = "displacement"
+
+    @property
+    def filter(self) -> StateSpace | None:
+        """The system between the motion and the channel."""
+        return self.dynamics
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the channel; None where it has none."""
+        return None
+
+    @property
+    def order(self) -> int:
+        """Which time derivative of a displacement it measures: 0, 1 or 2."""
+        return QUANTITIES.index(self.quantity)
+
+    def row(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the row (n,) over the model's DOFs of the displacement that it is about."""
+        raise NotImplementedError
+
+    def see(self, realisation: ModalRealisation) -> Seen:
+        """Return what it measures of the states, and of forces at once."""
+        return seen(realisation, self.row(realisation), self.order)
+
+
+def motion_unit(at: Place, direction: str, order: int = 0) -> str | None:
+    """Return the unit of a motion; None for a sum of displacements and rotations."""
+    turns = turning(at, direction)
+    return None if turns is None else ("rad" if turns else "m") + ("", "/s", "/s^2")[order]
+
+
+def force_unit(at: Place, direction: str) -> str | None:
+    """Return the unit of a force; None for a sum of forces and moments."""
+    turns = turning(at, direction)
+    return None if turns is None else "N m" if turns else "N"
+
+
+def turning(at: Place, direction: str) -> bool | None:
+    """Return whether a place moves by rotation; None for a sum of both kinds."""
+    places = list(at) if isinstance(at, Mapping) else [at]
+    kinds = {
+        (place.rpartition(":")[2] if isinstance(place, str) else direction).startswith("r")
+        for place in places
+    } or {direction.startswith("r")}
+    return kinds.pop() if len(kinds) == 1 else None

@@ -1,0 +1,156 @@
+"""What is seen of a machine: sensors, and points of interest that no sensor sees."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import ClassVar
+
+from ..errors import LabelError, unknown_label
+from ..labels import DIRECTIONS, Place
+from ..lti.statespace import StateSpace
+from ..values import FloatArray, Value, check_names, positive, short
+from .port import QUANTITIES, Quantity, Seen, SensorPort, motion_unit, seen
+from .port_checks import checked_direction, checked_filter, checked_name, checked_place
+from .realisation import ModalRealisation
+
+
+@dataclass(frozen=True, eq=False)
+class Sensor(SensorPort):
+    """A measured motion, in y.
+
+    Parameters
+    ----------
+    name : str
+        The channel's name; its noise is the channel `name:noise` of w.
+    at : str, (3,) array [m] or mapping
+        A DOF label, a point, or a sum {label or point: weight}.
+    direction : str
+        At points: x, y, z or rx, ry, rz.
+    quantity : {"displacement", "velocity", "acceleration"}
+        What is measured. An acceleration answers forces at once (D21, D22); a white disturbance
+        that reaches it would give its samples infinite variance, which Kalman filters and
+        simulation refuse: shape the disturbance, or give the sensor `dynamics` that roll off.
+    asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
+        One-sided amplitude spectral density of its white noise; a sample has variance
+        asd^2 rate / 2. It is added to the samples, after dynamics and delay; what passes through
+        them is an OutputDisturbance.
+    dynamics : StateSpace, optional
+        Sensor and anti-alias filter, motion to signal: stable; its states join the plant's.
+    delay : float [s]
+        Of the signal. Exact, also between samples, once the plant is sampled; a continuous plant
+        leaves it out and says so (`ports.with_pade(order)` approximates it there).
+
+    Raises
+    ------
+    LabelError, ModelError
+        For a bad name, place, direction, quantity, dynamics, or a negative asd or delay.
+    """
+
+    name: str
+    at: Place
+    direction: str = "z"
+    quantity: Quantity = "displacement"
+    asd: float = 0.0
+    dynamics: StateSpace | None = None
+    delay: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._set(
+            name=checked_name(self.name),
+            direction=checked_direction(self.name, self.direction),
+            at=checked_place(self.name, self.at),
+        )
+        if self.quantity not in QUANTITIES:
+            raise unknown_label(f"quantity of {self.name!r}", self.quantity, QUANTITIES)
+        self._set(
+            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
+            dynamics=checked_filter(self.name, "dynamics", self.dynamics),
+            delay=positive(self.delay, f"delay of {self.name!r}", zero=True),
+        )
+
+    @property
+    def unit(self) -> str | None:
+        """Unit of the motion, m or rad, per s, per s^2; None for a sum of both."""
+        return motion_unit(self.at, self.direction, self.order)
+
+    def row(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the row (n,) over the model's DOFs of its displacement."""
+        return realisation.row(self.at, self.direction)
+
+
+@dataclass(frozen=True, eq=False)
+class Poi(Value):
+    """A Point Of Interest: motions that no sensor sees, in z as `name:axis`.
+
+    Parameters
+    ----------
+    name : str
+        Its name.
+    at : str or (3,) array [m]
+        A DOF label (whose direction is replaced by the axes) or any point of the structure.
+    axes : sequence of str
+        Of x, y, z [m], rx, ry, rz [rad]; the first one is the axis that a Reference follows.
+
+    Raises
+    ------
+    LabelError, ModelError
+        For a bad name, place or axis.
+    """
+
+    home: ClassVar = "z"
+    name: str
+    at: Place
+    axes: tuple[str, ...] = ("z",)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.axes, Iterable):
+            raise LabelError(
+                f"axes of POI {self.name!r} are names such as ('z', 'rx'), got {short(self.axes)}."
+                " Name them."
+            )
+        axes = (self.axes,) if isinstance(self.axes, str) else tuple(self.axes)
+        for axis in axes:
+            if axis not in DIRECTIONS:
+                raise unknown_label(f"axis of POI {self.name!r}", axis, DIRECTIONS)
+        if not axes:
+            raise LabelError(f"POI {self.name!r} has no axes: name at least one, such as ('z',).")
+        check_names(axes, f"axes of POI {self.name!r}")
+        if isinstance(self.at, Mapping) and len(axes) > 1:
+            raise LabelError(
+                f"POI {self.name!r} is a combination of DOFs, so it has one axis, got {axes}. "
+                "Give a point or a DOF label, or one POI per combination."
+            )
+        self._set(axes=axes, name=checked_name(self.name), at=checked_place(self.name, self.at))
+
+    def channel(self, axis: str) -> str:
+        """Return the name of an axis in z, such as `die:z`."""
+        return f"{self.name}:{axis}"
+
+    def derived(self, axis: str, kind: str) -> str:
+        """Return the name of a reference, error or estimate: `die:hat`, `die:rx:hat`.
+
+        Parameters
+        ----------
+        axis : str
+            One of the POI's axes; the first is left out of the name.
+        kind : str
+            `ref`, `error` or `hat`.
+        """
+        return f"{self.name}:{kind}" if axis == self.axes[0] else f"{self.name}:{axis}:{kind}"
+
+    def unit(self, axis: str) -> str | None:
+        """Return the unit of an axis: m or rad; None for a sum of both."""
+        # a label gives the place alone: its direction is replaced by the axis
+        return motion_unit(self.at if isinstance(self.at, Mapping) else {}, axis)
+
+    def row(self, realisation: ModalRealisation, axis: str) -> FloatArray:
+        """Return the row (n,) over the model's DOFs of one axis."""
+        at: Place = self.at
+        if isinstance(at, str):
+            at = f"{at.split(':')[0]}:{axis}"
+        return realisation.row(at, axis)
+
+    def see(self, realisation: ModalRealisation, axis: str) -> Seen:
+        """Return what an axis shows of the states, and of forces at once."""
+        return seen(realisation, self.row(realisation, axis))
