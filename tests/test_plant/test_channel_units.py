@@ -6,7 +6,6 @@ import pytest
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.lti import Frf, StateSpace, append, connect, feedback, lft, parallel, series
-from flexplant.plant.channel_units import channel_units
 from stages import ports, some_modes
 
 
@@ -35,7 +34,7 @@ def every_kind():
 
 
 def test_ports_tell_the_unit_of_every_channel():
-    found = channel_units(every_kind())
+    found = every_kind().units
     wanted = {
         "push": "N", "twist": "N m", "floor": "m/s^2", "drift": "rad", "u1": "N", "m1": "N m",
         "u1:effort": "N", "m1:effort": "N m", "die:z": "m", "die:rx": "rad", "die:ref": "m",

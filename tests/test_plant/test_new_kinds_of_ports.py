@@ -47,9 +47,13 @@ class Led(SensorPort):
     lead: float
     asd: float = 0.0
 
+    def row(self, realisation):
+        """Return what it shows at rest."""
+        return realisation.row(self.at, "z")
+
     def see(self, realisation):
         """Return a row q and a row of T dq/dt."""
-        row = realisation.row(self.at, "z")
+        row = self.row(realisation)
         return Seen(
             realisation.motion(row, 0) + self.lead * realisation.motion(row, 1),
             realisation.at_once(row),

@@ -323,7 +323,7 @@ def test_static_gains_are_filters_without_states():
                                4 * bare.Gyu["y", "u"].evaluated(300j), rtol=1e-12)  # fmt: skip
 
 
-def test_the_structural_plant_has_static_gains_in_place_of_filters():
+def test_filters_do_not_hide_rigid_body_modes():
     base = channels()
     twice = StateSpace(*companion([18000.0], [1.0, 9000.0]))
     thrice = StateSpace(*companion([1.2e8], [1.0, 8000.0, 4e7]))
@@ -332,11 +332,6 @@ def test_the_structural_plant_has_static_gains_in_place_of_filters():
         y=[base.y[0].replace(dynamics=thrice), base.y[1]],
     )
     plant = assemble_plant(model(), ports).discretized(5e3, delay=1)
-    s = 2j
-    found = plant.structural.select(OUTPUTS, INPUTS).evaluated(s)
-    whole = plant.continuous.system.select(OUTPUTS, INPUTS).evaluated(s)
-    np.testing.assert_allclose(found, whole, rtol=2e-3)  # 2 rad/s: filters are static
-    assert plant.structural.n_states == 10
     assert plant.check()["stabilisable"].holds
     assert plant.check()["detectable"].holds
 

@@ -84,13 +84,14 @@ def test_estimates_and_servo_of_six_axes():
 
 def test_the_poi_between_nodes_moves_rigidly():
     plant = found()["plant"]
-    rows = plant.structural.C[[plant.z.index(f"die:{axis}") for axis in example().AXES]]
-    rigid = rows[:, 0:12:2] * plant.structural.A[0, 1]
+    g = plant.continuous.system
+    rows = g.C[[plant.z.index(f"die:{axis}") for axis in example().AXES]]
+    rigid = rows[:, 0:12:2] * g.A[0, 1]
     # rigid shapes at the sensors determine the body's motion; the POI must follow it
     centre = found()["decoupling"].centre
     see = np.array([body_row(p, d, centre) for p, d in example().SENSORS.values()])
-    y = [plant.structural.outputs.index(name) for name in example().SENSORS]
-    at_sensors = plant.structural.C[y][:, 0:12:2] * plant.structural.A[0, 1]
+    y = [g.outputs.index(name) for name in example().SENSORS]
+    at_sensors = g.C[y][:, 0:12:2] * g.A[0, 1]
     motion = np.linalg.solve(see, at_sensors)
     wanted = [body_row(example().POI, d, centre) @ motion for d in "xyz"] + [*motion[3:]]
     np.testing.assert_allclose(rigid, wanted, atol=1e-8)

@@ -87,7 +87,7 @@ def test_the_rigid_gain_is_newtons_law_free_partly_and_wholly_suspended(model):
 def test_free_and_suspended_gains_agree_to_rounding(model):
     """The free one's by its modes at 0 Hz, as ever; the suspended one's by geometry."""
     plant = sampled(model())
-    g = plant.structural
+    g = plant.continuous.system
     shapes = g.C[:, 0:6:2] * g.A[[0, 2, 4], [1, 3, 5]]
     modal = shapes[g.output_index(Z)] @ g.B[1:6:2][:, g.input_index(U)]
     for found in (rigid_gain(plant, Z, U), rigid_gain(held(model), Z, U)):

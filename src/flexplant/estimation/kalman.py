@@ -19,7 +19,6 @@ from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
-from ..plant.channel_units import plant_units
 from ..plant.realisation import Structure
 from ..values import FloatArray, Value, real_array
 from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
@@ -379,7 +378,7 @@ def _observer(plant: StandardPlant, gain: FloatArray, poi_gain: FloatArray) -> S
         outputs=estimates(channels),
         states=inner.states,
         name="kalman",
-        units=plant_units(plant),
+        units=plant.units,
     )
 
 

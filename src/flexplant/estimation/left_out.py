@@ -10,10 +10,10 @@ import numpy as np
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..plant.building import with_flexibility
 from ..plant.dynamics import structure_system
 from ..plant.ports import Ports
 from ..plant.realisation import ModalRealisation
-from ..plant.rebuilding import with_flexibility
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..values import ComplexArray, FloatArray, IntArray, Value

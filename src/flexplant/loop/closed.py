@@ -18,7 +18,6 @@ from ..lti.responses import Responder, remembered, responder
 from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant, standard_plant
-from ..plant.channel_units import plant_units
 from ..values import ComplexArray, FloatArray, Value, name_list
 from .blocks import as_block, check_inputs, drives, joined
 from .broken import BrokenLoop, moved
@@ -84,7 +83,7 @@ class ClosedLoop(Value):
     def units(self) -> dict[str, str]:
         """The SI units of the channels that have a known one, estimates included."""
         blocks = {name: unit for block in self.blocks for name, unit in block.units.items()}
-        return blocks | plant_units(self.plant)
+        return blocks | self.plant.units
 
     @cached_property
     def fed_back(self) -> tuple[str, ...]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from .building import continuous_plant
 from .ports import Ports
 from .realisation import ModalRealisation, Structure
 from .residual import ResidualForm, modes_of
 from .standard import StandardPlant
-from .wiring import continuous_plant
 
 
 def assemble_plant(

@@ -68,22 +68,5 @@ def with_filters(structure: StateSpace, ports: Ports) -> StateSpace:
     return system
 
 
-def with_gains(structure: StateSpace, ports: Ports) -> StateSpace:
-    """Return the structure with the static gains of its ports' filters in place of these."""
-    push = np.array([static_gain(port.filter) for port in ports.forces])
-    others = len(structure.outputs) - len(ports.y)
-    see = np.array([1.0] * others + [static_gain(sensor.filter) for sensor in ports.y])
-    return structure.replace(
-        B=structure.B * push,
-        C=see[:, None] * structure.C,
-        D=see[:, None] * structure.D * push,
-    )
-
-
 def _named(part: StateSpace | None, name: str) -> StateSpace:
     return (part or as_statespace(1.0)).replace(inputs=[name], outputs=[name])
-
-
-def static_gain(part: StateSpace | None) -> float:
-    """Return the gain of a filter at 0 Hz; 1 without one."""
-    return 1.0 if part is None else float(part.evaluated(0.0)[0, 0].real)

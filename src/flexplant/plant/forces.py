@@ -9,9 +9,8 @@ import numpy as np
 
 from ..labels import Place
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, positive, real_array
+from ..values import FloatArray, real_array
 from .port import ForcePort, force_unit, motion_unit
-from .port_checks import checked_direction, checked_filter, checked_name, checked_place
 from .realisation import ModalRealisation
 from .rigid.rigid_body import inertia_load
 
@@ -45,15 +44,6 @@ class Disturbance(ForcePort):
     direction: str = "z"
     asd: float = 0.0
     shape: StateSpace | None = None
-
-    def __post_init__(self) -> None:
-        self._set(
-            name=checked_name(self.name),
-            direction=checked_direction(self.name, self.direction),
-            at=checked_place(self.name, self.at),
-            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
-            shape=checked_filter(self.name, "shape", self.shape),
-        )
 
     @property
     def unit(self) -> str | None:
@@ -105,14 +95,9 @@ class BaseAcceleration(ForcePort):
     about: tuple[float, ...] | FloatArray = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         about = real_array(self.about, f"about of {self.name!r}", (3,))
-        self._set(
-            name=checked_name(self.name),
-            direction=checked_direction(self.name, self.direction),
-            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
-            shape=checked_filter(self.name, "shape", self.shape),
-            about=tuple(about.tolist()),
-        )
+        self._set(about=tuple(about.tolist()))
 
     @property
     def unit(self) -> str | None:
@@ -153,13 +138,6 @@ class OutputDisturbance(ForcePort):
     sensor: str
     asd: float = 0.0
     shape: StateSpace | None = None
-
-    def __post_init__(self) -> None:
-        self._set(
-            name=checked_name(self.name),
-            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
-            shape=checked_filter(self.name, "shape", self.shape),
-        )
 
     @property
     def added_to(self) -> str:
@@ -202,15 +180,6 @@ class Actuator(ForcePort):
     direction: str = "z"
     dynamics: StateSpace | None = None
     delay: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._set(
-            name=checked_name(self.name),
-            direction=checked_direction(self.name, self.direction),
-            at=checked_place(self.name, self.at),
-            dynamics=checked_filter(self.name, "dynamics", self.dynamics),
-            delay=positive(self.delay, f"delay of {self.name!r}", zero=True),
-        )
 
     @property
     def filter(self) -> StateSpace | None:

@@ -11,10 +11,10 @@ import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..values import FloatArray, Value, real_array
+from .building import rebuilt
 from .forces import Actuator, Disturbance
 from .partition import Partition
 from .ports import Poi, Ports
-from .rebuilding import rebuilt
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -11,8 +11,21 @@ from .ports import Ports
 from .realisation import ModalRealisation
 
 
+class _Unknown:
+    """What is not known of a plant unless its origin says so."""
+
+    #: what it was assembled from, the plant before weights, and the block before y
+    structure: Any = None
+    plain: Any = None
+    reading: Any = None
+    #: the plant before sampling, the factor of its noise, and its delay
+    continuous: Any = None
+    noise_factor: FloatArray | None = None
+    delay: float = 0.0
+
+
 @dataclass(frozen=True, eq=False, repr=False)
-class Assembled(Value):
+class Assembled(_Unknown, Value):
     """What is known of a plant that was assembled from a structure.
 
     Parameters
@@ -49,12 +62,9 @@ class Assembled(Value):
         """What is known of the structure: this value."""
         return self
 
-    plain = property(lambda self: None, doc="The plant is not weighted.")
-    reading = property(lambda self: None, doc="No block stands before y.")
-
 
 @dataclass(frozen=True, eq=False)
-class Foreign(Value):
+class Foreign(_Unknown, Value):
     """What is known of a plant that was made elsewhere.
 
     Parameters
@@ -74,13 +84,9 @@ class Foreign(Value):
     def __post_init__(self) -> None:
         self._set(noise_factor=self.noise_factor)
 
-    structure = property(lambda self: None, doc="The plant has no structure.")
-    plain = property(lambda self: None, doc="The plant is not weighted.")
-    reading = property(lambda self: None, doc="No block stands before y.")
-
 
 @dataclass(frozen=True, eq=False)
-class Weighted(Value):
+class Weighted(_Unknown, Value):
     """A plant made from another one by `weighted` or `through`.
 
     Parameters
@@ -93,20 +99,6 @@ class Weighted(Value):
 
     plain: Any
     reading: StateSpace | None = None
-
-    @property
-    def structure(self) -> Assembled | None:
-        """What is known of the structure of the plant before weights."""
-        found: Assembled | None = self.plain.origin.structure
-        return found
-
-    @property
-    def delay(self) -> float:
-        """Delay of the inputs u [samples]."""
-        return float(self.plain.delay)
-
-    continuous = property(lambda self: None, doc="Weights are of one sampling time.")
-    noise_factor = property(lambda self: None, doc="Not known in the states of the weights.")
 
 
 #: where a plant may have come from

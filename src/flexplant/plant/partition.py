@@ -17,26 +17,7 @@ from .origin import ELSEWHERE, Assembled, Foreign, Origin
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Partition(Value):
-    """The data of a standard plant; `StandardPlant` adds what is done with it.
-
-    Parameters
-    ----------
-    system : StateSpace
-        ``[w; u] -> [z; y]``.
-    w, u, z, y : sequences of str
-        Names of its channels.
-    asd : mapping {str: float}
-        One-sided amplitude spectral density of the w channels that are white noise.
-    origin : Assembled, Weighted or Foreign
-        Where it came from.
-
-    Raises
-    ------
-    LabelError
-        When the names are not those of the system's channels, in this order.
-    ModelError
-        When a density is negative or not finite.
-    """
+    """The data of a standard plant, in the fields of `StandardPlant`, and what they tell."""
 
     system: StateSpace
     w: tuple[str, ...]
@@ -154,7 +135,7 @@ class Partition(Value):
     @property
     def is_assembled(self) -> bool:
         """Whether it was assembled from a structure, weighted since or not."""
-        return self.origin.structure is not None
+        return self.unweighted.origin.structure is not None
 
     @property
     def assembled(self) -> Assembled:
@@ -167,7 +148,7 @@ class Partition(Value):
         ModelError
             When the plant was made elsewhere.
         """
-        found = self.origin.structure
+        found: Assembled | None = self.unweighted.origin.structure
         if found is None:
             raise ModelError(
                 "this plant was not assembled from a structure: its ports, modes and process noise "
@@ -195,12 +176,18 @@ class Partition(Value):
     @property
     def delay(self) -> float:
         """Delay of the inputs u [samples]."""
-        return self.origin.delay
+        return self.unweighted.origin.delay
 
     @property
     def dt(self) -> float:
         """Sampling time [s]; 0 when continuous."""
         return self.system.dt
+
+    @property
+    def units(self) -> dict[str, str]:
+        """The units of the channels, and of what its ports derive: estimates, too."""
+        derived = self.assembled.ports.units if self.is_assembled else {}
+        return derived | dict(self.system.units)
 
     @property
     def n_rigid(self) -> int:

@@ -7,9 +7,11 @@ from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 
+from ..errors import unknown_label
 from ..labels import Place
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value
+from .port_checks import checked_port
 from .realisation import ModalRealisation
 
 Quantity: TypeAlias = Literal["displacement", "velocity", "acceleration"]
@@ -51,6 +53,9 @@ class ForcePort(Value):
     direction: str
     asd: float = 0.0
 
+    def __post_init__(self) -> None:
+        self._set(**checked_port(self))
+
     @property
     def filter(self) -> StateSpace | None:
         """The system between the channel and the structure."""
@@ -68,15 +73,20 @@ class ForcePort(Value):
         return None
 
     def push(self, realisation: ModalRealisation) -> FloatArray:
-        """Return the load (n,) over the model's DOFs per unit of the channel."""
+        """Return the load (n,) over the model's DOFs per unit behind the filter."""
         raise NotImplementedError
+
+    def static_push(self, realisation: ModalRealisation) -> FloatArray:
+        """Return the load (n,) per unit of the channel at rest: the filter is its static gain."""
+        return static_gain(self.filter) * self.push(realisation)
 
 
 class SensorPort(Value):
     """A port in y. A new kind has the fields below, and says by `row` or `see` what it measures.
 
     By `row`, a displacement: that of a point beside another, say; with a `quantity` also its
-    velocity or acceleration. By `see`, anything else that is linear in states and forces.
+    velocity or acceleration. By `see`, anything that is linear in states and forces; `row` is then
+    what it shows at rest.
 
     Parameters
     ----------
@@ -100,6 +110,11 @@ class SensorPort(Value):
     delay: float = 0.0
     quantity: Quantity = "displacement"
 
+    def __post_init__(self) -> None:
+        self._set(**checked_port(self))
+        if self.quantity not in QUANTITIES:
+            raise unknown_label(f"quantity of {self.name!r}", self.quantity, QUANTITIES)
+
     @property
     def filter(self) -> StateSpace | None:
         """The system between the motion and the channel."""
@@ -119,9 +134,18 @@ class SensorPort(Value):
         """Return the row (n,) over the model's DOFs of the displacement that it is about."""
         raise NotImplementedError
 
+    def static_row(self, realisation: ModalRealisation) -> FloatArray:
+        """Return what the channel shows of displacements (n,) at rest: 0 of other quantities."""
+        return (static_gain(self.filter) if self.order == 0 else 0.0) * self.row(realisation)
+
     def see(self, realisation: ModalRealisation) -> Seen:
         """Return what it measures of the states, and of forces at once."""
         return seen(realisation, self.row(realisation), self.order)
+
+
+def static_gain(part: StateSpace | None) -> float:
+    """Return the gain of a filter at 0 Hz; 1 without one."""
+    return 1.0 if part is None else float(part.evaluated(0.0)[0, 0].real)
 
 
 def motion_unit(at: Place, direction: str, order: int = 0) -> str | None:

@@ -8,10 +8,27 @@ from typing import Any
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
-from ..values import check_names, real_array, short
+from ..values import check_names, positive, real_array, short
 
 #: endings of the channels that a plant makes itself: estimates, references, errors, efforts, noises
 DERIVED = ("hat", "ref", "error", "effort", "noise")
+
+
+def checked_port(port: Any) -> dict[str, Any]:
+    """Return the fields that ports have in common, each checked."""
+    name = checked_name(port.name)
+    checks: dict[str, Any] = {
+        "direction": checked_direction,
+        "at": checked_place,
+        "asd": lambda name, asd: positive(asd, f"asd of {name!r}", zero=True),
+        "shape": lambda name, shape: checked_filter(name, "shape", shape),
+        "dynamics": lambda name, dynamics: checked_filter(name, "dynamics", dynamics),
+        "delay": lambda name, delay: positive(delay, f"delay of {name!r}", zero=True),
+    }
+    given = port._fields()
+    return {"name": name} | {
+        key: check(name, given[key]) for key, check in checks.items() if key in given
+    }
 
 
 def checked_name(name: Any) -> str:

@@ -125,6 +125,26 @@ class Ports(Value):
         """All ports of the physical system: forces, then sensors."""
         return (*self.forces, *self.y)
 
+    @property
+    def units(self) -> dict[str, str]:
+        """The SI units of all channels that have one, and of what is derived from them.
+
+        Forces N or N m, motions m or rad (per s, per s^2), as the directions say; noises like their
+        sensors, references, errors and estimates like their POI, efforts like their actuator. A sum
+        of displacements and rotations has no unit. Filters of ports do not change units.
+        """
+        found = {port.name: port.unit for port in self.physical}
+        for port in self.w:
+            if port.added_to is not None:
+                found[port.name] = found[port.added_to]
+        found |= {f"{sensor.name}:noise": sensor.unit for sensor in self.y}
+        found |= {f"{actuator.name}:effort": actuator.unit for actuator in self.u}
+        for poi in self.z:
+            for axis in poi.axes:
+                found[poi.channel(axis)] = unit = poi.unit(axis)
+                found |= {poi.derived(axis, kind): unit for kind in ("ref", "error", "hat")}
+        return {name: unit for name, unit in found.items() if unit is not None}
+
     def poi(self, name: str) -> Poi:
         """Return the POI of a name.
 

@@ -9,9 +9,9 @@ from typing import ClassVar
 from ..errors import LabelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, check_names, positive, short
-from .port import QUANTITIES, Quantity, Seen, SensorPort, motion_unit, seen
-from .port_checks import checked_direction, checked_filter, checked_name, checked_place
+from ..values import FloatArray, Value, check_names, short
+from .port import Quantity, Seen, SensorPort, motion_unit, seen
+from .port_checks import checked_name, checked_place
 from .realisation import ModalRealisation
 
 
@@ -54,20 +54,6 @@ class Sensor(SensorPort):
     asd: float = 0.0
     dynamics: StateSpace | None = None
     delay: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._set(
-            name=checked_name(self.name),
-            direction=checked_direction(self.name, self.direction),
-            at=checked_place(self.name, self.at),
-        )
-        if self.quantity not in QUANTITIES:
-            raise unknown_label(f"quantity of {self.name!r}", self.quantity, QUANTITIES)
-        self._set(
-            asd=positive(self.asd, f"asd of {self.name!r}", zero=True),
-            dynamics=checked_filter(self.name, "dynamics", self.dynamics),
-            delay=positive(self.delay, f"delay of {self.name!r}", zero=True),
-        )
 
     @property
     def unit(self) -> str | None:

@@ -10,12 +10,12 @@ from typing import Any
 import numpy.typing as npt
 
 from ..labels import Place
-from ..lti.statespace import StateSpace, System
+from ..lti.statespace import System
 from .assumptions import AssumptionReport
+from .building import rebuilt, sampled
 from .moving import Along, along, moved
 from .partition import Partition
 from .ports import Ports
-from .rebuilding import rebuilt, sampled, structural
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
 from .weighting import measured_through, weighted
@@ -54,11 +54,6 @@ class StandardPlant(Partition):
     ModelError
         When a density is negative or not finite.
     """
-
-    @cached_property
-    def structural(self) -> StateSpace:
-        """The structure alone, [w; u] -> [z; y], continuous; filters as their static gains."""
-        return structural(self)
 
     def discretized(self, rate: float, *, delay: float = 0.0) -> StandardPlant:
         """Return the plant sampled at a rate: exact zero-order hold, mode by mode.

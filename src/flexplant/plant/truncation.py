@@ -12,8 +12,8 @@ from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import short
+from .building import rebuilt, sampled_like
 from .realisation import Structure
-from .rebuilding import rebuilt, sampled_like
 from .residual import modes_of
 from .standard import StandardPlant, standard_plant
 

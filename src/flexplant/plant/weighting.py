@@ -11,9 +11,9 @@ from ..errors import ModelError, unknown_label
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import short
+from .building import P
 from .origin import Weighted
 from .partition import Partition
-from .wiring import P
 
 
 def weighted(plant: P, z: Any, w: Any) -> P:

@@ -10,13 +10,9 @@ import numpy as np
 from ...errors import AssumptionError, unknown_label
 from ...lti.statespace import StateSpace
 from ...values import FloatArray, Value, name_list
-from ..dynamics import static_gain
-from ..forces import Actuator
-from ..port import SensorPort
-from ..ports import Ports
-from ..realisation import ModalRealisation
 from ..standard import StandardPlant, standard_plant
 from .rigid_body import RigidBody, rigid_body_of
+from .rigid_motion import projected
 
 #: relative: what the sensors show or the actuators push of other axes
 _CLEAN = 1e-6
@@ -110,8 +106,8 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
             raise unknown_label("rigid-body axis", axis, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
     sensors = [s for s in ports.y if s.order == 0]
-    see = _gains(sensors)[:, None] * _seen(realisation, sensors, body)
-    push = (_gains(ports.u)[:, None] * _pushed(realisation, ports, body)).T
+    see = projected([s.static_row(realisation) for s in sensors], body.motions)
+    push = projected([port.static_push(realisation) for port in ports.u], body.motions).T
     length = _length(body)
     T_y = _left(see, length, pick)
     T_u = _left(push.T, 1.0 / length, pick).T
@@ -128,24 +124,6 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
         body.centre,
         wanted,
     )
-
-
-def _gains(ports: Sequence[Actuator | SensorPort]) -> FloatArray:
-    return np.array([static_gain(port.filter) for port in ports])
-
-
-def _seen(
-    realisation: ModalRealisation, sensors: Sequence[SensorPort], body: RigidBody
-) -> FloatArray:
-    """Return what each sensor (ny, r) shows of the rigid-body motions."""
-    rows = [s.row(realisation) @ body.motions for s in sensors]
-    return np.array(rows).reshape(-1, len(body.axes))
-
-
-def _pushed(realisation: ModalRealisation, ports: Ports, body: RigidBody) -> FloatArray:
-    """Return the forces and moments (nu, r) of each actuator at the centre of gravity."""
-    rows = [port.push(realisation) @ body.motions for port in ports.u]
-    return np.array(rows).reshape(-1, len(body.axes))
 
 
 def _length(body: RigidBody) -> FloatArray:

@@ -10,7 +10,6 @@ import scipy.linalg as la
 
 from ...errors import AssumptionError, FlexplantError, unknown_label
 from ...values import FloatArray, IntArray
-from ..dynamics import static_gain
 from ..partition import Partition
 from ..realisation import ModalRealisation
 from .rigid_body import rigid_body_of
@@ -115,20 +114,21 @@ def seen(plant: Partition, motions: Carried, channels: Sequence[str]) -> FloatAr
     """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     places = {
-        poi.channel(axis): (1.0, poi.row(realisation, axis))
+        poi.channel(axis): poi.row(realisation, axis)
         for poi in ports.z
         for axis in poi.axes
         if poi.channel(axis) in channels
     }
-    for s in ports.y:
-        if s.name in channels:
-            gain = static_gain(s.filter) if s.order == 0 else 0.0
-            places[s.name] = (gain, s.row(realisation))
+    places |= {s.name: s.static_row(realisation) for s in ports.y if s.name in channels}
     for name in channels:
         if name not in places:
             raise unknown_label("motion of a POI or a sensor", name, list(places))
-    rows = [places[name][0] * (places[name][1] @ motions.shapes) for name in channels]
-    return np.array(rows).reshape(len(rows), motions.shapes.shape[1])
+    return projected([places[name] for name in channels], motions.shapes)
+
+
+def projected(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
+    """Return the parts (p, r) of rows over the DOFs, which may be none, in motions (n, r)."""
+    return np.array(rows).reshape(len(rows), motions.shape[0]) @ motions
 
 
 def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
@@ -167,6 +167,5 @@ def gain_of(
     for name in inputs:
         if name not in forces:
             raise unknown_label("force", name, list(forces))
-    loads = [static_gain(forces[name].filter) * forces[name].push(realisation) for name in inputs]
-    push = np.array(loads).reshape(len(loads), -1) @ motions.shapes
+    push = projected([forces[name].static_push(realisation) for name in inputs], motions.shapes)
     return np.asarray(seen(plant, motions, outputs) @ push.T)

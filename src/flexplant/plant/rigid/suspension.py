@@ -12,7 +12,7 @@ from ...errors import ModelError
 from ...labels import Place
 from ...modes import Modes, normal_form
 from ...reduction import ReducedModel
-from ...structure import FEModel
+from ...structure import Damper, FEModel, Spring
 from ...values import FloatArray, Value, positive
 from ..port_checks import checked_direction, checked_place
 
@@ -125,23 +125,10 @@ def _untouched(stretch: FloatArray, rows: FloatArray) -> FloatArray:
 
 
 def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
-    import scipy.sparse as sp
-
+    dampers = [Damper(s.at, s.damping, direction=s.direction) for s in springs if s.damping]
+    stiff = [Spring(s.at, s.stiffness, direction=s.direction) for s in springs]
+    suspended = model.with_parts([*stiff, *dampers])
     rows = np.array([model.row(s.at, s.direction) for s in springs])
-    sparse = sp.csc_array(rows)
-    K: Any = model.K
-    D: Any = model.D
-    k = sp.diags_array([s.stiffness for s in springs])
-    d = sp.diags_array([s.damping for s in springs])
-    stiff = sparse.T @ k @ sparse
-    damped = sparse.T @ d @ sparse
-    K = sp.csc_array(K + stiff) if sp.issparse(K) else K + stiff.toarray()
-    if any(s.damping for s in springs):
-        if D is None:
-            D = sp.csc_array(damped)
-        else:
-            D = sp.csc_array(D + damped) if sp.issparse(D) else D + damped.toarray()
-    suspended = model.replace(K=K, D=D)
     expected = _untouched(rows @ model.rigid_body, rows).shape[1]
     if suspended.rigid_body.shape[1] != expected:
         raise ModelError(

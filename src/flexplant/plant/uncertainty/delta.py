@@ -10,10 +10,9 @@ import numpy as np
 
 from ...errors import ModelError
 from ...values import Value
+from ..building import P, rebuilt
 from ..partition import Partition
 from ..realisation import MODAL, ModalRealisation
-from ..rebuilding import rebuilt
-from ..wiring import P
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,10 +12,10 @@ from ...lti.frequency import default_freq, frequency_response
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, System
 from ...values import ComplexArray, FloatArray, Value
+from ..building import continuous_plant
 from ..partition import Partition
 from ..realisation import Structure
 from ..residual import modes_of
-from ..wiring import continuous_plant
 
 #: the weight lies this far above the largest difference found
 _MARGIN = 1.05

@@ -13,8 +13,8 @@ from ...lti.statespace import StateSpace
 from ...updating import UpdateResult
 from ...updating.parameters.added import Parameter
 from ...values import FloatArray, positive
+from ..building import P
 from ..partition import Partition
-from ..wiring import P
 from .delta import Delta, modal_realisation, with_changes
 from .neglected import neglected_modes, opened
 from .pole_covariance import check_poles, check_range, fitted_poles, measured_poles, relative

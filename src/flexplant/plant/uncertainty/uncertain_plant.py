@@ -15,9 +15,8 @@ from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
 from ...updating.parameters.added import Parameter
 from ...values import FloatArray, Value, generator, real_array, whole
-from ..rebuilding import rebuilt
+from ..building import P, rebuilt
 from ..residual import modes_of
-from ..wiring import P
 from .delta import Delta, with_changes
 from .neglected import NeglectedModes
 
