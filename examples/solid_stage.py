@@ -127,7 +127,7 @@ def ports() -> fx.Ports:
     return fx.Ports(
         w=[fx.Disturbance(f"w{n}", p, direction=d, asd=FORCE) for n, (p, d) in PUSHERS.items()],
         u=[
-            fx.Actuator(n, p, direction=d, dynamics=amplifier, delay=40e-6)
+            fx.Actuator(n, p, direction=d, dynamics=amplifier, latency=40e-6)
             for n, (p, d) in PUSHERS.items()
         ],
         z=[fx.Poi("die", at=POI, axes=AXES)],

@@ -191,7 +191,7 @@ def shaped(kind):
     if kind == "filter":
         return base.replace(y=[s.replace(dynamics=lowpass(2500.0)) for s in base.y])
     if kind == "delay":
-        return base.replace(y=[s.replace(delay=3.3e-5) for s in base.y])
+        return base.replace(y=[s.replace(latency=3.3e-5) for s in base.y])
     if kind == "actuator":
         return base.replace(u=[a.replace(dynamics=lowpass(900.0)) for a in base.u])
     speed = Sensor("v", at=(0.3, 0.3, 0.0), quantity="velocity", asd=1e-7)

@@ -191,7 +191,7 @@ def test_noise_of_a_sample_is_exact_and_a_covariance(case):
 def test_the_same_noise_with_a_filter_and_a_late_sensor():
     # an anti-alias filter and a delay go through the dense exponential of the whole
     slow = lowpass(400.0, order=2)
-    given = channels(y=[Sensor("y", at="3:z", dynamics=slow, delay=1.7 / RATE, asd=1e-11)])
+    given = channels(y=[Sensor("y", at="3:z", dynamics=slow, latency=1.7 / RATE, asd=1e-11)])
     plant = quietly(model_of(*chain("held overdamped")), given).discretized(RATE, delay=0.4)
     M, D, K = chain("held overdamped")
     eye = np.eye(4)
@@ -211,7 +211,7 @@ def test_the_same_noise_with_a_filter_and_a_late_sensor():
     exact = C @ oracle.white_response(A, B[:, 1:], 1e-2) @ C.T
     assert row @ P @ row == pytest.approx(exact[0, 0], rel=1e-7, abs=0)
     # one sample's share: the motion at its end, and 0.7 of a sample earlier, as the sensor sees it
-    now = quietly(model_of(M, D, K), given.replace(y=[given.y[0].replace(delay=0.0)]))
+    now = quietly(model_of(M, D, K), given.replace(y=[given.y[0].replace(latency=0.0)]))
     now = now.discretized(RATE, delay=0.4).system
     see = np.zeros((2, plant.system.n_states))
     own = [plant.system.states.index(state) for state in now.states]

@@ -133,6 +133,15 @@ def test_modes_partly_above_half_the_rate_are_normal_and_all_are_warned_of():
         FlexplantWarning, match=r"all 2\d elastic modes.*24\d\.\d Hz and above.*rate is in Hz"
     ):
         plant.discretized(400.0)
-    late = ports().replace(u=[a.replace(delay=1.0) for a in ports().u])
-    with pytest.raises(ModelError, match=r"is 1 s, 1e\+04 samples at 10000 Hz.*delay=0.0001"):
+
+
+def test_latencies_and_delays_in_the_unit_of_the_other_are_refused():
+    """Latencies of ports are in seconds, the delay of a sampled loop is in samples."""
+    first = ports().u[0]
+    with pytest.raises(ModelError, match=r"'u1' is 1 s.*latency=1 / rate.*delay=1\)"):
+        first.replace(latency=1)
+    late = ports().replace(u=[a.replace(latency=0.5) for a in ports().u])
+    with pytest.raises(ModelError, match=r"is 0.5 s, 5000 samples at 10000 Hz.*latency=5e-05"):
         fx.assemble_plant(some_modes(), late).discretized(1e4)
+    with pytest.raises(ModelError, match=r"means 0.15 s.*1500 us are meant, it is delay=15 at"):
+        fx.assemble_plant(some_modes(), ports()).discretized(1e4, delay=1500)

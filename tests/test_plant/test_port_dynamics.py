@@ -143,9 +143,9 @@ def test_sampled_runs_follow_the_dense_machine(delay, own):
     late_y = (3 if own else 0, 12 if own else 0)
     base = channels()
     ports = base.replace(
-        u=[base.u[0], base.u[1].replace(delay=own * h / fine)],
-        y=[base.y[0].replace(delay=late_y[0] * h / fine),
-           base.y[1].replace(delay=late_y[1] * h / fine)],
+        u=[base.u[0], base.u[1].replace(latency=own * h / fine)],
+        y=[base.y[0].replace(latency=late_y[0] * h / fine),
+           base.y[1].replace(latency=late_y[1] * h / fine)],
     )  # fmt: skip
     plant = assemble_plant(model(), ports).discretized(1 / h, delay=delay)
     rng = np.random.default_rng(5)
@@ -163,9 +163,9 @@ def test_sampled_runs_follow_the_dense_machine(delay, own):
 
 def test_an_acceleration_keeps_its_direct_part_through_delays():
     h, fine = 2e-4, 10
-    y = [Sensor("a", at="1:x", quantity="acceleration", delay=0.4 * h)]
+    y = [Sensor("a", at="1:x", quantity="acceleration", latency=0.4 * h)]
     for late in (0.0, 0.3 * h, 0.8 * h):
-        ports = Ports(u=[Actuator("u", at="1:x", delay=late)], y=y)
+        ports = Ports(u=[Actuator("u", at="1:x", latency=late)], y=y)
         plant = assemble_plant(model(), ports).discretized(1 / h)
         g = plant.system.select(["a"])
         A, B, C = machine_with_filters(M, D, K, E[:1], E[:1], [None], [None])
@@ -220,7 +220,8 @@ def test_process_noise_holds_the_filters_and_late_samples():
     h = 2e-4
     late = np.array([0.0, 0.3, 0.85]) * h
     ports = channels()
-    ports = ports.replace(y=[ports.y[0].replace(delay=late[1]), ports.y[1].replace(delay=late[2])])
+    pairs = zip(ports.y, late[1:], strict=True)
+    ports = ports.replace(y=[sensor.replace(latency=t) for sensor, t in pairs])
     plant = assemble_plant(model(), ports).discretized(1 / h)
     A, B, C = dense()
     root = B[:, :2] * (np.array([0.3, 0.1]) / np.sqrt(2))
@@ -270,7 +271,7 @@ def test_the_kalman_filter_estimates_with_filters_and_delays():
     )  # fmt: skip
     errors = []
     for late in (0.0, 1e-4, 3e-4):
-        ports = base.replace(y=[s.replace(delay=late) for s in base.y])
+        ports = base.replace(y=[s.replace(latency=late) for s in base.y])
         plant = assemble_plant(model(), ports).discretized(5e3, delay=1)
         errors.append(design_kalman(plant).rms("die"))
     assert errors[0] < errors[1] < errors[2]
@@ -340,7 +341,7 @@ def plate_with_filters(**changes):
     """The paper's plate, a filter on each sensor (states before the modes) and each actuator."""
     base = ports(**changes)
     return base.replace(
-        y=[s.replace(dynamics=lowpass(3e3, order=2), delay=3e-5) for s in base.y],
+        y=[s.replace(dynamics=lowpass(3e3, order=2), latency=3e-5) for s in base.y],
         u=[a.replace(dynamics=lowpass(4e3)) for a in base.u],
     )
 
@@ -391,16 +392,16 @@ def test_weights_of_a_stage_with_every_kind_of_disturbance():
 
 
 def test_a_continuous_plant_names_the_delays_it_leaves_out():
-    ports = channels(u=[Actuator("u1", at="1:x", delay=2e-4)])
+    ports = channels(u=[Actuator("u1", at="1:x", latency=2e-4)])
     plant = assemble_plant(model(), ports)
-    assert "delays that act once it is sampled: u1 0.0002 s" in repr(plant)
+    assert "latencies that act once it is sampled: u1 0.0002 s" in repr(plant)
     assert "delays" not in repr(plant.discretized(5e3))
     close = assemble_plant(model(), ports.with_pade(4))
     assert "delays" not in repr(close)
     freq = FREQ[:4]
     exact = frequency_response(plant.Gyu, freq)["y1", "u1"] * np.exp(-2j * np.pi * freq * 2e-4)
     np.testing.assert_allclose(frequency_response(close.Gyu, freq)["y1", "u1"], exact, rtol=1e-7)
-    both = channels(y=[Sensor("y1", at="2:x", dynamics=filtered(SENSE), delay=1e-4)])
+    both = channels(y=[Sensor("y1", at="2:x", dynamics=filtered(SENSE), latency=1e-4)])
     late = assemble_plant(model(), both.with_pade(3))
     found = frequency_response(late.Gyw, freq)["y1", "rub"]
     bare = frequency_response(assemble_plant(model(), both).Gyw, freq)["y1", "rub"]
@@ -439,8 +440,8 @@ def test_refusals():
         with pytest.raises(ModelError, match=words):
             Sensor("y", at="1:x", dynamics=bad)
     for kind in (Actuator, Sensor):
-        with pytest.raises(ModelError, match="delay of 'p' must be zero or positive"):
-            kind("p", at="1:x", delay=-1e-3)
+        with pytest.raises(ModelError, match="latency of 'p' must be zero or positive"):
+            kind("p", at="1:x", latency=-1e-3)
     for kind in (Actuator, Sensor, Poi, Disturbance):
         with pytest.raises(ShapeError, match=r"a point of 'p' must have shape \(3,\)"):
             kind("p", at={(0.1, 0.2): 1.0})
@@ -451,9 +452,9 @@ def test_refusals():
     with pytest.raises(ModelError, match="does not move this model"):
         assemble_plant(model(), channels(w=[BaseAcceleration("b", "z")]))
     with pytest.raises(ModelError, match="order must be"):
-        channels(u=[Actuator("u", at="1:x", delay=1e-3)]).with_pade(0)
+        channels(u=[Actuator("u", at="1:x", latency=1e-3)]).with_pade(0)
     with pytest.raises(ModelError, match=r"residual must be FastStates\(\)"):
         assemble_plant(model(), channels(), residual="fast")
-    late = [Sensor("a", at="4:x", quantity="acceleration", delay=1e-5, asd=1e-3)]
+    late = [Sensor("a", at="4:x", quantity="acceleration", latency=1e-5, asd=1e-3)]
     with pytest.raises(AssumptionError, match=r"'rub' reaches 'a' at once.*anti-alias"):
         assemble_plant(model(), channels(y=late)).discretized(5e3)

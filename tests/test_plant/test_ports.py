@@ -156,7 +156,7 @@ def test_names_of_derived_channels_are_reserved(kind, ending):
         (lambda: Ports(u=5), r"Ports.u must be a sequence of Actuators, got 5.*u=\["),
         (lambda: Ports(u=[Sensor("y", at=P)]), r"got Sensor. It belongs in y"),
         (lambda: Sensor("y", at=P, asd=True), "asd of 'y' must be one number"),
-        (lambda: Actuator("u", at=P, delay="1 ms"), "delay of 'u'"),
+        (lambda: Actuator("u", at=P, latency="1 ms"), "latency of 'u'"),
     ],
 )
 def test_other_kinds_are_refused_at_the_door(make, words):

@@ -183,7 +183,7 @@ def _may_follow(plant: StandardPlant, ports: Ports) -> FloatArray:
     A white disturbance has no value at an instant, and u must not reach y in the sample in which
     it is computed from y.
     """
-    late = {port.name: plant.delay + port.delay / plant.dt > 0 for port in ports.u}
+    late = {port.name: plant.delay + port.latency / plant.dt > 0 for port in ports.u}
     parts = [(port.name, port.filter) for port in ports.forces]
     return np.array(
         [late.get(name, False) or (f is not None and not np.any(f.D)) for name, f in parts]
@@ -205,7 +205,7 @@ def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
     turn = np.where(poles.imag >= 0, omega, -omega)
     first = see.shape[0] - len(ports.y)
     for row, sensor in enumerate(ports.y, first):
-        see[row] *= np.exp(-turn * sensor.delay) * _gain(sensor.filter, turn)
+        see[row] *= np.exp(-turn * sensor.latency) * _gain(sensor.filter, turn)
     X = -(drive @ drive.conj().T) / np.add.outer(poles, poles.conj())
     return np.asarray(np.real(see @ X @ see.conj().T))
 

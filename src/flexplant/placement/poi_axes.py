@@ -107,4 +107,4 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
 
 def bare(port: Any) -> bool:
     """Return whether a port is without filter and delay."""
-    return not any(getattr(port, name, None) for name in ("dynamics", "shape", "delay"))
+    return not any(getattr(port, name, None) for name in ("dynamics", "shape", "latency"))

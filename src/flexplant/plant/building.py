@@ -107,7 +107,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         return plant.replace(system=system, origin=Foreign(None, float(delay), plant))
     origin = plant.assembled
     asd = np.array([plant.asd.get(name, 0.0) for name in origin.physical.inputs])
-    if origin.ports.delays or diagonal_pairs(origin.physical) is None:
+    if origin.ports.latencies or diagonal_pairs(origin.physical) is None:
         physical, factor = _with_own_delays(origin, rate, delay, asd)
     else:
         physical = discretized(origin.physical, rate, delay=delay, delayed=plant.u)
@@ -133,8 +133,8 @@ def _with_own_delays(
         rate,
         head=g.states.index(realisation.names[0]) if realisation.names else 0,
         pairs=realisation.pairs,
-        late_inputs={port.name: port.delay + common for port in ports.u},
-        late_outputs={port.name: port.delay for port in ports.y},
+        late_inputs={port.name: port.latency + common for port in ports.u},
+        late_outputs={port.name: port.latency for port in ports.y},
         asd=asd,
     )
 

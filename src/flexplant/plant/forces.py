@@ -163,15 +163,17 @@ class Actuator(ForcePort):
         At points: x, y, z [N] or rx, ry, rz [N m].
     dynamics : StateSpace, optional
         Amplifier and motor, command to force: stable; its states join the plant's.
-    delay : float [s]
-        Of the command, by cable or bus, besides that of `discretized`. It acts exactly, also
+    latency : float [s]
+        Delay of the command by cable or bus, in seconds, besides the `delay` in samples of
+        `discretized`. It acts exactly, also
         between samples, once the plant is sampled; a continuous plant leaves it out and says so
         (`ports.with_pade(order)` approximates it there).
 
     Raises
     ------
     LabelError, ModelError
-        For a bad name, place, direction, dynamics or a negative delay.
+        For a bad name, place, direction, dynamics, or a latency that is
+        negative or a second or more.
     """
 
     home: ClassVar = "u"
@@ -179,7 +181,7 @@ class Actuator(ForcePort):
     at: Place
     direction: str = "z"
     dynamics: StateSpace | None = None
-    delay: float = 0.0
+    latency: float = 0.0
 
     @property
     def filter(self) -> StateSpace | None:

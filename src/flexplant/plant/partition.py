@@ -48,10 +48,10 @@ class Partition(Value):
             names = getattr(self, side)
             shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
             lines.append(f"  {side} ({len(names)}) {shown}")
-        delays = self.assembled.ports.delays if self.is_assembled else {}
-        if delays and not self.dt:
-            late = ", ".join(f"{name} {delay:g} s" for name, delay in delays.items())
-            lines.append(f"  delays that act once it is sampled: {late}")
+        latencies = self.assembled.ports.latencies if self.is_assembled else {}
+        if latencies and not self.dt:
+            shown = ", ".join(f"{name} {late:g} s" for name, late in latencies.items())
+            lines.append(f"  latencies that act once it is sampled: {shown}")
         if self.form.startswith("dense"):
             lines.append(f"  {self.form}")
         return "\n".join(lines)

@@ -98,8 +98,8 @@ class SensorPort(Value):
         One-sided amplitude spectral density of its white noise.
     dynamics : StateSpace, optional
         Sensor and anti-alias filter.
-    delay : float [s]
-        Of the signal.
+    latency : float [s]
+        Delay of the signal, in seconds.
     """
 
     home: ClassVar = "y"
@@ -107,7 +107,7 @@ class SensorPort(Value):
     at: Place
     asd: float = 0.0
     dynamics: StateSpace | None = None
-    delay: float = 0.0
+    latency: float = 0.0
     quantity: Quantity = "displacement"
 
     def __post_init__(self) -> None:

@@ -10,6 +10,8 @@ from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
 from ..values import check_names, positive, real_array, short
 
+#: [s] a latency from here on is taken for a number of samples
+_SAMPLES = 1.0
 #: endings of the channels that a plant makes itself: estimates, references, errors, efforts, noises
 DERIVED = ("hat", "ref", "error", "effort", "noise")
 
@@ -23,7 +25,7 @@ def checked_port(port: Any) -> dict[str, Any]:
         "asd": lambda name, asd: positive(asd, f"asd of {name!r}", zero=True),
         "shape": lambda name, shape: checked_filter(name, "shape", shape),
         "dynamics": lambda name, dynamics: checked_filter(name, "dynamics", dynamics),
-        "delay": lambda name, delay: positive(delay, f"delay of {name!r}", zero=True),
+        "latency": checked_latency,
     }
     given = port._fields()
     return {"name": name} | {
@@ -44,6 +46,18 @@ def checked_name(name: Any) -> str:
             f"{name.replace(':', '_')!r}, say."
         )
     return name
+
+
+def checked_latency(name: str, latency: Any) -> float:
+    """Return the latency [s] of a port, or raise ModelError: a second is a number of samples."""
+    late = positive(latency, f"latency of {name!r}", zero=True)
+    if late >= _SAMPLES:
+        raise ModelError(
+            f"the latency of {name!r} is {late:g} s, in seconds: no loop runs that late. If "
+            f"samples are meant, divide by the rate, latency={late:g} / rate, or pass them to "
+            f"plant.discretized(rate, delay={late:g})."
+        )
+    return late
 
 
 def checked_direction(name: str, direction: str) -> str:

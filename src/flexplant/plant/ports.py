@@ -172,23 +172,23 @@ class Ports(Value):
         raise unknown_label("sensor", name, [sensor.name for sensor in self.y])
 
     @property
-    def delays(self) -> dict[str, float]:
-        """Delays [s] of the actuators and sensors that have one, by name."""
+    def latencies(self) -> dict[str, float]:
+        """Latencies [s] of the actuators and sensors that have one, by name."""
         ports: tuple[Actuator | SensorPort, ...] = (*self.u, *self.y)
-        return {port.name: port.delay for port in ports if port.delay}
+        return {port.name: port.latency for port in ports if port.latency}
 
     @property
     def has_dynamics(self) -> bool:
-        """Whether some port has a filter or a delay: states beside those of the structure."""
-        return bool(self.delays) or any(port.filter for port in self.physical)
+        """Whether some port has a filter or a latency: states beside those of the structure."""
+        return bool(self.latencies) or any(port.filter for port in self.physical)
 
     def with_pade(self, order: int = 2) -> Ports:
-        """Return the ports with every delay as an all-pass filter, for continuous designs.
+        """Return the ports with every latency as an all-pass filter, for continuous designs.
 
         Parameters
         ----------
         order : int
-            States of each; the phase is right up to about ``order / (6 delay)`` Hz.
+            States of each; the phase is right up to about ``order / (6 latency)`` Hz.
 
         Raises
         ------
@@ -197,11 +197,11 @@ class Ports(Value):
         """
 
         def late(port: Any) -> Any:
-            if not port.delay:
+            if not port.latency:
                 return port
-            line, own = pade(port.delay, order=order), port.filter
+            line, own = pade(port.latency, order=order), port.filter
             both = line if own is None else series(own, line)
             named = both.replace(states=[f"x{i}" for i in range(1, both.n_states + 1)])
-            return port.replace(dynamics=named, delay=0.0)
+            return port.replace(dynamics=named, latency=0.0)
 
         return self.replace(u=[late(port) for port in self.u], y=[late(port) for port in self.y])

@@ -15,20 +15,20 @@ from ..values import FloatArray, positive
 _HOPELESS = 10.0
 #: samples: a delay between 0 and this changes nothing that can be measured
 _NO_DELAY = 0.01
-#: samples: a delay of an actuator or sensor beyond this is in another unit
+#: samples: a delay beyond this is in another unit, of a loop, an actuator or a sensor
 _LONGEST = 1000.0
 #: damping ratio up to which a pole of a plant made elsewhere is a mode, not a filter
 _LIGHT = 0.3
 
 
 def check_rate(plant: Any, rate: float, delay: float) -> None:
-    """Judge a sampling rate [Hz] by the modes of a plant, and delays by the rate.
+    """Judge a sampling rate [Hz] by the modes of a plant, delays and latencies by the rate.
 
     Raises
     ------
     ModelError
         When the lowest elastic mode lies far above half the rate; when a delay is a negligible part
-        of a sample, or an actuator's or sensor's more than 1000 samples.
+        of a sample; when it, or the latency of an actuator or sensor, is more than 1000 samples.
 
     Warns
     -----
@@ -41,12 +41,18 @@ def check_rate(plant: Any, rate: float, delay: float) -> None:
             f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s and changes "
             f"nothing. If {delay:g} s is meant, it is delay={delay * rate:.4g} at {rate:g} Hz."
         )
-    for name, late in (plant.assembled.ports.delays if plant.is_assembled else {}).items():
+    if delay > _LONGEST:
+        raise ModelError(
+            f"delay={delay:g} is in samples, which here means {delay / rate:.3g} s: no loop runs "
+            f"that late. If {delay:g} us are meant, it is delay={1e-6 * delay * rate:.4g} at "
+            f"{rate:g} Hz."
+        )
+    for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
         if late * rate > _LONGEST:
             raise ModelError(
-                f"the delay of {name!r} is {late:g} s, {late * rate:.4g} samples at {rate:g} Hz: "
-                f"delays of ports are in seconds. If {late:g} samples are meant, it is "
-                f"delay={late / rate:.4g}."
+                f"the latency of {name!r} is {late:g} s, {late * rate:.4g} samples at {rate:g} Hz: "
+                f"latencies are in seconds. If {late:g} samples are meant, it is "
+                f"latency={late / rate:.4g}."
             )
     modes = _elastic(plant)
     if not modes.size or modes.min() <= 0.5 * rate:

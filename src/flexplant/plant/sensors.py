@@ -33,18 +33,19 @@ class Sensor(SensorPort):
         simulation refuse: shape the disturbance, or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
         One-sided amplitude spectral density of its white noise; a sample has variance
-        asd^2 rate / 2. It is added to the samples, after dynamics and delay; what passes through
+        asd^2 rate / 2. It is added to the samples, after dynamics and latency; what passes through
         them is an OutputDisturbance.
     dynamics : StateSpace, optional
         Sensor and anti-alias filter, motion to signal: stable; its states join the plant's.
-    delay : float [s]
-        Of the signal. Exact, also between samples, once the plant is sampled; a continuous plant
-        leaves it out and says so (`ports.with_pade(order)` approximates it there).
+    latency : float [s]
+        Delay of the signal, in seconds. Exact, also between samples, once the plant is sampled; a
+        continuous plant leaves it out and says so (`ports.with_pade(order)` approximates it there).
 
     Raises
     ------
     LabelError, ModelError
-        For a bad name, place, direction, quantity, dynamics, or a negative asd or delay.
+        For a bad name, place, direction, quantity, dynamics, a negative asd or latency, or
+        a latency of a second or more.
     """
 
     name: str
@@ -53,7 +54,7 @@ class Sensor(SensorPort):
     quantity: Quantity = "displacement"
     asd: float = 0.0
     dynamics: StateSpace | None = None
-    delay: float = 0.0
+    latency: float = 0.0
 
     @property
     def unit(self) -> str | None:
