@@ -8,9 +8,14 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..values import FloatArray, Rng, generator, real_array, short
+from .parameters.added import PointParameter
 from .search import Objective, SearchEnd
 from .sensitivities import checked_values
 from .update_result import Starts
+
+#: relative change of the model's eigenvalues that starts far away make at most, each parameter
+#: alone, and how many decades they may be nearer
+FAR, DECADES = 0.1, 1.5
 
 
 def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[FloatArray]:
@@ -43,6 +48,28 @@ def summary(begins: list[FloatArray], ends: list[SearchEnd | None]) -> Starts | 
         np.array([nan if found is None else found.p for found in ends]),
         np.array([np.inf if found is None else found.cost for found in ends]),
     )
+
+
+def scattered(objective: Objective, count: int, rng: Rng) -> list[FloatArray]:
+    """Return starts around the default one, as far as each parameter moves eigenvalues by 10 %.
+
+    Sizes are drawn evenly over decades; masses, springs and dampers are added, not taken away.
+    """
+    middle = objective.default_start
+    eigen = objective.begin(middle).eigen
+    every = list(range(eigen.poles.size))
+    moved = np.abs(objective.family.sensitivity(eigen, every)) / np.abs(eigen.poles)[:, None]
+    typical = np.median(moved, axis=0)
+    scale = np.where(typical > 0, FAR / np.where(typical > 0, typical, 1.0), 0.0)
+    scale = np.where(objective.has_prior, objective.prior_std, scale)
+    chance = generator(rng)
+    added = np.array([isinstance(q, PointParameter) for q in objective.parameters])
+    found = []
+    for _ in range(count):
+        sign = np.where(added & ~objective.has_prior, 1.0, chance.choice([-1.0, 1.0], middle.size))
+        step = sign * scale * 10 ** (-DECADES * chance.random(middle.size))
+        found.append(np.clip(middle + step, objective.lower, objective.upper))
+    return found
 
 
 def _drawn(objective: Objective, count: int, rng: Rng) -> FloatArray:

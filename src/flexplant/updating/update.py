@@ -12,20 +12,24 @@ from ..errors import FlexplantError, FlexplantWarning, ModelError, SolverError
 from ..values import FloatArray, Rng, flag, generator, positive
 from .approach import approached
 from .judgement.covariance import covariance
-from .judgement.goodness import chi_square, is_bad, worst
+from .judgement.goodness import chance, chi_square, is_bad, worst
 from .parameters.added import Parameter
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
 from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
 from .search.update_method import Trail
 from .sensitivities import checked_parameters
-from .starts import all_starts, summary
+from .starts import all_starts, scattered, summary
 from .unit_check import check_units
 from .update_result import History, UpdateResult
 from .updated_model import changed_model
 
 #: a parameter this close to its bound, relative to their distance, is at it
 AT_BOUND = 1e-6
+#: part of the measured power that a minimum leaves which has little to do with the measurement
+ABSURD = 0.1
+#: other starts that are tried after such an end, for models of up to so many DOFs and larger ones
+RETRIES, SMALL, RETRIES_LARGE = 20, 100, 4
 
 
 def update(
@@ -73,7 +77,10 @@ def update(
     start : (q,) array [kg, N s/m, N/m], optional
         Values to begin with. When not given zeros, or the means of priors, inside the bounds; then
         complex responses are fitted by the logarithm of their magnitude first, all entries about
-        equally weighted, and poles before shapes, since these converge from farther away.
+        equally weighted, and poles before shapes, since these converge from farther away. Where
+        responses alone are fitted and a tenth of their power is left, which noise does not
+        explain, up to 20 other starts are tried (`UpdateResult.starts`), 4 with a model of more
+        than 100 DOFs.
     starts : int or (s, q) array, optional
         Search from several starts, drawn between the bounds (or from the priors), and keep
         the best; `start` is one of them.
@@ -143,14 +150,13 @@ def update(
     begins = all_starts(objective, start, starts, rng)
     cold = start is None and starts is None and not method.penalised
     try:
-        before = _approach(objective, begins[0], max_iterations, enough) if cold else None
-        first = begins if before is None else [before.p[-1]]
-        best, ends = _searched(objective, first, method, max_iterations, enough)
+        if cold:
+            best, begins, ends = _cold(objective, begins[0], method, max_iterations, enough, rng)
+        else:
+            best, ends = _searched(objective, begins, method, max_iterations, enough)
     except (ModelError, SolverError):
         check_units(objective, begins[0])
         raise
-    if before is not None:
-        best.trail = before.joined(best.trail)
     check_units(objective, begins[0], best.trail.poles[0])
     if not best.converged:
         error = best.trail.error
@@ -182,6 +188,69 @@ def _approach(
         trail.add(objective, p, 1.0 if trail.p else 0.0)
     objective.path = path[:-1]
     return trail
+
+
+def _cold(
+    objective: Objective,
+    begin: FloatArray,
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+    rng: Rng,
+) -> tuple[SearchEnd, list[FloatArray], list[SearchEnd | None]]:
+    """Return the best end, the objective being there, all starts that were tried and their ends.
+
+    Where responses alone are fitted and the first end explains nothing of them (a peak of the
+    model lies on a wrong measured one), other starts are tried until one does.
+    """
+    begins = [begin]
+    best = _led(objective, begin, method, most, tolerance)
+    ends: list[SearchEnd | None] = [best]
+    if objective.numbers or not _absurd(objective, best.p):
+        return best, begins, ends
+    small = len(objective.family.V) <= SMALL
+    for other in scattered(objective, RETRIES if small else RETRIES_LARGE, rng):
+        begins.append(other)
+        try:
+            found = _led(objective, other, method, most, tolerance)
+        except (ModelError, SolverError):
+            ends.append(None)
+            continue
+        ends.append(found)
+        best = min(best, found, key=lambda one: one.cost)
+        if best is found and not _absurd(objective, best.p):
+            break
+    objective.path = []
+    objective.begin(best.trail.p[0])
+    for p in best.trail.p[1:]:
+        objective.at(p, refer=True)
+    return best, begins, ends
+
+
+def _led(
+    objective: Objective,
+    begin: FloatArray,
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+) -> SearchEnd:
+    """Return the end of a search from `begin` that goes through easier problems first."""
+    objective.path = []
+    before = _approach(objective, begin, most, tolerance)
+    first = begin if before is None else before.p[-1]
+    found = method.search(objective, first, most=most, tolerance=tolerance)
+    if before is not None:
+        found.trail = before.joined(found.trail)
+    return found
+
+
+def _absurd(objective: Objective, p: FloatArray) -> bool:
+    """Return whether a fit leaves far more than noise or a small error of the model would."""
+    point = objective.at(p)
+    r, size = objective.values(point, prior=False), objective.size(point)
+    chi2, dof = chi_square(objective, point, np.ones(p.size, dtype=bool))
+    likely = chi2 is not None and not is_bad(chance(chi2, dof))
+    return not likely and bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
 
 
 def _result(
@@ -230,11 +299,12 @@ def _complaint(fit: UpdateResult, objective: Objective, p: FloatArray) -> str:
     negative = ""
     if fit.negative_masses:
         negative = f"{', '.join(fit.negative_masses)} came out negative. "
+    tried = "" if fit.starts is None else f"{len(fit.starts)} starts were tried. "
     return (
         f"the updated model leaves more than noise: chi-square {fit.chi2:.4g} for {fit.dof} "
         f"degrees of freedom. It fits worst {worst(objective, objective.at(p))}. {negative}"
         "Something else differs between model and machine, or the noise is understated; "
-        "localise(model, residuals, candidates) searches for the place. The covariance is "
+        f"localise(model, residuals, candidates) searches for the place. {tried}The covariance is "
         f"widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for small errors of the "
         "model only."
     )

@@ -76,6 +76,9 @@ class Starts(Value):
     def __post_init__(self) -> None:
         self._set(begin=self.begin, end=self.end, cost=self.cost)
 
+    def __len__(self) -> int:
+        return int(self.cost.size)
+
     def __repr__(self) -> str:
         best = float(np.min(self.cost))
         same = int(np.sum(self.cost <= best + 1e-6 * max(abs(best), 1e-12)))
