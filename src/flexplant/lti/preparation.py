@@ -17,7 +17,7 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..values import FloatArray, Value
 from .discretisation import bilinear, tustin
-from .scaling import bordered_scale, state_scale
+from .scaling import bordered_scale, mean_speed, state_scale
 from .statespace import StateSpace
 
 #: a direction of D12 or D21 below this, beside columns of unit size, counts as missing
@@ -155,10 +155,10 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         When a sampled plant has a pole at z = -1.
     """
     # balanced first: whether I + A can be inverted must not depend on the units of the states
-    A, B, C = _balanced(P.A, P.B, P.C, np.exp(1j) * (1.5 if P.dt else _speed(P.A)))
+    A, B, C = _balanced(P.A, P.B, P.C, np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles())))
     g = P.replace(A=A, B=B, C=C, blocks=None)
     g = bilinear(g, 1.0 / P.dt) if P.dt else g
-    speed = _speed(g.A)
+    speed = mean_speed(g.poles())
     m1, p1 = len(g.inputs) - len(u), len(g.outputs) - len(y)
     root = np.sqrt(speed)
     A, B, C = g.A / speed, g.B / root, g.C / root
@@ -189,13 +189,6 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         tuple(u),
         tuple(y),
     )
-
-
-def _speed(A: FloatArray) -> float:
-    """Return the geometric mean of the plant's frequencies, those near zero left out."""
-    sizes = np.abs(la.eigvals(A)) if A.size else np.zeros(0)
-    sizes = sizes[sizes > 1e-6 * np.max(sizes, initial=0.0)]
-    return float(np.exp(np.mean(np.log(sizes)))) if sizes.size else 1.0
 
 
 def _normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray]:

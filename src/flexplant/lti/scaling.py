@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..values import FloatArray
+from ..values import ComplexArray, FloatArray
 
 #: size of B and C beside A: enough to hold the states of a chain together
 BORDER = 1.0
@@ -46,3 +46,13 @@ def even_scale(A: FloatArray) -> FloatArray:
 def balanced_matrix(A: FloatArray) -> FloatArray:
     """Return A with even rows and columns (LAPACK's gebal): the same eigenvalues."""
     return np.asarray(la.lapack.dgebal(A, scale=1, permute=0)[0])
+
+
+def mean_speed(poles: ComplexArray) -> float:
+    """Return the geometric mean [rad/s] of the sizes of poles, those near zero left out; 1 if none.
+
+    Free masses come out at rounding, which tells nothing about the others.
+    """
+    sizes = np.abs(poles)
+    moving = sizes[sizes > 1e-6 * sizes.max(initial=0.0)]
+    return float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0

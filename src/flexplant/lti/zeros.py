@@ -6,6 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..values import ComplexArray, FloatArray
+from .scaling import mean_speed
 from .statespace import StateSpace
 
 #: a zero closer to the limit than this, relative to its size, is tested as if it were on it
@@ -63,11 +64,7 @@ def axis_zeros(g: StateSpace) -> ComplexArray:
 
 def _speed(g: StateSpace) -> float:
     """Return a frequency [rad/s] that makes A of order one; 1 when sampled."""
-    if g.dt or not g.n_states:
-        return 1.0
-    sizes = np.abs(g.poles())
-    moving = sizes[sizes > 1e-6 * sizes.max(initial=0.0)]  # free masses come out at rounding
-    return float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
+    return 1.0 if g.dt else mean_speed(g.poles())
 
 
 def _scaled(g: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:

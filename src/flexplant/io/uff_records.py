@@ -1,0 +1,221 @@
+"""Records of universal files: which there are, what they hold, and whether they are whole."""
+
+from __future__ import annotations
+
+import importlib
+import warnings
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError, ModelError
+from ..labels import DIRECTIONS
+from ..values import FloatArray, short
+from .paths import file_path
+
+
+def check_systems(parts: list[dict[str, Any]], path: str) -> None:
+    """Raise ModelError when system 0 or 1, which stands for the global one, is another (2420)."""
+    straight = np.vstack([np.eye(3), np.zeros((1, 3))])
+    for part in parts:
+        listed = zip(part["CS_sys_labels"], part["CS_types"], part["CS_matrices"], strict=True)
+        for label, kind, matrix in listed:
+            if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > 1e-9):
+                raise ModelError(
+                    f"{path!r} defines coordinate system {int(label)} as a turned, moved or curved "
+                    "one (dataset 2420), and nodes are given in it: only global coordinates are "
+                    "read. Export these."
+                )
+
+
+def dataset_types(path: str | Path) -> list[int]:
+    """Return the types of the datasets in a file."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            file = importlib.import_module("pyuff").UFF(str(path))
+            return [int(kind) for kind in file.get_set_types()]
+        except Exception as error:
+            raise _damaged(path, "its datasets", error) from None
+
+
+def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
+    """Return the datasets of some kinds, as pyuff reads them."""
+    with file_path(path).open("rb") as file:
+        start = file.read(200)
+    try:
+        pyuff = importlib.import_module("pyuff")
+    except ImportError:
+        raise FlexplantError(
+            "universal files need pyuff. Install it: pip install 'flexplant[uff]'."
+        ) from None
+    if start.split()[:1] != [b"-1"]:
+        raise FlexplantError(
+            f"{str(path)!r} is no universal file: it begins with {start[:20]!r}, not with -1."
+        )
+    found = []
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # NumPy's of what pyuff calls
+        types = dataset_types(path)
+        file = pyuff.UFF(str(path))
+        for place, kind in enumerate(types):
+            if kind not in kinds:
+                continue
+            try:
+                part = file.read_sets(place)
+            except Exception as error:
+                raise _damaged(path, f"dataset {place + 1} (type {kind})", error) from None
+            part = part[0] if isinstance(part, list) else part
+            if kind == 58:
+                _check_58(part, path, place)
+            found.append(part)
+    return found
+
+
+def _damaged(path: str | Path, what: str, error: object) -> FlexplantError:
+    return FlexplantError(
+        f"{str(path)!r}: {what} cannot be read ({error!s:.100}). The file is cut off or damaged: "
+        "export it again."
+    )
+
+
+def _check_58(part: dict[str, Any], path: str | Path, place: int) -> None:
+    data, x = np.asarray(part.get("data", ())), np.asarray(part.get("x", ()))
+    points = whole_entry(part, "num_pts")
+    if data.size != points or x.size != points or not points:
+        raise _damaged(
+            path, f"dataset {place + 1} (type 58)", f"{data.size} of {points} points are there"
+        )
+    if not (np.all(np.isfinite(data)) and np.all(np.isfinite(x))):
+        raise _damaged(path, f"dataset {place + 1} (type 58)", "NaN or infinite numbers")
+
+
+def whole_entry(part: dict[str, Any], name: str) -> int:
+    """Return an entry of a record as an int, 0 where it is not there."""
+    try:
+        return int(part.get(name) or 0)
+    except (TypeError, ValueError):
+        raise FlexplantError(
+            f"dataset {part.get('type')}: {name} is {short(part.get(name))}, no whole number. The "
+            "file is damaged: export it again."
+        ) from None
+
+
+def _channel(part: dict[str, Any], side: str) -> tuple[str, int]:
+    """Return the name of a channel and the sign of its direction."""
+    node, code = whole_entry(part, f"{side}_node"), whole_entry(part, f"{side}_dir")
+    if 1 <= abs(code) <= 6:
+        return f"{node}:{DIRECTIONS[abs(code) - 1]}", 1 if code > 0 else -1
+    entity = str(part.get(f"{side}_ent_name") or "").strip().replace(".", " ")
+    return (entity if entity.strip("- ") and entity != "NONE" else str(node)), 1
+
+
+def paired_records(
+    records: list[dict[str, Any]], path: str
+) -> dict[tuple[str, str], tuple[int, dict[str, Any]]]:
+    """Return {(output, input): (sign, record)}, each pair once."""
+    pairs: dict[tuple[str, str], tuple[int, dict[str, Any]]] = {}
+    doubled = []
+    for part in records:
+        (output, up), (name, down) = _channel(part, "rsp"), _channel(part, "ref")
+        pair = (output, f"u {name}")
+        if pair in pairs:
+            doubled.append(" <- ".join(pair))
+        pairs[pair] = (up * down, part)
+    if doubled:
+        raise FlexplantError(
+            f"{path!r} holds {', '.join(doubled[:6])} more than once: repeated measurements are "
+            "averaged, not chosen from. Export each pair once (average_frfs joins files)."
+        )
+    return pairs
+
+
+def record_sides(pairs: Iterable[tuple[str, str]]) -> tuple[list[str], list[str]]:
+    """Return outputs and inputs of pairs, in order of nodes and directions."""
+
+    def place(name: str) -> tuple[Any, ...]:
+        node, _, direction = name.removeprefix("u ").partition(":")
+        known = direction in DIRECTIONS
+        return (0, int(node), DIRECTIONS.index(direction)) if known else (1, name)
+
+    listed = list(pairs)
+    return (
+        sorted({output for output, _ in listed}, key=place),
+        sorted({name for _, name in listed}, key=place),
+    )
+
+
+def check_complete(
+    pairs: Iterable[tuple[str, str]],
+    outputs: list[str],
+    inputs: list[str],
+    what: str,
+    path: str,
+    remedy: str,
+) -> None:
+    """Raise FlexplantError unless every output is there for every input."""
+    there = set(pairs)
+    missing = [f"{a} <- {b}" for a in outputs for b in inputs if (a, b) not in there]
+    if missing:
+        raise FlexplantError(
+            f"{path!r} lacks {len(missing)} of {len(outputs) * len(inputs)} {what}: "
+            f"{', '.join(missing[:8])}. Export every output for every input{remedy}."
+        )
+
+
+def common_frequencies(records: list[dict[str, Any]], path: str) -> FloatArray:
+    """Return the frequencies [Hz] of all records, which must be the same."""
+    first = np.asarray(records[0]["x"], dtype=np.float64)
+    for part in records:
+        if whole_entry(part, "abscissa_spec_data_type") not in (0, 1, 18):
+            raise FlexplantError(
+                f"{path!r}: a response is not over frequency (abscissa type "
+                f"{whole_entry(part, 'abscissa_spec_data_type')}, 18 is frequency). Export "
+                "it in Hz."
+            )
+        own = np.asarray(part["x"], dtype=np.float64)
+        step = float(np.ptp(first)) / max(first.size - 1, 1)
+        if own.size != first.size or np.max(np.abs(own - first)) > 1e-3 * step:
+            raise FlexplantError(
+                f"{path!r}: {_channel(part, 'rsp')[0]} <- u {_channel(part, 'ref')[0]} is at other "
+                f"frequencies ({own.size} from {own[0]:g} to {own[-1]:g} Hz) than "
+                f"{_channel(records[0], 'rsp')[0]} <- u {_channel(records[0], 'ref')[0]} "
+                f"({first.size} from {first[0]:g} to {first[-1]:g} Hz). Export all alike."
+            )
+    return first
+
+
+def coherence_of(
+    records: list[dict[str, Any]],
+    outputs: list[str],
+    inputs: list[str],
+    freq: FloatArray,
+    path: str,
+) -> FloatArray:
+    """Return the coherence (n_out, n_in, n_freq) of the records of type 6."""
+    pairs = {
+        pair: record
+        for pair, record in paired_records(records, path).items()
+        if pair[0] in outputs and pair[1] in inputs
+    }
+    check_complete(pairs, outputs, inputs, "coherences", path, ", or pass coherence=False")
+    if any(np.size(part["data"]) != freq.size for _, part in pairs.values()):
+        raise FlexplantError(
+            f"{path!r}: coherences are at other frequencies than the responses. Export all alike, "
+            "or pass coherence=False."
+        )
+    rows = [[np.real(pairs[a, b][1]["data"]) for b in inputs] for a in outputs]
+    # single precision goes beyond 1 by its rounding
+    return np.minimum(np.array(rows, dtype=np.float64), 1.0)
+
+
+def pole_of(part: dict[str, Any]) -> complex:
+    """Return the pole [rad/s] of a mode shape."""
+    if whole_entry(part, "analysis_type") != 2:
+        return complex(part["eig"])
+    omega = 2 * np.pi * float(part["freq"])
+    viscous, hysteretic = float(part["modal_damp_vis"]), float(part["modal_damp_his"])
+    zeta = viscous or hysteretic / 2
+    return complex(omega * (-zeta + 1j * np.sqrt(max(0.0, 1 - zeta**2))))
