@@ -10,7 +10,7 @@ from ..errors import AssumptionError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..plant.rigid.rigid_motion import carried_of, seen
+from ..plant.rigid.rigid_motion import rigid_modes_of, seen
 from ..values import FloatArray, Value
 from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .error import error_variances
@@ -79,7 +79,7 @@ class StaticEstimator(Value):
         plant = self.larger or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
-        held = carried_of(plant) if plant.is_assembled else None
+        held = rigid_modes_of(plant) if plant.is_assembled else None
         found = error_variances(plant, self.system, None if held is None else held.modes)
         return float(np.sqrt(found.values[row]))
 
@@ -120,7 +120,7 @@ def design_static(
     """
     plant = checked_plant(plant)
     ports = plant.assembled.ports
-    motions = carried_of(plant)
+    motions = rigid_modes_of(plant)
     orders = {s.name: s.order for s in ports.y}
     used = [name for name in sensors(plant) if orders.get(name) == 0]
     channels = poi_channels(plant)

@@ -30,8 +30,8 @@ from .sensors import Sensor as Sensor
 from .standard import StandardPlant as StandardPlant
 from .standard import standard_plant as standard_plant
 from .truncation import larger_plant as larger_plant
-from .uncertainty.delta import Delta as Delta
 from .uncertainty.neglected import NeglectedModes as NeglectedModes
 from .uncertainty.neglected import neglected_modes as neglected_modes
+from .uncertainty.uncertain_plant import Delta as Delta
 from .uncertainty.uncertain_plant import UncertainPlant as UncertainPlant
 from .visibility import ModeVisibility as ModeVisibility

@@ -95,8 +95,8 @@ class AssumptionReport(Value):
             said = " ".join(f"{item.finding} {item.remedy}" for item in failed)
             # what was said is not said again
             short = [item.replace(finding="as said.", remedy="") for item in failed]
-            told = tuple(short[failed.index(i)] if i in failed else i for i in known)
-            table = "\n".join(["The plant's assumptions:", *_lines(told)])
+            listed = tuple(short[failed.index(i)] if i in failed else i for i in known)
+            table = "\n".join(["The plant's assumptions:", *_lines(listed)])
             raise AssumptionError(f"{purpose} is not possible: {said}\n{table}")
 
 

@@ -15,7 +15,7 @@ from ..loop import ClosedLoop, close_loop
 from ..lti.interconnection import lft
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant
-from ..plant.rigid.rigid_motion import Carried, carried_of, gain_of
+from ..plant.rigid.rigid_motion import RigidModes, gain_of, rigid_modes_of
 from ..values import FloatArray, positive, real_array
 from .servo_axis import Axis, rigid_body, rigid_peak
 from .servo_loop import (
@@ -44,7 +44,7 @@ class ServoTask:
         Sampled.
     poi : Poi
         What is moved.
-    motions : Carried
+    motions : RigidModes
         The plant's rigid-body motions, free or on springs.
     rolloff, integrator, notches
         As for `design_servo`.
@@ -56,7 +56,7 @@ class ServoTask:
 
     plant: StandardPlant
     poi: Poi
-    motions: Carried
+    motions: RigidModes
     rolloff: float | None
     integrator: float | None
     notches: tuple[float, ...] | None
@@ -227,7 +227,7 @@ def servo_task(
     centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
     for freq in centres or ():
         _below_nyquist(freq, "notch", 1.0 / plant.dt)
-    motions = carried_of(plant)
+    motions = rigid_modes_of(plant)
     return ServoTask(
         plant,
         port,

@@ -1,4 +1,4 @@
-"""The rigid-body motions of a plant, free or carried by weak springs: by geometry, not by modes."""
+"""The rigid-body motions of a plant, free or on weak springs: by geometry, not by modes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _RIGID = 0.995
 _WEAK = 3.0
 
 
-class Carried(NamedTuple):
+class RigidModes(NamedTuple):
     """The rigid-body motions that cost no force, or only that of weak springs.
 
     Parameters
@@ -40,7 +40,7 @@ class Carried(NamedTuple):
     freq: FloatArray
 
 
-def carried(realisation: ModalRealisation) -> Carried:
+def rigid_modes(realisation: ModalRealisation) -> RigidModes:
     """Return the rigid-body motions of a structure that is free, or on weak springs.
 
     With R the motions of `rigid_body_of`, m their mass and S = R m^(-1/2), mode i has the part
@@ -50,7 +50,7 @@ def carried(realisation: ModalRealisation) -> Carried:
     r = realisation.n_rigid
     place = np.arange(r) * 2
     swing = realisation.pairs[:r, 0, 1]
-    free = Carried(realisation.outputs[:, place] * swing, np.arange(r), np.zeros(r))
+    free = RigidModes(realisation.outputs[:, place] * swing, np.arange(r), np.zeros(r))
     try:
         body = rigid_body_of(realisation)
     except FlexplantError:  # held, or without a geometry: no rigid-body motion but modes at 0 Hz
@@ -75,10 +75,10 @@ def carried(realisation: ModalRealisation) -> Carried:
     if not np.all(kept):
         shapes = shapes @ vectors[:, kept]
     size = np.sqrt(np.abs(np.linalg.det(realisation.pairs[modes])))
-    return Carried(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
+    return RigidModes(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
 
 
-def carried_of(plant: Partition) -> Carried:
+def rigid_modes_of(plant: Partition) -> RigidModes:
     """Return the rigid-body motions of a plant.
 
     Raises
@@ -88,7 +88,7 @@ def carried_of(plant: Partition) -> Carried:
     AssumptionError
         When the structure is held.
     """
-    motions = carried(plant.assembled.realisation)
+    motions = rigid_modes(plant.assembled.realisation)
     if not motions.modes.size:
         raise AssumptionError(
             "the plant has no rigid-body modes and no suspension modes: it is constrained. This "
@@ -98,7 +98,7 @@ def carried_of(plant: Partition) -> Carried:
     return motions
 
 
-def require_weak(motions: Carried, bandwidth: float, what: str) -> None:
+def require_weak(motions: RigidModes, bandwidth: float, what: str) -> None:
     """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz]."""
     worst = float(motions.freq.max(initial=0.0))
     if worst > bandwidth / _WEAK:
@@ -110,7 +110,7 @@ def require_weak(motions: Carried, bandwidth: float, what: str) -> None:
         )
 
 
-def seen(plant: Partition, motions: Carried, channels: Sequence[str]) -> FloatArray:
+def seen(plant: Partition, motions: RigidModes, channels: Sequence[str]) -> FloatArray:
     """Return the displacements (n, r) at channels of POIs and sensors; 0 of other quantities."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     places = {
@@ -155,11 +155,11 @@ def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) 
     LabelError
         When a name is unknown.
     """
-    return gain_of(plant, carried_of(plant), outputs, inputs)
+    return gain_of(plant, rigid_modes_of(plant), outputs, inputs)
 
 
 def gain_of(
-    plant: Partition, motions: Carried, outputs: Sequence[str], inputs: Sequence[str]
+    plant: Partition, motions: RigidModes, outputs: Sequence[str], inputs: Sequence[str]
 ) -> FloatArray:
     """Return `rigid_gain` where the motions of the plant are known."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports

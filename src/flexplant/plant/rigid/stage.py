@@ -17,7 +17,7 @@ from ...values import Value, positive
 from ..forces import BaseAcceleration
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant
-from .rigid_motion import Carried, carried_of, require_weak, rigid_gain, seen
+from .rigid_motion import RigidModes, require_weak, rigid_gain, rigid_modes_of, seen
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
 #: the table in `stage_weights`)
@@ -50,6 +50,8 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
         the rigid-body modes.
     LabelError
         When several POIs have a reference and none is named, or the named one has none.
+    ModelError
+        When the plant was not assembled from a structure.
     """
     plant, motions = _stage(plant)
     ports = plant.assembled.ports
@@ -195,12 +197,11 @@ def stage_weights(
     Raises
     ------
     AssumptionError
-        When the plant is not assembled from a free or weakly suspended structure with POIs,
-        actuators and sensors.
+        When the structure is not free or weakly suspended, or has no POIs, actuators or sensors.
     LabelError
         When there are several POIs and none is named, or the name is unknown.
     ModelError
-        When a number is out of range.
+        When the plant was not assembled from a structure, or a number is out of range.
     """
     plant, motions = _stage(plant)
     ports = plant.assembled.ports
@@ -257,13 +258,13 @@ def stage_weights(
     return StageWeights(z, w, text)
 
 
-def _stage(given: StandardPlant) -> tuple[StandardPlant, Carried]:
+def _stage(given: StandardPlant) -> tuple[StandardPlant, RigidModes]:
     """Return a plant that is a stage, and its rigid-body motions."""
     plant = standard_plant(given)
-    return plant, carried_of(plant)
+    return plant, rigid_modes_of(plant)
 
 
-def _arm(plant: StandardPlant, ports: Ports, motions: Carried) -> float:
+def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
     """Return the length that makes rotations displacements: how far the sensors are, in shape."""
     turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
     if not turning:

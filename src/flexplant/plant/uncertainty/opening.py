@@ -7,20 +7,19 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ...errors import ModelError
+from ...errors import LabelError, ModelError, unknown_label
 from ...identification import MeasuredModes
 from ...lti.statespace import StateSpace
-from ...updating import UpdateResult
+from ...updating import UpdateResult, eigenvalue_sensitivities
 from ...updating.parameters.added import Parameter
-from ...values import FloatArray, positive
+from ...values import ComplexArray, FloatArray, positive
 from ..building import P
 from ..partition import Partition
-from .delta import Delta, modal_realisation, with_changes
+from ..realisation import ModalRealisation
 from .neglected import neglected_modes, opened
-from .pole_covariance import check_poles, check_range, fitted_poles, measured_poles, relative
-from .uncertain_plant import UncertainPlant
+from .uncertain_plant import Delta, UncertainPlant, modal_realisation, with_changes
 
-#: relative doubts below this open no channel
+#: relative standard deviations below this open no channel
 _KNOWN = 1e-12
 #: relative change at which the plant's dependence on a Delta is read off
 _PROBE = 0.25
@@ -35,20 +34,20 @@ def uncertain(
     deviations: float = 2.0,
     neglected: Any = None,
 ) -> UncertainPlant[P]:
-    """Return a plant with the doubt of a fit opened; see `Partition.uncertain`."""
+    """Return a plant with channels for Deltas; see `StandardPlant.uncertain`."""
     realisation = modal_realisation(plant)
     many = positive(deviations, "deviations")
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
-        numbers, poles, doubt = fitted_poles(realisation, source, parameters, modes)
+        numbers, poles, doubt = _fitted_poles(realisation, source, parameters, modes)
     elif isinstance(source, MeasuredModes):
-        numbers, poles, doubt = measured_poles(source, modes)
+        numbers, poles, doubt = _measured_poles(source, modes)
     else:
         raise ModelError(
             f"uncertainty comes from an UpdateResult or MeasuredModes, got {type(source).__name__}."
         )
-    check_poles(realisation, numbers, poles, isinstance(source, UpdateResult))
-    G = relative(poles)
+    _check_poles(realisation, numbers, poles, isinstance(source, UpdateResult))
+    G = _relative(poles)
     doubt = G @ doubt @ G.T
     scale = many * np.sqrt(np.diag(doubt))
     kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
@@ -62,7 +61,7 @@ def uncertain(
     if not keep:
         raise ModelError(f"modes {list(numbers)} have no doubt: there is no uncertainty to open.")
     deltas = tuple(every[i] for i in keep)
-    check_range(deltas, many)
+    _check_range(deltas, many)
     system = _opened(plant.continuous, deltas)
     weight = None
     if neglected is not None:
@@ -131,3 +130,90 @@ def _check_affine(
 
 def _matrix(g: StateSpace) -> FloatArray:
     return np.block([[g.A, g.B], [g.C, g.D]])
+
+
+def _fitted_poles(
+    realisation: ModalRealisation,
+    fit: UpdateResult,
+    parameters: Sequence[Parameter] | None,
+    modes: Sequence[int] | None,
+) -> tuple[tuple[int, ...], ComplexArray, FloatArray]:
+    """Return mode numbers, poles and J C J', the covariance of [Re lambda; Im lambda]."""
+    names = tuple(parameter.name for parameter in parameters or ())
+    if names != tuple(fit.parameters):
+        raise LabelError(
+            f"the fit is of {list(fit.parameters)}, got the parameters {list(names)}: pass those "
+            "given to update, in the same order: plant.uncertain(fit, parameters)."
+        )
+    if fit.covariance is None:
+        raise ModelError(
+            "the fit has no covariance: as many numbers were measured as were fitted. Measure "
+            "another mode, or give MeasuredModes(covariance=...)."
+        )
+    elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
+    chosen = list(elastic if modes is None else modes)
+    found = eigenvalue_sensitivities(fit.model, list(parameters or ()), modes=chosen)
+    J = np.vstack([found.S.real, found.S.imag])
+    return found.modes, found.poles, J @ fit.covariance @ J.T
+
+
+def _measured_poles(
+    measured: MeasuredModes, modes: Sequence[int] | None
+) -> tuple[tuple[int, ...], ComplexArray, FloatArray]:
+    """Return mode numbers, poles and the covariance of [Re lambda; Im lambda], as measured."""
+    if measured.covariance is None or measured.modes is None:
+        raise ModelError(
+            "the measured modes need mode numbers and a covariance: "
+            "MeasuredModes(poles, modes=[...], covariance=...)."
+        )
+    chosen = list(measured.modes if modes is None else modes)
+    for number in chosen:
+        if number not in measured.modes:
+            raise unknown_label("measured mode", number, map(str, measured.modes))
+    at = [measured.modes.index(number) for number in chosen]
+    both = [*at, *(i + len(measured) for i in at)]
+    return tuple(chosen), measured.poles[at], measured.covariance[np.ix_(both, both)]
+
+
+def _relative(poles: ComplexArray) -> FloatArray:
+    """Return the derivatives of [log omega^2; log 2 zeta omega] to [Re lambda; Im lambda]."""
+    size = np.abs(poles) ** 2
+    damped = np.where(poles.real != 0, poles.real, np.inf)
+    zero = np.zeros((poles.size, poles.size))
+    return np.block(
+        [
+            [np.diag(2 * poles.real / size), np.diag(2 * poles.imag / size)],
+            [np.diag(1 / damped), zero],
+        ]
+    )
+
+
+def _check_poles(
+    realisation: ModalRealisation, modes: Sequence[int], poles: ComplexArray, strict: bool
+) -> None:
+    """Refuse a plant that has not the modes that the doubt is about."""
+    count = realisation.n_modes
+    for number, pole in zip(modes, poles, strict=True):
+        if not realisation.n_rigid < number <= count:
+            known = range(realisation.n_rigid + 1, count + 1)
+            raise unknown_label("elastic mode of the plant", number, map(str, known))
+        own = np.linalg.eigvals(realisation.pairs[number - 1])
+        off = np.min(np.abs(own - pole)) / abs(pole)
+        if off > (1e-6 if strict else 0.1):
+            raise ModelError(
+                f"mode {number} has the pole {pole:.6g} in the "
+                f"{'fit' if strict else 'measurement'} and {own[0]:.6g} in the plant: they are "
+                "not of the same model. Assemble the plant from fit.model."
+            )
+
+
+def _check_range(deltas: Sequence[Delta], deviations: float) -> None:
+    """Refuse Deltas that reach negative stiffness or damping."""
+    for delta in deltas:
+        if delta.scale >= 1:
+            what = "stiffness" if delta.kind == "freq" else "damping"
+            raise ModelError(
+                f"the {what} of mode {delta.mode} is doubted by {100 * delta.scale:.3g} % at "
+                f"{deviations:g} standard deviations, so it may be negative: no controller is "
+                "robust to that. Measure it better, leave the mode out, or lower deviations."
+            )
