@@ -101,7 +101,7 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
     """
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     forces = all(isinstance(port, Disturbance) for port in ports.w)
-    rigidly = realisation.static_inputs is None
+    rigidly = not realisation.static_inputs.size
     return forces and rigidly and all(map(bare, (*ports.w, *ports.u, *ports.y, *candidates)))
 
 

@@ -108,7 +108,7 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
     at = g.output_index(shown)
     C = np.zeros((points.shape[0], len(shown), g.n_states))
     D = np.repeat(g.D[at][None], points.shape[0], axis=0)
-    if realisation.static_outputs is not None:
+    if realisation.static_outputs.size:
         # forces reach a POI at once too, through filters and delays: what the whole plant knows
         for i, point in enumerate(points):
             there = _elsewhere(plant, poi.name, point).system
@@ -136,7 +136,7 @@ def _force_along(plant: Partition, port: Actuator | Disturbance, points: FloatAr
     B[:, plant.modal_states, 0] = rows @ realisation.inputs
     D = np.repeat(g.D[None, :, i : i + 1], points.shape[0], axis=0)
     at_once = any(np.any(one.see(realisation).direct) for one in plant.assembled.ports.y)
-    if at_once or realisation.static_inputs is not None:
+    if at_once or realisation.static_inputs.size:
         for k, point in enumerate(points):
             D[k] = _elsewhere(plant, port.name, point).system.D[:, i : i + 1]
     return Along(port.name, points, (port.name,), np.zeros((points.shape[0], 0, g.n_states)), D, B)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 import scipy.linalg as la
@@ -23,6 +23,10 @@ LARGEST_DENSE = 2500
 ILL_CONDITIONED = 30.0
 #: the form of a realisation whose modes do not see each other
 MODAL = "modal blocks"
+
+
+def _nothing() -> FloatArray:
+    return np.zeros(0)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,14 +67,16 @@ class ModalRealisation(Value):
     outputs: FloatArray
     names: tuple[str, ...]
     n_rigid: int
-    static_outputs: FloatArray | None = None
-    static_inputs: FloatArray | None = None
+    static_outputs: FloatArray = field(default_factory=_nothing)
+    static_inputs: FloatArray = field(default_factory=_nothing)
     coupling: FloatArray | None = None
     form: str = MODAL
 
     def __post_init__(self) -> None:
         self._set(pairs=self.pairs, inputs=self.inputs, outputs=self.outputs)
-        self._set(static_outputs=self.static_outputs, static_inputs=self.static_inputs)
+        n = self.inputs.shape[0]
+        self._set(static_outputs=self.static_outputs.reshape(n, -1))
+        self._set(static_inputs=self.static_inputs.reshape(n, -1))
         self._set(coupling=self.coupling)
 
     @property
@@ -121,8 +127,6 @@ class ModalRealisation(Value):
 
         Zero unless modes were replaced by their flexibility.
         """
-        if self.static_outputs is None or self.static_inputs is None:
-            return np.zeros(row.size)
         return np.asarray(self.static_inputs @ (row @ self.static_outputs))
 
 

@@ -90,17 +90,14 @@ class Feedthrough(ResidualForm):
         if coupling is not None:
             # damping between a mode that stays and one that answers at once is left out with it
             coupling = coupling[np.ix_(~fast, ~fast)]
-        if realisation.static_outputs is not None and realisation.static_inputs is not None:
-            see = np.hstack([realisation.static_outputs, see])
-            settled = np.hstack([realisation.static_inputs, settled])
         return replace(
             realisation,
             pairs=realisation.pairs[~fast],
             inputs=realisation.inputs[:, kept],
             outputs=realisation.outputs[:, kept],
             names=tuple(n for n, keep in zip(realisation.names, kept, strict=True) if keep),
-            static_outputs=see,
-            static_inputs=settled,
+            static_outputs=np.hstack([realisation.static_outputs, see]),
+            static_inputs=np.hstack([realisation.static_inputs, settled]),
             coupling=coupling,
         )
 
