@@ -30,7 +30,7 @@ class Stretch(SensorPort):
     length: float = 1.0
     asd: float = 0.0
     dynamics: StateSpace | None = None
-    delay: float = 0.0
+    latency: float = 0.0
     quantity: str = "displacement"
 
     def row(self, realisation):
@@ -117,8 +117,8 @@ def test_velocity_and_acceleration():
 
 
 def test_sampled_estimated_simulated_saved(tmp_path):
-    """A filter, a delay, a Kalman filter and a run: those of the same sum of displacements."""
-    filtered = {"asd": NOISE, "dynamics": lowpass(2e3), "delay": 1.3 / RATE}
+    """A filter, a latency, a Kalman filter and a run: those of the same sum of displacements."""
+    filtered = {"asd": NOISE, "dynamics": lowpass(2e3), "latency": 1.3 / RATE}
     own = Stretch("s", CORNERS[3], CORNERS[0], **filtered)
     same = Sensor("s", at={CORNERS[3]: 1.0, CORNERS[0]: -1.0}, **filtered)
     plants = [sampled(reduced(), with_sensor(sensor)) for sensor in (own, same)]
