@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.signal as ss
 
-from flexplant.errors import FlexplantWarning, ModelError
+from flexplant.errors import FlexplantWarning, ModelError, SolverError
 from flexplant.identification import (
     H1Estimator,
     Periodic,
@@ -146,3 +146,14 @@ def test_segments_too_short_for_the_damping_are_warned_of():
             assert "segment= of at least" in texts[0]
         else:
             assert np.abs(found.freq / freqs - 1).max() < 2e-3
+
+
+def test_no_stable_pole_of_short_segments_names_the_segments():
+    """Noise in segments: the diagram is empty, and the error names leakage as a possible cause."""
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=(2, 20_000))
+    frf = estimate_frf(u, y, 1000.0, method=H1Estimator(segment=0.5))
+    with pytest.raises(SolverError, match=r"no pole stays.*segments of 0.5 s.*8 Hz.*segment="):
+        identify_modes(frf, band=(20.0, 300.0), orders=range(2, 8))
+    with pytest.raises(SolverError, match=r"no pole stays[^S]*$"):
+        identify_modes(frf.replace(window=None), band=(20.0, 300.0), orders=range(2, 8))

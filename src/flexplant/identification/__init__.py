@@ -1,4 +1,4 @@
-"""What the hardware says: frequency responses, measured poles and mode shapes."""
+"""What was measured: frequency responses, measured poles and mode shapes."""
 
 from .average import average_frfs as average_frfs
 from .diagram import PoleSelection as PoleSelection

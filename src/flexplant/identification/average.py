@@ -1,4 +1,4 @@
-"""Repeated measurements of the same FRF: their mean, and the doubt that they show."""
+"""Repeated measurements of the same FRF: their mean, and the variance that they show."""
 
 from __future__ import annotations
 

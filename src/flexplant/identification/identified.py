@@ -1,4 +1,4 @@
-"""What an identification found: poles with their doubt, shapes, and the FRF they make."""
+"""What an identification found: poles with their covariance, shapes, and the FRF they make."""
 
 from __future__ import annotations
 
@@ -110,8 +110,8 @@ class IdentifiedModes(MeasuredModes):
         return Frf(freq, data, inputs=self.inputs, outputs=self.outputs, quantity="displacement")
 
     def _picked(self, places: list[int]) -> dict[str, Any]:
-        doubt = self.shape_covariance
+        spread = self.shape_covariance
         return super()._picked(places) | {
             "participation": self.participation[:, places],
-            "shape_covariance": None if doubt is None else doubt[places],
+            "shape_covariance": None if spread is None else spread[places],
         }

@@ -1,4 +1,4 @@
-"""From measured FRFs to poles, mode shapes and their doubt."""
+"""From measured FRFs to poles, mode shapes and their covariance."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..errors import LabelError, ModelError, ShapeError, SolverError, unknown_label
 from ..lti.frequency import Frf
 from ..parallel import one_thread
 from ..values import positive, real_array, short, whole
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
-from .leakage import leakage_warned
+from .leakage import leakage_warned, no_pole
 from .line_weights import PreparedLines, prepared
 from .pole_split import backed, reseated, separated
 from .pole_test import freedom, supported
 from .refine import Lines, refined
-from .residual_peaks import BROADEST, completed, exact, lessened, unexplained, warned
+from .residual_peaks import BROADEST, completed, exact, fewest_terms, unexplained, warned
 from .result import answer
 from .windows import diagram_of, weighted_by_remainder, windows
 
@@ -109,7 +109,7 @@ def identify_modes(
 
     with residues of rank one, so that close and repeated modes are told apart by several inputs
     and outputs. Rigid-body modes and modes below the band are in 1/s and 1/s^2, those above in
-    the powers of s. Chosen poles that noise would feign once in a thousand times are left out;
+    the powers of s. Chosen poles that noise alone would produce once in 1000 times are left out;
     where more than noise is left a pole is added. With `start` neither is done. What then is
     still not explained is warned of, with its frequency. A pole with another at the same place
     (repeated, or too close for the diagram) is taken apart where that lowers chi-square by more
@@ -201,7 +201,10 @@ def _identified(
     diagram = None
     if start is None:
         diagram = diagram_of(ready, _affordable(listed, ready), (0.01, 0.05, 0.95), 0.2)
-        chosen = diagram.automatic()
+        try:
+            chosen = diagram.automatic()
+        except SolverError as error:
+            raise no_pole(frf, error) from None
     elif start.participation.shape[0] != ready.data.shape[1]:
         raise ShapeError(
             f"start was chosen with {start.participation.shape[0]} references, this FRF has "
@@ -223,7 +226,7 @@ def _identified(
             fewer, part = supported(lines, fit.poles[light], fit.participation[:, light])
             if fewer.size < fit.poles.size:
                 fit = refined(lines, fewer, part, steps=max_iterations, strict=False)
-        lines, fit = lessened(lines, fit, tried[:-1], steps=max_iterations)
+        lines, fit = fewest_terms(lines, fit, tried[:-1], steps=max_iterations)
         if start is None:
             fit, _ = completed(lines, fit, steps=max_iterations)
             if not exact(lines, fit.model):

@@ -6,7 +6,7 @@ import warnings
 
 import numpy as np
 
-from ..errors import FlexplantWarning
+from ..errors import FlexplantWarning, SolverError
 from ..lti.frequency import Frf
 from ..values import ComplexArray
 
@@ -39,9 +39,21 @@ def leakage_warned(frf: Frf, poles: ComplexArray) -> None:
         f"segments of {1 / frf.resolution:.3g} s are too short for the damping near "
         f"{listed}{more}: below about 4/segment = {FEWEST * frf.resolution:.2g} Hz leakage "
         "widens a resonance and splits it into several poles, so that damping and the number of "
-        f"modes are wrong by more than they say. Take segment= of at least "
+        f"modes are wrong by more than their stated deviation. Take segment= of at least "
         f"{FEWEST * WIDENED / width[worst]:.2g} s (the true damping is less than what is seen), "
         "or excite with whole periods, Periodic(...).",
         FlexplantWarning,
         4,
+    )
+
+
+def no_pole(frf: Frf, error: SolverError) -> SolverError:
+    """Return the error of a diagram without stable poles, with leakage as a possible cause."""
+    if frf.window is None or frf.resolution is None:
+        return error
+    return SolverError(
+        f"{error} The responses come from windowed segments of {1 / frf.resolution:.3g} s: where "
+        f"resonances are narrower than about four lines ({FEWEST * frf.resolution:.2g} Hz), "
+        "leakage makes poles unstable. Take longer segments, segment=, or excite with whole "
+        "periods, Periodic(...)."
     )

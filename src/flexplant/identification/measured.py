@@ -202,7 +202,7 @@ def _checked_covariance(value: Any, count: int) -> FloatArray:
         la.cholesky(matrix)
     except la.LinAlgError:
         raise ModelError(
-            "covariance must be positive definite: a pole without doubt would get infinite "
+            "covariance must be positive definite: a pole of zero variance would get infinite "
             "weight. Give every pole a positive variance in (rad/s)^2."
         ) from None
     return (matrix + matrix.T) / 2

@@ -16,7 +16,7 @@ from .refine import Fit, Lines, projected_cost, refined
 APART = 0.5
 #: numbers of residual terms tried where 9 leave more than noise
 MORE = (25, 17, 13)
-#: a pole is weak whose cost is less than so many times the least that is asked of one
+#: a pole is weak whose cost is less than so many times the least that is required of one
 WEAK = 4.0
 
 

@@ -1,4 +1,4 @@
-"""Which poles the data support: those that noise would feign once in a thousand times."""
+"""Which poles the data support: poles that noise explains are left out (one in 1000 stays)."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ CHANCE = 1e-3
 def supported(
     lines: Lines, poles: ComplexArray, part: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Leave out, one by one, poles that noise may feign."""
+    """Leave out, one by one, poles that noise alone may explain."""
     least = price(lines)
     costs = _Costs(lines, poles, part)
     kept = list(range(poles.size))

@@ -60,7 +60,7 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
     if exact(lines, model):
         return found
     noiseless = not lines.known and _smooth(lines, model)
-    heard = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
+    measured = np.sum(np.abs(lines.data * lines.weight) ** 2, axis=(0, 1))
     for length in STRETCHES:
         if 4 * length > power.size:
             break
@@ -72,7 +72,7 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
         # chi-square leans to the right, its cube root does not (Wilson and Hilferty, 1931)
         height = 3.0 * middle / spread * (np.cbrt(total / middle) - 1.0)
         if noiseless:
-            share = total / np.convolve(heard, np.ones(length), mode="valid")
+            share = total / np.convolve(measured, np.ones(length), mode="valid")
             height = np.where(share > SHARE**2, height, 0.0)
         best = int(np.argmax(height))
         if height[best] > LIMIT:
@@ -127,7 +127,7 @@ def candidate(
     return more, parts, projected_cost(lines, more, parts)
 
 
-def lessened(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
+def fewest_terms(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
     """Return the fit with the fewest residual terms of modes above that the data let pass."""
     from scipy.stats import chi2
 
@@ -187,7 +187,7 @@ def warned(left: list[Peak]) -> None:
     listed = ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])
     warnings.warn(
         f"more than noise is left near {listed}: a mode may be missed or merged there, and its "
-        "neighbours be off by more than they say. Look at plot.identified and "
+        "neighbours be off by more than their stated deviation. Look at plot.identified and "
         "plot.stabilisation, choose poles by hand (start=), or narrow the band.",
         FlexplantWarning,
         4,

@@ -45,13 +45,13 @@ def answer(
     if not inside.size:
         raise SolverError("the fit moved every pole out of the band: widen it.")
     both = np.concatenate([inside, inside + fit.poles.size])
-    doubt = None
+    spread = None
     if not ready.swapped:
         large = np.argmax(np.abs(raw), axis=0)
         columns = np.arange(fit.poles.size)
         factor = np.abs(shapes[large, columns] / raw[large, columns]) ** 2
-        doubt = _shape_covariance(fit, ready) * factor[:, None, None] * max(1.0, misfit)
-        doubt = doubt[inside]
+        spread = _shape_covariance(fit, ready) * factor[:, None, None] * max(1.0, misfit)
+        spread = spread[inside]
     return IdentifiedModes(
         fit.poles[inside],
         covariance=covariance[np.ix_(both, both)],
@@ -68,14 +68,14 @@ def answer(
         mass_normalised=normalised,
         misfit=misfit,
         diagram=diagram,
-        shape_covariance=doubt,
+        shape_covariance=spread,
     )
 
 
 def _covariance(fit: Fit, ready: PreparedLines) -> FloatArray:
     """Return the covariance of [Re lambda; Im lambda] of all poles."""
     size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
-    # participation of repeated poles is known up to a rotation only: no doubt is asked of it
+    # participation of repeated poles is known up to a rotation only: it gets no variance
     inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
     both = 2 * fit.poles.size
     if ready.independent:

@@ -1,4 +1,4 @@
-"""The model becomes this machine's: parameters, residuals, sensitivities, update."""
+"""Model updating: parameters, residuals, sensitivities, searches and their judgement."""
 
 from .judgement.correlation import Correlation as Correlation
 from .judgement.correlation import correlate as correlate

@@ -68,7 +68,7 @@ class Family:
     parameters : sequence of q Parameter
         What changes.
     highest : int, optional
-        The highest mode number that will be asked for; an undamped model with condensed DOFs is
+        The highest mode number that will be needed; an undamped model with condensed DOFs is
         solved no further.
     """
 

@@ -49,7 +49,7 @@ def turned(point: Point, data: PoleRows) -> Point:
     try:
         columns = point.columns(data.numbers)
     except ModelError:
-        return point  # a mode is lost: whoever needs it says so
+        return point  # a mode is lost: an error where it is needed
     family = point.family
     S = family.sensitivity(point.eigen, columns)
     eigen = point.eigen

@@ -33,7 +33,7 @@ def check_units(objective: Objective, begin: FloatArray, start: Any = None) -> N
         try:
             start = objective.poles(objective.begin(begin))
         except ModelError:
-            return  # the search says what is wrong at the start
+            return  # the search raises what is wrong at the start
     known = dict(zip(objective.numbers, np.abs(start), strict=True))
     ratio = np.abs(data.target) / np.array([known[n] for n in data.numbers])
     below = bool(np.all(np.abs(2 * np.pi * ratio - 1) < NEAR))

@@ -1,4 +1,4 @@
-"""The answer of an update: parameters, their doubt, and the model that has become the machine's."""
+"""The result of an update: parameters, their covariance, and the updated model."""
 
 from __future__ import annotations
 
@@ -176,17 +176,17 @@ class UpdateResult(Value):
         margin = np.zeros(self.values.size) if self.std is None else 2 * self.std
         return tuple(
             q.name
-            for q, value, doubt in zip(self.unknowns, self.values, margin, strict=False)
-            if isinstance(q, AddedMass) and value < -doubt
+            for q, value, deviation in zip(self.unknowns, self.values, margin, strict=False)
+            if isinstance(q, AddedMass) and value < -deviation
         )
 
     def __repr__(self) -> str:
         std = self.std
-        doubts = [""] * len(self.parameters) if std is None else [f" +- {s:.2g}" for s in std]
+        deviations = [""] * len(self.parameters) if std is None else [f" +- {s:.2g}" for s in std]
         lines = [
-            f"  {name} = {value:.7g}{doubt} {unit}"
-            for name, value, doubt, unit in zip(
-                self.parameters[:5], self.values.tolist(), doubts, self.units, strict=False
+            f"  {name} = {value:.7g}{deviation} {unit}"
+            for name, value, deviation, unit in zip(
+                self.parameters[:5], self.values.tolist(), deviations, self.units, strict=False
             )
         ]
         if len(self.parameters) > 5:

@@ -8,7 +8,7 @@ from ...values import FloatArray
 from ..point_model import Point
 from ..search import Objective
 
-#: singular values of the scaled sensitivities below this part of the largest say nothing
+#: singular values of the scaled sensitivities below this part of the largest count as zero
 SINGULAR = 1e-9
 
 

@@ -1,4 +1,4 @@
-"""What a measurement could say about the parameters, before anything is solved."""
+"""Which parameters a measurement determines, before anything is solved."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters, checked_values
 
-#: correlations beyond this are told
+#: correlations beyond this are listed
 CORRELATED = 0.99
 #: a combination of parameters with a singular value below this part of the largest is lost
 LOST = 1e-6
@@ -27,7 +27,7 @@ CANCELS = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Identifiability(Value):
-    """What can be told of the parameters from the residuals, to first order.
+    """What the residuals determine of the parameters, to first order.
 
     Parameters
     ----------
@@ -45,7 +45,7 @@ class Identifiability(Value):
     unseen : sequence of str
         Parameters that no residual depends on.
     mixed : sequence of (str, ...)
-        Groups of parameters of which a combination cannot be told.
+        Groups of parameters of which a combination cannot be determined.
     missing : mapping {str: (int, ...)}
         For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
         would tell the lost combinations, those that change most first; none where no eigenvalue
@@ -72,7 +72,7 @@ class Identifiability(Value):
 
     @property
     def rank(self) -> int:
-        """Number of combinations of parameters that can be told."""
+        """Number of combinations of parameters that can be determined."""
         return int(np.sum(self.singular_values > LOST * self.singular_values[0]))
 
     def __repr__(self) -> str:
@@ -108,7 +108,7 @@ def identifiability(
     *,
     start: Sequence[float] | FloatArray | None = None,
 ) -> Identifiability:
-    """Return what the residuals can say about the parameters at a start, before solving.
+    """Return which parameters the residuals determine at a start, before solving.
 
     The singular values of the weighted sensitivities S, the correlation
     ``(S^T S)^-1`` of the estimate, and which modes are missing. Priors take no part.
@@ -149,15 +149,15 @@ def identifiability(
     scaled = np.where(seen, J / np.where(seen, length, 1.0), 0.0)
     _, s, Vt = np.linalg.svd(scaled, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(names) - s.size)])
-    told = s > LOST * s[0]
-    half = Vt[told].T / s[told]
+    clear = s > LOST * s[0]
+    half = Vt[clear].T / s[clear]
     unit = half @ half.T
-    lost = np.sum(Vt[~told] ** 2, axis=0) > 1e-6
+    lost = np.sum(Vt[~clear] ** 2, axis=0) > 1e-6
     std = np.where(lost | ~seen, np.inf, np.sqrt(np.diag(unit)) / np.where(seen, length, 1.0))
     size = np.where(lost, 1.0, np.sqrt(np.maximum(np.diag(unit), 1e-300)))
     correlation = np.where(np.outer(~lost, ~lost), unit / np.outer(size, size), np.eye(lost.size))
     mixed = []
-    for vector in Vt[~told]:
+    for vector in Vt[~clear]:
         group = tuple(
             n for n, part, ok in zip(names, vector, seen, strict=True) if ok and abs(part) > 0.1
         )
@@ -173,7 +173,7 @@ def identifiability(
         correlation=correlation,
         unseen=unseen,
         mixed=tuple(mixed),
-        missing=_missing(objective, point, names, poor, _lost(Vt[~told], seen, length)),
+        missing=_missing(objective, point, names, poor, _lost(Vt[~clear], seen, length)),
     )
 
 
@@ -206,11 +206,11 @@ def _missing(
     parts = np.abs(S) @ np.abs(lost.T)
     # what cancels but for rounding, or the truncation of the model, tells nothing
     felt = parts > 1e-6 * np.max(parts, axis=0, initial=0.0)
-    told = np.where(felt & (along > CANCELS * parts), along, 0.0)
+    clear = np.where(felt & (along > CANCELS * parts), along, 0.0)
     found = {}
     for name in poor:
         own = np.abs(lost[:, names.index(name)]) > 1e-3 * np.abs(lost).max(axis=1, initial=0.0)
-        share = np.max(told[:, own], axis=1, initial=0.0)
+        share = np.max(clear[:, own], axis=1, initial=0.0)
         order = np.argsort(-share, kind="stable")[:NAMED]
         largest = share.max(initial=0.0)
         found[name] = tuple(numbers[i] for i in order if share[i] > 1e-6 * largest > 0)

@@ -20,7 +20,7 @@ Derivatives: TypeAlias = "tuple[Matrix | None, Matrix | None, Matrix | None]"
 class Parameter(Value):
     """One unknown p on which M, D and K depend affinely: M(p) = M + p dM, and so on.
 
-    A subclass has a unique `name`, a `unit` and says its matrices; `bounds` (lowest, highest) and
+    A subclass has a unique `name`, a `unit` and its `matrices`; `bounds` (lowest, highest) and
     `prior` (mean, standard deviation) may say what is known of p beforehand.
     """
 
