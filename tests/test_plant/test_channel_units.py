@@ -74,6 +74,33 @@ def test_units_travel_with_the_channels(tmp_path):
     assert not elsewhere.system.units
 
 
+@pytest.mark.slow
+def test_designs_know_the_units_of_their_channels():
+    """Controllers, estimators and geometric transformations: what they read and what they drive."""
+    plant = fx.assemble_plant(some_modes(), ports())
+    sampled = plant.discretized(10e3, delay=1)
+    weights = fx.stage_weights(plant, 30.0)
+    apart = fx.decouple(sampled)
+    systems = [
+        fx.design_servo(sampled, bandwidth=50.0).system,
+        fx.design_static(sampled).system,
+        fx.design_hinf(plant.weighted(z=weights.z, w=weights.w)).system,
+        fx.reference_errors(sampled),
+        apart.to_actuators,
+        apart.to_motions,
+        apart.accelerations,
+    ]
+    for system in systems:
+        assert set(system.units) == {*system.inputs, *system.outputs}, system
+    assert systems[0].units["die:rx:hat"] == "rad"
+    assert systems[3].units["y1:error"] == "m"
+    assert apart.to_actuators.units["cog:rx:force"] == "N m"
+    assert apart.to_motions.units["cog:ry"] == "rad"
+    assert apart.accelerations.units["cog:z:acceleration"] == "m/s^2"
+    law = fx.frequency_response(systems[0], np.array([10.0, 20.0]))
+    assert law.unit("u1", "die:hat") == "N/m"
+
+
 def test_connections_keep_the_units_of_what_is_left():
     one = [[1.0]]
     g = StateSpace(

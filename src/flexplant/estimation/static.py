@@ -145,6 +145,7 @@ def design_static(
             inputs=used,
             outputs=estimates(channels),
             name="static",
+            units=plant.units,
         ),
         plant,
         None if larger is plant else larger_plant(plant, larger),

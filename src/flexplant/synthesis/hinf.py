@@ -97,7 +97,9 @@ def design_hinf(
     problem = prepared(plant.system, plant.u, plant.y)
     _require_reach(problem)
     found = method.solve(problem)
-    controller = problem.restored(found.A, found.B, found.C, found.D).replace(name="hinf")
+    controller = problem.restored(found.A, found.B, found.C, found.D).replace(
+        name="hinf", units=plant.units
+    )
     certificate = certified_norm(plant.system, controller, found.gamma)
     reached = reached_norms(plant, controller)
     left_out = spill_over(plant, [controller], larger)

@@ -286,4 +286,5 @@ def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatA
         outputs=plant.u,
         states=[f"{name}|{state}" for name in hats for state in axis.states],
         name="servo",
+        units=plant.units,
     )

@@ -16,6 +16,11 @@ from .rigid_motion import projected
 
 #: relative: what the sensors show or the actuators push of other axes
 _CLEAN = 1e-6
+#: units of displacements and rotations at the centre of gravity, by what a channel carries
+_UNITS = (
+    {"": "m", "acceleration": "m/s^2", "force": "N"},
+    {"": "rad", "acceleration": "rad/s^2", "force": "N m"},
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,9 +122,9 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     forces = [f"cog:{axis}:force" for axis in wanted]
     pushes = [f"cog:{axis}:acceleration" for axis in wanted]
     return Decoupling(
-        _static(T_u, forces, plant.u, plant.dt),
-        _static(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant.dt),
-        _static(T_u @ mass, pushes, plant.u, plant.dt),
+        _static(T_u, forces, plant.u, plant),
+        _static(T_y, [s.name for s in sensors], [f"cog:{axis}" for axis in wanted], plant),
+        _static(T_u @ mass, pushes, plant.u, plant),
         mass,
         body.centre,
         wanted,
@@ -163,6 +168,21 @@ def _check(
 
 
 def _static(
-    gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], dt: float
+    gain: FloatArray, inputs: Sequence[str], outputs: Sequence[str], plant: StandardPlant
 ) -> StateSpace:
-    return StateSpace([], [], [], gain, dt, inputs=inputs, outputs=outputs, name="decoupling")
+    units = plant.units
+    for channel in (*inputs, *outputs):
+        if channel.startswith("cog:"):
+            _, axis, *kind = channel.split(":")
+            units[channel] = _UNITS[axis.startswith("r")][kind[0] if kind else ""]
+    return StateSpace(
+        [],
+        [],
+        [],
+        gain,
+        plant.dt,
+        inputs=inputs,
+        outputs=outputs,
+        name="decoupling",
+        units=units,
+    )

@@ -82,6 +82,7 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
         inputs=[*sensors, followed.derived(followed.axes[0], "ref")],
         outputs=[f"{name}:error" for name in sensors],
         name="reference errors",
+        units=plant.units | {f"{n}:error": plant.units[n] for n in sensors if n in plant.units},
     )
 
 
