@@ -219,11 +219,15 @@ def _identified(
         lines = replace(lines, inflation=ready.inflation)
         if start is None:
             poles, part = supported(lines, poles, part)
+            if not poles.size:
+                raise no_pole(frf, _unsupported(low, high))
         # poles that turn out to be none may keep it from settling: judged at the end
         fit = refined(lines, poles, part, steps=max_iterations, strict=start is not None)
         if start is None:
             light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
             fewer, part = supported(lines, fit.poles[light], fit.participation[:, light])
+            if not fewer.size:
+                raise no_pole(frf, _unsupported(low, high))
             if fewer.size < fit.poles.size:
                 fit = refined(lines, fewer, part, steps=max_iterations, strict=False)
         lines, fit = fewest_terms(lines, fit, tried[:-1], steps=max_iterations)
@@ -247,6 +251,14 @@ def _identified(
     found = answer(frf, ready, lines, fit, (low, high), labels, diagram)
     leakage_warned(frf, found.poles)
     return found
+
+
+def _unsupported(low: float, high: float) -> SolverError:
+    return SolverError(
+        f"no resonance between {low:.4g} and {high:.4g} Hz stands out of the noise: what the poles "
+        "of the diagram explain could be chance. Move or widen the band, measure longer, or pick "
+        "poles by hand with stabilisation_diagram(frf).select(freq=[...])."
+    )
 
 
 def _affordable(orders: list[int], ready: PreparedLines) -> list[int]:

@@ -48,7 +48,7 @@ def leakage_warned(frf: Frf, poles: ComplexArray) -> None:
 
 
 def no_pole(frf: Frf, error: SolverError) -> SolverError:
-    """Return the error of a diagram without stable poles, with leakage as a possible cause."""
+    """Return the error of a search that found no pole, with leakage as a possible cause."""
     if frf.window is None or frf.resolution is None:
         return error
     return SolverError(

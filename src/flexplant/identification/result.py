@@ -13,6 +13,7 @@ from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray
 from .diagram import StabilisationDiagram
 from .identified import IdentifiedModes
+from .leakage import no_pole
 from .line_weights import PreparedLines
 from .pole_test import freedom
 from .refine import Fit, Lines
@@ -43,7 +44,10 @@ def answer(
     inside = np.array([k for k in order if band[0] <= freq[k] <= band[1]], dtype=np.int64)
     outside = np.array([k for k in order if not band[0] <= freq[k] <= band[1]], dtype=np.int64)
     if not inside.size:
-        raise SolverError("the fit moved every pole out of the band: widen it.")
+        lost = SolverError(
+            f"the fit moved every pole out of the band {band[0]:.4g} to {band[1]:.4g} Hz. Widen it."
+        )
+        raise no_pole(frf, lost)
     both = np.concatenate([inside, inside + fit.poles.size])
     spread = None
     if not ready.swapped:
