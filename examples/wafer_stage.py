@@ -153,7 +153,7 @@ def claims(cases: dict[float, dict[str, Any]]) -> dict[str, bool]:
     off = max(abs(row[0] / row[1] - 1.0) for row in rows)
     alone, cured = (1e9 * light["errors"][1e-3][f"updated, {n} modes"] for n in ("24", "all"))
     drawing, _, held = light["table"].rows.values()
-    peak = -20.0 * np.log10(held.margin)  # dB
+    peak = -20.0 * np.log10(max(held.margin, 1e-9))  # dB
     _, best, ours = (1e9 * loop["exposure"][0] for loop in light["loops"].values())
     old, _, new = (1e9 * loop["exposure"][0] for loop in usual["loops"].values())
     return {
