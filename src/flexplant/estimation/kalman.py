@@ -191,7 +191,10 @@ def design_kalman(
         S = C2 P C2' + R + R_t,   L = P C2' S^-1,   L_z = (C1 P C2' + N_t) S^-1
 
     with P of the Riccati equation of (A, C2, Q, R + R_t). The predicted error is that of this
-    filter on the plant with the modes left out.
+    filter on the plant with the modes left out. It knows what `larger` knows: a mesh that is too
+    coarse for the modes left out moves it by some per cent (below 5 % for a POI's z and 13 % for
+    its rotations between 8 x 8 and 10 x 10 elements). Without any delay of u the static compliance
+    is left out: it would close an algebraic loop from y to u to y.
 
     Parameters
     ----------
