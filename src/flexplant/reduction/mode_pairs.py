@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..values import FloatArray, IntArray
+from ..values import ComplexArray, FloatArray, IntArray
 
 #: modes closer than this, relatively, are compared as one subspace: any change mixes their shapes
 CLUSTER = 1e-3
 #: MAC from which on two modes are the same one
 PARTNER = 0.5
+#: what is this much smaller than the largest shape, at a node of all places, is not known
+_SEEN = 1e-3
 #: MAC beyond which two modes of one model have the same shape as far as it is known
 ALIKE = 0.9
 #: eigenvalues of inner products below this part of the largest are none
@@ -153,6 +156,40 @@ def _cosines(gram: Any, cross: Any, other_gram: Any) -> FloatArray:
     found = la.svdvals(both)
     cosines[: found.size] = found**2
     return cosines
+
+
+def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
+    """Return the MAC (m, m) of modes with each other, repeated ones by the span of their shapes.
+
+    A solver returns repeated modes in any rotation, so that only their span means anything: beside
+    another span they are as like as the nearest two shapes of both (the cosine squared of the
+    smallest principal angle); among themselves 1 where their shapes, as far as they are known,
+    are nearly dependent, else 0. A mode with a node at all places is like no other.
+
+    Parameters
+    ----------
+    shapes : (p, m) array
+        Of unit modal mass, at the places where they are known.
+    freq : (m,) array [Hz]
+        Within 1e-3 of the next: as good as repeated.
+    """
+    order = np.argsort(freq, kind="stable")
+    apart = np.flatnonzero(np.diff(freq[order]) > CLUSTER * freq[order][1:]) + 1
+    spans = np.split(order, apart)
+    alike = np.eye(freq.size)
+    largest = np.linalg.norm(shapes, axis=0).max(initial=0.0)
+    bases = []
+    for span in spans:
+        basis, sizes, _ = np.linalg.svd(shapes[:, span], full_matrices=False)
+        bases.append(basis[:, sizes > _SEEN * largest])
+        # two unit shapes at the angle a have singular values whose squares are 1 +- cos a
+        together = sizes[-1] ** 2 * (1 + ALIKE**0.5) < sizes[0] ** 2 * (1 - ALIKE**0.5)
+        if span.size > 1 and (together or sizes.size < span.size):
+            alike[np.ix_(span, span)] = 1.0
+    for i, j in combinations(range(len(spans)), 2):
+        cosine = np.linalg.svd(bases[i].conj().T @ bases[j], compute_uv=False).max(initial=0.0)
+        alike[np.ix_(spans[i], spans[j])] = alike[np.ix_(spans[j], spans[i])] = cosine**2
+    return alike
 
 
 def groups_alike(alike: FloatArray, clusters: Sequence[IntArray] = ()) -> IntArray:

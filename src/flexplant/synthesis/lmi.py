@@ -27,6 +27,8 @@ from .method import SolvedController
 
 #: gap between value and lower bound at which no other coordinates are tried
 _GAP = 5e-4
+#: times the tolerance with which a bound that stays loose is computed once more
+_COARSER = 10.0
 #: programs from one choice of states
 _ROUNDS = 4
 #: gamma, relative to the plant's size, that is taken for zero
@@ -108,7 +110,7 @@ class Lmi(Value):
         failures = []
         for back_off in self.back_off * _LOOSER:
             try:
-                K = moderate_controller(found.plant, 1.0 + back_off, self._settings)
+                K = moderate_controller(found.plant, 1.0 + back_off, self._settings(self.tolerance))
                 norm = _verified(problem, K, found.value * (1.0 + back_off))
             except (FlexplantError, la.LinAlgError) as error:
                 failures.append(f"{100 * back_off:.3g} % above it: {error}")
@@ -120,33 +122,38 @@ class Lmi(Value):
             + " Loosen weights, add a little noise to each sensor, or raise Lmi(back_off=...)."
         )
 
-    @property
-    def _settings(self) -> dict[str, float]:
+    def _settings(self, tolerance: float) -> dict[str, float]:
         return {
-            "tol_gap_abs": self.tolerance,
-            "tol_gap_rel": self.tolerance,
-            "tol_feas": self.tolerance,
+            "tol_gap_abs": tolerance,
+            "tol_gap_rel": tolerance,
+            "tol_feas": tolerance,
             "time_limit": self.time_limit,
         }
 
     def _smallest(self, plant: Plant) -> Optimum:
-        """Return the smallest gamma, from two choices of states unless the first one's is sure."""
+        """Return the smallest gamma, from other states and a coarser tolerance while not sure."""
         found: list[Optimum] = []
         failures: list[FlexplantError] = []
         guess = plant.size()
-        for start in (lqg_states, same_states):
+        # a solver that stops early stops elsewhere with another tolerance: its bounds hold too
+        for start, tolerance in (
+            (lqg_states, self.tolerance),
+            (same_states, self.tolerance),
+            (lqg_states, _COARSER * self.tolerance),
+        ):
             try:
-                scale = found[-1].value if found else guess
+                afresh = not found or tolerance != self.tolerance
+                scale = guess if afresh else found[-1].value
                 # what was found before an error stays
-                found.extend(self._rounds(start(plant), scale))
+                found.extend(self._rounds(start(plant), scale, self._settings(tolerance)))
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
-            if found and _settled(found[-1]):
+            if found and _settled(_tightest(found)):
                 break
         if not found:
             # a proof of infeasibility says more than a solver that stopped
             raise next((e for e in failures if isinstance(e, InfeasibleError)), failures[-1])
-        best = min(found, key=lambda one: one.value - one.lower)
+        best = _tightest(found)
         if best.value < _NOTHING * guess:
             raise InfeasibleError(
                 f"there is no smallest gamma: {best.value:.3g} is reached, where the plant's own "
@@ -155,14 +162,19 @@ class Lmi(Value):
             )
         return best._replace(lower=min(max(one.lower for one in found), best.value))
 
-    def _rounds(self, states: Plant, scale: float) -> Iterator[Optimum]:
+    @staticmethod
+    def _rounds(states: Plant, scale: float, settings: dict[str, float]) -> Iterator[Optimum]:
         """Yield smallest gammas, each in the states and the scale that the one before gives."""
         for number in range(_ROUNDS):
-            one = smallest_gamma(states.scaled(scale), scale, self._settings)
+            one = smallest_gamma(states.scaled(scale), scale, settings)
             yield one
             if _settled(one) or (number and one.value > 0.99 * scale):
                 return
             states, scale = one.plant.scaled(1.0 / one.value), one.value
+
+
+def _tightest(found: list[Optimum]) -> Optimum:
+    return min(found, key=lambda one: one.value - one.lower)
 
 
 def _settled(one: Optimum) -> bool:

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import ModelError, ShapeError
 from ...identification import MeasuredModes
-from ...reduction.mode_pairs import groups_alike
+from ...reduction.mode_pairs import groups_alike, likeness
 from ...values import ComplexArray, FloatArray, Value, short
 from ..pairing import mac as _mac
 from ..point_model import Point
@@ -224,7 +224,8 @@ def _alike(seen: ComplexArray, point: Point, columns: list[int]) -> tuple[tuple[
     """Return the numbers of modes in the range of those compared that look alike at the sensors."""
     inside = np.arange(min(columns), max(columns) + 1)
     inside = inside[(point.labels[inside] > 0) & np.any(seen[:, inside] != 0, axis=0)]
-    group, numbers = groups_alike(_mac(seen[:, inside], seen[:, inside])), point.labels[inside]
+    group = groups_alike(likeness(seen[:, inside], np.abs(point.eigen.poles[inside])))
+    numbers = point.labels[inside]
     found = [np.sort(numbers[group == first]).tolist() for first in np.unique(group)]
     return tuple(tuple(members) for members in found if len(members) > 1)
 
