@@ -141,9 +141,11 @@ class Lmi(Value):
             (same_states, self.tolerance),
             (lqg_states, _COARSER * self.tolerance),
         ):
+            coarser = tolerance > self.tolerance
+            if coarser and not found:
+                break
             try:
-                afresh = not found or tolerance != self.tolerance
-                scale = guess if afresh else found[-1].value
+                scale = found[-1].value if found and not coarser else guess
                 # what was found before an error stays
                 found.extend(self._rounds(start(plant), scale, self._settings(tolerance)))
             except (SolverError, InfeasibleError) as error:
