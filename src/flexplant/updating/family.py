@@ -237,7 +237,7 @@ class Family:
     def group_derivative(self, eigen: Eigen, columns: Sequence[int]) -> ComplexArray:
         """Return G (q, s, s): exactly repeated modes move by the eigenvalues of sum dp_b G_b."""
         change = self.derivatives(eigen, columns)
-        return np.asarray(-la.solve(eigen.scale(columns), change), dtype=np.complex128)
+        return np.asarray(-np.linalg.solve(eigen.scale(columns), change), dtype=np.complex128)
 
     def strength(self, omega: float) -> FloatArray:
         """Return (q,) how strongly each parameter can move an eigenvalue near `omega` at most."""
