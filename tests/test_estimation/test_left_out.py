@@ -140,9 +140,13 @@ def test_modes_that_the_reduced_model_knows_are_the_default():
         assert found.rms("die") == pytest.approx(
             design_kalman(plant, larger=real).rms("die"), rel=1e-6, abs=0
         )
+        # a reduced model given as the larger one counts what it left out itself
+        given = design_kalman(sampled(real.select(range(9))), larger=reduce(real, method))
+        assert given.certificate.left_out == 31
         # the plant itself as the larger one: nothing is left out
         alone = design_kalman(plant, larger=plant)
         assert alone.certificate.left_out == 0
+        assert "as if no modes were left out" in repr(alone)
         assert alone.left_out is None
         assert alone.rms("die") < found.rms("die")
         assert design_static(plant).rms("die") == pytest.approx(

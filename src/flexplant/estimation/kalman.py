@@ -105,6 +105,8 @@ class KalmanEstimator(Value):
             "modes left out are not known: truncation is not in these numbers"
             if count is None
             else f"with {count} modes left out"
+            if count
+            else "as if no modes were left out"
         )
         return (
             f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
@@ -191,10 +193,13 @@ def design_kalman(
         S = C2 P C2' + R + R_t,   L = P C2' S^-1,   L_z = (C1 P C2' + N_t) S^-1
 
     with P of the Riccati equation of (A, C2, Q, R + R_t). The predicted error is that of this
-    filter on the plant with the modes left out. It knows what `larger` knows: a mesh that is too
-    coarse for the modes left out moves it by some per cent (below 5 % for a POI's z and 13 % for
-    its rotations between 8 x 8 and 10 x 10 elements). Without any delay of u the static compliance
-    is left out: it would close an algebraic loop from y to u to y.
+    filter on the plant with the modes left out. It knows what `larger` knows, mesh errors of
+    those modes included: on a plate of 0.6 m x 0.6 m a model of 8 x 8 elements predicts the error
+    of z on finer ones within 6 %, that of rotations within 23 %; on one of 0.5 m x 0.3 m it
+    predicts z 65 % too large, since other shapes mix in modes of almost one frequency above
+    10 kHz. 12 x 12 elements are within 5 % for z there, beside 24 x 24. Refine the mesh of
+    `larger` until the prediction stays. Without any delay of u the static compliance is left out:
+    it would close an algebraic loop from y to u to y.
 
     Parameters
     ----------

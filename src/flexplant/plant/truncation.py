@@ -28,7 +28,8 @@ def larger_plant(
     plant : StandardPlant
         Of a weighted plant, or one seen `through` a block, the plain plant underneath counts.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        The larger model: a structure gets the plant's ports, a plant must have its channels. None:
+        The larger model: a structure gets the plant's ports, a plant must have its channels. Of a
+        reduced model the modes that it left out count as well. None:
         the modes that the plant's reduced model still knows.
 
     Returns
@@ -59,6 +60,8 @@ def larger_plant(
             f"larger must be a structure or a plant with more modes, got {short(given)}. Pass "
             "Modes, an FEModel, a ReducedModel or a StandardPlant, or leave it out."
         )
+    if isinstance(given, ReducedModel):
+        given = given.completed()  # what it left out itself counts as well
     return rebuilt(plain, realisation=modes_of(given))
 
 

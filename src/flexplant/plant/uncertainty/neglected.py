@@ -11,6 +11,7 @@ from ...errors import CertificateError, ModelError
 from ...lti.frequency import default_freq, frequency_response
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, System
+from ...reduction import ReducedModel
 from ...values import ComplexArray, FloatArray, Value
 from ..building import continuous_plant
 from ..partition import Partition
@@ -150,6 +151,8 @@ def _assembled(larger: Any, plant: Partition) -> Partition:
     """Return a larger model as a continuous plant: a structure gets the ports of the plant."""
     if hasattr(larger, "A"):
         return Partition.of(larger)
+    if isinstance(larger, ReducedModel):
+        larger = larger.completed()
     return continuous_plant(Partition, modes_of(larger), plant.assembled.ports)
 
 
