@@ -19,6 +19,7 @@ import numpy as np
 import scipy.io as sio
 
 import flexplant as fx
+from flexplant.updating import Localisation
 
 OUT = Path(__file__).parent / "out"
 L = 0.6
@@ -64,7 +65,7 @@ def measured(machine: Any) -> fx.Frf:
     )
 
 
-def poles(frf: fx.Frf) -> tuple[fx.IdentifiedModes, fx.MeasuredModes]:
+def poles(frf: fx.Frf) -> tuple[fx.identification.IdentifiedModes, fx.MeasuredModes]:
     """Return the identified modes of the sensors that are used, and those the drawing knows."""
     found = fx.identify_modes(frf.select(outputs=FITTED), band=BAND, hold=RATE)
     at = {name: SENSORS[name] for name in FITTED}
@@ -78,7 +79,7 @@ def response(frf: fx.Frf, lines: Any, outputs: list[str]) -> fx.FrfResidual:
     return fx.FrfResidual(frf.select(outputs=outputs), lines=lines, places=where, hold=RATE)
 
 
-def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[fx.Localisation, fx.Localisation]:
+def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[Localisation, Localisation]:
     """Return where the mass may be: by the poles, then by FRFs at the places left."""
     everywhere = {"nuisance": [stiffness, damping], "most": 1}
     by_poles = fx.localise(drawing, [eigenvalues], [*masses.values()], screen=8, **everywhere)

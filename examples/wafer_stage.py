@@ -138,7 +138,7 @@ def control(case: dict[str, Any]) -> dict[str, dict[str, Any]]:
 
 
 # %% Placement: where a fifth sensor would help the die most, the die itself left out
-def placement(case: dict[str, Any]) -> fx.SensorMap:
+def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
     """Return the predicted error of the die over places of a sensor beside those at the corners."""
     points = [(x, y, 0.0) for y in np.linspace(0, L, 13) for x in np.linspace(0, L, 13)]
     plant, goal = plant_of(case, "updated"), fx.PoiVariance("die")

@@ -15,7 +15,42 @@ def is_public(name, item):
     return ours and not name.startswith("_") and not isinstance(item, ModuleType)
 
 
-PUBLIC = {name: item for name, item in vars(flexplant).items() if is_public(name, item)}
+#: the whole front: what the examples and the README use and what users construct day by day;
+#: anything else stays in its room (`flexplant.lti.tustin`)
+FRONT = """
+FlexplantError FlexplantWarning load
+read_model read_matrices check DofSet FEModel FEMatrices kirchhoff_plate beam chain solid_block
+Rib Disc Rectangle interpolated PointMass Spring Damper ModalDamping Rayleigh Hysteretic
+solve_modes Modes reduce ReducedModel DesiredDofs ModalTruncation ModalBalanced Guyan Irs Serep
+CraigBampton Rubin MacNeal Krylov select_dofs rank_modes
+estimate_frf average_frfs identify_modes numbered MeasuredModes
+update UpdateResult AddedMass AddedDamping AddedStiffness MatrixParameter Eigenvalues ModeShapes
+FrfResidual localise identifiability validate sample_posterior
+Ports Actuator Disturbance BaseAcceleration OutputDisturbance Sensor Poi Reference
+assemble_plant StandardPlant decouple stage_weights reference_errors
+StateSpace Frf frequency_response h2_norm hinf_norm peak_gain lft balanced minimal modal_form
+lowpass discretized
+design_kalman design_static KalmanEstimator
+design_servo servo_bandwidth design_hinf Riccati Lmi Controller
+score_sensors score_actuators place_sensors place_actuators PoiVariance Placement sensor_map
+close_loop ClosedLoop compare_loops modulus_margin
+setpoint simulate Response compare_estimators reading_along
+"""
+ROOMS = {
+    *("lti", "sparse", "structure", "modes", "reduction", "identification", "updating", "plant"),
+    *("loop", "estimation", "synthesis", "placement", "simulation", "testbeds", "io", "errors"),
+    "plot",
+}
+
+
+def of(module):
+    return {name: item for name, item in vars(module).items() if is_public(name, item)}
+
+
+#: the front and what only the rooms show
+PUBLIC = of(flexplant)
+for room in sorted(ROOMS - {"errors", "plot"}):
+    PUBLIC |= of(getattr(flexplant, room))
 CLASSES = {name: item for name, item in PUBLIC.items() if inspect.isclass(item)}
 FUNCTIONS = {name: item for name, item in PUBLIC.items() if inspect.isfunction(item)}
 ERRORS = {n for n, c in CLASSES.items() if issubclass(c, BaseException)}
@@ -46,9 +81,22 @@ def listed(text):
     return {name.strip(" *") for head in heads for name in head.split(",")}
 
 
-def test_there_is_something_public():
-    assert {"StateSpace", "lft", "load"} <= set(PUBLIC)
-    assert len(PUBLIC) < 260
+def test_the_front_is_small():
+    """A name that joins the front is used by an example, the README or every second user."""
+    assert set(of(flexplant)) == set(FRONT.split())
+    assert len(FRONT.split()) <= 135
+    assert set(dir(flexplant)) == ROOMS.union(FRONT.split())
+    with pytest.raises(AttributeError, match=r"Use flexplant\.lti\.tustin\.$"):
+        _ = flexplant.tustin
+    with pytest.raises(AttributeError, match=r"no attribute 'Tustin'\.$"):
+        _ = flexplant.Tustin
+
+
+def test_dir_of_a_value_shows_what_it_is_for():
+    frf = flexplant.Frf([1.0], [[[1.0]]])
+    shown = dir(frf)
+    assert {"freq", "data", "select", "save", "keys", "window"} <= set(shown)
+    assert not [name for name in shown if name.startswith("_") or name == "registry"]
 
 
 def described(name, item):

@@ -8,6 +8,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import FlexplantError
 from flexplant.loop import close_loop
+from flexplant.placement import Exchange, Exhaustive
 from flexplant.testbeds import wafer_stage
 from stages import RATE, ports, sampled, some_modes
 
@@ -74,8 +75,8 @@ CALLS = [
     ("design_kalman larger", lambda x: fx.design_kalman(plant(), larger=x), ("none",)),
     ("design_static larger", lambda x: fx.design_static(plant(), larger=x), ("none",)),
     ("kalman rms on", lambda x: kalman().rms("die", on=x), ("none",)),
-    ("larger_plant", lambda x: fx.larger_plant(x), ()),
-    ("larger_plant larger", lambda x: fx.larger_plant(plant(), x), ("none",)),
+    ("larger_plant", lambda x: fx.plant.larger_plant(x), ()),
+    ("larger_plant larger", lambda x: fx.plant.larger_plant(plant(), x), ("none",)),
     ("design_static", lambda x: fx.design_static(x), ()),
     ("design_servo", lambda x: fx.design_servo(x, bandwidth=50.0), ()),
     ("design_servo bandwidth", lambda x: servo(bandwidth=x), ("fraction",)),
@@ -99,9 +100,9 @@ CALLS = [
     ("close_loop block", lambda x: fx.close_loop(plant(), x), ()),
     ("close_loop idle", lambda x: fx.close_loop(plant(), *loop().blocks, idle=x), ()),
     ("loop response", lambda x: loop().frequency_response(x), ()),
-    ("sensitivity", lambda x: fx.sensitivity(x), ()),
-    ("sensitivity freq", lambda x: fx.sensitivity(loop(), freq=x), ("none",)),
-    ("sensitivity at", lambda x: fx.sensitivity(loop(), at=x), ()),
+    ("sensitivity", lambda x: fx.loop.sensitivity(x), ()),
+    ("sensitivity freq", lambda x: fx.loop.sensitivity(loop(), freq=x), ("none",)),
+    ("sensitivity at", lambda x: fx.loop.sensitivity(loop(), at=x), ()),
     ("modulus_margin", lambda x: fx.modulus_margin(x), ()),
     ("simulate", lambda x: fx.simulate(x, duration=0.01), ()),
     ("simulate duration", lambda x: simulated(duration=x), ("fraction",)),
@@ -126,10 +127,10 @@ CALLS = [
     ("place_sensors count", lambda x: placed(count=x), ()),
     ("place_sensors required", lambda x: placed(required=x), ()),
     ("place_sensors method", lambda x: placed(method=x), ("none",)),
-    ("place_sensors rng", lambda x: placed(rng=x, method=fx.Exchange(starts=2)), ("none",)),
+    ("place_sensors rng", lambda x: placed(rng=x, method=Exchange(starts=2)), ("none",)),
     ("place_sensors criterion", lambda x: placed(criterion=x), ("none",)),
-    ("Exchange", lambda x: fx.Exchange(starts=x), ()),
-    ("Exhaustive", lambda x: fx.Exhaustive(limit=x), ()),
+    ("Exchange", lambda x: Exchange(starts=x), ()),
+    ("Exhaustive", lambda x: Exhaustive(limit=x), ()),
     ("score_sensors", lambda x: fx.score_sensors(plant(), x), ()),
     ("score_sensors layout", lambda x: fx.score_sensors(plant(), [x]), ()),
     ("sensor_map points", lambda x: fx.sensor_map(plant(), x, asd=1e-12), ()),

@@ -45,6 +45,11 @@ class Value:
         }
         return rebuild, (type(self), state)
 
+    def __dir__(self) -> list[str]:
+        """Return what is for use: fields, properties and methods, no private or inherited ones."""
+        public = {n for cls in type(self).__mro__ for n in vars(cls)} - {"registry"}
+        return sorted(n for n in public | set(self._fields()) if not n.startswith("_"))
+
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one."""
         return replace(self, **changes)  # type: ignore[type-var]

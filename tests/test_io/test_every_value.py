@@ -86,7 +86,7 @@ def made():
     solution = fx.lti.solve_care(np.array([[-1.0]]), np.eye(1), Q=np.eye(1), R=np.eye(1))
     yield from (fe, modes, rom, fx.DesiredDofs(rom.dofs.labels), select_dofs(modes, 25))
     yield from (normal_form(rom.M, rom.D, rom.K, rom.rigid_body), fx.ModalDamping(0.01))
-    yield fx.Pardiso()
+    yield fx.sparse.Pardiso()
     yield from (fx.Rayleigh(1.0, 1e-6), fx.AddedStiffness(at), *unknowns, residual, poles, fit)
     yield eigenvalue_sensitivities(rom, unknowns, modes=[6])
     yield from of_updates(rom, unknowns, residual, fit)
@@ -117,7 +117,11 @@ def of_reductions(fe, modes, rom):
     yield from (truncation, fx.reduce(modes, truncation), fx.ModalBalanced(8, at))
     yield from (fx.Guyan(at), fx.Irs(at, iterations=2), fx.Serep(at), fx.Krylov(at, [0.0, 500.0]))
     yield from (fx.CraigBampton(at, 3), fx.Rubin(at, 5), fx.MacNeal(at, 5))
-    yield from (fx.PivotedQr(), fx.EffectiveIndependence(), fx.Greedy())
+    yield from (
+        fx.reduction.PivotedQr(),
+        fx.reduction.EffectiveIndependence(),
+        fx.reduction.Greedy(),
+    )
     yield fx.rank_modes(modes, inputs=at)
     yield fx.reduce(modes, truncation).quality(fe, band=(100.0, 400.0), freq=np.array([250.0]))
 
@@ -147,24 +151,37 @@ def of_updates(rom, unknowns, residual, fit):
     seen = np.asarray(shapes.phi)[np.ix_(rows, np.array(poles.modes) - 1)]
     force = fx.assemble_plant(rom, ports()).Gyu.select([f"y{i}" for i in range(1, 5)])
     frf = fx.frequency_response(force, np.linspace(200, 800, 200))
-    yield from (fx.MatrixParameter("spring", dK=np.eye(25)), fx.ModeDamping(6))
+    yield from (fx.MatrixParameter("spring", dK=np.eye(25)), fx.updating.ModeDamping(6))
     yield from (fx.FrfResidual(frf, variance=np.ones(frf.data.shape), lines=[0, 1]),)
     yield from (fx.ModeShapes(poles, seen, rom.dofs.labels[:5]),)
-    yield from (fx.ShapeCorrelation(poles, seen, rom.dofs.labels[:5]),)
-    yield from (fx.Antiresonances([-5 + 1300j], at, at), fx.StaticCompliance(1e-6, at, at))
-    yield from (fx.GaussNewton(), fx.TrustRegion(), fx.Tikhonov(), fx.Lasso())
+    yield from (fx.updating.ShapeCorrelation(poles, seen, rom.dofs.labels[:5]),)
+    yield from (
+        fx.updating.Antiresonances([-5 + 1300j], at, at),
+        fx.updating.StaticCompliance(1e-6, at, at),
+    )
+    yield from (
+        fx.updating.GaussNewton(),
+        fx.updating.TrustRegion(),
+        fx.updating.Tikhonov(),
+        fx.updating.Lasso(),
+    )
     yield fx.identifiability(rom, unknowns, [residual])
     yield fx.localise(rom, [residual], [fx.AddedMass(label) for label in rom.dofs.labels[:4]])
-    yield fx.correlate(fit.model, [residual])
+    yield fx.updating.correlate(fit.model, [residual])
     bounded = [fx.AddedMass(at, bounds=(0.0, 1.0)), fx.AddedDamping(at, bounds=(-1.0, 1.0))]
-    yield fx.update(rom, bounded, [residual], method=fx.TrustRegion(), starts=2)
+    yield fx.update(rom, bounded, [residual], method=fx.updating.TrustRegion(), starts=2)
     yield fx.sample_posterior(rom, unknowns, [residual], fit, steps=20)
     yield fx.validate(rom, unknowns[:1], [residual.select([6])], [residual.select([7])])
-    yield from (fx.H1Estimator(), fx.H2Estimator(), fx.HvEstimator(), fx.Periodic(period=1.0))
+    yield from (
+        fx.identification.H1Estimator(),
+        fx.identification.H2Estimator(),
+        fx.identification.HvEstimator(),
+        fx.identification.Periodic(period=1.0),
+    )
     # modes far away leave more than nothing where there is no noise at all
     noise = np.random.default_rng(5).normal(size=(2, *frf.data.shape)) * np.abs(frf.data).max()
     frf = frf.replace(data=frf.data + 1e-4 * (noise[0] + 1j * noise[1]))
-    diagram = fx.stabilisation_diagram(frf, band=(400.0, 700.0), orders=range(2, 14))
+    diagram = fx.identification.stabilisation_diagram(frf, band=(400.0, 700.0), orders=range(2, 14))
     yield from (diagram, fx.identify_modes(frf, band=(400.0, 700.0), orders=range(2, 14)))
     yield diagram.select([463.1])
 

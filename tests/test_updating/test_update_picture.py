@@ -54,7 +54,7 @@ def test_everything_is_in_it(case):
         "convergence",
         "response",
     }
-    before, after = (fx.correlate(m, residuals) for m in (model, fit.model))
+    before, after = (fx.updating.correlate(m, residuals) for m in (model, fit.model))
     bars = [bar.get_height() for bar in axs["frequencies"].patches]
     np.testing.assert_allclose(bars, 100 * np.r_[before.freq_error, after.freq_error], atol=1e-12)
     np.testing.assert_allclose(axs["mac before"].images[0].get_array(), before.mac)

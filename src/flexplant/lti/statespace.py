@@ -314,7 +314,12 @@ class StateSpace(Value):
 
 
 def as_statespace(sys: System | FloatArray) -> StateSpace:
-    """Return `sys` as our StateSpace; arrays are static gains, a value with a `.system` is that.
+    """Return `sys` as our StateSpace.
+
+    Parameters
+    ----------
+    sys : StateSpace, control.StateSpace, a value with a `.system`, or (p, m) array
+        An array is a static gain.
 
     Raises
     ------

@@ -1,6 +1,6 @@
 """Filters for weights and controllers, one input and one output, as state space.
 
-All are continuous; `flexplant.tustin(weight, rate)` samples them for a sampled plant.
+All are continuous; `flexplant.lti.tustin(weight, rate)` samples them for a sampled plant.
 """
 
 from __future__ import annotations

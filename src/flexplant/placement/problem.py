@@ -14,7 +14,17 @@ from .layouts import WEAK, Layouts
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """The best choice of `count` candidates, `required` (indices) among them."""
+    """The best choice of candidates, as an optimisation problem.
+
+    Parameters
+    ----------
+    layouts : Layouts
+        The candidates and the score of each set of them.
+    count : int
+        How many to choose.
+    required : tuple of int
+        Indices of candidates that every choice holds.
+    """
 
     layouts: Layouts
     count: int
@@ -57,7 +67,19 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What a search found: a choice, its value, a bound, and the way there."""
+    """The result of a search.
+
+    Parameters
+    ----------
+    chosen : tuple of int
+        Indices of the candidates chosen.
+    value, bound : float
+        Their score, and a number below the score of every choice.
+    evaluations : int
+        How many sets were scored.
+    history : tuple of tuple of float
+        The best score after each step, for each start.
+    """
 
     chosen: tuple[int, ...]
     value: float

@@ -260,14 +260,19 @@ class StandardPlant(Partition):
 
 
 def standard_plant(given: StandardPlant | System) -> StandardPlant:
-    """Return a StandardPlant; of a system with labels when these tell w, u, z and y.
+    """Return a StandardPlant, also of a system whose labels tell w, u, z and y apart.
 
     Called by all functions that take a plant.
+
+    Parameters
+    ----------
+    given : StandardPlant, StateSpace or control.StateSpace
+        The plant.
 
     Raises
     ------
     LabelError
-        When the labels do not tell.
+        When the labels do not tell them apart.
     ModelError
         When it is neither.
     """
