@@ -32,7 +32,10 @@ def twin_class() -> Any:
         def get_prediction(
             self, u: Any = None, B: Any = None, F: Any = None, Q: Any = None
         ) -> tuple[FloatArray, FloatArray]:
-            x, P = super().get_prediction(_command(u, self.dim_u), B, F, Q)
+            # 1.4 takes u alone, so that what is not given is not passed on
+            given = {"B": B, "F": F, "Q": Q}
+            others = {name: value for name, value in given.items() if value is not None}
+            x, P = super().get_prediction(_command(u, self.dim_u), **others)
             return x, P
 
         def __reduce__(self) -> tuple[Any, ...]:

@@ -245,7 +245,8 @@ def _newton(
         K = kind.gain(p, P)
         change = kind.correction(p.A - K @ p.C, kind.residual(p, P, K))
         size = float(np.linalg.norm(change) / np.linalg.norm(P)) if np.any(P) else 0.0
-        if size < last:
+        # far from the solution the second step may be the larger one: the first one is arbitrary
+        if size < last or last > CORRECTION:
             P = 0.5 * (P + change + (P + change).T)
         if size < 1e-11 or (size >= 0.5 * last and last < CORRECTION):
             break
