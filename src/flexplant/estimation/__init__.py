@@ -1,8 +1,9 @@
 """Estimation: the motion at a point of interest from sensors elsewhere."""
 
-from .kalman import KalmanCertificate as KalmanCertificate
-from .kalman import KalmanEstimator as KalmanEstimator
-from .kalman import check_gain as check_gain
+from .certificate import KalmanCertificate as KalmanCertificate
+from .certificate import check_gain as check_gain
+from .estimator import KalmanEstimator as KalmanEstimator
+from .filter_model import FilterModel as FilterModel
 from .kalman import design_kalman as design_kalman
 from .left_out import LeftOut as LeftOut
 from .static import StaticEstimator as StaticEstimator

@@ -7,8 +7,36 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ShapeError
+from ..errors import ModelError, ShapeError
 from ..values import FloatArray, real_array
+from .filter_model import FilterModel
+
+
+def twin(model: FilterModel, covariance: FloatArray) -> Any:
+    """Return filterpy's filter of a model; P is the covariance of x[k|k-1], x is at rest.
+
+    Raises
+    ------
+    ModelError
+        When u reaches y at once, or the noises of process and sensors are correlated.
+    """
+    if np.any(model.D2):
+        raise ModelError(
+            "filterpy's filter has no feedthrough from u to y, this plant has one. Sample it "
+            "with a delay: plant.continuous.discretized(rate, delay=1)."
+        )
+    if np.any(model.S):
+        raise ModelError(
+            "filterpy's filter takes the noises of process and sensors as independent, those of "
+            "this plant are correlated. Use observer.estimate, which knows the correlation."
+        )
+    n, m = model.B.shape
+    found = twin_class()(dim_x=n, dim_z=model.C2.shape[0], dim_u=m)
+    found.F, found.B, found.H = model.A.copy(), model.B.copy(), model.C2.copy()
+    found.Q, found.R = model.Q.copy(), model.R.copy()
+    found.P = covariance.copy()
+    found.x = np.zeros((n, 1))
+    return found
 
 
 @cache

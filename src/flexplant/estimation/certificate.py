@@ -1,0 +1,110 @@
+"""The check of a Kalman gain: the covariance that follows from it, beside the claimed one."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import CertificateError, SolverError
+from ..lti.lyapunov import solve_stein
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, real_array
+from .channels import sensors
+from .filter_model import FilterModel, filter_model
+
+#: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this
+AGREEMENT = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class KalmanCertificate(Value):
+    """What was checked about a Kalman filter after it was computed.
+
+    Parameters
+    ----------
+    spectral_radius : float
+        Of the estimation error, below 1.
+    residual : float
+        Of the Riccati equation, relative, in states of unit variance.
+    difference : float
+        Largest relative difference between two ways to the POI variances, at most 1e-6: on the
+        filter's own model the Riccati equation and a Stein equation of the gain; on the plant with
+        the modes left out the joint Stein equation and its dual.
+    left_out : int, optional
+        How many modes left out are in the predicted error; None: none are known, truncation is not
+        in the number.
+    """
+
+    spectral_radius: float
+    residual: float
+    difference: float
+    left_out: int | None = None
+
+
+def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -> float:
+    """Return how far the POI variances of a gain are from those that a covariance claims.
+
+    The error's covariance follows from the gain alone:
+    ``P = F P F' + A L R L' A' + Q``, F = A (I - L C2), a Stein equation.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled.
+    gain : (n, ny) array
+        L.
+    covariance : (n, n) array
+        Claimed, after the measurement.
+
+    Returns
+    -------
+    float
+        Largest relative difference over the POI channels.
+
+    Raises
+    ------
+    ShapeError
+        When sizes do not match.
+    CertificateError
+        When the error is not stable or the difference exceeds 1e-6.
+    """
+    n, p = plant.system.n_states, len(sensors(plant))
+    gain = real_array(gain, "gain", (n, p))
+    covariance = real_array(covariance, "covariance", (n, n))
+    model = filter_model(plant)
+    return error_of(model, gain, model.A @ gain, covariance)[1]
+
+
+def error_of(
+    model: FilterModel, gain: FloatArray, predictor: FloatArray, covariance: FloatArray
+) -> tuple[float, float]:
+    """Return spectral radius and difference of a gain L and its predictor gain K, if both are good.
+
+    Raises
+    ------
+    CertificateError
+        As `check_gain`.
+    """
+    closed = model.A - predictor @ model.C2
+    radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
+    if radius >= 1:
+        raise CertificateError(
+            f"the estimation error is not stable: spectral radius {radius:.9f}. The gain is not "
+            "that of a Kalman filter of this plant."
+        )
+    try:
+        P = solve_stein(closed, model.driven(predictor))
+    except SolverError as error:
+        raise CertificateError(f"the estimation error could not be checked: {error}") from error
+    found = model.updated(P, gain)
+    truth = np.einsum("ij,jk,ik->i", model.C1, found, model.C1)
+    claim = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
+    size = np.where(truth > 0, truth, 1.0)
+    difference = float(np.max(np.abs(claim - truth) / size))
+    if not difference <= AGREEMENT:
+        raise CertificateError(
+            f"the gain gives POI variances that differ from the predicted ones by {difference:.1e} "
+            f"(allowed {AGREEMENT:.0e}). The prediction cannot be trusted."
+        )
+    return radius, difference

@@ -1,0 +1,146 @@
+"""The Kalman estimator: its gain, what it predicts of its own error, and what is done with it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..lti.statespace import StateSpace, System
+from ..plant import StandardPlant
+from ..values import FloatArray, Value
+from .certificate import KalmanCertificate
+from .channels import poi_channels, row_of, same_pois, sensors
+from .error import error_variances
+from .filter_model import FilterModel, filter_model
+from .left_out import LeftOut
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class KalmanEstimator(Value):
+    """A stationary Kalman filter of the motions at the POIs.
+
+    ::
+
+        x[k|k] = x[k|k-1] + L (y[k] - C2 x[k|k-1] - D22 u[k])
+        hat[k] = C1 x[k|k-1] + D12 u[k] + L_z (y[k] - C2 x[k|k-1] - D22 u[k])
+        x[k+1|k] = A x[k|k] + B2 u[k]
+
+    L_z is C1 L where no modes left out are known.
+
+    Parameters
+    ----------
+    system : StateSpace
+        From the sensors and the applied u to the estimates `die:hat`, `die:rx:hat`, ...; states
+        x[k|k-1].
+    plant : StandardPlant
+        What it was designed on.
+    gain : (n, ny) array
+        L, per sensor.
+    covariance : (n, n) array
+        Of the error of x[k|k], after the measurement, on the filter's own model.
+    certificate : KalmanCertificate
+        What was checked.
+    variances : (nz,) array [m^2 or rad^2]
+        Predicted, of the errors at the POIs: on the plant with the modes left out where these are
+        known.
+    left_out : LeftOut, optional
+        The modes left out, as noise and static compliance.
+    """
+
+    system: StateSpace
+    plant: StandardPlant
+    gain: FloatArray
+    covariance: FloatArray
+    certificate: KalmanCertificate
+    variances: FloatArray
+    left_out: LeftOut | None = None
+
+    def __post_init__(self) -> None:
+        self._set(gain=self.gain, covariance=self.covariance, variances=self.variances)
+
+    def __repr__(self) -> str:
+        channels = poi_channels(self.plant)
+        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in channels[:4])
+        count = self.certificate.left_out
+        counted = (
+            "modes left out are not known: truncation is not in these numbers"
+            if count is None
+            else f"with {count} modes left out"
+            if count
+            else "as if no modes were left out"
+        )
+        return (
+            f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
+            f"spectral radius {self.certificate.spectral_radius:.6f};\n"
+            f"  rms error {rms} ({counted})>"
+        )
+
+    @cached_property
+    def model(self) -> FilterModel:
+        """What the filter takes as the truth: matrices, and covariances of all noises."""
+        return filter_model(self.plant, self.left_out)
+
+    @property
+    def predictor_gain(self) -> FloatArray:
+        """K (n, ny), of ``x[k+1|k] = A x[k|k-1] + B2 u[k] + K e[k]`` with the innovation e."""
+        return self.system.B[:, : len(self.sensors)]
+
+    @cached_property
+    def predicted_covariance(self) -> FloatArray:
+        """Of the error of x[k|k-1] (n, n), before the measurement, on the filter's own model."""
+        model, moved = self.model, self.model.A @ self.gain
+        P = model.A @ self.covariance @ model.A.T + model.Q
+        if np.any(model.S):
+            K = self.predictor_gain
+            still = np.eye(len(self.sensors)) - model.C2 @ self.gain
+            innovation = np.linalg.solve(still, model.R)
+            P = P - K @ innovation @ K.T + moved @ innovation @ moved.T
+        return np.asarray(0.5 * (P + P.T))
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors, in the order of the columns of `gain`."""
+        return sensors(self.plant)
+
+    def rms(self, channel: str, *, on: StandardPlant | System | None = None) -> float:
+        """Return the rms of the estimation error at the sample instants.
+
+        Parameters
+        ----------
+        channel : str
+            A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
+        on : StandardPlant, optional
+            A plant that the filter runs on, sampled, with other modes or noises; the error there is
+            exact (`error_variances`), u at rest. None: the predicted error.
+
+        Returns
+        -------
+        float [m or rad]
+
+        Raises
+        ------
+        LabelError
+            When it is no motion of a POI, or the other plant lacks a channel.
+        ModelError
+            When the other plant is not sampled alike, or its noise is not known.
+        AssumptionError
+            When the error would contain a rigid-body motion of the other plant.
+        """
+        row = row_of(poi_channels(self.plant), channel)
+        variances = self.variances
+        if on is not None:
+            variances = error_variances(same_pois(self.plant, on), self.system).values
+        return float(np.sqrt(max(variances[row], 0.0)))
+
+    def to_filterpy(self) -> Any:
+        """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
+
+        Call `update(y)` and then `predict(u)`; y without references, u all actuators, as 1-D
+        arrays or as columns.
+        """
+        from .filterpy_twin import twin
+
+        return twin(self.model, self.predicted_covariance)

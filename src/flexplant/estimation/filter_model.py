@@ -1,0 +1,135 @@
+"""The model that a filter runs on: sampled, with the noises of process, sensors and POIs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import AssumptionError, ShapeError
+from ..plant import StandardPlant
+from ..values import FloatArray, Value
+from .channels import poi_channels, sensors
+from .left_out import LeftOut
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FilterModel(Value):
+    """What a filter takes as the truth.
+
+    ::
+
+        x[k+1] = A x[k] + B u[k] + w[k]         [w]   [Q  0  S]
+        z[k]   = C1 x[k] + D1 u[k] + n[k]   cov [n] = [0  V  N]
+        y[k]   = C2 x[k] + D2 u[k] + v[k]       [v]   [S' N' R]
+
+    Parameters
+    ----------
+    A, B, C1, D1, C2, D2 : arrays
+        From the commands u to the motions z at the POIs and to the sensors y.
+    Q : (n, n) array
+        Covariance that the disturbances add to x in one sample.
+    R : (ny, ny) array
+        Of the sensors: their own noise and that of modes left out.
+    V : (nz, nz) array
+        Of the motions of modes left out at the POIs.
+    N : (nz, ny) array
+        Between these and the noise of the sensors.
+    S : (n, ny) array
+        Between the noises of process and sensors.
+    dt : float [s]
+        Sampling time.
+    channels, sensors, commands : tuples of str
+        Names of z, y and u.
+    """
+
+    A: FloatArray
+    B: FloatArray
+    C1: FloatArray
+    D1: FloatArray
+    C2: FloatArray
+    D2: FloatArray
+    Q: FloatArray
+    R: FloatArray
+    V: FloatArray
+    N: FloatArray
+    S: FloatArray
+    dt: float
+    channels: tuple[str, ...]
+    sensors: tuple[str, ...]
+    commands: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        self._set(**{name: getattr(self, name) for name in _ARRAYS})
+
+    def __repr__(self) -> str:
+        n, ny = self.C2.T.shape
+        return f"<FilterModel: {n} states, {ny} sensors, {self.C1.shape[0]} POI channels>"
+
+    def innovation(self, P: FloatArray) -> FloatArray:
+        """Return the covariance ``C2 P C2' + R`` of the innovations, P that of x[k|k-1]."""
+        return np.asarray(self.C2 @ P @ self.C2.T + self.R)
+
+    def updated(self, P: FloatArray, gain: FloatArray) -> FloatArray:
+        """Return the covariance of x[k|k] in Joseph's form, which is right for any gain L."""
+        left = np.eye(P.shape[0]) - gain @ self.C2
+        updated = left @ P @ left.T + gain @ self.R @ gain.T
+        return np.asarray(0.5 * (updated + updated.T))
+
+    def driven(self, gain: FloatArray) -> FloatArray:
+        """Return ``Q + K R K' - K S' - S K'``, what one sample adds with a predictor gain K."""
+        mixed = gain @ self.S.T
+        added = self.Q + gain @ self.R @ gain.T - mixed - mixed.T
+        return np.asarray(0.5 * (added + added.T))
+
+
+_ARRAYS = ("A", "B", "C1", "D1", "C2", "D2", "Q", "R", "V", "N", "S")
+
+
+def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterModel:
+    """Return the model of a sampled plant, with the modes left out as noise where known.
+
+    Raises
+    ------
+    ShapeError
+        When the process noise has another size than the states.
+    """
+    own = plant if found is None else found.plant
+    g = own.system
+    n = g.n_states
+    if own.process_noise.shape != (n, n):
+        raise ShapeError(f"process_noise must be ({n}, {n}), got {own.process_noise.shape}.")
+    y, z = sensors(own), poi_channels(own)
+    toward, at = g.select(y, own.u), g.select(z, own.u)
+    rows = [own.y.index(name) for name in y]
+    R = own.sensor_noise[np.ix_(rows, rows)]
+    ny, nz = len(y), len(z)
+    V, N = np.zeros((nz, nz)), np.zeros((nz, ny))
+    if found is not None:
+        R, V, N = R + found.sensors, found.pois, found.cross
+    return FilterModel(
+        g.A, toward.B, at.C, at.D, toward.C, toward.D, own.process_noise, R, V, N,
+        np.zeros((n, ny)), own.dt, z, y, tuple(own.u),
+    )  # fmt: skip
+
+
+def check_noises(plant: StandardPlant) -> None:
+    """Raise AssumptionError for a sensor without noise, or one that white noise reaches at once."""
+    model = filter_model(plant)
+    silent = [name for name, v in zip(model.sensors, model.R.diagonal(), strict=True) if v <= 0]
+    if silent:
+        raise AssumptionError(
+            f"sensors {', '.join(silent)} have no noise (asd 0): the filter would trust them "
+            "without limit and differentiate them. Give Sensor(..., asd=) what the data sheet "
+            "says, in m/sqrt(Hz)."
+        )
+    inner = plant.system
+    loud = [name for name in plant.w if plant.asd.get(name, 0.0) > 0 and ":noise" not in name]
+    direct = inner.D[np.ix_(inner.output_index(model.sensors), inner.input_index(loud))]
+    if np.any(direct):
+        row, column = (int(i) for i in np.argwhere(direct)[0])
+        raise AssumptionError(
+            f"white noise of {loud[column]!r} reaches {model.sensors[row]!r} at once (an "
+            "acceleration sensor, say), so a sample of it would have infinite variance. Measure "
+            "displacement or velocity, or shape the disturbance."
+        )
