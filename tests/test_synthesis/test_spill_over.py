@@ -248,3 +248,8 @@ def test_modes_are_told_from_the_controllers_states():
                             C=system.C * scale, blocks=None)  # fmt: skip
     assert growing_modes(turned, names)[0] == first[0]
     assert growing_modes(system, ["x"] * len(names)) == ((), ())
+
+
+def test_four_modes_are_named_and_the_others_counted():
+    found = SpillOver(1.01, True, 0.0, 120, tuple(range(31, 48)), (2000.0,) * 17)
+    assert "mode 34 (2000 Hz) and 13 more" in repr(found) and "mode 35" not in repr(found)

@@ -15,6 +15,8 @@ from ..values import FloatArray, IntArray, Value
 
 #: a mode with less than this part of the one that takes part most is not named
 _TAKES_PART = 0.3
+#: so many modes are named in a message
+_NAMED = 4
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -83,7 +85,8 @@ class SpillOver(Value):
     def culprits(self) -> str:
         """The modes that take part in what grows, in words."""
         listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(self.modes, self.freq, strict=True)]
-        return ", ".join(listed)
+        more = len(listed) - _NAMED
+        return ", ".join(listed[:_NAMED]) + (f" and {more} more" if more > 0 else "")
 
     def __repr__(self) -> str:
         return f"<SpillOver: {self.summary}>"

@@ -10,13 +10,17 @@ from ..errors import ModelError
 from ..lti.discretisation import diagonal_pairs, discretized
 from ..lti.noise import noise_factor
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, positive
+from ..modes import Modes
+from ..reduction import ReducedModel
+from ..structure import FEModel
+from ..values import FloatArray, positive, short
 from .dynamics import structure_system, with_filters
 from .origin import Assembled, Foreign
 from .partition import Partition
 from .ports import Ports
 from .rate_check import check_rate
 from .realisation import ModalRealisation
+from .residual import modes_of
 from .sampling import sampled_physical
 
 P = TypeVar("P", bound=Partition)
@@ -165,6 +169,25 @@ def rebuilt(
         own.ports if ports is None else ports,
     )
     return sampled_like(plant, fresh)
+
+
+def with_modes_of(plant: P, larger: object) -> P:
+    """Return the plant of a larger structure, with the ports of the given one and sampled like it.
+
+    Of a reduced model the modes that it left out itself count as well.
+
+    Raises
+    ------
+    ModelError
+        When it is no structure, or the plant has no ports to assemble it with.
+    """
+    if not isinstance(larger, FEModel | Modes | ReducedModel):
+        raise ModelError(
+            f"larger must be a structure or a plant with more modes, got {short(larger)}. Pass "
+            "Modes, an FEModel, a ReducedModel or a StandardPlant, or leave it out."
+        )
+    whole = larger.completed() if isinstance(larger, ReducedModel) else larger
+    return rebuilt(plant, realisation=modes_of(whole))
 
 
 def with_flexibility(plant: P, flexibility: FloatArray) -> P:

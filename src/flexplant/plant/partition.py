@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any, Self, TypeGuard
 
 import numpy as np
 
@@ -13,6 +13,16 @@ from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import FloatArray, IntArray, Value, name_list, positive, short
 from .channel_sides import TYPE_THIS, sides
 from .origin import ELSEWHERE, Assembled, Foreign, Origin
+
+
+def is_system(given: object) -> TypeGuard[System]:
+    """Return whether it is a system with labels: ours, or one of python-control."""
+    return isinstance(given, StateSpace) or hasattr(given, "input_labels")
+
+
+def is_plant(given: object) -> TypeGuard[Partition | System]:
+    """Return whether it is a plant or a system with labels, not a structure."""
+    return isinstance(given, Partition) or is_system(given)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -69,7 +79,7 @@ class Partition(Value):
         """
         if isinstance(given, cls):
             return given
-        if isinstance(given, StateSpace) or hasattr(given, "input_labels"):
+        if is_system(given):
             return cls.from_statespace(given)
         raise ModelError(
             f"need a StandardPlant, got {short(given)}. Make it by assemble_plant(model, ports), "

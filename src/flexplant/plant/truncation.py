@@ -8,13 +8,10 @@ import numpy as np
 
 from ..errors import LabelError, ModelError
 from ..lti.statespace import StateSpace
-from ..modes import Modes
 from ..reduction import ReducedModel
-from ..structure import FEModel
-from ..values import short
-from .building import rebuilt, sampled_like
+from .building import sampled_like, with_modes_of
+from .partition import is_plant
 from .realisation import Structure
-from .residual import modes_of
 from .standard import StandardPlant, standard_plant
 
 
@@ -51,18 +48,10 @@ def larger_plant(
         model = plain.model
         if not isinstance(model, ReducedModel) or model.truncated is None:
             return None
-        larger = model.completed()
-    if isinstance(larger, StandardPlant | StateSpace) or hasattr(larger, "input_labels"):
+        larger = model
+    if is_plant(larger):
         return _matched(plain, standard_plant(larger))
-    given: object = larger
-    if not isinstance(given, FEModel | Modes | ReducedModel):
-        raise ModelError(
-            f"larger must be a structure or a plant with more modes, got {short(given)}. Pass "
-            "Modes, an FEModel, a ReducedModel or a StandardPlant, or leave it out."
-        )
-    if isinstance(given, ReducedModel):
-        given = given.completed()  # what it left out itself counts as well
-    return rebuilt(plain, realisation=modes_of(given))
+    return with_modes_of(plain, larger)
 
 
 def _matched(plant: StandardPlant, larger: StandardPlant) -> StandardPlant:

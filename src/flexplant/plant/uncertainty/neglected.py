@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -11,12 +10,10 @@ from ...errors import CertificateError, ModelError
 from ...lti.frequency import default_freq, frequency_response
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace, System
-from ...reduction import ReducedModel
 from ...values import ComplexArray, FloatArray, Value
-from ..building import continuous_plant
-from ..partition import Partition
+from ..building import with_modes_of
+from ..partition import Partition, is_plant
 from ..realisation import Structure
-from ..residual import modes_of
 
 #: the weight lies this far above the largest difference found
 _MARGIN = 1.05
@@ -85,7 +82,7 @@ def neglected_modes(
         When the sweep finds a larger difference than the weight.
     """
     small = Partition.of(plant).continuous
-    big = larger.continuous if isinstance(larger, Partition) else _assembled(larger, small)
+    big = Partition.of(larger).continuous if is_plant(larger) else with_modes_of(small, larger)
     moved = _moved(small)
     if set(big.u) != set(small.u) or not set(moved) <= set(big.y):
         raise ModelError(f"the larger plant has other channels: {big.u} -> {big.y}.")
@@ -145,15 +142,6 @@ def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateS
         A, B, C, D, inputs=inputs, outputs=outputs, states=[*system.states, *states],
         name=system.name, blocks=blocks,
     )  # fmt: skip
-
-
-def _assembled(larger: Any, plant: Partition) -> Partition:
-    """Return a larger model as a continuous plant: a structure gets the ports of the plant."""
-    if hasattr(larger, "A"):
-        return Partition.of(larger)
-    if isinstance(larger, ReducedModel):
-        larger = larger.completed()
-    return continuous_plant(Partition, modes_of(larger), plant.assembled.ports)
 
 
 def _moved(plant: Partition) -> list[str]:
