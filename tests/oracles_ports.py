@@ -102,3 +102,18 @@ def noise_of_late_outputs(A, root, C, h, late, steps=4000):
         both = np.vstack([own, then])
         total += (0.5 if k in (0, steps) else 1.0) * dt * both @ both.T
     return total
+
+
+def transmitted(M, D, K, r, s):
+    """Absolute motion (n,) of a structure whose ground moves by one along r.
+
+    In absolute coordinates: the ground pulls at springs and dampers, there is no inertia load.
+    """
+    return np.linalg.solve(s * s * M + s * D + K, (s * D + K) @ r)
+
+
+def on_a_heavy_base(M, D, K, base, r, s, ratio=1e11):
+    """Motion (n,) per acceleration of the base, relative to it: its DOFs are heavy and pushed."""
+    heavy = np.zeros_like(M)
+    heavy[base, base] = ratio * np.diag(M)[base]
+    return np.linalg.solve(s * s * (M + heavy) + s * D + K, heavy @ r) - r / s**2

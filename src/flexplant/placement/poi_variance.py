@@ -11,6 +11,7 @@ import numpy as np
 from ..errors import AssumptionError
 from ..estimation import design_kalman
 from ..plant import StandardPlant
+from ..plant.ground import followed
 from .criterion import Criterion, Scorer
 from .poi_axes import Axes, bare, checked_axes, factors_of, plain, shown, structure_part
 from .quadratic import quadratic
@@ -79,9 +80,11 @@ class PoiVariance(Criterion):
                 "them without limit. Give Sensor(..., asd=) what the data sheet says."
             )
         # noise that is shaped first does not arrive at once
-        loud = [port.push(realisation) for port in ports.w if port.asd > 0 and bare(port)]
+        loud = [port for port in ports.w if port.asd > 0 and bare(port)]
+        push = np.array([port.push(realisation) for port in loud])
+        ground = np.array([port.ground for port in loud])
         for sensor in candidates:
-            if np.any(np.dot(loud, sensor.see(realisation).direct)):
+            if loud and np.any(followed(sensor.see(realisation), sensor.order, push, ground)):
                 raise AssumptionError(
                     f"white noise of a disturbance reaches {sensor.name!r} at once "
                     "(an acceleration, say), so a sample of it would have infinite variance. "

@@ -90,7 +90,7 @@ def continuous_plant(cls: type[P], realisation: ModalRealisation, ports: Ports) 
             f"ports must be a Ports value, got {type(given).__name__}. "
             "Put the channels in one: Ports(w=[...], u=[...], z=[...], y=[...])."
         )
-    physical = with_filters(structure_system(realisation, ports), ports)
+    physical = with_filters(structure_system(realisation, ports), realisation, ports)
     return wired(cls, Assembled(ports, realisation, physical))
 
 
@@ -202,5 +202,5 @@ def with_flexibility(plant: P, flexibility: FloatArray) -> P:
     """
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     bare = structure_system(realisation, ports)
-    physical = with_filters(bare.replace(D=bare.D + flexibility), ports)
+    physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
     return sampled_like(plant, wired(type(plant), Assembled(ports, realisation, physical)))

@@ -7,6 +7,7 @@ import numpy as np
 from ..errors import ModelError
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, as_statespace
+from .ground import Carried, Parts, followed, with_ground
 from .ports import Ports
 from .realisation import ModalRealisation
 
@@ -28,9 +29,11 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
     motions = {
         poi.channel(axis): poi.see(realisation, axis) for poi in ports.z for axis in poi.axes
     }
-    measured = [sensor.see(realisation) for sensor in ports.y]
-    found = [*motions.values(), *measured]
-    C, D = np.array([one.row for one in found]), np.array([push @ one.direct for one in found])
+    found = [*motions.values(), *(sensor.see(realisation) for sensor in ports.y)]
+    orders = [*(0 for _ in motions), *(sensor.order for sensor in ports.y)]
+    ground = np.array([port.ground for port in ports.forces])
+    C = np.array([one.row for one in found])
+    D = np.array([followed(*one, push, ground) for one in zip(found, orders, strict=True)])
     sensors = [sensor.name for sensor in ports.y]
     for column, port in enumerate(ports.forces):
         if port.added_to is not None:
@@ -47,25 +50,48 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
     )
 
 
-def with_filters(structure: StateSpace, ports: Ports) -> StateSpace:
-    """Return the structure between the filters of its ports.
+def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Ports) -> StateSpace:
+    """Return the structure between the filters of its ports, absolute motions included.
 
     States are those of the sensors' filters, the structure's, those of the forces' filters: what
     drives stands behind what is driven, so that A is block upper triangular.
+
+    Raises
+    ------
+    ModelError
+        When an absolute motion is unbounded.
     """
-    before = [_named(port.filter, port.name) for port in ports.forces]
-    seen = structure.outputs[: len(structure.outputs) - len(ports.y)]
-    after = [_named(None, name) for name in seen]
-    after += [_named(sensor.filter, sensor.name) for sensor in ports.y]
+    before = {port.name: _named(port.filter, port.name) for port in ports.forces}
+    filters = {sensor.name: sensor.filter for sensor in ports.y}
+    after = {name: _named(filters.get(name), name) for name in structure.outputs}
+    moving = _carried(realisation, ports)
+    if moving:
+        structure, before, after = with_ground(Parts(structure, before, after), moving)
     system = structure
-    if any(part.n_states for part in before):
-        system = series(append(*before), system)
-    elif any(part.D[0, 0] != 1.0 for part in before):
-        gains = np.array([part.D[0, 0] for part in before])
+    if any(part.n_states for part in before.values()):
+        system = series(append(*before.values()), system)
+    elif any(part.D[0, 0] != 1.0 for part in before.values()):
+        gains = np.array([part.D[0, 0] for part in before.values()])
         system = system.replace(B=system.B * gains, D=system.D * gains)
-    if any(part.n_states or part.D[0, 0] != 1.0 for part in after):
-        system = series(system, append(*after))
+    if any(part.n_states or part.D[0, 0] != 1.0 for part in after.values()):
+        system = series(system, append(*after.values()))
     return system
+
+
+def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:
+    """Return which displacements and velocities move with the ground, and how far."""
+    grounds = {port.name: port.ground for port in ports.forces if np.any(port.ground)}
+    if not grounds:
+        return {}
+    seen = {poi.channel(a): (0, poi.see(realisation, a)) for poi in ports.z for a in poi.axes}
+    seen |= {port.name: (port.order, port.see(realisation)) for port in ports.y if port.order < 2}
+    found = {}
+    for output, (order, one) in seen.items():
+        gains = {name: float(one.carried @ ground) for name, ground in grounds.items()}
+        moved = {name: gain for name, gain in gains.items() if gain}
+        if moved:
+            found[output] = Carried(order, moved)
+    return found
 
 
 def _named(part: StateSpace | None, name: str) -> StateSpace:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..labels import Place
 from ..lti.statespace import StateSpace
+from ..structure.rigid import turned_about
 from ..values import FloatArray, real_array
 from .port import ForcePort, force_unit, motion_unit
 from .realisation import ModalRealisation
@@ -59,9 +60,12 @@ class Disturbance(ForcePort):
 class BaseAcceleration(ForcePort):
     """An acceleration of the floor (or frame) under the whole structure, in w.
 
-    All motions are then relative to the base, and the structure feels ``-M r a``, r its rigid-body
-    motion in the direction. A free structure answers as a rigid body; springs to ground
-    (`suspend`) and supports make it bend.
+    The structure feels ``-M r a``, r its rigid-body motion in the direction, and moves relative to
+    the base: so do POIs, and sensors of displacement and velocity. What is `absolute` (as
+    accelerometers are) has the motion of the base added: its acceleration r a, or the integrals of
+    it. These are bounded where the `shape` has zeros at 0 Hz, as many as there are integrals, or
+    the sensor's `dynamics` have (those of a geophone). A free structure stays where it is; springs
+    to ground (`suspend`) and supports make it bend.
 
     Parameters
     ----------
@@ -84,8 +88,8 @@ class BaseAcceleration(ForcePort):
     Notes
     -----
     Modes and reduced models know their inertia against motions that their shapes can make: free
-    or suspended structures. For a held one pass the FEModel; the mass that couples to its removed
-    DOFs is not in its matrices.
+    or suspended structures. For a held one pass the FEModel; one that was held by `fixed` knows the
+    mass that couples it to its held DOFs, matrices made elsewhere have lost it.
     """
 
     name: str
@@ -103,6 +107,11 @@ class BaseAcceleration(ForcePort):
     def unit(self) -> str | None:
         """m/s^2 or rad/s^2."""
         return motion_unit({}, self.direction, 2)
+
+    @property
+    def ground(self) -> FloatArray:
+        """The rigid-body motion (6,) of the ground about the origin."""
+        return turned_about(self.direction, np.asarray(self.about))
 
     def push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) ``-M r`` over the model's DOFs of a unit acceleration."""

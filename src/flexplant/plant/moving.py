@@ -108,8 +108,9 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
     at = g.output_index(shown)
     C = np.zeros((points.shape[0], len(shown), g.n_states))
     D = np.repeat(g.D[at][None], points.shape[0], axis=0)
-    if realisation.static_outputs.size:
-        # forces reach a POI at once too, through filters and delays: what the whole plant knows
+    carried = poi.absolute and any(np.any(port.ground) for port in plant.assembled.ports.w)
+    if realisation.static_outputs.size or carried:
+        # forces reach a POI at once too, the ground by its shape: what the whole plant knows
         for i, point in enumerate(points):
             there = _elsewhere(plant, poi.name, point).system
             C[i], D[i] = there.C[at], there.D[at]

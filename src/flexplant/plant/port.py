@@ -20,7 +20,7 @@ QUANTITIES: tuple[Quantity, ...] = ("displacement", "velocity", "acceleration")
 
 
 class Seen(NamedTuple):
-    """What a channel measures: ``row x + direct f``.
+    """What a channel measures: ``row x + direct f + carried g``.
 
     Parameters
     ----------
@@ -28,20 +28,33 @@ class Seen(NamedTuple):
         Over the states of the modes.
     direct : (n,) array
         Over loads at the model's DOFs: what follows a force at once.
+    carried : (6,) array
+        Over the rigid-body motions of the ground about the origin (x, y, z, rx, ry, rz), in the
+        derivative that is measured: 0 of what is measured against the ground.
     """
 
     row: FloatArray
     direct: FloatArray
+    carried: FloatArray = np.zeros(6)
 
 
-def seen(realisation: ModalRealisation, row: FloatArray, order: int = 0) -> Seen:
-    """Return how the time derivative of some order of a displacement (a row over DOFs) is seen."""
+def seen(
+    realisation: ModalRealisation,
+    row: FloatArray,
+    order: int = 0,
+    carried: FloatArray | None = None,
+) -> Seen:
+    """Return how the time derivative of some order of a displacement (a row over DOFs) is seen.
+
+    Against the ground, or with its motion `carried` (6,) along.
+    """
+    along = np.zeros(6) if carried is None else carried
     if order == 0:
-        return Seen(realisation.motion(row, 0), realisation.at_once(row))
+        return Seen(realisation.motion(row, 0), realisation.at_once(row), along)
     direct = np.zeros(row.size)
     if order == 2:  # an acceleration follows a force at once: d2q/dt2 = S A A x + S A N' f
         direct = realisation.inputs @ realisation.motion(row, 1)
-    return Seen(realisation.motion(row, order), direct)
+    return Seen(realisation.motion(row, order), direct, along)
 
 
 class ForcePort(Value):
@@ -72,6 +85,11 @@ class ForcePort(Value):
         """The sensor that it is added to, for what does not act on the structure."""
         return None
 
+    @property
+    def ground(self) -> FloatArray:
+        """The rigid-body motion (6,) of the ground about the origin whose acceleration it is."""
+        return np.zeros(6)
+
     def push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) over the model's DOFs per unit behind the filter."""
         raise NotImplementedError
@@ -100,6 +118,10 @@ class SensorPort(Value):
         Sensor and anti-alias filter.
     latency : float [s]
         Delay of the signal, in seconds.
+    quantity : {"displacement", "velocity", "acceleration"}
+        What is measured.
+    absolute : bool, optional
+        Whether the motion of the ground is part of it; that of accelerations when not given.
     """
 
     home: ClassVar = "y"
@@ -109,6 +131,7 @@ class SensorPort(Value):
     dynamics: StateSpace | None = None
     latency: float = 0.0
     quantity: Quantity = "displacement"
+    absolute: bool | None = None
 
     def __post_init__(self) -> None:
         self._set(**checked_port(self))
@@ -130,9 +153,18 @@ class SensorPort(Value):
         """Which time derivative of a displacement it measures: 0, 1 or 2."""
         return QUANTITIES.index(self.quantity)
 
+    @property
+    def inertial(self) -> bool:
+        """Whether it measures absolute motion: no accelerometer measures against the ground."""
+        return self.order == 2 if self.absolute is None else self.absolute
+
     def row(self, realisation: ModalRealisation) -> FloatArray:
         """Return the row (n,) over the model's DOFs of the displacement that it is about."""
         raise NotImplementedError
+
+    def carried(self, realisation: ModalRealisation) -> FloatArray:
+        """Return its motion (6,) with each rigid-body motion about the origin."""
+        return np.asarray(self.row(realisation) @ realisation.model.rigid_motions())
 
     def static_row(self, realisation: ModalRealisation) -> FloatArray:
         """Return what the channel shows of displacements (n,) at rest: 0 of other quantities."""
@@ -140,7 +172,8 @@ class SensorPort(Value):
 
     def see(self, realisation: ModalRealisation) -> Seen:
         """Return what it measures of the states, and of forces at once."""
-        return seen(realisation, self.row(realisation), self.order)
+        along = self.carried(realisation) if self.inertial else None
+        return seen(realisation, self.row(realisation), self.order, along)
 
 
 def static_gain(part: StateSpace | None) -> float:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
@@ -26,6 +28,7 @@ def checked_port(port: Any) -> dict[str, Any]:
         "shape": lambda name, shape: checked_filter(name, "shape", shape),
         "dynamics": lambda name, dynamics: checked_filter(name, "dynamics", dynamics),
         "latency": checked_latency,
+        "absolute": checked_choice,
     }
     given = port._fields()
     return {"name": name} | {
@@ -58,6 +61,16 @@ def checked_latency(name: str, latency: Any) -> float:
             f"plant.discretized(rate, delay={late:g})."
         )
     return late
+
+
+def checked_choice(name: str, absolute: Any) -> bool | None:
+    """Return whether a motion is absolute, or None where that was left open."""
+    if absolute is not None and not isinstance(absolute, bool | np.bool_):
+        raise ModelError(
+            f"absolute of {name!r} is True (with the motion of the ground) or False (against the "
+            f"ground), got {short(absolute)}."
+        )
+    return None if absolute is None else bool(absolute)
 
 
 def checked_direction(name: str, direction: str) -> str:

@@ -9,9 +9,10 @@ from typing import ClassVar
 from ..errors import LabelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace
+from ..structure.rigid import place_motion
 from ..values import FloatArray, Value, check_names, short
 from .port import Quantity, Seen, SensorPort, motion_unit, seen
-from .port_checks import checked_name, checked_place
+from .port_checks import checked_choice, checked_name, checked_place
 from .realisation import ModalRealisation
 
 
@@ -40,6 +41,10 @@ class Sensor(SensorPort):
     latency : float [s]
         Delay of the signal, in seconds. Exact, also between samples, once the plant is sampled; a
         continuous plant leaves it out and says so (`ports.with_pade(order)` approximates it there).
+    absolute : bool, optional
+        Whether a BaseAcceleration moves it too: True of inertial sensors, as of a geophone
+        (absolute velocity), False of what measures against the floor. When not given,
+        accelerations are absolute, displacements and velocities are relative to the floor.
 
     Raises
     ------
@@ -55,6 +60,7 @@ class Sensor(SensorPort):
     asd: float = 0.0
     dynamics: StateSpace | None = None
     latency: float = 0.0
+    absolute: bool | None = None
 
     @property
     def unit(self) -> str | None:
@@ -64,6 +70,10 @@ class Sensor(SensorPort):
     def row(self, realisation: ModalRealisation) -> FloatArray:
         """Return the row (n,) over the model's DOFs of its displacement."""
         return realisation.row(self.at, self.direction)
+
+    def carried(self, realisation: ModalRealisation) -> FloatArray:
+        """Return its motion (6,) with each rigid-body motion about the origin."""
+        return place_motion(realisation.model.full_dofs, self.at, self.direction)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +88,8 @@ class Poi(Value):
         A DOF label (whose direction is replaced by the axes) or any point of the structure.
     axes : sequence of str
         Of x, y, z [m], rx, ry, rz [rad]; the first one is the axis that a Reference follows.
+    absolute : bool
+        Whether a BaseAcceleration moves it too; its motion relative to the floor otherwise.
 
     Raises
     ------
@@ -89,6 +101,7 @@ class Poi(Value):
     name: str
     at: Place
     axes: tuple[str, ...] = ("z",)
+    absolute: bool = False
 
     def __post_init__(self) -> None:
         if not isinstance(self.axes, Iterable):
@@ -108,7 +121,8 @@ class Poi(Value):
                 f"POI {self.name!r} is a combination of DOFs, so it has one axis, got {axes}. "
                 "Give a point or a DOF label, or one POI per combination."
             )
-        self._set(axes=axes, name=checked_name(self.name), at=checked_place(self.name, self.at))
+        name, absolute = checked_name(self.name), checked_choice(self.name, self.absolute)
+        self._set(axes=axes, name=name, at=checked_place(name, self.at), absolute=bool(absolute))
 
     def channel(self, axis: str) -> str:
         """Return the name of an axis in z, such as `die:z`."""
@@ -133,11 +147,15 @@ class Poi(Value):
 
     def row(self, realisation: ModalRealisation, axis: str) -> FloatArray:
         """Return the row (n,) over the model's DOFs of one axis."""
-        at: Place = self.at
-        if isinstance(at, str):
-            at = f"{at.split(':')[0]}:{axis}"
-        return realisation.row(at, axis)
+        return realisation.row(self._at(axis), axis)
 
     def see(self, realisation: ModalRealisation, axis: str) -> Seen:
         """Return what an axis shows of the states, and of forces at once."""
-        return seen(realisation, self.row(realisation, axis))
+        along = None
+        if self.absolute:
+            along = place_motion(realisation.model.full_dofs, self._at(axis), axis)
+        return seen(realisation, self.row(realisation, axis), 0, along)
+
+    def _at(self, axis: str) -> Place:
+        """Return the place of an axis: of a label the direction is replaced."""
+        return f"{self.at.split(':')[0]}:{axis}" if isinstance(self.at, str) else self.at

@@ -49,6 +49,9 @@ class FEModel(Placed, Value):
         What the n rows stand for, with coordinates.
     name : str, optional
         For display.
+    held_inertia : (n, 6) array, optional
+        Loads ``M_fs r_s`` that the acceleration of held DOFs s makes by their mass coupling, for
+        the six rigid-body motions of the ground about the origin; kept by `fixed`.
 
     Raises
     ------
@@ -75,6 +78,7 @@ class FEModel(Placed, Value):
     D: Matrix | None = None
     dofs: DofSet = field(kw_only=True)
     name: str | None = field(default=None, kw_only=True)
+    held_inertia: FloatArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         if not isinstance(self.dofs, DofSet):
@@ -103,6 +107,8 @@ class FEModel(Placed, Value):
         if D is not None:
             _check_semidefinite(D, "D")
         self._set(M=M, K=K, D=D)
+        if self.held_inertia is not None:
+            self._set(held_inertia=real_array(self.held_inertia, "held_inertia", (n, 6)))
         if digits is not None:
             for said in (
                 endangered(K, M, digits),
@@ -149,6 +155,14 @@ class FEModel(Placed, Value):
     def inertia(self, motions: FloatArray) -> FloatArray:
         """Return the loads (n, r) ``M motions`` of motions (n, r)."""
         return np.asarray(self.M @ motions)
+
+    def ground_inertia(self, ground: FloatArray) -> FloatArray:
+        """Return the load (n,) ``M_ff r_f + M_fs r_s`` of a motion (6,) of the ground.
+
+        About the origin: x, y, z, rx, ry, rz. Of DOFs held by `fixed` the coupling is known.
+        """
+        load = self.inertia(self.rigid_motions() @ ground)
+        return load if self.held_inertia is None else load + self.held_inertia @ ground
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return zeros (6,): the DOFs can make every rigid-body motion, at some cost."""
@@ -243,7 +257,9 @@ class FEModel(Placed, Value):
     def fixed(self, labels: Iterable[str]) -> FEModel:
         """Return the model with some DOFs held still: their rows and columns are taken out.
 
-        Places between nodes stay known where they were.
+        Places between nodes stay known where they were, and so does the load that the mass of the
+        held DOFs makes when the ground moves (`held_inertia`); parts that are added later load
+        their free DOFs only.
 
         Parameters
         ----------
@@ -266,7 +282,7 @@ class FEModel(Placed, Value):
         """
         held = np.zeros(self.n_dof, dtype=bool)
         held[self.dofs.indices(labels)] = True
-        rows = np.flatnonzero(~held)
+        rows, still = np.flatnonzero(~held), np.flatnonzero(held)
         if not rows.size:
             raise ModelError(
                 f"all {self.n_dof} DOFs would be fixed: nothing moves. Fix fewer of them."
@@ -274,11 +290,16 @@ class FEModel(Placed, Value):
         shape = self.dofs.interpolation
         if shape is not None:
             shape = HeldShape(shape, rows)
+        M: Any = self.M
+        load = np.asarray(M[rows][:, still] @ self.rigid_motions()[still])
+        if self.held_inertia is not None:
+            load = load + self.held_inertia[rows]
         return self._with(
             **{
                 name: None if matrix is None else frozen(matrix[rows][:, rows])
                 for name, matrix in (("M", self.M), ("K", self.K), ("D", self.D))
             },
+            held_inertia=frozen(load),
             dofs=self.dofs._taken(rows).replace(interpolation=shape),
         )
 
@@ -309,7 +330,9 @@ class FEModel(Placed, Value):
         (np.float64(1.0), np.float64(5000.0), np.float64(0.25))
         """
         unit = units(length, mass, time)
+        load = self.held_inertia
         return self._with(
+            held_inertia=None if load is None else frozen(unit.ground_load(load, self.dofs)),
             M=frozen(unit.mass_matrix(self.M, self.dofs)),
             K=frozen(unit.stiffness_matrix(self.K, self.dofs)),
             D=None if self.D is None else frozen(unit.damping_matrix(self.D, self.dofs)),

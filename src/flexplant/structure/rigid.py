@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, cast
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
-from ..labels import DofSet
+from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
 from ..sparse.rayleigh_ritz import absolute
@@ -50,6 +51,32 @@ def rigid_motions(dofs: DofSet) -> FloatArray:
             rows = kind == moved
             motions[rows, 3 + axis] = sign * dofs.xyz[rows, along]
     return motions
+
+
+def turned_about(direction: str, about: FloatArray) -> FloatArray:
+    """Return the motions (6,) about the origin that are a motion about another point."""
+    axis, own = DIRECTIONS.index(direction), np.zeros(6)
+    own[axis] = 1.0
+    if axis >= 3:  # e x (p - about) = e x p + about x e
+        own[:3] = np.cross(about, own[3:])
+    return own
+
+
+def place_motion(dofs: DofSet, at: Place, direction: str) -> FloatArray:
+    """Return how far a place moves (6,) with each of the six rigid-body motions about the origin.
+
+    By its coordinates, not by shapes: a place beside a held DOF moves with the ground too.
+    """
+    if isinstance(at, Mapping):
+        parts = [weight * place_motion(dofs, place, direction) for place, weight in at.items()]
+        return np.asarray(np.sum(parts, axis=0))
+    if isinstance(at, str):
+        direction, at = at.rpartition(":")[2], dofs.xyz[dofs.index(at)]
+    axis, own = DIRECTIONS.index(direction), np.zeros(6)
+    own[axis] = 1.0
+    if axis < 3:  # (e_r x p) . e = (p x e) . e_r
+        own[3:] = np.cross(np.asarray(at, dtype=np.float64), own[:3])
+    return own
 
 
 def body_motions(M: Matrix, K: Matrix, dofs: DofSet) -> FloatArray:

@@ -73,6 +73,11 @@ class Units:
         """Return a stiffness matrix (n, n) in N/m, N, N m."""
         return self._scaled(K, dofs, self.mass / self.time**2)
 
+    def ground_load(self, load: FloatArray, dofs: DofSet) -> FloatArray:
+        """Return loads (n, 6) of the six rigid-body accelerations in kg, kg m, kg m^2."""
+        rows = self.length / self.of_dofs(dofs)
+        return np.asarray(load * np.outer(rows, [1.0] * 3 + [self.length] * 3) * self.mass)
+
     def of_dofs(self, dofs: DofSet) -> FloatArray:
         """Return one unit of each DOF (n,): metres for displacements, 1 rad for rotations."""
         return np.where(dofs.kinds < 3, self.length, 1.0)

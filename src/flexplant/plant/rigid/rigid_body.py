@@ -8,6 +8,8 @@ import numpy as np
 
 from ...errors import ModelError
 from ...labels import DIRECTIONS
+from ...structure import FEModel
+from ...structure.rigid import turned_about
 from ...values import FloatArray, Value
 from ..realisation import ModalRealisation, Structure
 
@@ -55,6 +57,8 @@ def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArra
             f"a base acceleration along {direction!r} does not move this model: its DOFs are "
             f"{', '.join(sorted(set(model.full_dofs.directions)))}."
         )
+    if isinstance(model, FEModel):
+        return -model.ground_inertia(turned_about(direction, about))
     missed = model.missed_motions(about)[axis]
     if missed > _SPANNED:
         raise ModelError(
