@@ -3,11 +3,11 @@
 ::
 
     FlexplantError
-    ├── LabelError       (ValueError)    a name or a point that the model does not know
+    ├── LabelError       (ValueError)    a name or a point that the model does not have
     ├── ShapeError       (ValueError)    arrays whose sizes do not belong together
     ├── ModelError       (ValueError)    a model that is not physical, or not what is needed here
-    ├── AssumptionError  (ValueError)    a standard assumption of the asked design does not hold
-    ├── InfeasibleError  (RuntimeError)  no solution of the asked quality exists
+    ├── AssumptionError  (ValueError)    a standard assumption of the design does not hold
+    ├── InfeasibleError  (RuntimeError)  no solution of the required quality exists
     ├── SolverError      (RuntimeError)  a numerical method did not reach its own tolerance
     └── CertificateError (RuntimeError)  an answer failed the check by another route
     FlexplantWarning     (UserWarning)
@@ -32,15 +32,15 @@ class ShapeError(FlexplantError, ValueError):
 
 
 class ModelError(FlexplantError, ValueError):
-    """The model is not physical (say, an indefinite M) or not fit for the asked operation."""
+    """The model is not physical (say, an indefinite M) or not fit for the operation."""
 
 
 class AssumptionError(FlexplantError, ValueError):
-    """A standard assumption of the asked design does not hold."""
+    """A standard assumption of the design does not hold."""
 
 
 class InfeasibleError(FlexplantError, RuntimeError):
-    """No solution of the asked quality exists."""
+    """No solution of the required quality exists."""
 
 
 class SolverError(FlexplantError, RuntimeError):
@@ -52,7 +52,7 @@ class CertificateError(FlexplantError, RuntimeError):
 
 
 class FlexplantWarning(UserWarning):
-    """Something the caller should know, although an answer is given."""
+    """A result that the caller should use with care."""
 
 
 def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = "") -> LabelError:

@@ -240,7 +240,7 @@ class DofSet(Value):
         rows = np.flatnonzero(self.kinds == kind)
         if not rows.size:
             raise LabelError(
-                f"no DOF in direction {direction!r}: {self!r}. Ask for one that is there."
+                f"no DOF in direction {direction!r}: {self!r}. Choose one that is there."
             )
         point = real_array(xyz, "xyz", (3,))
         distance = np.linalg.norm(self.xyz[rows] - point, axis=1)

@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 #: work of one chunk [s]: long beside the cost of sending it, short beside the whole
 CHUNK = 0.5
-#: items computed here before the rest is sent take this long [s]: they tell how long one takes
+#: items computed here before the rest is sent take this long [s]: they show how long one takes
 PROBE = 0.05
 #: shorter work than this [s] shows no bar
 PATIENCE = 2.0

@@ -98,7 +98,7 @@ def _no_numbers(value: Any, name: str, shape: tuple[int | None, ...] | None) -> 
 
 
 def _form(shape: tuple[int | None, ...]) -> str:
-    """Return in words what a shape asks for."""
+    """Return in words what a shape requires."""
     if not shape:
         return "be one number"
     sizes = ", ".join("any" if n is None else str(n) for n in shape)

@@ -256,7 +256,7 @@ def test_bad_methods_are_refused(make):
 
 def test_two_periodic_inputs_need_two_experiments():
     u = multisine(2, rate=RATE, period=0.1, periods=3, rng=1)[:1]
-    with pytest.raises(ModelError, match="cannot tell 2"):
+    with pytest.raises(ModelError, match="cannot separate 2"):
         estimate_frf(u, u, RATE, method=Periodic(period=0.1))
 
 

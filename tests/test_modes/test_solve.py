@@ -162,10 +162,10 @@ def test_a_count_that_does_not_agree_raises(monkeypatch):
     model = make_plate(elements=(24, 24))
     below = counted.modes_below
     monkeypatch.setattr(counted, "modes_below", lambda *args: below(*args) - 1)
-    with pytest.raises(SolverError, match="count tells"):
+    with pytest.raises(SolverError, match="count finds"):
         solve_modes(model, count=24)
     monkeypatch.setattr(counted, "modes_below", lambda *args: below(*args) + 1)
-    with pytest.raises(SolverError, match="count tells"):
+    with pytest.raises(SolverError, match="count finds"):
         solve_modes(model, count=24)
 
 

@@ -324,7 +324,7 @@ def test_what_cannot_be_opened_is_said():
         plant.uncertain(MeasuredModes([-1 + 9j], modes=(2,), covariance=[1.0]))
     with pytest.raises(ModelError, match="deviations must be positive"):
         plant.uncertain(measured(), deviations=0.0)
-    with pytest.raises(ModelError, match=r"damping of mode 6 is doubted by \d+ % at 2 standard"):
+    with pytest.raises(ModelError, match=r"damping of mode 6 is uncertain by \d+ % at 2 standard"):
         plant.uncertain(measured(60.0))
     weighted = plant.weighted(z={"die:z": 2.0})
     bare = StandardPlant.from_statespace(plant.system, u=plant.u, y=plant.y)

@@ -84,7 +84,7 @@ def test_a_missing_mode_of_a_repeated_pair_is_not_paired_with_a_stranger(plate, 
     assert sorted(again.mac[6:8]) == pytest.approx([0.0, 1.0], abs=1e-9)
     assert np.nanmax(np.abs(again.freq_error)) < 1e-9
     assert again.alike == ((7, 8),)
-    assert "cannot be told apart: modes 7, 8" in repr(again)
+    assert "cannot be distinguished: modes 7, 8" in repr(again)
     assert [line.endswith("alike: 8") for line in again.table().splitlines()].index(True) == 7
 
 

@@ -128,7 +128,7 @@ def test_refusals(plate, modes):
         ModalTruncation(5, modes=[1, 2, 3])
     with pytest.raises(ModelError, match="left out"):
         reduce(modes, ModalTruncation(2))
-    with pytest.raises(ModelError, match="mode 99 is asked for"):
+    with pytest.raises(ModelError, match="mode 99 is required"):
         reduce(modes, ModalTruncation(99))
     with pytest.raises(ModelError, match="have their damping"):
         reduce(modes, ModalTruncation(9, damping=LOW))

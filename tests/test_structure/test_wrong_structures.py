@@ -136,7 +136,9 @@ def test_wrong_kinds_are_refused_with_a_next_step(function):
 
 @pytest.mark.parametrize("option", ["thickness", "density", "poisson_ratio", "holes"])
 def test_a_function_of_too_few_arguments_is_told_what_it_is_asked(option):
-    with pytest.raises(ModelError, match=rf"{option} is asked at the centre \(x, y\).*lambda x, y"):
+    with pytest.raises(
+        ModelError, match=rf"{option} is evaluated at the centre \(x, y\).*lambda x, y"
+    ):
         of_plate(**{option: lambda x: 0.2})
 
 

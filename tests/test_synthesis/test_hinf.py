@@ -181,7 +181,7 @@ def test_the_controller_is_saved_whole(tmp_path):
     np.testing.assert_array_equal(back.system.A, found.system.A)
     lines = repr(found).splitlines()
     assert lines[0].startswith("<Controller H-infinity by Riccati: 61 states, gamma 0.98")
-    assert "reached, of 1 that the weights ask: motions from disturbances" in lines[1]
+    assert "reached, of 1 that the weights require: motions from disturbances" in lines[1]
     assert "swept norm" in lines[2]
     assert "none known, none checked; larger= gives them" in lines[3]
     assert dict(back.reached) == dict(found.reached)
@@ -252,7 +252,7 @@ def small():
 
 def test_wrong_arguments_are_refused():
     P = small()
-    with pytest.raises(LabelError, match=r"do not tell which are w, u, z and y.*Type Standard"):
+    with pytest.raises(LabelError, match=r"do not show which are w, u, z and y.*Type Standard"):
         design_hinf(P)
     with pytest.raises(LabelError, match="name both u and y"):
         design_hinf(P, u=["u"])

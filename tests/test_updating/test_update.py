@@ -385,7 +385,7 @@ def test_unobservable_parameters_are_named(plate, make):
     # undamped: mass and spring move one imaginary part only
     held = make([1, 2], [(0, None, 90), (0, 1, 110)])
     one = MeasuredModes([5j], modes=[1])
-    with pytest.raises(ModelError, match="mass at 2:z, stiffness at 2:z cannot be told apart"):
+    with pytest.raises(ModelError, match="mass at 2:z, stiffness at 2:z cannot be distinguished"):
         update(held, [AddedMass("2:z"), AddedStiffness("2:z")], [Eigenvalues(one)])
     three = [AddedMass("1:z"), AddedMass("2:z"), AddedDamping("2:z")]
     with pytest.raises(ModelError, match="2 real equations, 3 unknowns"):

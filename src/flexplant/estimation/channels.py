@@ -20,7 +20,7 @@ def checked_plant(given: StandardPlant | System) -> StandardPlant:
     ModelError
         When it is no plant, or weighted.
     LabelError
-        When it is a system whose channels do not tell w, u, z and y.
+        When it is a system whose channels do not name w, u, z and y.
     AssumptionError
         When it has no POI or no sensor.
     """

@@ -1,4 +1,4 @@
-"""The Kalman estimator: its gain, what it predicts of its own error, and what is done with it."""
+"""The Kalman estimator: gain, predicted error and use."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class KalmanEstimator(Value):
 
     @cached_property
     def model(self) -> FilterModel:
-        """What the filter takes as the truth: matrices, and covariances of all noises."""
+        """The model of the filter: matrices, and covariances of all noises."""
         return filter_model(self.plant, self.left_out)
 
     @property

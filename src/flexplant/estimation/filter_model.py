@@ -15,7 +15,7 @@ from .left_out import LeftOut
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FilterModel(Value):
-    """What a filter takes as the truth.
+    """The model of a filter.
 
     ::
 

@@ -28,7 +28,7 @@ def twin(model: FilterModel, covariance: FloatArray) -> Any:
     if np.any(model.S):
         raise ModelError(
             "filterpy's filter takes the noises of process and sensors as independent, those of "
-            "this plant are correlated. Use observer.estimate, which knows the correlation."
+            "this plant are correlated. Use observer.estimate, which includes the correlation."
         )
     n, m = model.B.shape
     found = twin_class()(dim_x=n, dim_z=model.C2.shape[0], dim_u=m)

@@ -91,15 +91,15 @@ def design_static(
 
     ``hat = R_z R_y^+ y`` with R_y and R_z the rigid-body modes at the sensors and the POIs: the
     least-squares rigid-body motion that the sensors show, at the POI. Usual practice, and the
-    baseline for anything that knows that the structure bends.
+    baseline for anything with a flexible model.
 
     Parameters
     ----------
     plant : StandardPlant
         Assembled from a structure that is free or on weak springs, continuous or sampled.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        The structure with more modes, for the predicted error. None: the modes that the plant's
-        reduced model knows beyond those it kept.
+        The structure with more modes, for the predicted error. None: the modes of the plant's
+        reduced model beyond those it kept.
 
     Returns
     -------

@@ -26,7 +26,7 @@ class PoleSelection(Value):
         With positive imaginary parts.
     participation : (n_in, m) complex array
         How each input (each output, where those are fewer) excites them; independent columns
-        tell repeated poles apart.
+        distinguish repeated poles.
     """
 
     poles: ComplexArray

@@ -17,7 +17,7 @@ from .measured import MeasuredModes
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IdentifiedModes(MeasuredModes):
-    r"""Measured modes with all that the fit knows; made by `identify_modes`.
+    r"""Measured modes with all results of the fit; made by `identify_modes`.
 
     .. math:: H(s) = \sum_k \frac{\psi_k l_k^T}{s - \lambda_k}
         + \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k} + E(s)

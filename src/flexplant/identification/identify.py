@@ -16,7 +16,7 @@ from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
 from .leakage import leakage_warned, no_pole
 from .line_weights import PreparedLines, prepared
-from .pole_split import backed, reseated, separated
+from .pole_split import backed, relocated, separated
 from .pole_test import freedom, supported
 from .refine import Lines, refined
 from .residual_peaks import BROADEST, completed, exact, fewest_terms, unexplained, warned
@@ -46,7 +46,7 @@ def stabilisation_diagram(
         Measured; weighted by its variance where it has one. Velocity and acceleration are
         integrated; no quantity is taken for displacement.
     band : (low, high) [Hz], optional
-        What to look at; all by default.
+        The frequencies used; all by default.
     orders : iterable of int, optional
         Model orders; each has order * min(n_in, n_out) poles. 2 to 40 by default.
     tolerances : (float, float, float)
@@ -107,7 +107,7 @@ def identify_modes(
         \frac{\bar\psi_k \bar l_k^T}{s - \bar\lambda_k}
         + \sum_{p=1}^{lower} \frac{E_{-p}}{s^p} + \sum_{p=0}^{upper-1} E_p s^p
 
-    with residues of rank one, so that close and repeated modes are told apart by several inputs
+    with residues of rank one, so that close and repeated modes are distinguished by several inputs
     and outputs. Rigid-body modes and modes below the band are in 1/s and 1/s^2, those above in
     the powers of s. Chosen poles that noise alone would produce once in 1000 times are left out;
     where more than noise is left a pole is added. With `start` neither is done. What then is
@@ -130,7 +130,7 @@ def identify_modes(
     lower : int
         Number of residual terms of rigid-body modes and modes below the band.
     upper : int, optional
-        Number of those of modes above; when not given 3, and up to 25 where the data ask for them:
+        Number of those of modes above; when not given 3, and up to 25 where the data require them:
         with too few the poles are biased by a standard deviation before the misfit shows it.
     hold : float [Hz], optional
         Rate of the zero-order hold between the inputs and the machine, where the FRF is that of
@@ -237,7 +237,7 @@ def _identified(
                 if upper is None:
                     lines, fit = backed(lines, fit, steps=max_iterations)
                 fit = separated(lines, fit, steps=max_iterations)
-                fit = reseated(lines, fit, steps=max_iterations)
+                fit = relocated(lines, fit, steps=max_iterations)
             fit, left = completed(lines, fit, steps=max_iterations)
         else:
             left = unexplained(lines, fit)

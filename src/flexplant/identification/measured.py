@@ -73,11 +73,11 @@ class MeasuredModes(Value):
 
     def __repr__(self) -> str:
         known = "" if self.modes is None else ", modes " + _listed(self.modes, "d")
-        doubt = "" if self.covariance is None else ", with covariance"
+        spread = "" if self.covariance is None else ", with covariance"
         plural = "" if len(self) == 1 else "s"
         return (
             f"<MeasuredModes: {len(self)} pole{plural}{known} at "
-            f"{_listed(self.freq, '.1f')} Hz{doubt}>"
+            f"{_listed(self.freq, '.1f')} Hz{spread}>"
         )
 
     @property
@@ -109,7 +109,7 @@ class MeasuredModes(Value):
         Raises
         ------
         LabelError
-            When there is no such pole, or it is asked for twice.
+            When there is no such pole, or it is given twice.
         ModelError
             When a place is no whole number.
         """

@@ -35,7 +35,7 @@ def numbered(
     .. math:: MAC = \frac{|\phi^H \psi|^2}{(\phi^H\phi)(\psi^H\psi)}
 
     over the measured DOFs; for repeated modes of the model (within 0.5 %) it is the MAC with the
-    nearest shape of their span, which cannot tell them apart: they are numbered by frequency, and
+    nearest shape of their span, which cannot distinguish them: they are numbered by frequency, and
     where fewer poles than modes of one frequency are measured, by the lowest numbers.
 
     Parameters

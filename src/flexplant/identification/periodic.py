@@ -74,7 +74,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
         )
     if n_exp < n_in:
         raise ModelError(
-            f"{n_exp} experiments cannot tell {n_in} periodic inputs apart: make one per input, "
+            f"{n_exp} experiments cannot separate {n_in} periodic inputs: make one per input, "
             "with the phases of `multisine`."
         )
     Y, U = (line_spectra(side, samples, periods) for side in (data.y, data.u))

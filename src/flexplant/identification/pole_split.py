@@ -1,4 +1,4 @@
-"""Two modes that a fit took for one, and more behind all of them: added where data ask."""
+"""Two modes that a fit took for one, and residual terms: added where the data require them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ WEAK = 4.0
 def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
     r"""Return the fit with those poles taken apart that are two.
 
-    A pole of two modes, repeated or so close that one pole passes for both, asks for residues
+    A pole of two modes, repeated or so close that one pole passes for both, requires residues
     of rank two (several inputs), or for a pole of its own at each output (one input):
 
     .. math:: \frac{\psi l^T}{s-\lambda} \to \frac{\psi l^T + \psi' l_\perp^T}{s-\lambda}
@@ -84,12 +84,12 @@ def _pairs(fit: Fit, k: int) -> list[tuple[ComplexArray, ComplexArray]]:
 
 
 def _narrow(more: Fit, fit: Fit) -> bool:
-    """Whether no pole became broader than any was: then it stood in for something else."""
+    """Whether no pole became broader than any was: then it replaced something else."""
     zeta = [-f.poles.real / np.abs(f.poles) for f in (more, fit)]
     return bool(zeta[0].max() <= 1.5 * zeta[1].max())
 
 
-def reseated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
+def relocated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
     """Return the fit with weak poles moved to where they lower the cost most.
 
     Noise gives the likelihood of a mode that is hardly seen several peaks; the fit climbs the one
@@ -121,7 +121,7 @@ def reseated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
 
 
 def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
-    """Return the fit with more residual terms where the data ask for them.
+    """Return the fit with more residual terms where the data require them.
 
     Sampling folds modes of more than half the rate into the band: each is weak and as broad as
     its frequency and damping were, many together are no noise. What a first few of these terms

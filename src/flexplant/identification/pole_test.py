@@ -35,7 +35,7 @@ def price(lines: Lines) -> float:
     chi-square of that many degrees; it has as many places to do so as there are lines. Where
     errors of neighbouring lines are correlated, noise that changes little over a few lines has
     `inflation` times the power of independent errors. A pole kept in vain costs little; one left
-    out biases its neighbours by up to the root of this price.
+    out biases its neighbours by up to the root of this amount.
     """
     from scipy.stats import chi2
 

@@ -129,7 +129,7 @@ def refined(
 
 
 def unsettled(count: int, steps: int) -> SolverError:
-    """Return the error of a fit that goes on and on."""
+    """Return the error of a fit that does not converge."""
     return SolverError(
         f"the refinement of {count} poles did not settle within {steps} steps: leave out "
         "poles that do not stand out of the noise, or narrow the band."
@@ -137,7 +137,7 @@ def unsettled(count: int, steps: int) -> SolverError:
 
 
 class _Projected:
-    """The fit at given poles and participation, and its slopes when asked for."""
+    """The fit at given poles and participation, and its derivatives when required."""
 
     def __init__(
         self,

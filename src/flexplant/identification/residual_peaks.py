@@ -14,7 +14,7 @@ from ..values import ComplexArray
 from .pole_test import freedom, price
 from .refine import Fit, Lines, projected_cost, refined
 
-#: lengths [lines] of the stretches that are looked at
+#: lengths [lines] of the stretches that are examined
 STRETCHES = (3, 9, 27, 81)
 #: standard deviations of a stretch's chi-square above which it is not explained
 LIMIT = 6.0
@@ -143,7 +143,7 @@ def fewest_terms(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) ->
 
 
 def completed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Fit, list[Peak]]:
-    """Return the fit with the poles added that its residual asks for, and the peaks still left."""
+    """Return the fit with the poles added that its residual requires, and the peaks still left."""
     left = unexplained(lines, fit)
     for _ in range(MOST):
         better = next(filter(None, (_added(lines, fit, peak, steps) for peak in left[:2])), None)

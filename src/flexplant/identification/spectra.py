@@ -25,7 +25,7 @@ class SpectralMethod(Value):
     overlap : float
         Share of a segment that the next one sees again, 0 to below 1.
     window : str or tuple
-        As `scipy.signal.get_window` knows; "boxcar" where all signals are periodic in a segment.
+        As `scipy.signal.get_window` takes; "boxcar" where all signals are periodic in a segment.
     """
 
     segment: float | None = None
@@ -53,7 +53,7 @@ class H1Estimator(SpectralMethod):
     overlap : float
         Share of a segment that the next one sees again, 0 to below 1.
     window : str or tuple
-        As `scipy.signal.get_window` knows.
+        As `scipy.signal.get_window` takes.
 
     Raises
     ------
@@ -72,7 +72,7 @@ class H2Estimator(SpectralMethod):
     overlap : float
         Share of a segment that the next one sees again, 0 to below 1.
     window : str or tuple
-        As `scipy.signal.get_window` knows.
+        As `scipy.signal.get_window` takes.
 
     Raises
     ------
@@ -93,7 +93,7 @@ class HvEstimator(SpectralMethod):
     overlap : float
         Share of a segment that the next one sees again, 0 to below 1.
     window : str or tuple
-        As `scipy.signal.get_window` knows.
+        As `scipy.signal.get_window` takes.
 
     Raises
     ------
@@ -158,7 +158,7 @@ def spectral_frf(data: Records, method: SpectralMethod, quantity: str | None) ->
     n_ref = found.n_in
     if found.count <= n_ref + 1:
         raise ModelError(
-            f"{found.count:.1f} independent averages cannot tell {n_ref} inputs and noise apart: "
+            f"{found.count:.1f} independent averages cannot separate {n_ref} inputs and noise: "
             "shorten segment=, or measure longer."
         )
     if data.r is None:

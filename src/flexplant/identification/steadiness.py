@@ -171,12 +171,12 @@ def transient(
         # of the whole record's first period: a transient from rest is of the response's size
         tau = mine / size[best]
         start = tau * np.abs(z[best]) ** (-2.0 * first)
-        heard: Any = ndi.uniform_filter1d(seen, **ones) * length
+        power: Any = ndi.uniform_filter1d(seen, **ones) * length
         # between resonances slow vibration made by noise looks like a decay
         peak = mine > PEAK * ndi.maximum_filter1d(mine, NEAR)
         bias = tau * np.abs(mean[best]) ** 2 / (rest / kept)
         for k in np.flatnonzero(
-            (mine > limit * rest) & (bias > VISIBLE**2) & peak & (start > LEAST**2 * heard)
+            (mine > limit * rest) & (bias > VISIBLE**2) & peak & (start > LEAST**2 * power)
         ):
             decay = float(np.abs(z[best[k]]))
             more = int(np.ceil(np.log(10.0 * bias[k]) / (-2.0 * np.log(decay))))

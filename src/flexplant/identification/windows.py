@@ -1,4 +1,4 @@
-"""Wide bands in parts: weak modes are found where strong ones far away do not drown them."""
+"""Wide bands in parts: weak modes are found where strong ones elsewhere do not dominate."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .diagram import StabilisationDiagram, built_diagram
 from .line_weights import PreparedLines
 from .plscf import Moments, OrderPoles
 
-#: lines of a part, and the share of it that is looked at beyond each of its ends
+#: lines of a part, and the share of it that is used beyond each of its ends
 LINES, OVERLAP = 400, 0.25
 #: poles this share of the band outside of it are looked for: they bend the responses inside
 MARGIN = 0.04
@@ -20,7 +20,7 @@ MARGIN = 0.04
 
 @dataclass(frozen=True, eq=False)
 class Window:
-    """A part of the band: its own lines first..last, and those looked at."""
+    """A part of the band: its own lines first..last, and those used."""
 
     first: int
     last: int

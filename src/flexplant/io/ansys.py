@@ -46,8 +46,8 @@ def read_ansys(
         A .rst or .cdb file, whose local coordinate systems are turned to global directions; or a
         text table `node, x, y, z`. Without it the result is not `located`, enough for held models.
     rotations : mapping {node: (3, 3) array}, optional
-        Direction cosines of local coordinate systems, where `nodes` does not tell: row i holds the
-        global components of local axis i.
+        Direction cosines of local coordinate systems, where `nodes` does not give them: row i
+        holds the global components of local axis i.
 
     Returns
     -------

@@ -94,23 +94,23 @@ def one_matrix_each(
 def chosen(
     names: Iterable[str], wanted: Mapping[str, str | None], source: str
 ) -> dict[str, str | None]:
-    """Return which of the names of a file are K, M and D; those asked for must be there.
+    """Return which of the names of a file are K, M and D; those named must be there.
 
     Raises
     ------
     ModelError
-        When one asked for is missing, or no or several names look like K.
+        When one that is named is missing, or no or several names look like K.
     """
     there = list(names)
     found: dict[str, str | None] = {}
-    for part, asked in wanted.items():
-        if asked is not None:
-            if asked not in there:
+    for part, name in wanted.items():
+        if name is not None:
+            if name not in there:
                 raise ModelError(
-                    f"{source!r} has no variable {asked!r}: it holds {there[:10]}. Names are "
+                    f"{source!r} has no variable {name!r}: it holds {there[:10]}. Names are "
                     "case-sensitive; fields of a structure are written 'structure.field'."
                 )
-            found[part] = asked
+            found[part] = name
             continue
         # the shortest path first: K before model.K
         usual = [

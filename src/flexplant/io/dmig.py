@@ -83,7 +83,7 @@ def read_dmig(
         raise _wrong(str(path), len(lines) - 1, lines[-1], "a whole line")
     if not blocks:
         raise FlexplantError(
-            f"{str(path)!r} has no DMIG cards. Ask for them in the run: PARAM,EXTOUT,DMIGPCH or "
+            f"{str(path)!r} has no DMIG cards. Request them in the run: PARAM,EXTOUT,DMIGPCH or "
             "EXTSEOUT(DMIGPCH)."
         )
     K, M, D = (

@@ -24,7 +24,7 @@ class Format:
     read : callable
         The reader: the file, then options by name, to FEMatrices.
     begins : callable, optional
-        Tells from the first `HEAD` bytes, in lower case: what a file says of itself goes before
+        Decides from the first `HEAD` bytes, in lower case: what a file says of itself goes before
         its name.
     mesh : tuple of str
         Endings of the files that hold the nodes of such matrices.
@@ -54,5 +54,5 @@ class Elsewhere:
 
 
 def ends(path: Path, suffixes: tuple[str, ...]) -> bool:
-    """Tell whether the name of a file has one of the suffixes."""
+    """Return whether the name of a file has one of the suffixes."""
     return path.name.lower().endswith(suffixes)

@@ -49,7 +49,7 @@ def write_mat(path: str | Path, system: System | StandardPlant) -> None:
     if plant is not None:
         content |= {side: _cells(getattr(plant, side)) for side in "wuzy"}
         content["asd"] = np.array([plant.asd.get(name, 0.0) for name in plant.w])
-    file: Any  # the stubs know names of files only
+    file: Any  # the type stubs take names of files only
     with written(path) as file:
         scipy.io.savemat(file, content, oned_as="column")
 

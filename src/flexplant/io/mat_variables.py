@@ -19,7 +19,7 @@ def mat_variables(path: str | Path, **options: Any) -> dict[str, Any]:
     FlexplantError
         When it is no MATLAB file, or of version 7.3.
     """
-    file: Any  # the stubs know names of files only
+    file: Any  # the type stubs take names of files only
     with file_path(path).open("rb") as file:
         try:
             content = scipy.io.loadmat(file, **options)

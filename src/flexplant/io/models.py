@@ -55,7 +55,7 @@ def read_matrices(
     exodus: str | Path | None = None,
     rotations: Mapping[int, Any] | None = None,
 ) -> FEMatrices:
-    """Return the matrices of a file, whichever program wrote it, for `check` to look at.
+    """Return the matrices of a file, whichever program wrote it, for `check`.
 
     By suffix and content: Matrix Market or Abaqus .mtx; Harwell-Boeing .rsa, .rua; MATLAB .mat;
     NumPy and SciPy .npz, .npy; ANSYS .full; Nastran .op4 and .pch; Sierra .m.
@@ -144,7 +144,7 @@ def read_model(
     """Return the model of a file, whichever program wrote it.
 
     As `read_matrices(...).converted(*units).model(massless=...)`: what is wrong with a file is
-    refused with a reason, and `check(read_matrices(...))` tells it all at once.
+    refused with a reason, and `check(read_matrices(...))` reports all of it.
 
     Parameters
     ----------

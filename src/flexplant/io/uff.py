@@ -152,7 +152,7 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     FlexplantError
         When pyuff is missing, the file is damaged or holds no modes, or modes at other nodes.
     LabelError
-        When a mode asked for is not there.
+        When a mode that is named is not there.
     ModelError
         When a mode has zero frequency (a rigid-body mode), or a pole is not stable.
     FileNotFoundError

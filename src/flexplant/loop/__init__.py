@@ -1,4 +1,4 @@
-"""Closing the loop by names, and how well it then stands: sensitivities and margins."""
+"""Closing the loop by names, its sensitivities and margins."""
 
 from .closed import ClosedLoop as ClosedLoop
 from .closed import close_loop as close_loop

@@ -17,9 +17,9 @@ def joined(
     plant: StandardPlant, systems: Sequence[StateSpace], driven: list[str], watched: list[str]
 ) -> StateSpace:
     """Return the blocks as one system from y to the driven actuators and what is watched."""
-    heard = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
+    applied = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
     none = np.zeros((0, 0))
-    silent = [name for name in heard if name not in driven]
+    silent = [name for name in applied if name not in driven]
     zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
     # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: signals are
     # joined in units in which direct gains are at most one, powers of two so that no digit changes

@@ -20,7 +20,7 @@ Side = Literal["u", "y"]
 
 @dataclass(frozen=True)
 class BrokenLoop:
-    """A loop taken apart: y = P u, u = K y.
+    """A loop broken into plant and controller: y = P u, u = K y.
 
     Parameters
     ----------

@@ -246,7 +246,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def left_out(self) -> SpillOver | None:
-        """How the same controller stands on the plant with the modes left out; None: not known."""
+        """Stability and margin with the modes left out; None: not known."""
         if self.larger is None:
             return None
         whole = ClosedLoop(self.larger, self.blocks, self.controller, self.idle)
@@ -296,8 +296,8 @@ def close_loop(
         Actuators that stay without a drive on purpose.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`. The loop is then
-        checked there too (`ClosedLoop.left_out`); unless given, with those that the plant's
-        reduced model still knows.
+        checked there too (`ClosedLoop.left_out`); unless given, with those that the plant's reduced
+        model still has.
 
     Returns
     -------
@@ -308,13 +308,13 @@ def close_loop(
     -----
     FlexplantWarning
         When the closed loop is unstable, or is with the modes that the plant left out; it is
-        returned all the same, to be looked at. Marginal poles (a rigid-body mode that nothing
+        returned all the same, for inspection. Marginal poles (a rigid-body mode that nothing
         holds) are named by its repr alone.
 
     Raises
     ------
     LabelError
-        When the names of a system do not tell which channels are w, u, z and y, an input is
+        When the names of a system do not show which channels are w, u, z and y, an input is
         connected to nothing, an actuator is driven by nothing (and not idle), or
         a name other than an actuator's is driven twice.
     ModelError

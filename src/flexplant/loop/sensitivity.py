@@ -216,7 +216,7 @@ def _controller(law: Any) -> StateSpace:
 
 
 def _quantities(law: Any) -> dict[str, str]:
-    """Return what the sensors measure that a controller was designed for, as far as it knows."""
+    """Return what the sensors measure that a controller was designed for, where that is known."""
     plant = getattr(law, "plant", None)
     if not isinstance(plant, StandardPlant) or not plant.is_assembled:
         return {}

@@ -1,4 +1,4 @@
-"""How a loop stands on the plant with the modes that its design left out: spill-over."""
+"""Spill-over: stability and margin of a loop on the plant with the modes left out of its design."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class SpillOver(Value):
         return "spectral radius" if self.sampled else "largest real part"
 
     @property
-    def culprits(self) -> str:
+    def growing(self) -> str:
         """The modes that take part in what grows, in words."""
         listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(self.modes, self.freq, strict=True)]
         more = len(listed) - _NAMED
@@ -96,7 +96,7 @@ class SpillOver(Value):
         """The finding in one line."""
         found = f"{self._measure} {self.stability:.6f}"
         if not self.is_stable:
-            return f"unstable ({self.states} states), {found}: {self.culprits or 'no mode named'}"
+            return f"unstable ({self.states} states), {found}: {self.growing or 'no mode named'}"
         peak = -20.0 * np.log10(self.modulus_margin)
         return f"stable ({self.states} states), {found}, |S| at u up to {peak:.3g} dB"
 

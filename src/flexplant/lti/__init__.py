@@ -1,4 +1,4 @@
-"""Linear time-invariant systems: the control side's one type and what is done with it."""
+"""Linear time-invariant systems: the control side's one type and its methods."""
 
 from .balancing import BalancedReduction as BalancedReduction
 from .balancing import balanced as balanced

@@ -1,4 +1,4 @@
-"""Balanced reduction: fewer states, with the error promised beforehand and measured afterwards."""
+"""Balanced reduction: fewer states, with the error bounded beforehand and measured afterwards."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ class RiccatiProblem(NamedTuple):
 
 
 class Discrete:
-    """What the discrete equation asks of the common course of solution."""
+    """The steps of the solution for the discrete equation."""
 
     equation = "discrete Riccati equation"
 
@@ -74,11 +74,11 @@ class Discrete:
         return doubled(closed, residual)
 
     def stable(self, poles: ComplexArray) -> bool:
-        """Tell whether the closed loop is strictly stable."""
+        """Return whether the closed loop is strictly stable."""
         return bool(np.max(np.abs(poles), initial=0.0) < 1.0)
 
     def slow(self, poles: ComplexArray) -> bool:
-        """Tell whether the closed loop is so slow that its stability may be rounding."""
+        """Return whether the closed loop is so slow that its stability may be rounding."""
         return bool(np.max(np.abs(poles)) > 0.99)
 
     def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:
@@ -91,7 +91,7 @@ class Discrete:
 
 
 class Continuous:
-    """What the continuous equation asks of the common course of solution."""
+    """The steps of the solution for the continuous equation."""
 
     equation = "continuous Riccati equation"
 
@@ -150,11 +150,11 @@ class Continuous:
         return solve_continuous(closed, residual)
 
     def stable(self, poles: ComplexArray) -> bool:
-        """Tell whether the closed loop is strictly stable."""
+        """Return whether the closed loop is strictly stable."""
         return bool(np.max(poles.real, initial=-np.inf) < 0.0)
 
     def slow(self, poles: ComplexArray) -> bool:
-        """Tell whether the closed loop is so slow that its stability may be rounding."""
+        """Return whether the closed loop is so slow that its stability may be rounding."""
         return bool(np.max(poles.real) > -0.01 * np.max(np.abs(poles)))
 
     def relative(self, p: RiccatiProblem, residual: FloatArray, P: FloatArray) -> float:

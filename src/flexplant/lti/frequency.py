@@ -56,7 +56,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         Of a measurement: inverse of the length of a segment or period that was transformed.
     window : str or tuple, optional
         Of a measurement averaged over windowed segments: their window, as
-        `scipy.signal.get_window` knows; needs `resolution`. Such lines leak, and their errors are
+        `scipy.signal.get_window` takes; needs `resolution`. Such lines leak, and their errors are
         correlated (`line_correlation`). None where nothing leaks: computed, or whole periods.
     overlap : float
         Share of a segment that the next one sees again, 0 to below 0.95.

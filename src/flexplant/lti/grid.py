@@ -1,4 +1,4 @@
-"""Frequencies at which a system is worth looking at: dense around its resonances."""
+"""Grids of frequencies, dense around the resonances of a system."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .statespace import StateSpace, System, as_statespace
 TURN = 0.6
 #: a channel this far below the others of its row and column at a frequency is taken for zero
 FLOOR = 1e-6
-#: a pole with less damping than this has no finite response at its frequency: none is asked there
+#: a pole with less damping than this has no finite response at its frequency: it is not computed
 UNDAMPED = 1e-12
 #: relative width of the narrowest interval that is halved
 NARROWEST = 1e-8
@@ -148,7 +148,7 @@ def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 600) -> Floa
         s = np.asarray(np.log(s[np.abs(s) > 1e-12]) / dt, dtype=np.complex128)
     nyquist = 0.5 / dt if dt else np.inf
     size = np.abs(s) / (2 * np.pi)
-    # rigid-body poles and rounding of them at 0 or 1 tell nothing about where to look
+    # rigid-body poles and rounding of them at 0 or 1 say nothing about the frequencies of interest
     size_seen = size[size > 1e-6 * np.max(size, initial=0.0)]
     if not size_seen.size:
         size_seen = np.array([0.01 * nyquist if dt else 1.0])

@@ -136,7 +136,7 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
     forward, back : StateSpace
         G and H, connected in order of their channels.
     sign : {-1, +1}
-        Negative feedback unless told otherwise.
+        Negative feedback unless given.
 
     Raises
     ------

@@ -88,7 +88,7 @@ def common_fields(parts: Sequence[Any]) -> dict[str, Any]:
 
 
 def joined_units(parts: Sequence[Any]) -> dict[str, str]:
-    """Return the units of the channels of all parts; the first that knows one names it."""
+    """Return the units of the channels of all parts; the first unit given holds."""
     return {name: unit for part in reversed(parts) for name, unit in part.units.items()}
 
 

@@ -17,7 +17,7 @@ LEAST, FARTHEST = 1e-3, 40
 
 
 def checked_window(window: Any) -> str | tuple[Any, ...]:
-    """Return a window that `scipy.signal.get_window` knows."""
+    """Return a window that `scipy.signal.get_window` takes."""
     from scipy.signal import get_window  # costs a third of a second that few need
 
     window = tuple(window) if isinstance(window, list) else window
@@ -56,7 +56,7 @@ def line_correlation(
     freq : (n_freq,) array [Hz]
         Increasing.
     window : str or tuple
-        As `scipy.signal.get_window` knows.
+        As `scipy.signal.get_window` takes.
     resolution : float [Hz]
         Inverse of the length of a segment.
     overlap : float

@@ -11,7 +11,7 @@ from ..values import FloatArray, real_array
 from .scaling import even_scale
 from .statespace import StateSpace, System, as_statespace, is_block_diagonal
 
-#: doublings: 2^60 terms of the series; a slower decay is not told from none
+#: doublings: 2^60 terms of the series; a slower decay is not distinguished from none
 DOUBLINGS = 60
 #: largest accepted residual, relative to the terms of the equation
 TOLERANCE = 1e-10

@@ -45,7 +45,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     ModelError
         When `sys` is no system or tol is not between 0 and 1.
     SolverError
-        When stable and unstable modes cannot be told apart.
+        When stable and unstable modes cannot be distinguished.
 
     References
     ----------
@@ -75,8 +75,8 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
 def _cleaned(part: StateSpace, other: StateSpace) -> StateSpace:
     """Return a part with B and C set to zero where they are rounding beside those of the other."""
     idle = np.linalg.norm(part.B) <= NOISE * np.linalg.norm(other.B)
-    blind = np.linalg.norm(part.C) <= NOISE * np.linalg.norm(other.C)
-    return part.replace(B=0 * part.B, C=0 * part.C) if idle or blind else part
+    unseen = np.linalg.norm(part.C) <= NOISE * np.linalg.norm(other.C)
+    return part.replace(B=0 * part.B, C=0 * part.C) if idle or unseen else part
 
 
 def _less(g: StateSpace, tol: float) -> StateSpace:

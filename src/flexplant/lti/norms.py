@@ -296,7 +296,7 @@ class _Level:
         H = np.block([[F, (BV / gap_in) @ BV.T], [-(CU.T / gap_out) @ CU, -F.T]])
         balanced = balanced_matrix(H)
         values: ComplexArray = np.asarray(la.eigvals(balanced), dtype=np.complex128)
-        # eigenvalues that only seem to lie on the axis do no harm: the gain is looked at there
+        # eigenvalues that only seem to lie on the axis do no harm: the gain is computed there
         near = np.abs(values.real) <= 1e-9 * np.linalg.norm(balanced)
         swing = np.unique(np.abs(values.imag[near]))
         if self.dt:

@@ -268,7 +268,7 @@ def _closed_form(
     g: StateSpace, pairs: FloatArray, real: npt.NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, ComplexArray, ComplexArray]:
     a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
-    # a 1 x 1 block gets a partner that nothing drives, with a pole that no frequency meets
+    # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
     d[~real[:, 1]] = 0.0 if g.dt else -1.0
     root = np.sqrt((0.25 * (a - d) ** 2 + b * c).astype(np.complex128))
     mean = 0.5 * (a + d)

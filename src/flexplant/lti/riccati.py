@@ -31,7 +31,7 @@ class RiccatiSolution(Value):
         Symmetric.
     gain : (n, p) array
         ``K = (A P C' + S) (C P C' + R)^-1`` (or ``(P C' + S) R^-1``): the filter's closed loop is
-        A - K C. From the control doors it is F (m, n), closed loop A - B F.
+        A - K C. From the control forms it is F (m, n), closed loop A - B F.
     poles : (n,) array
         Eigenvalues of the closed loop.
     residual : float

@@ -51,7 +51,7 @@ def balanced_matrix(A: FloatArray) -> FloatArray:
 def mean_speed(poles: ComplexArray) -> float:
     """Return the geometric mean [rad/s] of the sizes of poles, those near zero left out; 1 if none.
 
-    Free masses come out at rounding, which tells nothing about the others.
+    Free masses come out at rounding, which says nothing about the others.
     """
     sizes = np.abs(poles)
     moving = sizes[sizes > 1e-6 * sizes.max(initial=0.0)]

@@ -11,7 +11,7 @@ from ..errors import SolverError
 from ..values import FloatArray, Value
 from .joining import block_eigenvalues
 from .scaling import state_scale
-from .stability import doubted_poles
+from .stability import uncertain_poles
 from .statespace import (
     StateSpace,
     System,
@@ -75,10 +75,10 @@ def split_stable(sys: System) -> Split:
         return Split(g, g.replace(D=0 * g.D), 0.0)
     if is_block_diagonal(g):
         return _by_blocks(g)
-    poles, doubt = doubted_poles(g)
+    poles, error = uncertain_poles(g)
     growth = np.abs(poles) - 1.0 if g.dt else poles.real
-    outside = growth >= -doubt
-    edge = float(min(growth[outside].min(), 0.0) - doubt[outside].max()) if outside.any() else 0.0
+    outside = growth >= -error
+    edge = float(min(growth[outside].min(), 0.0) - error[outside].max()) if outside.any() else 0.0
     d = state_scale(g.A, g.B, g.C)
     A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
 

@@ -1,4 +1,4 @@
-"""Whether a system has norms at all, and the pole that says no."""
+"""Whether a system has norms at all, and the pole that makes them infinite."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from ..values import ComplexArray, FloatArray
 from .scaling import state_scale
 from .statespace import StateSpace
 
-#: poles this close to the axis, relative to the size of A, are looked at with their condition
+#: poles this close to the axis, relative to the size of A, are examined with their condition
 NEAR = 1e-6
 #: roundings of A that a pole is allowed to have suffered
 ROUNDINGS = 4.0
@@ -33,14 +33,14 @@ def obstacle(g: StateSpace, *, axis_only: bool = False) -> Obstacle | None:
     """
     if not g.n_states:
         return None
-    poles, doubt = doubted_poles(g)
+    poles, error = uncertain_poles(g)
     growth = np.abs(poles) - 1.0 if g.dt else poles.real
-    on_axis = np.abs(growth) <= doubt
+    on_axis = np.abs(growth) <= error
     beyond = (growth > 0) & ~on_axis & (not axis_only)
     if not (beyond | on_axis).any():
         return None
     worst = int(np.argmax(np.where(beyond if beyond.any() else on_axis, growth, -np.inf)))
-    pole, unsure = poles[worst], float(doubt[worst])
+    pole, unsure = poles[worst], float(error[worst])
     edge = "the unit circle" if g.dt else "the imaginary axis"
     freq = float(abs(np.angle(pole) / g.dt if g.dt else pole.imag)) / (2 * np.pi)
     if beyond[worst]:
@@ -55,7 +55,7 @@ def obstacle(g: StateSpace, *, axis_only: bool = False) -> Obstacle | None:
     return Obstacle(f"marginal: {kind} lies on {edge}{rounding}", 0.0 if integrates else freq)
 
 
-def doubted_poles(g: StateSpace) -> tuple[ComplexArray, FloatArray]:
+def uncertain_poles(g: StateSpace) -> tuple[ComplexArray, FloatArray]:
     """Return the poles and how far rounding may have moved each."""
     poles = g.poles()
     if g.blocks is not None and max(g.blocks) <= 2:
@@ -64,11 +64,11 @@ def doubted_poles(g: StateSpace) -> tuple[ComplexArray, FloatArray]:
     A = g.A * d / d[:, None]
     size = float(np.linalg.norm(A, 2))
     gap = np.abs(np.abs(poles) - 1.0 if g.dt else poles.real)
-    doubt = np.finfo(float).eps * size * np.ones(poles.size)
+    error = np.finfo(float).eps * size * np.ones(poles.size)
     if not np.any(gap <= NEAR * size):
-        return poles, doubt
+        return poles, error
     found: Any = la.eig(A, left=True, right=True)
     values, left, right = found
     aligned = np.abs(np.einsum("ij,ij->j", left.conj(), right))
     condition = 1.0 / np.maximum(aligned, np.sqrt(np.finfo(float).eps))
-    return np.asarray(values, dtype=np.complex128), ROUNDINGS * doubt * condition
+    return np.asarray(values, dtype=np.complex128), ROUNDINGS * error * condition

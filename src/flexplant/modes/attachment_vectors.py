@@ -113,8 +113,8 @@ def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) 
     """Return the elastic static response (n, m) to loads, M-orthogonal to the rigid-body motions.
 
     ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes.
-    The structure is held at r DOFs, where its rigid-body motions are best told apart; in balance,
-    these carry no force, and the rigid-body part of the answer is taken out afterwards.
+    The structure is held at r DOFs, where its rigid-body motions are best distinguished; in
+    balance, these carry no force, and the rigid-body part of the answer is taken out afterwards.
 
     Raises
     ------
@@ -162,7 +162,7 @@ def projected_zeta(D: Matrix | None, vectors: FloatArray, omega: FloatArray) -> 
 
 
 def labels_of(at: Sequence[Place], dofs: DofSet) -> tuple[str, ...]:
-    """Return the names of places, after checking that the model knows them."""
+    """Return the names of places, after checking that the model has them."""
     for place in at:
         dofs.row(place)
     return tuple(named(place) for place in at)

@@ -45,7 +45,7 @@ class BlockLanczos:
     locked : (n, r) array
         M-orthonormal vectors, modes already known: deflated.
     want : int
-        About how many modes will be asked for.
+        About how many modes will be requested.
     rng : int, SeedSequence or Generator
         Of the starting block: the same one gives the same answer.
     start : (n, s) array, optional
@@ -108,18 +108,18 @@ class BlockLanczos:
             sure = int(np.count_nonzero(theta * FOUND >= _ROUNDING * theta[0]))
             limited = sure < min(count, theta.size)
             wanted = sure if limited else count
-            asked = np.full(min(wanted, theta.size), tolerance)
+            required = np.full(min(wanted, theta.size), tolerance)
             if not limited:
-                asked[count - extra :] = max(tolerance, VALUE)
-            limit = np.maximum(asked * theta[: asked.size], _ROUNDING * theta[0])
-            if theta.size >= wanted and np.all(error[: asked.size] <= limit):
+                required[count - extra :] = max(tolerance, VALUE)
+            limit = np.maximum(required * theta[: required.size], _ROUNDING * theta[0])
+            if theta.size >= wanted and np.all(error[: required.size] <= limit):
                 basis = self._V[self._r : self._r + self._m]
                 return theta[:wanted], basis.T @ mix[:, :wanted]
             if self._r + self._m + 2 * self._next.shape[1] > self._capacity:
                 self._restart(theta, mix, min(count + self._block, theta.size))
         raise SolverError(
             f"Lanczos did not converge for {count} modes in {self.steps} steps: M and K are badly "
-            "conditioned. Look for DOFs with next to no mass, or ask for fewer modes."
+            "conditioned. Look for DOFs with next to no mass, or request fewer modes."
         )
 
     def _random(self, columns: int) -> FloatArray:

@@ -199,7 +199,7 @@ class Modes(Placed, Value):
     def orthonormal_basis(self) -> FloatArray:
         """M-orthonormal real shapes B (n, b) that span those of the modes.
 
-        Complex modes tell M on their span by how they answer at once: ``B B' = sum Re(phi phi'
+        Complex modes give M on their span by how they answer at once: ``B B' = sum Re(phi phi'
         lambda / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes.
         """
         if not np.iscomplexobj(self.phi):

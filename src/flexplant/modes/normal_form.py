@@ -128,7 +128,7 @@ class RealForm(NamedTuple):
 
     @property
     def is_proportional(self) -> bool:
-        """Whether D damps each elastic mode by itself; rigid-body motions are not looked at."""
+        """Whether D damps each elastic mode by itself; rigid-body motions are left out."""
         C = self.C[self.n_rigid :, self.n_rigid :]
         rate = np.diag(C)
         coupling = float(np.abs(C - np.diag(rate)).max(initial=0.0))

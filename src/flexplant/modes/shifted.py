@@ -28,7 +28,7 @@ _dissected: weakref.WeakKeyDictionary[FEModel, Dissection]
 class StiffnessFactor:
     """``K - sigma M = L L^T`` of a sparse model, with sigma just below zero.
 
-    Get it from `stiffness_factor`, which hands out the same one for as long as someone holds it.
+    Get it from `stiffness_factor`, which returns the same one as long as it is in use.
 
     Parameters
     ----------
@@ -119,7 +119,7 @@ class StiffnessFactor:
 
 
 def stiffness_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
-    """Return the factor of a sparse model, the same one for as long as someone holds it.
+    """Return the factor of a sparse model, the same one as long as it is in use.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ from .normal_form import PROPORTIONAL, check_drag, normal_form
 from .shifted import modes_below, stiffness_factor
 from .sparse_modes import counted_modes
 
-#: M-orthonormality that is asked of every answer
+#: M-orthonormality that every result must have
 _ORTHONORMAL = 1e-12
 #: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
 _RESIDUAL = (1e-8, 1e-12)

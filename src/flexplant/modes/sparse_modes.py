@@ -17,7 +17,7 @@ from ..values import FloatArray, Rng
 from .lanczos import FOUND, BlockLanczos
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
 
-#: modes beyond the last wanted one among which a gap is looked for
+#: modes beyond the last wanted one among which a gap is searched
 _EXTRA = 4
 #: omega^2 closer than this (relative), or than so many of their roundings, belong together
 _GAP, _GAP_ROUNDINGS = 1e-8, 4.0
@@ -86,7 +86,7 @@ def _counted(
         if count > _MOST:
             raise ModelError(
                 f"below {np.sqrt(top) / (2 * np.pi):.6g} Hz this model of {n} DOFs has {below} "
-                f"elastic modes: more than {_MOST} are not solved for at once. Ask for a lower "
+                f"elastic modes: more than {_MOST} are not solved for at once. Choose a lower "
                 "frequency, or for the lowest ones with count=."
             )
     squares, phi = np.zeros(0), np.zeros((n, 0))
@@ -118,8 +118,8 @@ def _counted(
             break
         missing = min(counted - sure + _EXTRA, n - r - squares.size)
     raise SolverError(
-        f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count tells {counted + r} modes, "
-        f"{sure + r} were found: closely repeated frequencies. Ask for some more or fewer modes."
+        f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count finds {counted + r} modes, "
+        f"{sure + r} were found: closely repeated frequencies. Request some more or fewer modes."
     )
 
 
@@ -178,8 +178,8 @@ def _searched(
         phi = factor.solve(force)
         phi -= locked @ (deflated.T @ phi)
         squares, phi = rayleigh_ritz(stiffness, mass, phi)
-        asked = squares.size - extra if squares.size == want else squares.size
-        left = _residual(stiffness, mass, squares[:asked], phi[:, :asked])
+        kept = squares.size - extra if squares.size == want else squares.size
+        left = _residual(stiffness, mass, squares[:kept], phi[:, :kept])
         if left < best:
             best, found = left, phi
         if left <= 1:

@@ -46,7 +46,7 @@ class Exhaustive(Search):
         if problem.subsets > self.limit:
             raise ModelError(
                 f"there are {problem.subsets} subsets, more than Exhaustive(limit={self.limit}) "
-                "allows. Use Exchange(), whose bound tells how far from the optimum it can be, or "
+                "allows. Use Exchange(), whose bound shows how far from the optimum it can be, or "
                 "a higher limit."
             )
         kept, more = problem.required, problem.count - len(problem.required)

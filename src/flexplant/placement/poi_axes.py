@@ -1,4 +1,4 @@
-"""The axes of a POI that a criterion sums over, and what a plant knows of them."""
+"""The axes of a POI that a criterion sums over, and their rows in a plant."""
 
 from __future__ import annotations
 

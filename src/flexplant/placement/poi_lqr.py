@@ -33,8 +33,8 @@ from .quadratic import quadratic
 class PoiLqr(Criterion):
     """Least mean square of a POI's motion and the effort it takes: for actuators.
 
-    ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising controllers that know the
-    state, with the plant's disturbances and its delay of u. More actuators never make it larger.
+    ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising state
+    feedbacks, with the plant's disturbances and delay of u. More actuators never make it larger.
 
     Parameters
     ----------
@@ -152,6 +152,6 @@ class PoiLqr(Criterion):
             )
         except SolverError as error:
             raise SolverError(
-                f"{error} The effort of {self.effort:g} m/N may be too small to tell gains apart: "
+                f"{error} The effort of {self.effort:g} m/N may be too small to distinguish gains: "
                 "try a larger one."
             ) from error

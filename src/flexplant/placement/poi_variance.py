@@ -94,7 +94,7 @@ class PoiVariance(Criterion):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
 
-        Delay lines of u are left out: the filter knows their states exactly. Where ports have
+        Delay lines of u are left out: their states are known exactly. Where ports have
         filters or delays every choice has states of its own, and the plant is made anew.
         """
         if not plain(plant, candidates):

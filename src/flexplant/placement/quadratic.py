@@ -168,7 +168,7 @@ def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
         gain = _gain(X, g)
         left = np.eye(X.shape[0]) - gain @ g
         residual = A.T @ (left @ X @ left.T + gain @ gain.T) @ A + H - X
-        # closed loops that are barely stable look converged: `control_dare` tells them apart
+        # closed loops that are barely stable look converged: `control_dare` distinguishes them
         if np.linalg.norm(residual) <= RESIDUAL * np.linalg.norm(X):
             return X
     return control_dare(A, g.T, Q=H, R=np.eye(g.shape[0])).P

@@ -1,4 +1,4 @@
-"""Which standard assumptions a plant meets, in physical words, rigid-body modes first."""
+"""Which standard assumptions hold for a plant, in physical words, rigid-body modes first."""
 
 from __future__ import annotations
 

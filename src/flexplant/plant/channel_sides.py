@@ -8,7 +8,7 @@ from ..errors import LabelError
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace
 
-#: what to type for a system whose names do not tell
+#: what to type for a system whose names do not show its channels
 TYPE_THIS = "StandardPlant.from_statespace(sys, w=[...], u=[...], z=[...], y=[...], asd={...})"
 
 
@@ -62,5 +62,5 @@ def sides(g: StateSpace) -> Sides:
 
 def _untold(why: str) -> LabelError:
     return LabelError(
-        f"the names of the channels do not tell which are w, u, z and y: {why}. Type {TYPE_THIS}."
+        f"the names of the channels do not show which are w, u, z and y: {why}. Type {TYPE_THIS}."
     )

@@ -87,8 +87,8 @@ class BaseAcceleration(ForcePort):
 
     Notes
     -----
-    Modes and reduced models know their inertia against motions that their shapes can make: free
-    or suspended structures. For a held one pass the FEModel; one that was held by `fixed` knows the
+    Modes and reduced models have an inertia against motions that their shapes can make: free
+    or suspended structures. For a held one pass the FEModel; one that was held by `fixed` has the
     mass that couples it to its held DOFs, matrices made elsewhere have lost it.
     """
 

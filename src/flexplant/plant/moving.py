@@ -110,7 +110,7 @@ def _poi_along(plant: Partition, poi: Poi, points: FloatArray) -> Along:
     D = np.repeat(g.D[at][None], points.shape[0], axis=0)
     carried = poi.absolute and any(np.any(port.ground) for port in plant.assembled.ports.w)
     if realisation.static_outputs.size or carried:
-        # forces reach a POI at once too, the ground by its shape: what the whole plant knows
+        # forces reach a POI at once too, the ground by its shape: of the whole plant
         for i, point in enumerate(points):
             there = _elsewhere(plant, poi.name, point).system
             C[i], D[i] = there.C[at], there.D[at]

@@ -27,7 +27,7 @@ def is_plant(given: object) -> TypeGuard[Partition | System]:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Partition(Value):
-    """The data of a standard plant, in the fields of `StandardPlant`, and what they tell."""
+    """The data of a standard plant, in the fields of `StandardPlant`, and derived quantities."""
 
     system: StateSpace
     w: tuple[str, ...]
@@ -68,12 +68,12 @@ class Partition(Value):
 
     @classmethod
     def of(cls, given: Any) -> Self:
-        """Return a plant; of a system with labels when these tell w, u, z and y.
+        """Return a plant; of a system with labels when these name w, u, z and y.
 
         Raises
         ------
         LabelError
-            When the labels do not tell.
+            When the labels do not.
         ModelError
             When it is neither.
         """
@@ -123,7 +123,7 @@ class Partition(Value):
         Raises
         ------
         LabelError
-            When a name is unknown or on two sides, or none is given and the channels do not tell.
+            When a name is unknown or on two sides, or none is given and the names do not show them.
         """
         g = as_statespace(sys)
         if u is None and y is None and w is None and z is None:

@@ -23,7 +23,7 @@ _SHOWN = 3
 
 
 class _Case(NamedTuple):
-    """One question to the modes that do not decay by themselves."""
+    """One test of the modes that do not decay by themselves."""
 
     key: str
     verb: str
@@ -41,11 +41,11 @@ class _Pole(NamedTuple):
 
 
 def reach_and_sight(plant: Partition) -> list[Assumption]:
-    """Ask which modes that do not decay w and u reach, and y and z see (Hautus)."""
+    """Return which modes that do not decay w and u reach, and y and z see (Hautus)."""
     bare = plant.unweighted.continuous
     if not bare.is_assembled:  # states of a system made elsewhere have any units
         bare = bare.replace(system=evened(bare.system))
-    poles = _undying(bare.system)
+    poles = _persistent(bare.system)
     rigid = bare.n_rigid
     found = []
     for case in _cases(bare, poles):
@@ -87,7 +87,7 @@ def _cases(plant: Partition, poles: list[_Pole]) -> list[_Case]:
     return [w, y, z, u] if plant.is_assembled else [u, y]
 
 
-def _undying(g: StateSpace) -> list[_Pole]:
+def _persistent(g: StateSpace) -> list[_Pole]:
     """Return the poles on or beyond the stability limit, upper half plane, each once."""
     poles = g.poles()
     margin = np.abs(poles) - 1 if g.dt else poles.real / np.maximum(np.abs(poles), 1.0)

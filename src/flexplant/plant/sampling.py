@@ -170,7 +170,7 @@ class _Layout:
                     A[rows, self.pushed[age, i]] += effect[:, i]
 
     def remember(self, A: FloatArray, B: FloatArray) -> None:
-        """Let the lines of the inputs move on by one."""
+        """Shift the delay lines of the inputs by one sample."""
         for (age, i), state in self.pushed.items():
             if age == 1:
                 B[state, i] = 1.0

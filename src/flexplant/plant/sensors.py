@@ -1,4 +1,4 @@
-"""What is seen of a machine: sensors, and points of interest that no sensor sees."""
+"""Outputs of a machine: sensors, and points of interest that no sensor measures."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ class Sensor(SensorPort):
 
 @dataclass(frozen=True, eq=False)
 class Poi(Value):
-    """A Point Of Interest: motions that no sensor sees, in z as `name:axis`.
+    """A Point Of Interest: motions that no sensor measures, in z as `name:axis`.
 
     Parameters
     ----------

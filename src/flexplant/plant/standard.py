@@ -1,4 +1,4 @@
-"""The standard plant: one StateSpace, the names of w, u, z, y in it, and what is done with it."""
+"""The standard plant: one StateSpace, the names of w, u, z, y in it, and its methods."""
 
 from __future__ import annotations
 
@@ -202,7 +202,7 @@ class StandardPlant(Partition):
         deviations: float = 2.0,
         neglected: Any = None,
     ) -> UncertainPlant[StandardPlant]:
-        """Return the plant with the doubt of a fit opened as real Deltas on its modes.
+        """Return the plant with the uncertainty of a fit as real Deltas on its modes.
 
         The covariance of the parameters goes to the modes by the eigenvalue sensitivities,
         ``J C J'``; each chosen mode's stiffness omega^2 and damping 2 zeta omega becomes a channel
@@ -234,8 +234,8 @@ class StandardPlant(Partition):
         LabelError
             When parameters are not those of the fit, or a mode is unknown.
         ModelError
-            When there is no covariance, the fit is of another model, or the doubt covers negative
-            stiffness or damping.
+            When there is no covariance, the fit is of another model, or the uncertainty covers
+            negative stiffness or damping.
         """
         return uncertain(
             self,
@@ -260,7 +260,7 @@ class StandardPlant(Partition):
 
 
 def standard_plant(given: StandardPlant | System) -> StandardPlant:
-    """Return a StandardPlant, also of a system whose labels tell w, u, z and y apart.
+    """Return a StandardPlant, also of a system whose labels distinguish w, u, z and y.
 
     Called by all functions that take a plant.
 
@@ -272,7 +272,7 @@ def standard_plant(given: StandardPlant | System) -> StandardPlant:
     Raises
     ------
     LabelError
-        When the labels do not tell them apart.
+        When the labels do not distinguish them.
     ModelError
         When it is neither.
     """

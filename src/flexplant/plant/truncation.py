@@ -1,4 +1,4 @@
-"""The plant with the modes that a reduction left out: what designs on the reduced one meet."""
+"""The plant with the modes that a reduction left out: the check of designs on the reduced one."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def larger_plant(
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         The larger model: a structure gets the plant's ports, a plant must have its channels. Of a
         reduced model the modes that it left out count as well. None:
-        the modes that the plant's reduced model still knows.
+        the modes that the plant's reduced model still has.
 
     Returns
     -------

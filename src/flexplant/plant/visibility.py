@@ -70,7 +70,7 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     Parameters
     ----------
     plant : StandardPlant
-        Not weighted; of a sampled plant the continuous one is looked at.
+        Not weighted; of a sampled plant the continuous one is used.
     """
     plant = plant.continuous
     if not plant.is_assembled:

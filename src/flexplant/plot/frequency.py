@@ -38,7 +38,7 @@ def frf(
     colors : mapping {label: color}, optional
         Of some lines.
     unit : str, optional
-        Of the gain, where the responses do not know it; 0 dB is one of it.
+        Of the gain, where the responses have none; 0 dB is one of it.
     reference : str, optional
         A label: the differences of the other responses from this one are drawn as dotted lines,
         where they share its frequencies.

@@ -131,7 +131,7 @@ def _mac(ax: Axes, seen: Correlation, name: str) -> None:
     if seen.alike:
         shown = "; ".join(", ".join(map(str, group)) for group in seen.alike[:3])
         more = "; ..." if len(seen.alike) > 3 else ""
-        title += f"\nthe sensors cannot tell apart {shown}{more}"
+        title += f"\nthe sensors cannot distinguish {shown}{more}"
     ax.set(xlabel="mode of the model", ylabel="measured mode", title=title)
 
 
@@ -147,9 +147,9 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
     size = np.where(size > 0, size, 1.0)
     labels = []
     for i in range(count):
-        doubt = "" if fit.std is None else f" ± {fit.std[i]:.1g}"
+        error = "" if fit.std is None else f" ± {fit.std[i]:.1g}"
         edge = ", AT ITS BOUND" if fit.parameters[i] in fit.at_bound else ""
-        labels.append(f"{fit.parameters[i]}\n{values[i]:.4g}{doubt} {fit.units[i]}{edge}")
+        labels.append(f"{fit.parameters[i]}\n{values[i]:.4g}{error} {fit.units[i]}{edge}")
         prior = getattr(fit.unknowns[i], "prior", None) if fit.unknowns else None
         if prior is not None:
             mean, width = prior[0] / size[i], 1.96 * prior[1] / size[i]

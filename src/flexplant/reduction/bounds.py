@@ -1,4 +1,4 @@
-"""What a truncation cannot miss by more: over all frequencies, and below one of them."""
+"""Bounds of the error of a truncation: over all frequencies, and below one of them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from .ranking import peak_gains
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ErrorBound(Value):
-    """What a reduction cannot miss by more, known before any response is computed.
+    """A bound of the error of a reduction, known before any response is computed.
 
     Parameters
     ----------

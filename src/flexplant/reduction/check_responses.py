@@ -21,7 +21,7 @@ from .bounds import ErrorBound
 SMALL = 600
 #: check frequencies beside the resonances, of small and of large models
 _GRID = (60, 6)
-#: resonances looked at, of small and of large models
+#: resonances checked, of small and of large models
 _RESONANCES = (200, 6)
 
 

@@ -103,7 +103,7 @@ class CraigBampton(ReductionMethod):
         rows = part.others
         if self.modes > rows.size:
             raise ModelError(
-                f"{self.modes} fixed-interface modes of an interior of {rows.size} DOFs: ask for "
+                f"{self.modes} fixed-interface modes of an interior of {rows.size} DOFs: choose "
                 "fewer."
             )
         interior = FEModel(

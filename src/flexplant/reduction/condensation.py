@@ -326,7 +326,7 @@ def kept_columns(numbers: tuple[int, ...], modes: Modes) -> IntArray:
         When a number is beyond the modes, or a rigid-body mode is left out.
     """
     if numbers[-1] > modes.n_modes:
-        raise ModelError(f"mode {numbers[-1]} is asked for, but there are {modes.n_modes}.")
+        raise ModelError(f"mode {numbers[-1]} is required, but there are {modes.n_modes}.")
     left = sorted(set(range(1, modes.n_rigid + 1)) - set(numbers))
     if left:
         raise ModelError(

@@ -1,4 +1,4 @@
-"""Ways to choose degrees of freedom that tell modes apart; each is a small value."""
+"""Ways to choose degrees of freedom that distinguish modes; each is a small value."""
 
 from __future__ import annotations
 

@@ -76,7 +76,7 @@ class Krylov(ReductionMethod):
                 f"freq must be one or more frequencies [Hz] from 0 up, got {self.freq!r:.60}."
             )
         if np.unique(freq).size < freq.size:
-            raise ModelError("an expansion frequency is there twice: ask for more moments.")
+            raise ModelError("an expansion frequency is there twice: choose more moments.")
         self._set(
             inputs=tuple(places(self.inputs)),
             freq=freq,

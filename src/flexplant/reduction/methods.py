@@ -19,7 +19,7 @@ from .reduced import ReducedModel
 
 #: beyond this, rounding in K* (eps cond^2) spoils the low modes
 _CONDITION_LIMIT = 1e6
-#: part of the largest pivot above which a row of phi tells a mode of its own
+#: part of the largest pivot above which a row of phi determines a mode of its own
 _TELLS = 1e-3
 
 
@@ -40,7 +40,7 @@ class DesiredDofs(ReductionMethod):
     dofs : sequence of str, DofSet or DofSelection
         As many labels as there are modes plus attachment vectors. With fewer labels than modes
         and no attachment vectors, the lowest modes are kept, as many as there are labels; the
-        model knows the others as `truncated`.
+        model keeps the others as `truncated`.
 
     Raises
     ------
@@ -128,7 +128,7 @@ def refused_partition(
         return condition
     raise ModelError(
         f"phi_kk is near singular: condition {condition:.3g} (limit {limit:.0e}). The DOFs do not "
-        f"tell the {what} apart, and M*, K* would be rounding. " + _proposal(dofs, basis, labels)
+        f"distinguish the {what}, and M*, K* would be rounding. " + _proposal(dofs, basis, labels)
     )
 
 

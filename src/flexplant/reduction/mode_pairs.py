@@ -36,8 +36,8 @@ class ModePairs(NamedTuple):
         Modal assurance criterion with it; of a cluster the squared cosines of the angles between
         the two subspaces, which hold for every basis of a repeated mode; 0 without a partner there.
     group : (m,) array of int
-        First (from 0) of the modes whose shapes cannot be told from that of each: a cluster, or
-        shapes that are alike as far as they are known.
+        First (from 0) of the modes whose shapes cannot be distinguished from that of each: a
+        cluster, or shapes that are alike as far as they are known.
     """
 
     partner: IntArray
@@ -193,7 +193,7 @@ def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
 
 
 def groups_alike(alike: FloatArray, clusters: Sequence[IntArray] = ()) -> IntArray:
-    """Return for each mode the first one whose shape cannot be told from its own.
+    """Return for each mode the first one whose shape cannot be distinguished from its own.
 
     Parameters
     ----------

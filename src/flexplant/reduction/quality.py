@@ -28,7 +28,7 @@ from .mode_pairs import paired
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ReductionQuality(Value):
-    """What a reduced model gets right, judged against the full one.
+    """The error of a reduced model beside the full one.
 
     Parameters
     ----------
@@ -44,8 +44,8 @@ class ReductionQuality(Value):
         whose shapes are any basis of a subspace, the squared cosines of the angles between the two
         subspaces.
     group : (m,) array of int
-        Number of the first mode whose shape cannot be told from that of each: of repeated modes
-        that lack a partner it is not known which one is missing.
+        Number of the first mode whose shape cannot be distinguished from that of each: of
+        repeated modes that lack a partner it is not known which one is missing.
     check_freq : (f,) array [Hz]
         Where responses were compared.
     frf_error : (p, q) array
@@ -104,7 +104,7 @@ class ReductionQuality(Value):
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:
-        """Numbers of the elastic modes whose shapes cannot be told apart, group by group."""
+        """Numbers of the elastic modes whose shapes cannot be distinguished, group by group."""
         elastic = self.full_freq > 0
         firsts = np.unique(self.group[elastic])
         groups = [self.modes[elastic & (self.group == first)].tolist() for first in firsts]
@@ -135,7 +135,7 @@ class ReductionQuality(Value):
         if self.alike:
             listed = "; ".join(", ".join(map(str, members)) for members in self.alike[:4])
             more = ", ..." if len(self.alike) > 4 else ""
-            lines.append(f"shapes that cannot be told apart: modes {listed}{more}")
+            lines.append(f"shapes that cannot be distinguished: modes {listed}{more}")
         if self.frf_error.size:
             i, j = np.unravel_index(int(np.argmax(self.frf_error)), self.frf_error.shape)
             lines.append(
@@ -273,16 +273,16 @@ def _loss(reduced: Reduced, loss: float | None) -> float:
 def _full_modes(reduced: Reduced, full: FEModel | Modes, count: int | None, high: float) -> Modes:
     if isinstance(full, Modes):
         return full
-    asked = 0
+    number = 0
     if count is not None:
-        asked = whole(count, "count", maximum=full.n_dof)
+        number = whole(count, "count", maximum=full.n_dof)
     # the reduced model has about as many in the band: a count is cheaper than "all below"
-    asked = max(asked, int(np.sum(_undamped_modes(reduced).freq <= high)) + 8)
+    number = max(number, int(np.sum(_undamped_modes(reduced).freq <= high)) + 8)
     while True:
-        found = solve_modes(full, count=min(asked, full.n_dof), damping=ModalDamping(0.0))
+        found = solve_modes(full, count=min(number, full.n_dof), damping=ModalDamping(0.0))
         if found.n_modes == full.n_dof or found.freq[-1] > high:
             return found
-        asked *= 2
+        number *= 2
 
 
 def _compared(

@@ -1,4 +1,4 @@
-"""Which degrees of freedom tell the modes apart."""
+"""Which degrees of freedom distinguish the modes."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def select_dofs(
     criterion: SelectionCriterion | None = None,
     limit: float = 1e12,
 ) -> DofSelection:
-    """Return DOFs at which modes and attachment vectors are well told apart.
+    """Return DOFs at which modes and attachment vectors are well distinguished.
 
     Parameters
     ----------
@@ -85,7 +85,7 @@ def select_dofs(
     ShapeError
         When `count` does not fit.
     ModelError
-        When `count` is no whole number, the modes are complex, or no candidates tell them apart.
+        When `count` is no whole number, the modes are complex, or no candidates distinguish them.
 
     Examples
     --------
@@ -99,7 +99,7 @@ def select_dofs(
     """
     if not isinstance(modes, Modes):
         raise ModelError(
-            f"select_dofs tells modes apart, got {type(modes).__name__}: "
+            f"select_dofs distinguishes modes, got {type(modes).__name__}: "
             "select_dofs(solve_modes(model, count=24), 24)."
         )
     rule = PivotedQr() if criterion is None else criterion
@@ -138,7 +138,7 @@ def select_dofs(
     top = positive(limit, "limit")
     if not singular[-1] * top > singular[0]:
         raise ModelError(
-            f"no {number} of these DOFs tell the modes apart (condition above {top:.3g}): the "
+            f"no {number} of these DOFs distinguish the modes (condition above {top:.3g}): the "
             "required ones depend on each other, or all candidates lie on node lines. Name other "
             "candidates."
         )

@@ -177,7 +177,7 @@ class ModalBalanced(ReductionMethod):
     inputs, outputs : place or sequence of places
         Forces and displacements that matter; no outputs: the inputs.
     among : int, optional
-        With an FEModel: how many of its lowest modes are looked at; None: all of a model that is
+        With an FEModel: how many of its lowest modes are used; None: all of a model that is
         not large.
     static_at : place or sequence of places
         Where the static compliance of what was left out is kept.

@@ -20,8 +20,8 @@ Numbers: TypeAlias = "float | FloatArray"
 class Response(Value, Mapping[str, FloatArray]):
     """Sampled signals of one run or of several, by name.
 
-    `response["die:error"]` is an array over time, (n_time,) for one run; when runs were asked for
-    by number, (n_runs, n_time), also for one. A Mapping: `dict(response)` feeds a data frame.
+    `response["die:error"]` is an array over time, (n_time,) for one run; when the number of runs
+    was given, (n_runs, n_time), also for one. A Mapping: `dict(response)` feeds a data frame.
 
     Parameters
     ----------

@@ -227,7 +227,7 @@ def _check_sampled(loop: ClosedLoop) -> None:
 
 
 def _warn_unstable(loop: ClosedLoop, steps: int) -> None:
-    """Warn of a loop that runs away; an integrator that is left alone is no such loop."""
+    """Warn of an unstable loop; an integrator without feedback is none."""
     radius = loop.spectral_radius
     if radius <= 1:
         return
@@ -240,7 +240,7 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> None:
     warnings.warn(
         f"the loop is unstable (spectral radius {radius:.9g}; {found.reason}): what grows fastest "
         f"grows {by} in these {steps} samples, and no rms of it means anything. Lower the gain or "
-        "the delay of its controller; loop.modulus_margin tells how far a loop is from this.",
+        "the delay of its controller; loop.modulus_margin shows how far a loop is from this.",
         FlexplantWarning,
         stacklevel=3,
     )

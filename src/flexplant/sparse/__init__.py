@@ -1,3 +1,3 @@
-"""Symmetric sparse factors that know nothing of structures: orderings, Cholesky, LDL', PARDISO."""
+"""Symmetric sparse factors: orderings, Cholesky, LDL', PARDISO."""
 
 from .pardiso import Pardiso as Pardiso

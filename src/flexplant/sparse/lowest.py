@@ -77,22 +77,22 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
     stiff, heavy = np.abs(diagonal(K)), diagonal(M)
     ratios = stiff[heavy > 0] / heavy[heavy > 0]
     typical = float(np.median(ratios[ratios > 0])) if np.any(ratios > 0) else 1.0
-    shift, asked, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
+    shift, number, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
     floor = max(rounding, ROUNDING)
     limit = min(int(np.count_nonzero(heavy > 0)), _MOST)
     # one elimination order serves all shifts
     order = dissect(sp.csc_array(K + shift * M)) if K.shape[0] > DENSE_LIMIT else None
     for _ in range(6):
-        asked = min(asked, limit)
-        shapes = _inverse_iteration(K, M, shift, asked, order)
+        number = min(number, limit)
+        shapes = _inverse_iteration(K, M, shift, number, order)
         values = np.einsum("ij,ij->j", shapes, np.asarray(K @ shapes))
         spread = np.einsum("ij,ij->j", np.abs(shapes), np.asarray(size @ np.abs(shapes)))
         zero = np.abs(values) <= floor * spread
         rank = np.lexsort((np.abs(values), ~zero))
         values, shapes, spread = values[rank], shapes[:, rank], spread[rank]
         n_zero = int(np.count_nonzero(zero))
-        if n_zero == asked and asked < limit:
-            asked *= 3
+        if n_zero == number and number < limit:
+            number *= 3
             continue
         elastic = np.abs(values[n_zero:])
         # close to the elastic modes, these separate well; as near to zero as rounding allows

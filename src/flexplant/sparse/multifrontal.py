@@ -120,7 +120,7 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
 
     ``A = L D L^T`` front by front: Cholesky where the pivot block is positive definite,
     Bunch-Kaufman within the block where it is not. The factor is not kept. A random ``b = A x`` is
-    eliminated along: ``x^T A x = y^T D^-1 y`` with ``L y = b`` tells whether pivots restricted to
+    eliminated along: ``x^T A x = y^T D^-1 y`` with ``L y = b`` shows whether pivots restricted to
     the blocks were stable.
 
     Raises
@@ -206,7 +206,7 @@ def _assembled(
 ) -> Iterator[tuple[Front, FloatArray, FloatArray, FloatArray]]:
     """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it.
 
-    `rest` must hold what remains for the parent when the next front is asked for.
+    `rest` must hold what remains for the parent when the next front is allocated.
     """
     pointer, index, value = _permuted_triangle(lower, dissection.order)
     place = np.zeros(dissection.order.size, dtype=np.int64)

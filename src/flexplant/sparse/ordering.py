@@ -179,7 +179,7 @@ def _bisect(graph: sp.csr_array, xyz: FloatArray, width: IntArray, hubs: Any, le
         inside = np.flatnonzero(live)
         if not inside.size:
             break
-        # live parts numbered 0, 1, ...
+        # parts left, numbered 0, 1, ...
         names, number = np.unique(part[inside], return_inverse=True)
         size = np.bincount(number, weights=width[inside])
         cut = (size > leaf) & (np.bincount(number) > 1)

@@ -1,4 +1,4 @@
-"""MKL PARDISO in place of the library's own factor, where someone asks for it."""
+"""MKL PARDISO in place of the library's own factor, where it is chosen."""
 
 from __future__ import annotations
 
@@ -81,10 +81,10 @@ class PardisoCholesky:
         self._options = np.zeros(64, dtype=np.int32)
         self._options[0] = 1  # none of the defaults
         self._options[1] = 2  # nested dissection (METIS)
-        self._options[17] = -1  # tell the entries of the factor
+        self._options[17] = -1  # report the entries of the factor
         nothing = np.zeros(1)
         self._call(_FACTOR, nothing, nothing, 1)
-        # memory and options live on in the arguments until MKL has released what it holds
+        # memory and options remain in the arguments until MKL has released what it holds
         weakref.finalize(self, _release, self._mkl, self._memory, self._options, self._n)
 
     @property

@@ -1,4 +1,4 @@
-"""What is screwed to a structure: point masses, springs, dampers; and structures held still."""
+"""Point masses, springs and dampers attached to a structure; and structures with held DOFs."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ class Damping(Value):
 class ModalDamping(Damping):
     """A damping ratio for all modes, or one for each: Z in equation (5) of the paper.
 
-    Rigid-body modes are undamped unless asked: a structure in free flight has nothing to rub on.
+    Rigid-body modes are undamped unless stated: a free structure dissipates nothing in them.
 
     Parameters
     ----------
@@ -174,8 +174,8 @@ class ModalDamping(Damping):
 class Rayleigh(Damping):
     """Damping ``D = alpha M + beta K``: ratio ``alpha / (2 omega) + beta omega / 2``.
 
-    Rigid-body modes are left undamped unless asked: a structure in free flight has nothing to rub
-    on.
+    Rigid-body modes are left undamped unless stated: a free structure dissipates
+    nothing in them.
 
     Parameters
     ----------

@@ -143,7 +143,7 @@ def check_stiffness(
     raise ModelError(
         f"{several} no stiffness ({found}): a mechanism, a zero-energy motion beyond the {r} "
         f"rigid-body motions of the geometry, or springs too soft for the digits of K.{moved} Join "
-        "or hold these, look for wrong coordinates (check(model) tells), or suspend the modes "
+        "or hold these, look for wrong coordinates (see check(model)), or suspend the modes "
         "rather than the model on soft springs."
     )
 

@@ -32,7 +32,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     """Return a model (or DofSet) whose shapes are interpolated between its nodes.
 
     For imported models, whose elements are not known: places may then be any point inside the
-    nodes, not only labels. It is asked for, never done silently.
+    nodes, not only labels. It is done on request, never silently.
 
     Parameters
     ----------
@@ -122,7 +122,7 @@ class ScatteredShape(Interpolation):
         if not terms:
             raise LabelError(
                 f"this model has no motion {direction!r}, and no displacements whose slopes would "
-                f"give it: it has {', '.join(sorted(set(self.directions)))}. Ask for one of these."
+                f"give it: it has {', '.join(sorted(set(self.directions)))}. Choose one of these."
             )
         return np.asarray(
             sum(sign * field.slopes(places, axis) for sign, field, axis in terms) / len(terms)

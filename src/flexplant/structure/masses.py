@@ -14,7 +14,7 @@ from .rigid import rigid_motions
 
 @dataclass(frozen=True)
 class RigidMass:
-    """What M says of the body as a whole; NaN where the DOFs cannot tell.
+    """What M says of the body as a whole; NaN where the DOFs do not determine it.
 
     Attributes
     ----------
@@ -35,7 +35,7 @@ def rigid_mass(M: Any, dofs: DofSet) -> RigidMass:
     """Return mass, centre of gravity and inertia: ``R^T M R`` of the six rigid-body motions R.
 
     With all six directions it is ``[[m I, -m [c]x], [m [c]x, J]]``; a flat model that moves in z
-    only tells m, two coordinates of c, and the inertia about two axes.
+    only determines m, two coordinates of c, and the inertia about two axes.
     """
     motions = rigid_motions(dofs)
     whole = motions.T @ np.asarray(M @ motions)

@@ -28,10 +28,10 @@ from .zero_energy import freed
 
 @dataclass(frozen=True, eq=False, repr=False)
 class FEMatrices(Value):
-    """Matrices of ``M q'' + D q' + K q = f`` as a file holds them; `check` tells what is wrong.
+    """Matrices of ``M q'' + D q' + K q = f`` as a file holds them; `check` reports what is wrong.
 
-    An FEModel demands a positive definite M, known DOFs and coordinates; nothing of this is asked
-    here. `model` makes one when all is there, and says what is missing when not.
+    An FEModel demands a positive definite M, known DOFs and coordinates; nothing of this is
+    required here. `model` makes one when all is there, and says what is missing when not.
 
     Parameters
     ----------
@@ -362,7 +362,7 @@ class FEMatrices(Value):
         if self.dofs is None:
             raise ModelError(
                 f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
-                "coordinates. with_dofs(DofSet(nodes, directions, xyz)) tells it, or dofs= of "
+                "coordinates. with_dofs(DofSet(nodes, directions, xyz)) gives it, or dofs= of "
                 "read_model."
             )
         ready = self

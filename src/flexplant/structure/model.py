@@ -182,7 +182,7 @@ class FEModel(Placed, Value):
                 moved = np.array([d == direction for d in self.dofs.directions], dtype=np.float64)
                 return float(moved @ (self.M @ moved))
         raise ModelError(
-            "the model has no translational DOF, so that its mass is not known. Ask for "
+            "the model has no translational DOF, so that its mass is not known. Compute "
             "rotation^T M rotation instead, an inertia."
         )
 
@@ -191,7 +191,7 @@ class FEModel(Placed, Value):
 
         Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix; so is the
         viscous equivalent of a loss factor. Rayleigh damping is ``alpha M + beta K``. Rigid-body
-        motions are undamped in all of them unless the law asks for it (`rigid`).
+        motions are undamped in all of them unless the law says so (`rigid`).
 
         Parameters
         ----------
@@ -343,8 +343,8 @@ class FEModel(Placed, Value):
     def _proven(cls, **fields: Any) -> Self:
         """Return a model whose matrices are known to be symmetric and definite, and read-only.
 
-        Not through the checks of the door: a factorisation that proves it again takes longer than
-        everything that leads here.
+        Without the checks of the constructor: a factorisation that proves it again takes
+        longer than everything before.
         """
         model = object.__new__(cls)
         for name, value in fields.items():

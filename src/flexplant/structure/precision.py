@@ -1,4 +1,4 @@
-"""What few digits of K, printed or of single precision, do to the soft modes of a model."""
+"""The error of soft modes when K has few digits, printed or of single precision."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def held_by_rounding(
     digits : int
         Of the entries of K.
     found : (n, r) array, optional
-        Rigid-body motions that the model knows already.
+        Rigid-body motions of the model that are known already.
     """
     nearly = nearly_free(K, M, dofs, digits).shape[1]
     if found is not None and force_free(M, K, found):

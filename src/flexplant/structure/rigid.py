@@ -181,7 +181,7 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
 
 
 def _everywhere_small(K: Matrix, size_of_K: Any, motions: FloatArray) -> FloatArray:
-    """Return those of some motions that meet no large force at any DOF: nothing grounds them."""
+    """Return those of some motions without a large force at any DOF: nothing grounds them."""
     entries: Any = K.diagonal()
     weight = 1 / np.sqrt(np.where(entries > 0, entries, 1.0))[:, None]
     force = np.abs(weight * np.asarray(K @ motions)).max(axis=0)
@@ -238,7 +238,7 @@ def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -
         positive definite.
     """
     done = np.zeros((basis.shape[0], 0))
-    loaded = np.zeros((basis.shape[0], 0))  # M done: each vector meets M as few times as possible
+    loaded = np.zeros((basis.shape[0], 0))  # M done, for as few products with M as possible
     for i in range(basis.shape[1]):
         vector = basis[:, i]
         length = _length(M, vector) if vector.any() else 0.0

@@ -77,7 +77,7 @@ def projected(
 ) -> tuple[FloatArray, FloatArray, FloatArray | None, IntArray]:
     """Return K, M, D on the motions that M can accelerate, in n - q of the DOFs, and which.
 
-    Where N has no inertia, ``N^T K q = 0`` at every frequency. It tells q of the DOFs, s, by the
+    Where N has no inertia, ``N^T K q = 0`` at every frequency. It gives q of the DOFs, s, by the
     others, ``q_s = -(N^T K)_s^-1 (N^T K)_m q_m``: exact, all finite eigenvalues stay, and the
     DOFs that are kept keep their meaning.
 

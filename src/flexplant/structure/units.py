@@ -94,7 +94,7 @@ class Units:
             return dofs
         if dofs.interpolation is not None:
             raise ModelError(
-                f"the DOFs carry a {type(dofs.interpolation).__name__}, which knows its nodes in "
+                f"the DOFs carry a {type(dofs.interpolation).__name__}, whose nodes are in "
                 "the old unit of length. Convert first and interpolate after: "
                 "interpolated(model.replace(dofs=dofs.replace(interpolation=None)).converted(...))."
             )

@@ -171,7 +171,7 @@ def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     if not motions.shape[1]:
         raise ModelError(
             "no rigid-body motion of the geometry is free but for rounding: the structure is held, "
-            "or the coordinates are wrong. check(...) tells which."
+            "or the coordinates are wrong. check(...) shows which."
         )
     R = orthonormalised(M, motions)
     loaded = np.asarray(M @ R)

@@ -17,7 +17,7 @@ from ..values import FloatArray
 
 #: relative: what counts as on the imaginary axis; the largest residual of a Riccati equation
 _AXIS, _RESIDUAL = 1e-10, 1e-6
-#: residuals that are looked at: Newton's correction between them squares the error
+#: residuals that are examined: Newton's correction between them squares the error
 _CORRECTIONS = 4
 #: relative: a difference of the costs of z that is rounding
 _CANCELLED = 1e-12
@@ -150,7 +150,7 @@ def _correction(closed: FloatArray, residual: FloatArray, d: FloatArray) -> Floa
 def _require_full_columns(A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> None:
     """Raise OnAxisError when [A - s I, B; C, D] loses rank at an undamped pole s of A.
 
-    The Hamiltonian would tell, but four of its eigenvalues meet at a rigid-body mode that costs
+    The Hamiltonian would show it, but four of its eigenvalues meet at a rigid-body mode that costs
     nothing, and rounding spreads them over 1e-4.
     """
     poles = np.linalg.eigvals(A)

@@ -69,7 +69,7 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
 def reached_norms(P: StandardPlant, K: StateSpace) -> dict[str, float]:
     """Return the largest gain of lft(P, K) from each group of w to each group of z, by a sweep.
 
-    The groups are told by the names that `assemble_plant` gives: of w `references` (die:ref),
+    The groups follow from the names that `assemble_plant` gives: of w `references` (die:ref),
     `noises` (y1:noise) and `disturbances`, of z `efforts` (u1:effort) and `motions`. Empty for a
     plant that was not assembled from a structure.
     """
@@ -89,7 +89,7 @@ def reached_norms(P: StandardPlant, K: StateSpace) -> dict[str, float]:
 
 
 def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dict[str, list[int]]:
-    """Return the places of names by group, told by their endings; empty groups left out."""
+    """Return the places of names by group, from their endings; empty groups left out."""
     groups: dict[str, list[int]] = {rest: [], **{group: [] for group in endings}}
     for i, name in enumerate(names):
         own = next((group for group, end in endings.items() if name.endswith(end)), rest)

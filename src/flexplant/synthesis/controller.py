@@ -27,8 +27,8 @@ class Controller(Value):
     certificate : mapping {str: float}
         Numbers computed after the design by another route.
     reached : mapping {str: float}
-        Of a weighted design: the norm from each group of w to each group of z, beside 1, which is
-        what the weights ask for. The largest is close to gamma.
+        Of a weighted design: the norm from each group of w to each group of z, beside 1, which
+        is what the weights require. The largest is close to gamma.
     left_out : SpillOver, optional
         How the loop stands on the plant with the modes left out, where these are known.
     notes : sequence of str
@@ -56,7 +56,7 @@ class Controller(Value):
         lines = [f"<Controller {self.method}: {self.system.n_states} states{gamma}>"]
         if self.reached:
             shown = ", ".join(f"{key} {value:.3g}" for key, value in self.reached.items())
-            lines.append(f"  reached, of 1 that the weights ask: {shown}")
+            lines.append(f"  reached, of 1 that the weights require: {shown}")
         if self.certificate:
             own = self.certificate.items()
             shown = ", ".join(f"{k} {v:.4g}" for k, v in own if "left out" not in k)

@@ -1,4 +1,4 @@
-"""design_hinf: H-infinity controllers that are accepted by the norm of their own closed loop."""
+"""design_hinf: H-infinity controllers verified by the norm of the closed loop."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def design_hinf(
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
         there too, sampled and delayed alike. Unless given, with those that the plant's reduced
-        model still knows.
+        model still has.
 
     Returns
     -------
@@ -82,7 +82,7 @@ def design_hinf(
     if u is None and y is None:
         plant = standard_plant(plant)
     elif isinstance(plant, StandardPlant):
-        raise ModelError("a StandardPlant knows its u and y: leave them out.")
+        raise ModelError("a StandardPlant names its u and y: leave them out.")
     else:
         plant = StandardPlant.from_statespace(plant, u=u, y=y)
     method = Riccati() if method is None else method

@@ -323,7 +323,7 @@ def _reconstructed(
 
 
 def _solve(problem: Any, settings: dict[str, float]) -> None:
-    """Solve a semidefinite program; its LMIs are looked at by their eigenvalues afterwards.
+    """Solve a semidefinite program; its LMIs are checked by their eigenvalues afterwards.
 
     Where Clarabel stops without an answer, the next of `ATTEMPTS` is made; the last resort is a
     point at which progress became insufficient, which often is one that holds.

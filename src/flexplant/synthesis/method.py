@@ -1,4 +1,4 @@
-"""What a method of H-infinity synthesis is, and what it hands back."""
+"""What a method of H-infinity synthesis is, and what it returns."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""H-infinity synthesis by two Riccati equations, accepted by the closed loop's norm only."""
+"""H-infinity synthesis by two Riccati equations, verified by the closed loop's norm."""
 
 from __future__ import annotations
 
@@ -180,7 +180,7 @@ def _direct_bound(problem: Prepared) -> float:
 
 
 def _bound_at(problem: Prepared, omega: float) -> float:
-    """Return what no controller undercuts at one frequency: u cannot act on, y does not tell."""
+    """Return a lower bound of gamma at one frequency: the part that u or y does not reach."""
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     try:
         P = problem.system.evaluated(1j * omega)
@@ -220,8 +220,8 @@ class _Attempt(NamedTuple):
 def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     """Return the central controller for gamma, or why there is none.
 
-    Refuted means proved, not that the numerics failed: at some frequency what u cannot act on or y
-    does not tell exceeds gamma; or an accurate stabilising solution is not positive semi-definite,
+    Refuted means proved, not that the numerics failed: at some frequency the part that u or y does
+    not reach exceeds gamma; or an accurate stabilising solution is not positive semi-definite,
     or rho(X Y) > gamma^2.
     """
     try:

@@ -68,7 +68,7 @@ def design_servo(
         What will give the estimates `die:hat`, ...; unless given, the POI itself.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`. Unless given, those
-        that the plant's reduced model still knows.
+        that the plant's reduced model still has.
 
     Returns
     -------

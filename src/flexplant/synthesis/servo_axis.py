@@ -84,7 +84,7 @@ class Axis:
 
 
 def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
-    """Return one motion of the body, held and late: acceleration commanded to error.
+    """Return one motion of the body, held and delayed: acceleration commanded to error.
 
     Its frequency is that of a suspension [Hz], 0 when free.
     """

@@ -24,7 +24,7 @@ TARGET = 2.0
 _NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
 #: loop gain at a resonance below which a notch there serves nothing
 _QUIET = 0.3
-#: loop gain below which a frequency is not looked at
+#: loop gain below which a frequency is left out
 _SILENT = 0.05
 
 
@@ -63,8 +63,8 @@ class ServoLoop:
         near = size >= size.max() / np.sqrt(S.shape[-1])
         return float(np.linalg.svd(S[near], compute_uv=False)[:, 0].max())
 
-    def loud(self, axis: Axis) -> FloatArray:
-        """Return the modes [Hz] whose resonances have loop gain, the loudest first."""
+    def resonant(self, axis: Axis) -> FloatArray:
+        """Return the modes [Hz] whose resonances have loop gain, the largest first."""
         gain = np.abs(axis.response(self.freq)) * self._size
         near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
         peaks = np.max(np.where(near, gain[:, None], 0.0), axis=0, initial=0.0)
@@ -74,15 +74,15 @@ class ServoLoop:
     def notched(self, axis: Axis, stable: Callable[[Axis], bool]) -> Axis:
         """Return the axis with notches at the modes where they bring |S| at u down.
 
-        One after the other, while |S| is above 6 dB or the loop is unstable: of the loudest modes
-        the one whose notch lowers the peak most. In a stable loop a notch that gains nothing is
-        not placed.
+        One after the other, while |S| is above 6 dB or the loop is unstable: of the modes of
+        largest gain the one whose notch lowers the peak most. In a stable loop a notch that gains
+        nothing is not placed.
         """
         peak = self.peak(axis)
         for _ in range(_NOTCHES):
             if peak <= TARGET and stable(axis):
                 break
-            left = [f for f in self.loud(axis).tolist() if f not in axis.notches][:_TRIED]
+            left = [f for f in self.resonant(axis).tolist() if f not in axis.notches][:_TRIED]
             tried = [_with(axis, freq) for freq in left]
             if not tried:
                 break

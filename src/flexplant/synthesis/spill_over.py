@@ -1,4 +1,4 @@
-"""Every design on the plant with the modes that it left out, before the machine has them."""
+"""The check of a design on the plant with the modes that it left out."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..structure import FEModel
 
 
 def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> SpillOver | None:
-    """Return how a design's loop stands on the plant with the modes left out; None: not known.
+    """Return the check of a design's loop with the modes left out; None: they are not known.
 
     Parameters
     ----------
@@ -40,7 +40,7 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
     if found is not None and not found.is_stable:
         warnings.warn(
             f"with the modes that the plant left out the loop is {found.summary}. The machine has "
-            "these modes: ask for less bandwidth, keep them in the plant, or weight the efforts "
+            "these modes: choose less bandwidth, keep them in the plant, or weight the efforts "
             "(or roll the controller off) before them.",
             FlexplantWarning,
             stacklevel=4,

@@ -86,7 +86,7 @@ def wafer_stage(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class WaferStage(Value):
-    """A machine that can be measured and run, but not looked into.
+    """A machine that can be measured and run, but whose model is hidden.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class WaferStage(Value):
             if (freq := abs(pole) / (2.0 * np.pi)) >= 0.5 * self.rate:
                 raise ModelError(
                     f"mode {mode} at {freq:.4g} Hz is not below half the rate, {0.5 * self.rate:g} "
-                    "Hz: no measurement of this machine shows it. Ask for lower modes, or raise "
+                    "Hz: no measurement of this machine shows it. Choose lower modes, or raise "
                     "the rate."
                 )
             found.append(pole)

@@ -1,4 +1,4 @@
-"""The way to a good start: problems that converge from far away, before the one that was posed."""
+"""A good start: problems that converge from far away, before the one that was posed."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ def _best_split(
     groups = group_derivatives(family, point.eigen)
     for way in np.vstack([np.eye(scale.size), -np.eye(scale.size)]) / scale:
         S, eigen = _along(groups, point.eigen, columns, S, way)
-        # rounding in the row of a vector that stays would ask for a step without bounds
+        # rounding in the row of a vector that stays would give a step without bounds
         felt = np.where(np.abs(S) > UNSEEN * scale, S, 0.0)
         scaled, *_ = np.linalg.lstsq(
             data.whitened(felt) / scale, data.whitened(gap), rcond=SINGULAR

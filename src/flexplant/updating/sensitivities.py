@@ -132,7 +132,7 @@ def eigenvalue_sensitivities(
                 raise ModelError(
                     f"modes {[i + eigen.n_rigid + 1 for i in group]} are repeated, and "
                     f"{', '.join(p.name for p in listed)} split them along different vectors: "
-                    "no derivatives to all of them exist. Ask for one parameter at a time."
+                    "no derivatives to all of them exist. Take one parameter at a time."
                 )
     return Sensitivities(
         modes=tuple(i + eigen.n_rigid + 1 for i in columns),

@@ -111,7 +111,7 @@ def update(
     Raises
     ------
     ModelError
-        When the measured eigenvalues do not depend on a parameter or cannot tell some apart (S is
+        When the measured eigenvalues do not depend on a parameter or cannot distinguish some (S is
         singular), or the matrices are indefinite at `start`.
     LabelError
         When a mode number or a place is unknown.
@@ -142,7 +142,7 @@ def update(
         method = GaussNewton() if plain and not bounded and starts is None else TrustRegion()
     if bounded and not method.keeps_bounds:
         raise ModelError(
-            f"{type(method).__name__} knows no bounds: use TrustRegion(), or drop bounds=."
+            f"{type(method).__name__} takes no bounds: use TrustRegion(), or drop bounds=."
         )
     if plain and method.weighs_poles:
         given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))

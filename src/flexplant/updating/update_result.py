@@ -118,7 +118,7 @@ class UpdateResult(Value):
         Why the iteration ended.
     at_bound : sequence of str
         Names of the parameters that ended at one of their bounds: the data pull beyond it, and
-        the covariance does not know of it.
+        the covariance does not include it.
     starts : Starts or None
         What every start led to, when there were several.
     unknowns : sequence of Parameter
@@ -275,7 +275,7 @@ class UpdateResult(Value):
         ModelError
             When it is no model, or the parameters make its matrices indefinite.
         LabelError, ShapeError
-            When it does not know the place of a parameter, or matrices of a parameter belong to
+            When it lacks the place of a parameter, or matrices of a parameter belong to
             another number of DOFs.
         """
         if not hasattr(model, "rigid_body") or not hasattr(model, "dofs"):

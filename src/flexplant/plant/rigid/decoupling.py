@@ -42,7 +42,7 @@ class Decoupling(Value):
     mass : (r, r) array [kg, kg m, kg m^2]
         Inertia about the centre of gravity; a rotational block need not be diagonal.
     centre : (3,) array [m]
-        The centre of gravity; 0 in directions that the model's motions do not tell.
+        The centre of gravity; 0 in directions that the model's motions do not determine.
     axes : sequence of str
         The r axes, of x, y, z, rx, ry, rz.
     """
@@ -156,13 +156,13 @@ def _check(
     if np.any(wrong):
         i, j = (int(k) for k in np.argwhere(wrong)[0])
         what = (
-            f"do not tell {wanted[i]!r} at all"
+            f"do not determine {wanted[i]!r} at all"
             if body.axes[j] == wanted[i]
             else f"mix {wanted[i]!r} with {body.axes[j]!r}"
         )
         raise AssumptionError(
             f"the axis {wanted[i]!r} cannot be decoupled: the {side} "
-            f"({', '.join(names) or 'none'}) {what}. Add or move some, or ask for fewer "
+            f"({', '.join(names) or 'none'}) {what}. Add or move some, or choose fewer "
             f"axes: decouple(plant, axes=...) of {', '.join(body.axes)}."
         )
 

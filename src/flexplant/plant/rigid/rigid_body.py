@@ -30,7 +30,7 @@ class RigidBody(Value):
     mass : (r, r) array [kg, kg m, kg m^2]
         ``motions' M motions``.
     centre : (3,) array [m]
-        The centre of gravity; what the motions do not tell of it is 0.
+        The centre of gravity; what the motions do not determine of it is 0.
     """
 
     axes: tuple[str, ...]
@@ -48,7 +48,7 @@ def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArra
     Raises
     ------
     ModelError
-        When the model does not tell its inertia against this motion.
+        When the model does not determine its inertia against this motion.
     """
     model, axis = realisation.model, DIRECTIONS.index(direction)
     motion = model.rigid_motions(about)[:, axis : axis + 1]

@@ -62,15 +62,15 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
     if not sensors:
         kinds = ", ".join(sorted({s.quantity for s in ports.y})) or "none"
         raise AssumptionError(
-            f"there is no displacement sensor in y (its sensors: {kinds}): where the rigid body is "
-            "they do not tell. Add Sensor(name, at=...)."
+            f"there is no displacement sensor in y (its sensors: {kinds}): they do not "
+            "determine where the rigid body is. Add Sensor(name, at=...)."
         )
     axes = seen(plant, motions, [followed.channel(axis) for axis in followed.axes])
     count = motions.modes.size
     if len(followed.axes) < count or np.linalg.matrix_rank(axes) < count:
         raise AssumptionError(
-            f"POI {followed.name!r} with axes {followed.axes} does not tell the {count} rigid-body "
-            "motions: give the POI all its axes."
+            f"POI {followed.name!r} with axes {followed.axes} does not determine the {count} "
+            "rigid-body motions: give the POI all its axes."
         )
     moved = seen(plant, motions, sensors) @ np.linalg.pinv(axes)[:, 0]
     return StateSpace(
@@ -139,9 +139,9 @@ def stage_weights(
     accelerates the rigid body by ``w_c^2`` times it, f_c being 1.6 times the bandwidth:
     ``[W_S S, W_S P W_d; W_u K S, W_u K P W_d]`` with 1/W_S rising as f/f_c up to peak, W_u letting
     the efforts roll off from 6 f_c, W_d = disturbance f0. K P W_d is the complementary sensitivity
-    T at u, and the weights of z are divided by ``peak disturbance effort``, so that gamma = 1 asks
-    for |T| < peak at u: with the default ratios this block decides, and gamma is how far the loop
-    is from it. The controller lists what each block reaches (`Controller.reached`).
+    T at u, and the weights of z are divided by ``peak disturbance effort``, so that gamma = 1
+    requires |T| < peak at u: with the default ratios this block decides, and gamma is how far the
+    loop is from it. The controller lists what each block reaches (`Controller.reached`).
 
     What the knobs do, measured on the paper's plate at 0.1 % damping, 10 kHz, one sample late:
     designed on the updated model with 24 modes, judged on the machine with all of them. "to" is
@@ -168,7 +168,7 @@ def stage_weights(
     makes the loop slower, both together make it better damped; peak and noise matter little
     here: noise below 0.02 leaves the controller more gain at the modes that the model lacks (at
     100 Hz |S| at u is then 11 dB, where 0.05 gives 8.9), above 0.15 it costs bandwidth. 0.3 for
-    disturbance and effort ask for S alone, at the expense of |S| at u.
+    disturbance and effort weight S alone, at the expense of |S| at u.
 
     At 1 % damping updating hardly matters on this machine (80 Hz: 7.5 dB at u designed on the
     drawing, 7.3 on the updated model); at 0.1 % the drawing's design is unstable there. On 16
@@ -217,7 +217,7 @@ def stage_weights(
     if plant.dt and crossing * plant.dt > 0.2:
         raise ModelError(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {1 / plant.dt:g} Hz: the "
-            "weights could not be sampled. Ask for less, or raise the rate."
+            "weights could not be sampled. Lower it, or raise the rate."
         )
     require_weak(motions, bandwidth, "a set of weights")
     force = (2.0 * np.pi * crossing) ** 2 / float(push)

@@ -132,7 +132,7 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     expected = _untouched(rows @ model.rigid_body, rows).shape[1]
     if suspended.rigid_body.shape[1] != expected:
         raise ModelError(
-            f"the springs are so weak beside the structure that the matrices do not tell: "
+            "the springs are so weak that rounding of the structure's matrices exceeds them: "
             f"{suspended.rigid_body.shape[1]} rigid-body motions are left in them, {expected} by "
             "geometry. Solve the modes of the free structure first and suspend those: "
             "suspend(solve_modes(model), springs)."

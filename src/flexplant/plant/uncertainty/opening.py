@@ -39,17 +39,17 @@ def uncertain(
     many = positive(deviations, "deviations")
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
-        numbers, poles, doubt = _fitted_poles(realisation, source, parameters, modes)
+        numbers, poles, covariance = _fitted_poles(realisation, source, parameters, modes)
     elif isinstance(source, MeasuredModes):
-        numbers, poles, doubt = _measured_poles(source, modes)
+        numbers, poles, covariance = _measured_poles(source, modes)
     else:
         raise ModelError(
             f"uncertainty comes from an UpdateResult or MeasuredModes, got {type(source).__name__}."
         )
     _check_poles(realisation, numbers, poles, isinstance(source, UpdateResult))
     G = _relative(poles)
-    doubt = G @ doubt @ G.T
-    scale = many * np.sqrt(np.diag(doubt))
+    covariance = G @ covariance @ G.T
+    scale = many * np.sqrt(np.diag(covariance))
     kinds: tuple[Literal["freq", "damping"], ...] = ("freq", "damping")
     every = [
         Delta(f"mode{number}:{kind}", number, kind, float(size))
@@ -59,7 +59,7 @@ def uncertain(
     ]
     keep = sorted(np.flatnonzero(scale > _KNOWN), key=lambda i: (every[i].mode, i))
     if not keep:
-        raise ModelError(f"modes {list(numbers)} have no doubt: there is no uncertainty to open.")
+        raise ModelError(f"modes {list(numbers)} have no variance: there is nothing uncertain.")
     deltas = tuple(every[i] for i in keep)
     _check_range(deltas, many)
     system = _opened(plant.continuous, deltas)
@@ -71,7 +71,7 @@ def uncertain(
         plant,
         system,
         deltas,
-        doubt[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep]),
+        covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep]),
         many,
         weight,
         source if isinstance(source, UpdateResult) else None,
@@ -191,7 +191,7 @@ def _relative(poles: ComplexArray) -> FloatArray:
 def _check_poles(
     realisation: ModalRealisation, modes: Sequence[int], poles: ComplexArray, strict: bool
 ) -> None:
-    """Refuse a plant that has not the modes that the doubt is about."""
+    """Refuse a plant without the modes that are uncertain."""
     count = realisation.n_modes
     for number, pole in zip(modes, poles, strict=True):
         if not realisation.n_rigid < number <= count:
@@ -213,7 +213,7 @@ def _check_range(deltas: Sequence[Delta], deviations: float) -> None:
         if delta.scale >= 1:
             what = "stiffness" if delta.kind == "freq" else "damping"
             raise ModelError(
-                f"the {what} of mode {delta.mode} is doubted by {100 * delta.scale:.3g} % at "
+                f"the {what} of mode {delta.mode} is uncertain by {100 * delta.scale:.3g} % at "
                 f"{deviations:g} standard deviations, so it may be negative: no controller is "
                 "robust to that. Measure it better, leave the mode out, or lower deviations."
             )

@@ -119,7 +119,7 @@ class UncertainPlant(Value, Generic[P]):
     neglected : NeglectedModes, optional
         Weight on the modes that the plant lacks.
     fit : UpdateResult, optional
-        Where the doubt comes from; `sample` draws its parameters.
+        Where the uncertainty comes from; `sample` draws its parameters.
     parameters : sequence of Parameter
         Those of the fit.
     """
@@ -184,7 +184,7 @@ class UncertainPlant(Value, Generic[P]):
         return with_changes(self.plant, changes)
 
     def sample(self, rng: Any, n: int = 1) -> list[P]:
-        """Return machines that the doubt allows, ports and sampling those of the nominal plant.
+        """Return machines within the uncertainty, ports and sampling those of the nominal plant.
 
         From a fit: its parameters are drawn from their covariance and each machine's matrices are
         rebuilt, so shapes and all modes differ too. From measured modes: stiffness and damping of
@@ -204,7 +204,7 @@ class UncertainPlant(Value, Generic[P]):
         Raises
         ------
         ModelError
-            When a machine drawn is not physical: the doubt is too large for a normal distribution.
+            When a machine drawn is not physical: too uncertain for a normal distribution.
         """
         machines = []
         for i, own in enumerate(generator(rng).spawn(whole(n, "n")), 1):
@@ -212,8 +212,8 @@ class UncertainPlant(Value, Generic[P]):
                 machines.append(self._drawn(own))
             except ModelError as error:
                 raise ModelError(
-                    f"machine {i} of the sample is not physical: {error} The doubt reaches beyond "
-                    "what the structure allows; measure more modes, or scale the covariance."
+                    f"machine {i} of the sample is not physical: {error} The uncertainty reaches "
+                    "beyond what the structure allows; measure more modes, or scale the covariance."
                 ) from None
         return machines
 

@@ -29,7 +29,7 @@ class ModelCheck(Value):
     mass : (3,) array [kg]
         Against translation in x, y, z; NaN where no DOF moves so.
     center : (3,) array [m]
-        Centre of gravity; NaN where the DOFs cannot tell.
+        Centre of gravity; NaN where the DOFs do not determine it.
     inertia : (3, 3) array [kg m^2]
         About the centre of gravity.
     rigid : tuple of str
@@ -89,7 +89,7 @@ class ModelCheck(Value):
         failed, noted = len(self.of("fail")), len(self.of("note"))
         named = f" {self.source!r}" if self.source else ""
         result = "ok" if self.ok else f"{failed} FAILED"
-        head = f"<ModelCheck{named}: {result}, {noted} to look at>"
+        head = f"<ModelCheck{named}: {result}, {noted} warning{'s' * (noted != 1)}>"
         text = [head]
         for found, subject, finding, following in self.lines:
             mark = {"ok": "ok  ", "note": "note", "fail": "FAIL"}[found]
@@ -110,7 +110,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     Parameters
     ----------
     model : FEModel or FEMatrices
-        What to look at; matrices as a file holds them may be wrong in any way.
+        What is checked; matrices as a file holds them may be wrong in any way.
 
     Returns
     -------

@@ -20,7 +20,7 @@ from ..rigid import rigid_motions
 from ..singular_mass import left_out, null_motions
 from ..zero_energy import ZeroEnergy, zero_energy
 
-#: asked of the solver: six rigid-body motions and some elastic modes
+#: requested from the solver: six rigid-body motions and some elastic modes
 _MODES = 10
 #: a rigid-body motion whose relative force is below this is free; its residual measures rounding
 _FREE = 1e-10
@@ -28,7 +28,7 @@ _FREE = 1e-10
 
 @dataclass(frozen=True)
 class Facts:
-    """Everything `check` speaks of."""
+    """All facts that `check` reports."""
 
     given: FEMatrices
     skew: dict[str, tuple[float, int, int]]
@@ -167,7 +167,7 @@ def _mass_state(given: FEMatrices, M: Any, no_mass: Any) -> tuple[bool | None, I
 
 
 def _rounding(K: Any, given: FEMatrices) -> float:
-    """Return the relative error of K's entries, as its digits or its free rigid motions tell."""
+    """Return the relative error of K's entries, from its digits or its free rigid motions."""
     written = 0.0 if given.digits is None else 10.0**-given.digits
     if given.dofs is None:
         return written

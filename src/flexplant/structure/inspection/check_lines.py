@@ -97,8 +97,8 @@ def _stiffness_line(found: Facts) -> Line:
         )
     kind = "positive semi-definite" if found.n_zero else "positive definite"
     freq = found.first_freq
-    heard = f", first elastic mode at {freq:.5g} Hz" if np.isfinite(freq) else ""
-    return ("ok", "definiteness of K", f"{kind}{heard}", "")
+    known = f", first elastic mode at {freq:.5g} Hz" if np.isfinite(freq) else ""
+    return ("ok", "definiteness of K", f"{kind}{known}", "")
 
 
 def _damping_line(found: Facts) -> Line:
@@ -298,7 +298,7 @@ def scales(found: Facts) -> list[Line]:
                 "note",
                 "penalties",
                 f"held by a huge stiffness: {listed(found.names(penalty))}",
-                "their rounding drowns soft modes; hold them: FEMatrices.without([...])",
+                "their rounding exceeds soft modes; hold them: FEMatrices.without([...])",
             )
         )
     dofs = found.given.dofs

@@ -106,11 +106,11 @@ def _asked(function: Any, name: str, centres: FloatArray) -> list[Any]:
         inspect.signature(function).bind(*centres.tolist()[0])
     except TypeError as error:
         raise ModelError(
-            f"{name} is asked at the centre ({names}) of each element, and this function cannot be "
-            f"called so: {error}. Write it as lambda {names}: ..."
+            f"{name} is evaluated at the centre ({names}) of each element, and this function "
+            f"cannot be called so: {error}. Write it as lambda {names}: ..."
         ) from None
     except (ValueError, IndexError):
-        pass  # a function of C tells nothing of its arguments
+        pass  # a function of C has no signature
     return [function(*centre) for centre in centres.tolist()]
 
 
@@ -205,7 +205,7 @@ def present_of(
     Raises
     ------
     ModelError
-        When nothing is left, or it falls apart: `corners` tells whether a common corner holds.
+        When nothing is left, or it falls apart: `corners` says whether a common corner holds.
     """
     import scipy.ndimage
 

@@ -1,4 +1,4 @@
-"""What an update is worth: correlation, identifiability, localisation, validation, posterior."""
+"""The quality of an update: correlation, identifiability, localisation, validation, posterior."""
 
 from .correlation import Correlation as Correlation
 from .correlation import correlate as correlate

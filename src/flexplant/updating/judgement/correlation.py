@@ -128,9 +128,9 @@ class Correlation(Value):
     fdac : (n_freq, n_freq) array
         Of the responses; empty without.
     alike : sequence of groups of int
-        Numbers of the model's modes, in the measured range, whose shapes the sensors cannot tell
-        apart (a MAC above 0.9 with each other there): they are paired by frequency, and a high MAC
-        does not say which of a group was measured.
+        Numbers of the model's modes, in the measured range, whose shapes the sensors cannot
+        distinguish (a MAC above 0.9 with each other there): they are paired by frequency, and a
+        high MAC does not say which of a group was measured.
     """
 
     modes: tuple[int, ...]
@@ -161,7 +161,7 @@ class Correlation(Value):
             parts.append(f"least FRAC {self.frac.min():.4f}")
         text = f"<Correlation: {', '.join(parts) or 'nothing compared'}"
         if self.alike:
-            text += "\n  the sensors cannot tell apart the shapes of modes "
+            text += "\n  the sensors cannot distinguish the shapes of modes "
             text += "; ".join(", ".join(map(str, group)) for group in self.alike[:SHOWN])
             text += "; ..." if len(self.alike) > SHOWN else ""
         return text + ">"

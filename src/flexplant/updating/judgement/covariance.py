@@ -1,4 +1,4 @@
-"""How well an update knows its parameters."""
+"""The covariance of the parameters of an update."""
 
 from __future__ import annotations
 

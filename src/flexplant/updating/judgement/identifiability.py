@@ -21,7 +21,7 @@ LOST = 1e-6
 #: modes that are named as missing
 NAMED = 3
 #: an eigenvalue that changes by less than this part of what the parts of a combination change it
-#: by does not tell the combination
+#: by does not determine the combination
 CANCELS = 1e-3
 
 
@@ -48,8 +48,8 @@ class Identifiability(Value):
         Groups of parameters of which a combination cannot be determined.
     missing : mapping {str: (int, ...)}
         For parameters that are unseen or mixed: the modes, not measured so far, whose eigenvalues
-        would tell the lost combinations, those that change most first; none where no eigenvalue
-        does, as of mirror images on a symmetric structure.
+        would determine the lost combinations, those that change most first; none where no
+        eigenvalue does, as of mirror images on a symmetric structure.
     """
 
     parameters: tuple[str, ...]
@@ -84,7 +84,7 @@ class Identifiability(Value):
         ]
         if self.unseen:
             lines.append(f"  unseen: {', '.join(self.unseen[:4])}")
-        lines += [f"  not told apart: {', '.join(group[:4])}" for group in self.mixed[:2]]
+        lines += [f"  not distinguished: {', '.join(group[:4])}" for group in self.mixed[:2]]
         q = len(self.parameters)
         close = [
             f"{self.parameters[i]} and {self.parameters[j]} {self.correlation[i, j]:+.3f}"
@@ -97,7 +97,7 @@ class Identifiability(Value):
             if modes:
                 lines.append(f"  measure modes {', '.join(map(str, modes))} for {name}")
             else:
-                lines.append(f"  no eigenvalue tells {name} apart: measure shapes or responses")
+                lines.append(f"  no eigenvalue separates {name}: measure shapes or responses")
         return "\n".join(lines) + ">"
 
 
@@ -185,9 +185,9 @@ def _lost(vectors: FloatArray, seen: Any, length: FloatArray) -> FloatArray:
 def _missing(
     objective: Objective, point: Any, names: tuple[str, ...], poor: list[str], lost: FloatArray
 ) -> dict[str, tuple[int, ...]]:
-    """Return for each poorly known parameter the unmeasured modes that tell a lost combination.
+    """Return the unmeasured modes that determine a lost combination, for poorly known parameters.
 
-    A mode that moves with a parameter tells nothing new where it moves with the others alike: only
+    A mode that moves with a parameter adds nothing where it moves with the others alike: only
     the change of its eigenvalue along the combination counts, against what the parts of the
     combination change it by.
     """
@@ -197,14 +197,14 @@ def _missing(
     columns = point.columns(numbers)
     size = np.abs(point.eigen.poles[columns])[:, None]
     S = objective.family.sensitivity(point.eigen, columns) / size
-    # how repeated modes split has no sign: only their mean tells a direction
+    # how repeated modes split has no sign: only their mean has a direction
     for group in repeated_groups(point.eigen.poles):
         mean = np.trace(objective.family.group_derivative(point.eigen, group), axis1=1, axis2=2)
         for i in [i for i, column in enumerate(columns) if column in group]:
             S[i] = mean / len(group) / size[i]
     along = np.abs(S @ lost.T)
     parts = np.abs(S) @ np.abs(lost.T)
-    # what cancels but for rounding, or the truncation of the model, tells nothing
+    # what cancels but for rounding, or the truncation of the model, determines nothing
     felt = parts > 1e-6 * np.max(parts, axis=0, initial=0.0)
     clear = np.where(felt & (along > CANCELS * parts), along, 0.0)
     found = {}

@@ -91,7 +91,7 @@ class Localisation(Value):
 
     @property
     def alike(self) -> tuple[str, ...]:
-        """Single candidates that the data cannot tell from the best one (BIC within 2).
+        """Single candidates that the data cannot distinguish from the best one (BIC within 2).
 
         On a symmetric structure poles alone leave all mirror images alike.
         """
@@ -102,8 +102,8 @@ class Localisation(Value):
     def rivals(self) -> tuple[str, ...]:
         """Candidates that alone explain nearly as much as the best one, at most 1 % less.
 
-        The data tell those that are not `alike` from the best, but only by a small part of the
-        residual, which an error of the model itself could make or hide: mirror images on a
+        The data distinguish those that are not `alike` from the best, but only by a small part of
+        the residual, which an error of the model itself could make or hide: mirror images on a
         symmetric structure.
         """
         least = float(np.max(self.score)) - NEAR

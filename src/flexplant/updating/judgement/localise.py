@@ -36,7 +36,7 @@ def localise(
     to first order, and members are exchanged while that helps. The least extended Bayesian
     information criterion ``chi^2 + k ln n + 2 ln C(c, k)`` (``n ln(e/n)`` for ``chi^2`` where the
     noise is not known) chooses; its last term counts in how many ways k of c places can be chosen,
-    so that c places without a change name none. To know what stands out, give more data than
+    so that c places without a change name none. To find what stands out, give more data than
     `most` unknowns.
 
     What is wrong everywhere (Young's modulus, damping) hides what is wrong in one place: as
@@ -94,7 +94,7 @@ def localise(
     fits = Subsets(whole, given, len(listed))
     if fits.rows <= len(beside):
         raise ModelError(
-            f"{fits.rows} data do not tell {len(beside)} nuisance parameters, let alone a "
+            f"{fits.rows} data do not determine {len(beside)} nuisance parameters, let alone a "
             "candidate beside them: measure more modes or lines."
         )
     values, score, criterion = _singles(fits, screen)

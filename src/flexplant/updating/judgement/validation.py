@@ -22,7 +22,7 @@ from .correlation import Correlation, correlate
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Validation(Value):
-    """An update judged by data it has not seen.
+    """An update judged by data that were not fitted.
 
     Parameters
     ----------
@@ -46,7 +46,7 @@ class Validation(Value):
 
     @property
     def helped(self) -> bool:
-        """Whether the update brought the model nearer to data it has not seen."""
+        """Whether the update brought the model nearer to data that were not fitted."""
         return bool(self.unused[1] < self.unused[0])
 
     def __repr__(self) -> str:

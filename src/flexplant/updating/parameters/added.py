@@ -35,7 +35,7 @@ class Parameter(Value):
         Raises
         ------
         LabelError
-            When the model does not know the place.
+            When the model has no such place.
         """
         raise NotImplementedError
 

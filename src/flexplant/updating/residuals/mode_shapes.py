@@ -48,7 +48,7 @@ class ModeShapes(Residual):
     covariance : (modes, m, m) array, optional
         ``E[n n^H]`` of each shape instead of `std`, real or Hermitian; what it says of the scale
         is not used, so it may be singular there (a shape whose largest entry was set to 1). That of
-        `measured`, where its shapes are taken and it knows one (`shape_covariance`).
+        `measured`, where its shapes are taken and it has one (`shape_covariance`).
     assign : bool
         Whether modes are assigned by MAC with the measured shapes; False: by continuation.
 
@@ -137,7 +137,7 @@ class ModeShapes(Residual):
 class ShapeCorrelation(ModeShapes):
     """Residuals ``(1 - sqrt(MAC)) / sqrt(MAC)`` of measured mode shapes, one for each mode.
 
-    Blind to first order near a perfect fit: `ModeShapes` says more with the same data. For
+    Without a derivative near a perfect fit: `ModeShapes` says more with the same data. For
     comparison with published studies.
 
     Parameters

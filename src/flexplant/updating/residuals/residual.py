@@ -48,7 +48,7 @@ class Bound:
         return self.name
 
     def assigned(self, point: Point) -> Point:
-        """Return the point with modes relabelled by the measurement, where it can tell."""
+        """Return the point with modes relabelled by the measurement, where it determines them."""
         return point
 
 

@@ -16,7 +16,7 @@ from .update_method import SearchEnd, Trail, UpdateMethod
 ROUNDING = 1e-11
 #: a parameter's effect below this share of what it could have is none
 UNSEEN = 1e-9
-#: singular values of S, its columns of length one, below which parameters cannot be told apart
+#: singular values of S, its columns of length one, below which parameters cannot be distinguished
 SINGULAR = 1e-7
 #: how often a step that harms is halved
 HALVINGS = 30
@@ -123,7 +123,7 @@ def _step(
         mixed = np.abs(np.linalg.svd(J / length)[2][-1])
         together = [name for name, part in zip(names, mixed, strict=True) if part > 0.1]
         raise ModelError(
-            f"{', '.join(together)} cannot be told apart by {objective.text} ({r.size} real "
+            f"{', '.join(together)} cannot be distinguished by {objective.text} ({r.size} real "
             f"equations, {len(names)} unknowns, S is singular): some combination of them changes "
             "nothing. Measure more modes, drop one of them, give priors, begin elsewhere (start=) "
             "or cut it off, GaussNewton(truncate=1e-3). identifiability(...) shows which."
