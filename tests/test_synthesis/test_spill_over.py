@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
+from flexplant.estimation import design_static
 from flexplant.labels import DofSet
 from flexplant.loop import SpillOver, close_loop
 from flexplant.loop.spill_over import growing_modes
@@ -25,7 +26,7 @@ from flexplant.plant import (
 from flexplant.reduction import DesiredDofs, reduce
 from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
-from flexplant.synthesis import Lmi, design_hinf
+from flexplant.synthesis import Lmi, Riccati, design_hinf, design_servo
 from flexplant.synthesis.spill_over import spill_over
 from oracles_ports import chain
 from oracles_synthesis import closed_loop, split, stability
@@ -190,9 +191,9 @@ def test_a_closed_loop_carries_the_check(tmp_path):
     assert back.left_out.modes == found.left_out.modes and back.notes == found.notes
 
 
-@pytest.mark.parametrize("crossing", [5.0, 100.0])
-def test_linear_matrix_inequalities_are_checked_too(crossing):
-    """Five masses in a row as one rigid body, pushed at one end and seen at the other."""
+@cache
+def row_of_masses():
+    """Five masses in a row, pushed at one end and seen at the other; sampled as a rigid body."""
     M, D, K = chain()
     row = DofSet(range(1, 6), ["x"] * 5, [(0.1 * i, 0.0, 0.0) for i in range(5)])
     body = FEModel(M, K, D, dofs=row)
@@ -203,19 +204,66 @@ def test_linear_matrix_inequalities_are_checked_too(crossing):
         y=[Sensor("y1", at="5:x", asd=1e-9)],
     )
     stiff = assemble_plant(solve_modes(body, count=1), channels).discretized(5e3, delay=1)
-    push = M.trace() * (2 * np.pi * crossing) ** 2
+    return body, stiff, assemble_plant(body, channels).discretized(5e3, delay=1)
+
+
+def by_lmi(method, bandwidth):
+    body, stiff, _ = row_of_masses()
+    push = body.M.sum() * (2 * np.pi * bandwidth) ** 2
     problem = stiff.weighted(z={"die:x": push}, w={"y1:noise": 0.1 / push, "push": 1.0})
+    return design_hinf(problem, method, larger=body)
+
+
+def by_servo(bandwidth):
+    body, stiff, _ = row_of_masses()
+    observer = design_static(stiff, larger=body)
+    return observer, design_servo(
+        stiff, bandwidth=bandwidth, observer=observer, notches=(), larger=body
+    )
+
+
+@pytest.mark.parametrize(
+    ("make", "peak"),
+    [
+        (lambda: [by_lmi(Lmi(), 5.0)], "low"),
+        (lambda: [by_lmi(Lmi(), 15.0)], "high"),
+        (lambda: [by_lmi(Lmi(), 100.0)], "unstable"),
+        (lambda: [by_lmi(Riccati(), 17.0)], "high"),
+        (lambda: by_servo(10.0), "low"),
+        (lambda: by_servo(32.0), "high"),
+        (lambda: by_servo(50.0), "unstable"),
+    ],
+)
+def test_every_design_is_warned_of_modes_left_out_that_bring_the_peak_above_8_db(make, peak):
     with warnings.catch_warnings(record=True) as seen:
         warnings.simplefilter("always")
-        found = design_hinf(problem, Lmi(), larger=body)
-    whole = assemble_plant(body, channels).discretized(5e3, delay=1)
+        *before, found = make()
+    _, _, whole = row_of_masses()
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
-        radius = np.abs(np.linalg.eigvals(close_loop(whole, found).system.A)).max()
+        loop = close_loop(whole, *before, found)
+    radius = np.abs(np.linalg.eigvals(loop.system.A)).max()
     assert found.left_out.spectral_radius == pytest.approx(radius, abs=1e-9)
-    assert (radius < 1) == (crossing < 50)
-    assert (2 in found.left_out.modes) == (radius >= 1)
-    assert bool(seen) == (radius >= 1)
+    assert (radius < 1) == (peak != "unstable") and found.left_out.is_high == (peak == "high")
+    assert bool(seen) == (peak != "low") == bool({2, 3} & set(found.left_out.modes))
+    if peak == "unstable":
+        return
+    g, K = whole.system.select(["y1"], ["u1"]), loop.controller.select(["u1"], ["y1"])
+    fine = [np.linspace(120.0, 180.0, 2000), np.linspace(318.0, 328.0, 2000)]
+    freq = np.unique(np.concatenate([np.geomspace(1.0, 2400.0, 1000), *fine]))
+    gain = [
+        ((one.C @ np.linalg.solve(z * np.eye(one.n_states) - one.A, one.B)) + one.D)[0, 0]
+        for z in np.exp(2j * np.pi * freq * whole.dt)
+        for one in (g, K)
+    ]
+    size = np.abs(1.0 / (1.0 - np.multiply(*np.reshape(gain, (-1, 2)).T)))
+    assert 1.0 / found.left_out.modulus_margin == pytest.approx(size.max(), rel=0.01)
+    assert (size.max() > 2.5) == (peak == "high")
+    if peak == "high":
+        assert found.left_out.peak_freq == pytest.approx(freq[np.argmax(size)], rel=1e-3)
+        said, own = str(seen[0].message), solve_modes(row_of_masses()[0]).freq
+        number = 1 + int(np.argmin(np.abs(own - found.left_out.peak_freq)))
+        assert f"dB without them: mode {number} (" in said
 
 
 def test_a_continuous_design_is_checked_in_continuous_time():
@@ -251,5 +299,5 @@ def test_modes_are_told_from_the_controllers_states():
 
 
 def test_four_modes_are_named_and_the_others_counted():
-    found = SpillOver(1.01, True, 0.0, 120, tuple(range(31, 48)), (2000.0,) * 17)
+    found = SpillOver(1.01, True, 0.0, 0.5, np.nan, 120, tuple(range(31, 48)), (2000.0,) * 17)
     assert "mode 34 (2000 Hz) and 13 more" in repr(found) and "mode 35" not in repr(found)

@@ -80,14 +80,18 @@ class BrokenLoop:
         edge = np.abs(poles) - 1.0 if self.dt else poles.real
         return bool(np.max(edge, initial=-1.0) >= 0)
 
+    @cached_property
+    def worst(self) -> tuple[float, float]:
+        """The largest sigma_max(S_u) and its frequency [Hz], over a grid refined at its peaks."""
+        rounds = 6 if self.measured is None else 0
+        freq, size = climbed(lambda freq: largest(inverted(self.gain(freq))), self.grid, rounds)
+        highest = int(np.argmax(size))
+        return float(size[highest]), float(freq[highest])
+
     @property
     def modulus_margin(self) -> float:
-        """``1 / max_f sigma_max(S_u)``, over a grid refined at its peaks; 0 when unstable."""
-        if self.is_unstable:
-            return 0.0
-        rounds = 6 if self.measured is None else 0
-        _, size = climbed(lambda freq: largest(inverted(self.gain(freq))), self.grid, rounds)
-        return 1.0 / float(size.max())
+        """``1 / max_f sigma_max(S_u)``; 0 when unstable."""
+        return 0.0 if self.is_unstable else 1.0 / self.worst[0]
 
 
 def inverted(L: ComplexArray) -> ComplexArray:

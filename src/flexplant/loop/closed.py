@@ -21,7 +21,7 @@ from ..plant import StandardPlant, larger_plant, standard_plant
 from ..values import ComplexArray, FloatArray, Value, name_list
 from .blocks import as_block, check_inputs, drives, joined
 from .broken import BrokenLoop, moved
-from .spill_over import SpillOver, growing_modes
+from .spill_over import SpillOver, growing_modes, high
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -251,18 +251,18 @@ class ClosedLoop(Value):
             return None
         whole = ClosedLoop(self.larger, self.blocks, self.controller, self.idle)
         stability = whole.spectral_radius if self.plant.dt else whole.spectral_abscissa
-        modes, freq = (
-            ((), ())
-            if whole.is_stable
-            else growing_modes(whole.monitored, self.larger.system.states)
-        )
+        margin, without, peak = whole.modulus_margin, self.modulus_margin, float("nan")
+        modes: tuple[int, ...] = ()
+        freq: tuple[float, ...] = ()
+        states = self.larger.system.states
+        if not whole.is_stable:
+            modes, freq = growing_modes(whole.monitored, states)
+        else:
+            peak = whole.broken.worst[1]
+            if high(margin, without):
+                modes, freq = growing_modes(whole.monitored, states, near=peak)
         return SpillOver(
-            stability,
-            bool(self.plant.dt),
-            whole.modulus_margin,
-            self.larger.system.n_states,
-            modes,
-            freq,
+            stability, bool(self.plant.dt), margin, without, peak, len(states), modes, freq
         )
 
     @cached_property

@@ -15,6 +15,8 @@ from ..values import FloatArray, IntArray, Value
 
 #: a mode with less than this part of the one that takes part most is not named
 _TAKES_PART = 0.3
+#: |S| at u above which modes left out are warned of (8 dB), and how much larger than without them
+_HIGH, _LARGER = 2.5, 1.1
 #: so many modes are named in a message
 _NAMED = 4
 
@@ -32,18 +34,24 @@ class SpillOver(Value):
         Which of both it is.
     modulus_margin : float
         There, broken at u; 0 when unstable.
+    without : float
+        Modulus margin on the plant itself, without these modes; 0 when unstable there.
+    peak_freq : float [Hz]
+        Where |S| at u is largest with them; NaN when unstable.
     states : int
         Of the plant with the modes left out.
     modes : sequence of int
         Numbers (from 1, rigid-body modes included) of the modes of that plant which take part most
-        in what grows; empty when stable.
+        in what grows, or in the peak of |S| at u where this is `high`; empty otherwise.
     freq : sequence of float [Hz]
-        At which it grows, one for each of these modes.
+        Of that, one for each of these modes.
     """
 
     stability: float
     sampled: bool
     modulus_margin: float
+    without: float
+    peak_freq: float
     states: int
     modes: tuple[int, ...] = ()
     freq: tuple[float, ...] = ()
@@ -55,6 +63,16 @@ class SpillOver(Value):
     def is_stable(self) -> bool:
         """Whether the loop is stable there."""
         return self.stability < (1.0 if self.sampled else 0.0)
+
+    @property
+    def is_high(self) -> bool:
+        """Whether the loop is stable, but the modes left out bring |S| at u above 8 dB."""
+        return self.is_stable and high(self.modulus_margin, self.without)
+
+    @property
+    def is_fine(self) -> bool:
+        """Whether the modes left out change nothing that a design should be warned of."""
+        return self.is_stable and not self.is_high
 
     @property
     def spectral_radius(self) -> float:
@@ -82,11 +100,9 @@ class SpillOver(Value):
         return "spectral radius" if self.sampled else "largest real part"
 
     @property
-    def growing(self) -> str:
-        """The modes that take part in what grows, in words."""
-        listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(self.modes, self.freq, strict=True)]
-        more = len(listed) - _NAMED
-        return ", ".join(listed[:_NAMED]) + (f" and {more} more" if more > 0 else "")
+    def named_modes(self) -> str:
+        """The modes that take part in what grows or peaks, in words."""
+        return named(self.modes, self.freq)
 
     def __repr__(self) -> str:
         return f"<SpillOver: {self.summary}>"
@@ -96,13 +112,35 @@ class SpillOver(Value):
         """The finding in one line."""
         found = f"{self._measure} {self.stability:.6f}"
         if not self.is_stable:
-            return f"unstable ({self.states} states), {found}: {self.growing or 'no mode named'}"
-        peak = -20.0 * np.log10(self.modulus_margin)
-        return f"stable ({self.states} states), {found}, |S| at u up to {peak:.3g} dB"
+            return f"unstable ({self.states} states), {found}: {self.named_modes}"
+        there = f"stable ({self.states} states), {found}, |S| at u up to {_db(self.modulus_margin)}"
+        if not self.is_high:
+            return there
+        return (
+            f"{there} at {self.peak_freq:.4g} Hz where it is at most {_db(self.without)} without "
+            f"them: {self.named_modes}"
+        )
+
+
+def _db(margin: float) -> str:
+    return f"{-20.0 * np.log10(margin):.3g} dB"
+
+
+def named(modes: Sequence[int], freq: Sequence[float]) -> str:
+    """Return modes in words, the first few of many."""
+    listed = [f"mode {n} ({f:.4g} Hz)" for n, f in zip(modes, freq, strict=True)]
+    more = len(listed) - _NAMED
+    first = ", ".join(listed[:_NAMED]) or "no mode named"
+    return first + (f" and {more} more" if more > 0 else "")
+
+
+def high(margin: float, without: float) -> bool:
+    """Return whether modes make |S| at u larger than 8 dB: margins with and without them."""
+    return margin < min(1.0 / _HIGH, without / _LARGER)
 
 
 def growing_modes(
-    loop: StateSpace, states: Sequence[str]
+    loop: StateSpace, states: Sequence[str], near: float | None = None
 ) -> tuple[tuple[int, ...], tuple[float, ...]]:
     """Return the numbers of the modes that take part in what grows, and its frequencies [Hz].
 
@@ -116,6 +154,9 @@ def growing_modes(
         The closed loop: states of the plant, then of the controller.
     states : sequence of str
         Names of the plant's states; `mode7:q` and `mode7:v` are those of mode 7.
+    near : float [Hz], optional
+        Instead of all that grows, the eigenvalue that makes the peak at this frequency: the one
+        nearest to ``e^(2 pi i f dt)`` (or ``2 pi i f``).
     """
     numbers = _numbers(states, loop.n_states)
     if not np.any(numbers):
@@ -123,9 +164,15 @@ def growing_modes(
     eigen: Any = la.eig(loop.A, left=True, right=True)
     values, left, right = eigen
     edge = np.abs(values) - 1.0 if loop.dt else values.real
-    grows = np.flatnonzero((edge >= 0) & (values.imag >= 0))
+    if near is None:
+        looked_at = np.flatnonzero((edge >= 0) & (values.imag >= 0))
+        looked_at = looked_at[np.argsort(-edge[looked_at], kind="stable")]
+    else:
+        turn = 2j * np.pi * near
+        turned = np.exp(turn * loop.dt) if loop.dt else turn
+        looked_at = np.argsort(np.abs(values - turned), kind="stable")[:1]
     found: dict[int, float] = {}
-    for i in grows[np.argsort(-edge[grows], kind="stable")]:
+    for i in looked_at:
         part = np.abs(left[:, i] * right[:, i])
         share = _summed(part, numbers)
         pole = np.log(values[i]) / loop.dt if loop.dt else values[i]

@@ -72,7 +72,7 @@ def design_hinf(
     Warns
     -----
     FlexplantWarning
-        When the modes left out make the loop unstable; it names them.
+        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
 
     References
     ----------

@@ -8,7 +8,7 @@ from typing import Any
 
 from ..errors import FlexplantWarning, ModelError, SolverError
 from ..loop import ClosedLoop
-from ..loop.spill_over import growing_modes
+from ..loop.spill_over import growing_modes, named
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..plant.rigid.rigid_motion import require_weak
@@ -17,7 +17,7 @@ from .controller import Controller
 from .servo_axis import Axis
 from .servo_loop import TARGET
 from .servo_task import ServoTask, servo_task
-from .spill_over import unchecked
+from .spill_over import CLOSE, unchecked
 
 
 @one_thread()
@@ -96,7 +96,8 @@ def design_servo(
     Warns
     -----
     FlexplantWarning
-        When the loop on the POI itself is unstable, or the modes left out make the loop unstable.
+        When the loop on the POI itself is unstable, or the modes left out make the loop unstable or
+        bring |S| at u above 8 dB.
     """
     task = servo_task(
         plant,
@@ -136,10 +137,11 @@ def design_servo(
             advice = f"The largest bandwidth that holds 6 dB there is {reach:.3g} Hz."
     if not closed.is_stable:
         _refuse(closed, float(bandwidth), observer is not None, advice)
-    elif left_out is not None and not left_out.is_stable:
+    elif left_out is not None and not left_out.is_fine:
         warnings.warn(
             f"with the modes that the plant left out the servo's loop at {bandwidth:g} Hz is "
-            f"{left_out.summary}. The machine has these modes. {advice}",
+            f"{left_out.summary}. The machine has these modes{CLOSE if left_out.is_high else ''}. "
+            f"{advice}",
             FlexplantWarning,
             stacklevel=3,
         )
@@ -206,12 +208,11 @@ def servo_bandwidth(
 
 def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -> None:
     """Raise SolverError for the loop that will run, warn of a loop on the POI itself."""
-    modes, freq = growing_modes(closed.monitored, closed.plant.system.states)
-    named = ", ".join(f"mode {n} ({f:.4g} Hz)" for n, f in zip(modes, freq, strict=True))
+    modes = named(*growing_modes(closed.monitored, closed.plant.system.states))
     what = "with its observer" if observed else "on the POI itself"
     text = (
         f"the servo's loop at {bandwidth:g} Hz {what} is unstable (spectral radius "
-        f"{closed.spectral_radius:.6f}; takes part most: {named or 'no mode'}). {advice} "
+        f"{closed.spectral_radius:.6f}; takes part most: {modes}). {advice} "
         "Lower the bandwidth or the delay, or raise the rate."
     )
     if observed:

@@ -11,6 +11,9 @@ from ..loop import SpillOver, close_loop
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
 
+#: what a high peak means
+CLOSE = ", and one that differs a little from the model may be unstable"
+
 
 def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> SpillOver | None:
     """Return the check of a design's loop with the modes left out; None: they are not known.
@@ -27,7 +30,8 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
     Warns
     -----
     FlexplantWarning
-        When the loop is unstable there, with the numbers of the modes.
+        When the loop is unstable there or |S| at u above 8 dB because of them, with the numbers of
+        the modes.
     """
     whole = larger_plant(plant, larger)
     if whole is None:
@@ -37,11 +41,11 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
     with warnings.catch_warnings():  # one warning is enough, where the user called from
         warnings.simplefilter("ignore", FlexplantWarning)
         found = close_loop(plain, *before, *blocks, larger=whole).left_out
-    if found is not None and not found.is_stable:
+    if found is not None and not found.is_fine:
         warnings.warn(
             f"with the modes that the plant left out the loop is {found.summary}. The machine has "
-            "these modes: choose less bandwidth, keep them in the plant, or weight the efforts "
-            "(or roll the controller off) before them.",
+            f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
+            "the plant, or weight the efforts (or roll the controller off) before them.",
             FlexplantWarning,
             stacklevel=4,
         )
