@@ -72,6 +72,15 @@ def machine_frf(**options):
 #: (name, call of one argument, kinds that are allowed there)
 CALLS = [
     ("design_kalman", lambda x: fx.design_kalman(x), ()),
+    ("design_hinf_filter", lambda x: fx.estimation.design_hinf_filter(x), ()),
+    ("hinf_filter accuracy", lambda x: fx.estimation.design_hinf_filter(plant(), accuracy=x), ()),
+    ("design_minimax_filter", lambda x: fx.estimation.design_minimax_filter(x, [plant()]), ()),
+    ("minimax_filter machines", lambda x: fx.estimation.design_minimax_filter(plant(), x), ()),
+    (
+        "minimax_filter iterations",
+        lambda x: fx.estimation.design_minimax_filter(plant(), [plant()], iterations=x),
+        (),
+    ),
     ("design_kalman larger", lambda x: fx.design_kalman(plant(), larger=x), ("none",)),
     ("design_static larger", lambda x: fx.design_static(plant(), larger=x), ("none",)),
     ("kalman rms on", lambda x: kalman().rms("die", on=x), ("none",)),

@@ -4,7 +4,12 @@ from .certificate import KalmanCertificate as KalmanCertificate
 from .certificate import check_gain as check_gain
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel
+from .hinf_filter import design_hinf_filter as design_hinf_filter
 from .kalman import design_kalman as design_kalman
 from .left_out import LeftOut as LeftOut
+from .minimax import design_minimax_filter as design_minimax_filter
+from .robust import HinfFilterCertificate as HinfFilterCertificate
+from .robust import MinimaxCertificate as MinimaxCertificate
+from .robust import RobustFilter as RobustFilter
 from .static import StaticEstimator as StaticEstimator
 from .static import design_static as design_static

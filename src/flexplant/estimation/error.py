@@ -96,7 +96,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     observer = observer.select(observer.outputs, read)
     C1, C2 = g.C[g.output_index(poi_channels(plant))], g.C[g.output_index(read)]
     noise = np.sqrt(plant.sensor_noise[np.ix_(*[[plant.y.index(name) for name in read]] * 2)])
-    rigid, rest = _parts(plant)
+    rigid, rest = moving_parts(plant)
     if suspension is not None:
         rest = np.setdiff1d(rest, plant.modal_states.reshape(-1, 2)[suspension])
     n, m, k = rest.size, observer.n_states, rigid.size
@@ -119,7 +119,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     return _Joint(A, drive, E, direct, n, _eigen(A[:n, :n], A[:n, n:]))
 
 
-def _parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
+def moving_parts(plant: StandardPlant) -> tuple[IntArray, IntArray]:
     """Return the states of modes on the unit circle, and all others that noise reaches."""
     g, factor = plant.system, plant.noise_factor
     kept = np.zeros(0, dtype=np.int64)

@@ -8,16 +8,17 @@ import numpy as np
 
 from ..errors import AssumptionError, CertificateError
 from ..lti.riccati import solve_dare
-from ..lti.statespace import StateSpace, System
+from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from ..values import FloatArray
 from .certificate import AGREEMENT, KalmanCertificate, error_of
-from .channels import checked_plant, estimates
+from .channels import checked_plant
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .filter_model import FilterModel, check_noises, filter_model
+from .filter_system import filter_system
 from .left_out import left_out
 
 
@@ -93,7 +94,7 @@ def design_kalman(
     model = filter_model(plant, found)
     design = _designed(model)
     own = plant if found is None else found.plant
-    system = _observer(own, model, design)
+    system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
     if whole is None or found is None:
         certificate = design.certificate
         if larger is not None:
@@ -144,18 +145,3 @@ def _designed(model: FilterModel) -> _Design:
     radius, difference = error_of(model, gain, predictor, covariance)
     certificate = KalmanCertificate(radius, solution.residual, difference)
     return _Design(gain, predictor, poi_gain, covariance, variances, certificate)
-
-
-def _observer(plant: StandardPlant, model: FilterModel, design: _Design) -> StateSpace:
-    return StateSpace(
-        model.A - design.predictor @ model.C2,
-        np.hstack([design.predictor, model.B - design.predictor @ model.D2]),
-        model.C1 - design.poi_gain @ model.C2,
-        np.hstack([design.poi_gain, model.D1 - design.poi_gain @ model.D2]),
-        plant.dt,
-        inputs=[*model.sensors, *model.commands],
-        outputs=estimates(model.channels),
-        states=plant.system.states,
-        name="kalman",
-        units=plant.units,
-    )

@@ -1,0 +1,232 @@
+"""The filter whose worst error over several machines is smallest."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..lti.statespace import System
+from ..parallel import one_thread
+from ..plant import StandardPlant, UncertainPlant
+from ..values import FloatArray, short, whole
+from .channels import same_pois
+from .error import error_variances
+from .filter_system import filter_system, own_variances
+from .kalman import design_kalman
+from .machine_error import Gains, MachineError, machine_error
+from .robust import MinimaxCertificate, RobustFilter
+
+#: width of the smooth maximum relative to the largest value, from coarse to fine
+_WIDTHS = (0.1, 0.01, 0.001)
+#: the search's values and those of the errors in closed form agree to this
+_AGREEMENT = 1e-6
+#: step of a state's variance per innovation's, where the POIs do not say how large it may be
+_PART = 0.03
+
+
+@one_thread()
+def design_minimax_filter(
+    plant: StandardPlant | System,
+    machines: Sequence[StandardPlant],
+    *,
+    iterations: int = 200,
+) -> RobustFilter:
+    """Return the filter on one plant's matrices whose worst error over machines is smallest.
+
+    A Kalman filter is best on its own plant; on a machine whose modes lie half a percent beside
+    them its error may be twice as large. The filter keeps the matrices A, B2, C1, C2 of the plant
+    and chooses both gains::
+
+        minimise over K, L_z   max_i  mean_j  E(z_j - hat_j)^2 on machine i / sizes_j^2
+
+    The variances follow from a Stein equation of machine and filter, ``X = F X F' + N N'``, their
+    gradients from its dual, ``dJ/dF = 2 Y F X``, and a smooth maximum
+    ``t log sum exp(J_i / t)`` is minimised by BFGS for three widths t, the last a thousandth of
+    the worst value. The problem is not convex: the search starts at the Kalman filter and is never
+    worse.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, not weighted: the nominal plant.
+    machines : sequence of StandardPlant
+        Sampled alike, with the same ports: `plant.uncertain(fit).sample(rng, 20)`.
+    iterations : int
+        At most so many for each width.
+
+    Returns
+    -------
+    RobustFilter
+        Its certificate holds the worst value over the machines by `error_variances`, beside that
+        of the Kalman filter and that of the worst machine's own Kalman filter, which no filter
+        betters.
+
+    Raises
+    ------
+    AssumptionError
+        As `design_kalman`; or when the error of the nominal Kalman filter on a machine has no
+        variance: a rigid-body motion enters it.
+    ModelError, LabelError
+        When there is no machine, or one has another sampling time or other channels.
+    SolverError
+        When no Kalman filter exists.
+    CertificateError
+        When the search's variances are not those of `error_variances`.
+
+    References
+    ----------
+    Geromel, Optimal linear filtering under parameter uncertainty, IEEE Trans. Signal Processing
+    47, 1999 (the finite set of machines); the dual Stein equation for the gradient: Levine, Athans,
+    IEEE Trans. Automatic Control 15, 1970.
+    """
+    steps = whole(iterations, "iterations")
+    kalman = design_kalman(plant, larger=plant)  # type: ignore[arg-type]
+    plant, model = kalman.plant, kalman.model
+    sizes = np.sqrt(kalman.variances)
+    others = _checked(plant, machines)
+    start = Gains(kalman.predictor_gain, model.C1 @ kalman.gain)
+    errors = [machine_error(plant, model, other, start, sizes) for other in others]
+    unit = _Units.of(
+        errors[0], model.innovation(kalman.predicted_covariance), start, kalman.covariance
+    )
+    found, slope = _searched(errors, unit, start, steps)
+    values = np.array([error.value(found) for error in errors])
+    system = filter_system(plant, model, found.K, found.L_z, "minimax_filter")
+    truth = _means(others, system, sizes)
+    difference = float(np.max(np.abs(values - truth) / truth))
+    if not difference <= _AGREEMENT:
+        raise CertificateError(
+            f"the variances of the search and those of the filter in closed form differ by "
+            f"{difference:.1e} (allowed {_AGREEMENT:.0e}). The filter cannot be trusted."
+        )
+    certificate = MinimaxCertificate(
+        float(truth.max()),
+        float(_means(others, kalman.system, sizes).max()),
+        max(_best(other, sizes) for other in others),
+        difference,
+        slope,
+    )
+    return RobustFilter(
+        system,
+        plant,
+        found.K,
+        found.L_z,
+        sizes,
+        own_variances(model, found.K, found.L_z),
+        certificate,
+    )
+
+
+def _checked(plant: StandardPlant, machines: Sequence[StandardPlant]) -> list[StandardPlant]:
+    """Return the machines as plants with the sensors and POIs of the nominal one."""
+    if isinstance(machines, UncertainPlant):
+        raise ModelError(
+            "machines are sampled plants, got an UncertainPlant: draw them from it, "
+            "uncertain.sample(rng, 20), so that it is known which ones the worst case is of."
+        )
+    if isinstance(machines, StandardPlant) or not isinstance(machines, Sequence) or not machines:
+        raise ModelError(
+            f"machines must be a list of at least one StandardPlant, got {short(machines)}. Pass "
+            "those that plant.uncertain(fit).sample(rng, 20) draws."
+        )
+    return [same_pois(plant, other) for other in machines]
+
+
+def _means(machines: Sequence[StandardPlant], system: System, sizes: FloatArray) -> FloatArray:
+    """Return the mean relative variance of a filter on each machine."""
+    found = [error_variances(machine, system).values for machine in machines]
+    return np.asarray(np.mean(np.array(found) / sizes**2, axis=1))
+
+
+def _best(machine: StandardPlant, sizes: FloatArray) -> float:
+    """Return the mean relative variance of a machine's own Kalman filter."""
+    return float(np.mean(design_kalman(machine, larger=machine).variances / sizes**2))
+
+
+class _Units(NamedTuple):
+    """Changes of K and L_z are ``left x right``: at the Kalman filter J has the Hessian 2 I.
+
+    There ``J(K) = J + tr(Y dK S dK')``, S the covariance of the innovation and Y the Gramian of
+    the error from states to POIs; in other units the search takes a thousand steps.
+    """
+
+    states: FloatArray
+    pois: FloatArray
+    right: FloatArray
+
+    @classmethod
+    def of(
+        cls, error: MachineError, innovation: FloatArray, start: Gains, covariance: FloatArray
+    ) -> _Units:
+        """Return the units at a start on the nominal plant."""
+        Y, d = error.sight(start)
+        # what the POIs hardly see moves by a part of its deviation for an innovation of one
+        spread = np.maximum(covariance.diagonal() / d**2, 1e-12)
+        values, vectors = np.linalg.eigh(Y + np.diag(1.0 / (_PART * spread)))
+        states = d[:, None] * vectors / np.sqrt(values)
+        size = np.sqrt(innovation.diagonal())
+        values, vectors = np.linalg.eigh(innovation / size / size[:, None])
+        right = (vectors / np.sqrt(values)).T / size
+        return cls(states, np.diag(error.sizes * np.sqrt(error.sizes.size)), right)
+
+
+def _searched(
+    errors: Sequence[MachineError], unit: _Units, start: Gains, steps: int
+) -> tuple[Gains, float]:
+    """Return the best gains that were found, and the relative slope there."""
+    from scipy.optimize import minimize
+
+    split = start.K.size
+    best: list[tuple[float, Gains]] = []
+
+    def gains(x: FloatArray) -> Gains:
+        return Gains(
+            start.K + unit.states @ x[:split].reshape(start.K.shape) @ unit.right,
+            start.L_z + unit.pois @ x[split:].reshape(start.L_z.shape) @ unit.right,
+        )
+
+    def smooth(x: FloatArray, width: float) -> tuple[float, FloatArray]:
+        at = gains(x)
+        try:
+            found = [error.value_and_gradient(at) for error in errors]
+        except SolverError:  # the filter is not stable
+            return np.inf, np.zeros(x.size)
+        values = np.array([value for value, _ in found])
+        weight = np.exp((values - values.max()) / width)
+        if not best or values.max() < best[0][0]:
+            best[:] = [(float(values.max()), at)]
+        slope = np.zeros(x.size)
+        for part, (_, rate) in zip(weight / weight.sum(), found, strict=True):
+            slope[:split] += part * (unit.states.T @ rate.K @ unit.right.T).reshape(-1)
+            slope[split:] += part * (unit.pois @ rate.L_z @ unit.right.T).reshape(-1)
+        return float(values.max() + width * np.log(weight.sum())), slope
+
+    def relative(x: FloatArray, width: float, scale: float) -> tuple[float, FloatArray]:
+        value, slope = smooth(x, width * scale)
+        return value / scale, slope / scale
+
+    x = np.zeros(split + start.L_z.size)
+    if not np.isfinite(smooth(x, 1.0)[0]):
+        raise AssumptionError(
+            "the Kalman filter of the nominal plant is not stable to working precision, so the "
+            "search has no start."
+        )
+    steepness = 0.0
+    for width in _WIDTHS:
+        scale = best[0][0]
+
+        with np.errstate(all="ignore"):
+            result = minimize(
+                relative,
+                x,
+                args=(width, scale),
+                jac=True,
+                method="BFGS",
+                options={"maxiter": steps, "gtol": 1e-5},
+            )
+        x = result.x
+        steepness = float(np.linalg.norm(result.jac))
+    return best[0][1], steepness
