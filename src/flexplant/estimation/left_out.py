@@ -199,8 +199,9 @@ def _covariance(blocks: _Blocks, chosen: IntArray, ports: Ports) -> FloatArray:
             "solve_modes(damping=...)."
         )
     omega = np.asarray(1j * np.repeat(blocks.omega[chosen], 2), dtype=np.complex128)
-    drive = blocks.push[chosen].reshape(poles.size, -1)[:, : len(ports.w)]
-    drive = drive * np.array([_density(port, omega) for port in ports.w]).reshape(-1, poles.size).T
+    drive = blocks.push[chosen].reshape(poles.size, -1)
+    density = [_density(port, omega) for port in ports.forces]  # of actuators: their input noise
+    drive = drive * np.array(density).reshape(-1, poles.size).T
     see = blocks.see[:, chosen].reshape(-1, poles.size).copy()
     turn = np.where(poles.imag >= 0, omega, -omega)
     first = see.shape[0] - len(ports.y)

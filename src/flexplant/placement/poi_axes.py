@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..errors import LabelError, unknown_label
-from ..plant import Disturbance, Poi, StandardPlant
+from ..plant import Actuator, Disturbance, Poi, StandardPlant
 from ..values import FloatArray, positive
 
 #: axes of a POI that count, each once or by a factor
@@ -102,6 +102,8 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     forces = all(isinstance(port, Disturbance) for port in ports.w)
     rigidly = not realisation.static_inputs.size
+    # noise of an actuator comes and goes with it
+    forces = forces and not any(isinstance(c, Actuator) and c.asd > 0 for c in candidates)
     return forces and rigidly and all(map(bare, (*ports.w, *ports.u, *ports.y, *candidates)))
 
 

@@ -80,7 +80,7 @@ class PoiVariance(Criterion):
                 "them without limit. Give Sensor(..., asd=) what the data sheet says."
             )
         # noise that is shaped first does not arrive at once
-        loud = [port for port in ports.w if port.asd > 0 and bare(port)]
+        loud = [port for port in ports.forces if port.asd > 0 and bare(port)]
         push = np.array([port.push(realisation) for port in loud])
         ground = np.array([port.ground for port in loud])
         for sensor in candidates:

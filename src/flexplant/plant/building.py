@@ -42,7 +42,7 @@ def wired(cls: type[P], origin: Assembled) -> P:
     noises = [f"{s.name}:noise" for s in ports.y if s.asd > 0]
     tracked = [ports.poi(reference.poi) for reference in ports.references]
     refs = [poi.derived(poi.axes[0], "ref") for poi in tracked]
-    w = [*(d.name for d in ports.w), *noises, *refs]
+    w = [*(d.name for d in ports.w), *ports.input_noises, *noises, *refs]
     z = [
         *pois,
         *(poi.derived(poi.axes[0], "error") for poi in tracked),
@@ -69,7 +69,7 @@ def wired(cls: type[P], origin: Assembled) -> P:
     for name in actuators:
         D[row[f"{name}:effort"], column[name]] = 1.0
     system = physical.replace(B=B, C=C, D=D, inputs=inputs, outputs=outputs, units=ports.units)
-    asd = {d.name: d.asd for d in ports.w if d.asd > 0}
+    asd = {d.name: d.asd for d in ports.w if d.asd > 0} | ports.input_noises
     asd |= {f"{s.name}:noise": s.asd for s in ports.y if s.asd > 0}
     return cls(system, tuple(w), tuple(actuators), tuple(z), tuple(y), asd, origin)
 
@@ -203,4 +203,11 @@ def with_flexibility(plant: P, flexibility: FloatArray) -> P:
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     bare = structure_system(realisation, ports)
     physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)
+    direct = [p for p in ports.u if p.asd > 0 and (p.filter is None or np.any(p.filter.D))]
+    if direct:  # white noise has no value at an instant that a compliance could follow
+        columns = physical.input_index([f"{port.name}:disturbance" for port in direct])
+        without = with_filters(bare, realisation, ports)
+        B, D = np.array(physical.B), np.array(physical.D)
+        B[:, columns], D[:, columns] = without.B[:, columns], without.D[:, columns]
+        physical = physical.replace(B=B, D=D)
     return sampled_like(plant, wired(type(plant), Assembled(ports, realisation, physical)))

@@ -53,6 +53,8 @@ def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
 def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Ports) -> StateSpace:
     """Return the structure between the filters of its ports, absolute motions included.
 
+    Noise at an amplifier's input is an input more, beside the command: it has no states.
+
     States are those of the sensors' filters, the structure's, those of the forces' filters: what
     drives stands behind what is driven, so that A is block upper triangular.
 
@@ -75,7 +77,13 @@ def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Po
         system = system.replace(B=system.B * gains, D=system.D * gains)
     if any(part.n_states or part.D[0, 0] != 1.0 for part in after.values()):
         system = series(system, append(*after.values()))
-    return system
+    noisy = [name.rpartition(":")[0] for name in ports.input_noises]
+    if not noisy:
+        return system
+    twice = [*range(len(system.inputs)), *system.input_index(noisy).tolist()]
+    return system.replace(
+        B=system.B[:, twice], D=system.D[:, twice], inputs=[*system.inputs, *ports.input_noises]
+    )
 
 
 def _carried(realisation: ModalRealisation, ports: Ports) -> dict[str, Carried]:

@@ -177,11 +177,14 @@ class Actuator(ForcePort):
         `discretized`. It acts exactly, also
         between samples, once the plant is sampled; a continuous plant leaves it out and says so
         (`ports.with_pade(order)` approximates it there).
+    asd : float [N/sqrt(Hz), N m/sqrt(Hz)]
+        One-sided amplitude spectral density of white noise at the amplifier's input, the channel
+        `name:disturbance` of w. It passes the same `dynamics` as the command, not its latency.
 
     Raises
     ------
     LabelError, ModelError
-        For a bad name, place, direction, dynamics, or a latency that is
+        For a bad name, place, direction, dynamics, a negative asd, or a latency that is
         negative or a second or more.
     """
 
@@ -191,6 +194,7 @@ class Actuator(ForcePort):
     direction: str = "z"
     dynamics: StateSpace | None = None
     latency: float = 0.0
+    asd: float = 0.0
 
     @property
     def filter(self) -> StateSpace | None:

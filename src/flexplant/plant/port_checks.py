@@ -15,7 +15,8 @@ from ..values import check_names, positive, real_array, short
 #: [s] a latency from here on is taken for a number of samples
 _SAMPLES = 1.0
 #: endings of the channels that a plant makes itself: estimates, references, errors, efforts, noises
-DERIVED = ("hat", "ref", "error", "effort", "noise")
+#: of sensors and disturbances of actuators
+DERIVED = ("hat", "ref", "error", "effort", "noise", "disturbance")
 
 
 def checked_port(port: Any) -> dict[str, Any]:

@@ -53,7 +53,7 @@ class Ports(Value):
     Parameters
     ----------
     w : sequence of Disturbance, BaseAcceleration and OutputDisturbance
-        Disturbances; sensor noises and references are added to them.
+        Disturbances; those of amplifiers, sensor noises and references are added to them.
     u : sequence of Actuator
         Actuators; each adds an effort `name:effort` to z.
     z : sequence of Poi
@@ -138,7 +138,8 @@ class Ports(Value):
             if port.added_to is not None:
                 found[port.name] = found[port.added_to]
         found |= {f"{sensor.name}:noise": sensor.unit for sensor in self.y}
-        found |= {f"{actuator.name}:effort": actuator.unit for actuator in self.u}
+        for kind in ("effort", "disturbance"):
+            found |= {f"{actuator.name}:{kind}": actuator.unit for actuator in self.u}
         for poi in self.z:
             for axis in poi.axes:
                 found[poi.channel(axis)] = unit = poi.unit(axis)
@@ -176,6 +177,11 @@ class Ports(Value):
         """Latencies [s] of the actuators and sensors that have one, by name."""
         ports: tuple[Actuator | SensorPort, ...] = (*self.u, *self.y)
         return {port.name: port.latency for port in ports if port.latency}
+
+    @property
+    def input_noises(self) -> dict[str, float]:
+        """Densities of the white noise at the amplifiers' inputs, by channel `u1:disturbance`."""
+        return {f"{port.name}:disturbance": port.asd for port in self.u if port.asd > 0}
 
     @property
     def has_dynamics(self) -> bool:

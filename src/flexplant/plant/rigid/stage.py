@@ -251,6 +251,10 @@ def stage_weights(
             w[port.name] = push_size * turned * (2.0 * np.pi * crossing) ** 2
         else:
             w[port.name] = push_size * force * (arm if port.direction.startswith("r") else 1.0)
+    for actuator in ports.u:
+        if actuator.asd > 0:
+            turned = arm if actuator.direction.startswith("r") else 1.0
+            w[f"{actuator.name}:disturbance"] = push_size * force * turned
     w |= {name: positive(noise, "noise") for name in plant.w if name.endswith(":noise")}
     text = (
         f"{bandwidth:g} Hz: gamma 1 is |T| < {peak:g} at u, forces in {force:.4g} N, rotations in "
