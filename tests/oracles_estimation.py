@@ -138,3 +138,73 @@ def scalar_filter_variance(a, nominal, K, L, q, r):
     X = np.linalg.solve(np.eye(4) - np.kron(F, F), M.reshape(-1)).reshape(2, 2)
     E = np.array([1 - L, -(1 - L)])
     return E @ X @ E + L * L * r
+
+
+def batch(plant, y, u, P0, Z, upto):
+    """Best linear unbiased estimates of z[k] from the measurements before sample upto[k], dense.
+
+    plant: A, B, C1, D1, C2, D2, Q, R, V, N, S. All states of the record are linear in x'[0], delta
+    and the process noise; the measurements that are not NaN are stacked, their covariance is
+    inverted, and delta (columns Z, no prior) is found by generalised least squares. Returns
+    estimates and variances (N, nz).
+    """
+    A, C1, C2 = plant["A"], plant["C1"], plant["C2"]
+    N, ny = y.shape
+    n, nz = A.shape[0], C1.shape[0]
+    # unit noises: x'[0], then (w, v, n) of each sample
+    joint = np.block([
+        [plant["Q"], plant["S"], np.zeros((n, nz))],
+        [plant["S"].T, plant["R"], plant["N"].T],
+        [np.zeros((nz, n)), plant["N"], plant["V"]],
+    ])  # fmt: skip
+    root, first = _root(joint), _root(P0)
+    width = first.shape[1] + N * root.shape[1]
+    X, D, mean = np.zeros((n, width)), Z.copy(), np.zeros(n)
+    X[:, : first.shape[1]] = first
+    rows = {name: [] for name in ("yX", "yD", "ym", "zX", "zD", "zm")}
+    for k in range(N):
+        noise = np.zeros((root.shape[0], width))
+        at = first.shape[1] + k * root.shape[1]
+        noise[:, at : at + root.shape[1]] = root
+        rows["yX"].append(C2 @ X + noise[n : n + ny])
+        rows["zX"].append(C1 @ X + noise[n + ny :])
+        rows["yD"].append(C2 @ D)
+        rows["zD"].append(C1 @ D)
+        rows["ym"].append(C2 @ mean + plant["D2"] @ u[k])
+        rows["zm"].append(C1 @ mean + plant["D1"] @ u[k])
+        X, D = A @ X + noise[:n], A @ D
+        mean = A @ mean + plant["B"] @ u[k]
+    rows = {name: np.array(parts) for name, parts in rows.items()}
+    hat, variance = np.full((N, nz), np.nan), np.full((N, nz), np.inf)
+    for k in range(N):
+        end = min(max(upto[k], 0), N)
+        kept = np.isfinite(y[:end]).ravel()
+        size = np.sqrt(np.tile(np.diag(plant["R"]), end))[kept]
+        Y, H, value = (
+            rows[name][:end].reshape(end * ny, width)[kept] / size[:, None]
+            for name, width in (("yX", X.shape[1]), ("yD", D.shape[1]), ("ym", 1))
+        )
+        value = (y[:end].ravel()[kept] / size) - value[:, 0]
+        zX, zD, zm = (rows[name][k] for name in ("zX", "zD", "zm"))
+        weights = np.linalg.solve(Y @ Y.T, Y @ zX.T).T if end else np.zeros((nz, 0))
+        left = zX - weights @ Y
+        G = zD - weights @ H
+        information = H.T @ np.linalg.solve(Y @ Y.T, H)
+        scale = np.sqrt(np.maximum(np.diag(information), 1e-300))
+        sizes, V = np.linalg.eigh(information / scale / scale[:, None])
+        unseen = sizes < 1e-9 if Z.shape[1] else np.zeros(0, dtype=bool)
+        G = G / scale @ V
+        if np.any(np.abs(G[:, unseen]) > 1e-6 * np.abs(G).max(initial=0)):
+            continue
+        G, V, sizes = G[:, ~unseen], V[:, ~unseen], sizes[~unseen]
+        delta = V.T @ (H.T @ np.linalg.solve(Y @ Y.T, value) / scale) / sizes
+        hat[k] = zm + G @ delta + weights @ value
+        variance[k] = np.sum(left**2, axis=1) + np.sum(G**2 / sizes, axis=1)
+    return hat, variance
+
+
+def _root(covariance):
+    size = np.sqrt(np.diag(covariance))
+    size = np.where(size > 0, size, 1.0)
+    values, vectors = np.linalg.eigh(covariance / size / size[:, None])
+    return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))

@@ -14,7 +14,9 @@ from . import io as io
 from . import testbeds as testbeds
 from .errors import FlexplantError as FlexplantError
 from .errors import FlexplantWarning as FlexplantWarning
+from .estimation import FixedLag as FixedLag
 from .estimation import KalmanEstimator as KalmanEstimator
+from .estimation import Smoother as Smoother
 from .estimation import design_kalman as design_kalman
 from .estimation import design_static as design_static
 from .identification import MeasuredModes as MeasuredModes

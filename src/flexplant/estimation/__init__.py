@@ -2,10 +2,15 @@
 
 from .certificate import KalmanCertificate as KalmanCertificate
 from .certificate import check_gain as check_gain
+from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel
 from .hinf_filter import design_hinf_filter as design_hinf_filter
 from .kalman import design_kalman as design_kalman
+from .lags import Filter as Filter
+from .lags import FixedLag as FixedLag
+from .lags import Predictor as Predictor
+from .lags import Smoother as Smoother
 from .left_out import LeftOut as LeftOut
 from .minimax import design_minimax_filter as design_minimax_filter
 from .robust import HinfFilterCertificate as HinfFilterCertificate

@@ -7,6 +7,7 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
@@ -14,7 +15,9 @@ from ..values import FloatArray, Value
 from .certificate import KalmanCertificate
 from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
+from .estimate import Estimate, estimated
 from .filter_model import FilterModel, filter_model
+from .lags import Filter, Lag
 from .left_out import LeftOut
 
 
@@ -134,6 +137,62 @@ class KalmanEstimator(Value):
         if on is not None:
             variances = error_variances(same_pois(self.plant, on), self.system).values
         return float(np.sqrt(max(variances[row], 0.0)))
+
+    def estimate(
+        self,
+        records: Any,
+        lag: Lag | None = None,
+        *,
+        start: npt.ArrayLike | None = None,
+    ) -> Estimate:
+        """Return the motions at the POIs from recorded measurements and commands.
+
+        Until its gain is stationary the filter is the time-varying one, and so it is in and after
+        gaps, where the sensors that are there go on to count; then it runs in blocks of samples.
+        It counts as stationary when what is left changes all later estimates and innovations
+        together by less than 1e-8 of their variance.
+
+        Parameters
+        ----------
+        records : Response, mapping {channel: (N,) array} or data frame
+            All sensors and the commands u as the controller gave them (delays are in the filter);
+            NaN are missing samples of a sensor. Other channels are left aside.
+        lag : Predictor, Filter, FixedLag or Smoother, optional
+            When the estimates are known; Filter() when not given.
+        start : (n,) array, optional
+            The state x[0|-1] of the stationary filter: zeros for a machine at rest, or the `state`
+            of the estimate before. None: damped modes are in the stationary motion that the
+            disturbances keep up, rigid-body motions and undamped modes are quite unknown (diffuse,
+            no prior at all), and u was 0 before the record.
+
+        Returns
+        -------
+        Estimate
+            ``result["die:hat"]``, its deviation, and the innovations.
+
+        Raises
+        ------
+        LabelError
+            When a sensor or command is not in the records.
+        ShapeError
+            When channels differ in length, or `start` is no state.
+        ModelError
+            When `records` hold no channels, infinite values, or times of another rate, or `lag`
+            is none.
+
+        References
+        ----------
+        Anderson, Moore, Optimal Filtering, 1979, ch. 7; de Jong, The diffuse Kalman filter, Ann.
+        Statist. 19, 1991.
+        """
+        return estimated(
+            self.model,
+            self.predicted_covariance,
+            records,
+            Filter() if lag is None else lag,
+            start,
+            self.plant.units,
+        )
 
     def to_filterpy(self) -> Any:
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.

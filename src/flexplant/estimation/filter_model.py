@@ -66,6 +66,20 @@ class FilterModel(Value):
         n, ny = self.C2.T.shape
         return f"<FilterModel: {n} states, {ny} sensors, {self.C1.shape[0]} POI channels>"
 
+    def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
+        """Return the model with states x / d and measurements y / s."""
+        return self.replace(
+            A=self.A * d / d[:, None],
+            B=self.B / d[:, None],
+            C1=self.C1 * d,
+            C2=self.C2 * d / s[:, None],
+            D2=self.D2 / s[:, None],
+            Q=self.Q / d / d[:, None],
+            R=self.R / s / s[:, None],
+            N=self.N / s,
+            S=self.S / d[:, None] / s,
+        )
+
     def innovation(self, P: FloatArray) -> FloatArray:
         """Return the covariance ``C2 P C2' + R`` of the innovations, P that of x[k|k-1]."""
         return np.asarray(self.C2 @ P @ self.C2.T + self.R)

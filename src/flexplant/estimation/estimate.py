@@ -1,0 +1,208 @@
+"""What an estimator made of a record: estimates, their deviations, and the innovations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..lti.lyapunov import scale_of
+from ..parallel import one_thread
+from ..values import FloatArray, Value, known_units, real_array, short
+from .channels import estimates
+from .filter_model import FilterModel
+from .lags import Filter, FixedLag, Lag, Predictor, Smoother
+from .passage import Passage, passed
+from .records import Recorded, recorded
+from .sight import Sight
+from .smoothing import lagged, smoothed
+from .start import Start, stationary_start
+from .steady import Steady
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Estimate(Value, Mapping[str, FloatArray]):
+    """Estimated motions over a record, by name, with their deviations and the innovations.
+
+    ``result["die:hat"]`` (N,) is an estimate, ``result["y1:innovation"]`` what the sensor y1 showed
+    beyond the prediction. A Mapping: `dict(result)` feeds a data frame.
+
+    Parameters
+    ----------
+    time : (N,) array [s]
+        Sampling instants.
+    names : sequence of str
+        Of the estimates.
+    data : (nz, N) array [m or rad]
+        The estimates; NaN while the measurements do not determine one yet.
+    deviations : (nz, N) array [m or rad]
+        Standard deviations of their errors, on the filter's own model: modes left out count as
+        white noise. Infinite while nothing determines an estimate yet.
+    sensors : sequence of str
+        The sensors.
+    innovations : (ny, N) array
+        Measurements less their prediction, in the sensors' units; NaN where one is missing, or
+        nothing predicts it yet.
+    innovation_deviations : (ny, N) array
+        Their standard deviations.
+    whitened : (ny, N) array
+        ``W e`` with ``W' W`` the inverse of their covariance: white noise of unit variance when
+        the model is right.
+    lag : Predictor, Filter, FixedLag or Smoother
+        When the estimates are known.
+    state : (n,) array
+        x[N|N-1], from which `estimate(..., start=)` goes on with the next record.
+    units : mapping {channel: unit}
+        SI units.
+    """
+
+    time: FloatArray
+    names: Sequence[str]
+    data: FloatArray
+    deviations: FloatArray
+    sensors: Sequence[str]
+    innovations: FloatArray
+    innovation_deviations: FloatArray
+    whitened: FloatArray
+    lag: Lag
+    state: FloatArray
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    # values are compared by identity; Mapping's == would compare arrays
+    __eq__ = object.__eq__
+    __hash__ = object.__hash__
+
+    def __post_init__(self) -> None:
+        arrays = ("time", "data", "deviations", "innovations", "innovation_deviations")
+        self._set(
+            **{name: np.asarray(getattr(self, name), dtype=np.float64) for name in arrays},
+            whitened=np.asarray(self.whitened, dtype=np.float64),
+            state=np.asarray(self.state, dtype=np.float64),
+            names=tuple(self.names),
+            sensors=tuple(self.sensors),
+            units=dict(self.units),
+        )
+
+    def __repr__(self) -> str:
+        missing = int(np.count_nonzero(np.isnan(self.innovations)))
+        gaps = f", {missing} of {self.innovations.size} innovations missing" if missing else ""
+        last = ", ".join(
+            f"{name} {value:.3g}" for name, value in zip(self.names, self._typical(), strict=True)
+        )
+        return (
+            f"<Estimate by {self.lag!r}: {self.time.size} samples{gaps};\n"
+            f"  median deviation {last}>"
+        )
+
+    def _typical(self) -> list[float]:
+        return [float(value) for value in np.median(self.deviations, axis=1)]
+
+    def __getitem__(self, channel: str) -> FloatArray:
+        side, row = self._found(channel)
+        return np.asarray((self.data, self.innovations)[side][row])
+
+    def __iter__(self) -> Iterator[str]:
+        yield from self.names
+        yield from (f"{name}:innovation" for name in self.sensors)
+
+    def __len__(self) -> int:
+        return len(self.names) + len(self.sensors)
+
+    @property
+    def dt(self) -> float:
+        """Sampling time [s]."""
+        if self.time.size < 2:
+            return 0.0
+        return float(self.time[-1] - self.time[0]) / (self.time.size - 1)
+
+    def deviation(self, channel: str) -> FloatArray:
+        """Return the standard deviation (N,) of an estimate's error, or of an innovation.
+
+        Parameters
+        ----------
+        channel : str
+            `die:hat`, `y1:innovation`.
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        """
+        side, row = self._found(channel)
+        return np.asarray((self.deviations, self.innovation_deviations)[side][row])
+
+    def _found(self, channel: str) -> tuple[int, int]:
+        if channel in self.names:
+            return 0, list(self.names).index(channel)
+        sensor = channel.removesuffix(":innovation") if isinstance(channel, str) else channel
+        if sensor != channel and sensor in self.sensors:
+            return 1, list(self.sensors).index(sensor)
+        raise EstimateChannelError(str(unknown_label("channel", channel, list(self))))
+
+
+class EstimateChannelError(LabelError, KeyError):
+    """An estimate has no such channel; a KeyError too, as of any Mapping."""
+
+    __str__ = Exception.__str__
+
+
+@one_thread()
+def estimated(
+    model: FilterModel,
+    P: FloatArray,
+    records: Any,
+    lag: Any,
+    start: Any,
+    units: Mapping[str, str],
+) -> Estimate:
+    """Return the estimate of a record by the filter of a model with stationary covariance P."""
+    if not isinstance(lag, Predictor | Filter | FixedLag | Smoother):
+        raise ModelError(
+            f"lag must say when an estimate is known, got {short(lag)}. Pass Predictor(), "
+            "Filter(), FixedLag(samples) or Smoother()."
+        )
+    record = recorded(records, model)
+    d, s = scale_of(P.diagonal()), scale_of(model.innovation(P).diagonal())
+    unit = model.scaled(d, s)
+    steady = Steady(unit, P / d / d[:, None])
+    sight = Sight(
+        np.hstack([unit.C1, unit.N])[None], unit.D1[None], np.diagonal(unit.V)[None].copy()
+    )
+    first: Start | FloatArray = (
+        stationary_start(unit) if start is None else real_array(start, "start", (d.size,)) / d
+    )
+    later = isinstance(lag, FixedLag | Smoother)
+    passage = passed(
+        steady,
+        Recorded(record.time, record.y / s, record.u),
+        sight,
+        first,
+        predict=isinstance(lag, Predictor),
+        keep=later,
+    )
+    hat, variance = _by(passage, sight, lag)
+    return Estimate(
+        record.time,
+        estimates(model.channels),
+        hat.T,
+        np.sqrt(np.maximum(variance, 0.0)).T,
+        model.sensors,
+        (passage.innovations * s).T,
+        (passage.deviation * s).T,
+        passage.whitened.T,
+        lag,
+        passage.state * d,
+        known_units(units, estimates(model.channels))
+        | {f"{name}:innovation": units[name] for name in model.sensors if name in units},
+    )
+
+
+def _by(passage: Passage, sight: Sight, lag: Lag) -> tuple[FloatArray, FloatArray]:
+    if isinstance(lag, FixedLag):
+        return lagged(passage, sight, lag.samples)
+    if isinstance(lag, Smoother):
+        return smoothed(passage, sight)
+    return passage.hat, passage.variance

@@ -1,0 +1,48 @@
+"""When an estimate is wanted: before a measurement, with it, some samples later, or at the end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TypeAlias
+
+from ..values import Value, whole
+
+
+@dataclass(frozen=True, eq=False)
+class Predictor(Value):
+    """From the measurements before a sample: x[k|k-1]."""
+
+
+@dataclass(frozen=True, eq=False)
+class Filter(Value):
+    """From the measurements up to a sample, its own among them: x[k|k]."""
+
+
+@dataclass(frozen=True, eq=False)
+class FixedLag(Value):
+    """From the measurements up to some samples after: x[k|k+lag], known that much later.
+
+    Parameters
+    ----------
+    samples : int
+        The lag, at least 1. At the end of a record what there is.
+
+    Raises
+    ------
+    ModelError
+        When it is no whole number from 1.
+    """
+
+    samples: int
+
+    def __post_init__(self) -> None:
+        self._set(samples=whole(self.samples, "samples"))
+
+
+@dataclass(frozen=True, eq=False)
+class Smoother(Value):
+    """From all measurements of the record: the fixed-interval smoother x[k|N-1]."""
+
+
+#: when an estimate is wanted
+Lag: TypeAlias = Predictor | Filter | FixedLag | Smoother

@@ -1,0 +1,244 @@
+"""The filter's way through a record: sample by sample while its gain changes, then in blocks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ..lti.recursion import Recursion
+from ..values import FloatArray
+from .records import Recorded
+from .sight import Sight
+from .start import Start
+from .steady import Gains, Steady, gains
+from .unknowns import Found, Unknowns
+
+#: the gain counts as stationary when all that its last changes would still do to the estimates and
+#: innovations, summed over time, is this part of their variances
+SETTLED = 1e-8
+#: samples between two looks whether it is
+_LOOK = 16
+
+
+class Moment(NamedTuple):
+    """What a later pass needs of a sample at which the gain was not stationary."""
+
+    gains: Gains
+    T: FloatArray  # (nz, n), what the next adjoint adds to the estimate
+    shown: FloatArray  # (ny, r), delta in the whitened innovation
+    seen: FloatArray  # (nz, r), delta in the estimate
+    hat: FloatArray  # (nz,), for delta = 0
+    variance: FloatArray  # (nz,), for delta known
+    found: Found | None
+
+
+class Passage(NamedTuple):
+    """What a filter made of a record."""
+
+    steady: Steady
+    hat: FloatArray  # (N, nz)
+    variance: FloatArray  # (N, nz)
+    white: FloatArray  # (N, ny), whitened innovations for delta = 0, zeros where missing
+    innovations: FloatArray  # (N, ny), NaN where missing or nothing is known yet
+    deviation: FloatArray  # (N, ny), of the innovations
+    whitened: FloatArray  # (N, ny), NaN where missing
+    moments: dict[int, Moment]
+    stretches: list[tuple[int, int, bool]]  # (first, last + 1, stationary)
+    found: Found | None
+    state: FloatArray  # (n,), x[N|N-1]
+
+    def whole(self) -> Iterator[tuple[int, int, bool]]:
+        """Yield the stretches from the last to the first."""
+        return reversed(self.stretches)
+
+
+def passed(
+    steady: Steady,
+    record: Recorded,
+    sight: Sight,
+    start: Start | FloatArray,
+    *,
+    predict: bool = False,
+    keep: bool = False,
+) -> Passage:
+    """Return the filter's way through a record.
+
+    Parameters
+    ----------
+    steady : Steady
+        The stationary filter, in states and sensors of unit variance.
+    record : Recorded
+        In the same units.
+    sight : Sight
+        Of the POIs.
+    start : Start or (n,) array
+        Of a machine of unknown motion; or x[0|-1] of the stationary filter.
+    predict : bool
+        Whether the estimates are those before the measurement.
+    keep : bool
+        Whether a later pass needs the moments at which the gain was not stationary.
+    """
+    return _Walk(steady, record, sight, predict=predict, keep=keep).done(start)
+
+
+class _Walk:
+    """The walk through one record; its arrays are filled on the way."""
+
+    def __init__(
+        self, steady: Steady, record: Recorded, sight: Sight, *, predict: bool, keep: bool
+    ) -> None:
+        self.steady, self.model, self.sight = steady, steady.model, sight
+        self.predict, self.keep = predict, keep
+        self.there = np.asarray(np.isfinite(record.y))
+        self.y, self.u = np.where(self.there, record.y, 0.0), record.u
+        (N, ny), nz = record.y.shape, sight.c.shape[1]
+        self.hat, self.variance = np.empty((N, nz)), np.empty((N, nz))
+        self.white = np.zeros((N, ny))
+        self.innovations, self.deviation = np.full((N, ny), np.nan), np.full((N, ny), np.nan)
+        self.whitened = np.full((N, ny), np.nan)
+        self.moments: dict[int, Moment] = {}
+        self.found: Found | None = None
+
+    def done(self, start: Start | FloatArray) -> Passage:
+        """Walk from a start to the end of the record."""
+        N, whole = self.y.shape[0], np.all(self.there, axis=1, keepdims=True)[:, 0]
+        gaps = np.flatnonzero(~whole)
+        stretches: list[tuple[int, int, bool]] = []
+        if isinstance(start, Start):
+            x, P, Z = np.zeros(start.P.shape[0]), start.P, start.Z
+            k, settled = 0, False
+        else:
+            x, P, Z = start, self.steady.P, np.zeros((start.size, 0))
+            k, settled = 0, True
+        unknowns = Unknowns(Z.shape[1])
+        while k < N:
+            first = k
+            if settled and whole[k]:
+                later = np.searchsorted(gaps, k)
+                k = int(gaps[later]) if later < gaps.size else N
+                x, P = self._steadily(first, k, x), self.steady.P
+                stretches.append((first, k, True))
+                continue
+            settled = False
+            while k < N and not settled:
+                x, P, Z = self._step(k, x, P, Z, unknowns)
+                k += 1
+                if k < N and whole[k] and (k - first) % _LOOK == 0:
+                    settled, x, Z = self._settled(x, P, Z)
+            stretches.append((first, k, False))
+        if Z.shape[1] and self.found is not None:
+            x = x + Z @ self.found.value
+        return Passage(
+            self.steady, self.hat, self.variance, self.white, self.innovations, self.deviation,
+            self.whitened, self.moments, stretches, self.found, x,
+        )  # fmt: skip
+
+    def _step(
+        self, k: int, x: FloatArray, P: FloatArray, Z: FloatArray, unknowns: Unknowns
+    ) -> tuple[FloatArray, FloatArray, FloatArray]:
+        m, there = self.model, self.there[k]
+        g = gains(m, P, there)
+        here = self.sight.at(k)
+        e = np.where(there, self.y[k] - m.C2 @ x - m.D2 @ self.u[k], 0.0)
+        enter = self.steady.entering(g, predict=self.predict)
+        n = x.size
+        form = self.steady.form(P, g, predict=self.predict)
+        hat = here.c[:, :n] @ x + here.c @ (enter @ e) + here.D1 @ self.u[k]
+        variance = np.einsum("zi,ij,zj->z", here.c, form, here.c) + here.V
+        white = g.W @ e
+        C = m.C2 @ Z
+        before = self.found if Z.shape[1] else None
+        self._innovate(k, e, m.innovation(P), C, before)
+        self.white[k] = white
+        shown, seen = g.W @ C, here.c[:, :n] @ Z - here.c @ (enter @ (C * there[:, None]))
+        self.hat[k], self.variance[k] = hat, variance
+        if Z.shape[1]:
+            unknowns.add(shown, white)
+            after = unknowns.found()
+            used = before if self.predict else after
+            self.found = after
+            if used is None:
+                used = Found(np.zeros(Z.shape[1]), np.zeros((Z.shape[1], 0)), np.eye(Z.shape[1]))
+            self.hat[k] += seen @ used.value
+            self.variance[k] += used.added(seen)
+            self.hat[k][np.isinf(self.variance[k])] = np.nan
+        if self.keep:
+            T = here.c @ self.steady.onward(P, g)
+            self.moments[k] = Moment(
+                g, T, shown, seen, hat, variance, self.found if Z.shape[1] else None
+            )
+        closed = m.A - g.K @ m.C2
+        x = m.A @ x + m.B @ self.u[k] + g.K @ e
+        P = closed @ P @ closed.T + m.driven(g.K)
+        return x, 0.5 * (P + P.T), closed @ Z
+
+    def _innovate(
+        self, k: int, e: FloatArray, S: FloatArray, C: FloatArray, found: Found | None
+    ) -> None:
+        """Record the innovation with what is known of delta before the measurement."""
+        there = np.flatnonzero(self.there[k])
+        if C.shape[1]:
+            if found is None:
+                return
+            extra = found.added(C)
+            e = e - C @ found.value
+            known = there[np.isfinite(extra[there])]
+            S = S + (C @ found.X) @ (C @ found.X).T
+        else:
+            known = there
+        self.innovations[k, known] = e[known]
+        self.deviation[k, known] = np.sqrt(S.diagonal()[known])
+        if known.size == there.size and there.size:
+            root = np.linalg.cholesky(S[np.ix_(there, there)])
+            self.whitened[k, there] = np.linalg.solve(root, e[there])
+
+    def _settled(
+        self, x: FloatArray, P: FloatArray, Z: FloatArray
+    ) -> tuple[bool, FloatArray, FloatArray]:
+        """Tell whether the gain is stationary; delta is put into x once it fades from it."""
+        weight, size = self._weight
+        if Z.shape[1]:
+            assert self.found is not None  # noqa: S101
+            X = Z @ self.found.X
+            # a pass back changes delta itself by the root of what is left of it here
+            left = SETTLED * (1e-8 if self.keep else 1.0)
+            if self.found.open.size or np.sum((weight @ X) * X) > left:
+                return False, x, Z
+            x, Z = x + Z @ self.found.value, Z[:, :0]
+        excess = float(np.sum(weight * (P - self.steady.P)))
+        return abs(excess) < SETTLED + 1e-13 * size, x, Z
+
+    @property
+    def _weight(self) -> tuple[FloatArray, float]:
+        if not hasattr(self, "_kept_weight"):
+            weight = self.steady.weight(self.sight)
+            self._kept_weight = weight, float(np.sum(np.abs(weight) * np.abs(self.steady.P)))
+        return self._kept_weight
+
+    def _steadily(self, first: int, last: int, x: FloatArray) -> FloatArray:
+        """Fill a stretch of the stationary filter and return the state after it."""
+        m, g, at = self.model, self.steady.gains, slice(first, last)
+        here, n = self.sight.part(at), x.size
+        enter = self.steady.entering(g, predict=self.predict)
+        ny = enter.shape[1]
+        fixed = here.c.shape[0] == 1
+        see = here.c[0] if fixed else np.eye(n + ny)
+        direct = see @ enter
+        moved = np.zeros((see.shape[0], self.u.shape[1])) if not fixed else here.D1[0]
+        system = Recursion(
+            self.steady.F,
+            np.hstack([g.K, m.B - g.K @ m.D2]),
+            np.vstack([see[:, :n] - direct @ m.C2, -g.W @ m.C2]),
+            np.block([[direct, moved - direct @ m.D2], [g.W, -g.W @ m.D2]]),
+        )
+        out, x = system.run(np.hstack([self.y[at], self.u[at]]), x)
+        watched, white = out[:, :-ny], out[:, -ny:]
+        self.hat[at] = watched if fixed else here.applied(watched) + here.commanded(self.u[at])
+        self.variance[at] = here.variances(self.steady.form(self.steady.P, g, predict=self.predict))
+        self.white[at] = self.whitened[at] = white
+        S = m.innovation(self.steady.P)
+        self.innovations[at] = white @ np.linalg.inv(g.W).T
+        self.deviation[at] = np.sqrt(S.diagonal())
+        return x

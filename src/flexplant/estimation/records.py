@@ -1,0 +1,105 @@
+"""Recorded data: measurements and commands by channel name, missing samples as NaN."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..values import FloatArray, real_array, short
+from .filter_model import FilterModel
+
+
+class Recorded(NamedTuple):
+    """A record: time (N,), measurements y (N, ny) with NaN where missing, commands u (N, nu)."""
+
+    time: FloatArray
+    y: FloatArray
+    u: FloatArray
+
+
+def recorded(records: Any, model: FilterModel) -> Recorded:
+    """Return the sensors and commands of a model from what was recorded.
+
+    Parameters
+    ----------
+    records : Response, mapping {channel: (N,) array} or data frame
+        All sensors and commands by name; other channels are left aside. NaN are samples of a
+        sensor that are missing. Times are its `time`, as an attribute or a channel; without any
+        the record starts at 0.
+    model : FilterModel
+        Whose channels are wanted.
+
+    Raises
+    ------
+    LabelError
+        When a channel is missing.
+    ShapeError
+        When channels are not of one length, or hold several runs.
+    ModelError
+        When it is no record, a command is not finite, or the times are not the model's samples.
+    """
+    if not hasattr(records, "keys") or not hasattr(records, "__getitem__"):
+        raise ModelError(
+            f"records must give channels by name, got {short(records)}. Pass a Response, a data "
+            "frame, or a mapping such as {'y1': array, 'u1': array}."
+        )
+    known = [str(name) for name in records.keys()]  # noqa: SIM118 - a data frame iterates so too
+    for name in (*model.sensors, *model.commands):
+        if name not in known:
+            missing = unknown_label("channel", name, known, "the records")
+            what = (
+                "A sensor that was not recorded is an array of NaN"
+                if name in model.sensors
+                else "A command that was not given is an array of zeros"
+            )
+            raise LabelError(f"{missing} {what}: the filter needs all of its channels.")
+    y = [_channel(records[name], name, missing=True) for name in model.sensors]
+    u = [_channel(records[name], name) for name in model.commands]
+    sizes = {name: part.size for name, part in zip(model.sensors, y, strict=True)}
+    sizes |= {name: part.size for name, part in zip(model.commands, u, strict=True)}
+    if len(set(sizes.values())) > 1:
+        raise ShapeError(
+            f"channels of one record have one length, got {short(sizes)}. Cut them to the same "
+            "samples, or fill what is missing of a sensor with NaN."
+        )
+    count = next(iter(sizes.values()))
+    if not count:
+        raise ShapeError("the record holds no samples: there is nothing to estimate from.")
+    commands = np.column_stack(u) if u else np.zeros((count, 0))
+    return Recorded(_time(records, known, count, model.dt), np.column_stack(y), commands)
+
+
+def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
+    try:
+        array = np.asarray(values, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ModelError(
+            f"channel {name!r} must hold numbers, got {short(values)}. Pass an array over time."
+        ) from error
+    if array.ndim != 1:
+        raise ShapeError(
+            f"channel {name!r} must be (N,), one run over time, got {array.shape}. Of several runs "
+            "take one: response.replace(data=response.data[0])."
+        )
+    if missing and not np.any(np.isinf(array)):
+        return array
+    return real_array(array, f"channel {name!r}")
+
+
+def _time(records: Any, known: list[str], count: int, dt: float) -> FloatArray:
+    """Return the times, which must be in steps of dt."""
+    given = records["time"] if "time" in known else getattr(records, "time", None)
+    if given is None or callable(given):
+        return np.asarray(dt * np.arange(count))
+    time = real_array(given, "time", (count,))
+    steps = np.diff(time)
+    if steps.size and np.max(np.abs(steps - dt)) > 1e-3 * dt:
+        k = int(np.argmax(np.abs(steps - dt)))
+        raise ModelError(
+            f"the record goes from {time[k]:.9g} to {time[k + 1]:.9g} s in one sample, the samples "
+            f"of the filter are {dt:.9g} s apart. Design it at the rate of the record, and put NaN "
+            "in the place of samples that were lost."
+        )
+    return time

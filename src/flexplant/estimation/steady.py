@@ -1,0 +1,75 @@
+"""The gains of a filter: of one covariance, and the stationary ones."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..lti.lyapunov import solve_stein
+from ..values import FloatArray
+from .filter_model import FilterModel
+from .sight import Sight
+
+
+class Gains(NamedTuple):
+    """L, K and the whitening W of the innovations, zeros at sensors that are missing."""
+
+    L: FloatArray
+    K: FloatArray
+    W: FloatArray
+
+
+def gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> Gains:
+    """Return the gains of a covariance P before the measurement, for the sensors that are there."""
+    M = P @ model.C2.T
+    S = model.C2 @ M + model.R
+    W = np.zeros_like(S)
+    there = np.flatnonzero(seen)
+    if there.size:
+        at = np.ix_(there, there)
+        W[at] = np.linalg.inv(np.linalg.cholesky(0.5 * (S + S.T)[at]))
+    weight = W.T @ W
+    L = M @ weight
+    return Gains(L, model.A @ L + model.S @ weight, W)
+
+
+class Steady:
+    """The stationary filter of a model in states and sensors of unit variance."""
+
+    def __init__(self, model: FilterModel, P: FloatArray) -> None:
+        self.model, self.P = model, P
+        self.gains = gains(model, P, np.ones(model.C2.shape[0], dtype=bool))
+        self.F = model.A - self.gains.K @ model.C2
+
+    def form(self, P: FloatArray, g: Gains, *, predict: bool) -> FloatArray:
+        """Return the form omega of the error [x; b], b the estimate of n in units of N."""
+        n, ny = self.model.C2.T.shape
+        omega = np.zeros((n + ny, n + ny))
+        if predict:
+            omega[:n, :n] = P
+            return omega
+        omega[:n, :n] = self.model.updated(P, g.L)
+        omega[:n, n:], omega[n:, :n] = -g.L, -g.L.T
+        omega[n:, n:] = -g.W.T @ g.W
+        return omega
+
+    def entering(self, g: Gains, *, predict: bool) -> FloatArray:
+        """Return how an innovation enters [x; b] (n + ny, ny)."""
+        both = np.vstack([g.L, g.W.T @ g.W])
+        return np.zeros_like(both) if predict else both
+
+    def onward(self, P: FloatArray, g: Gains) -> FloatArray:
+        """Return the rows (n + ny, n) by which a later adjoint enters [x; b]."""
+        closed = self.model.A - g.K @ self.model.C2
+        return np.vstack([P @ closed.T, -g.K.T])
+
+    def weight(self, sight: Sight) -> FloatArray:
+        """Return Y: ``trace(Y dP)`` is what dP adds to all later variances, relative to them."""
+        n = self.model.A.shape[0]
+        some = np.unique(np.linspace(0, sight.c.shape[0] - 1, 50).astype(np.int64))
+        chosen = Sight(*(part[some] for part in sight))
+        size = np.sqrt(chosen.variances(self.form(self.P, self.gains, predict=False)))
+        rows = (chosen.c[:, :, :n] / size[:, :, None] / np.sqrt(some.size)).reshape(-1, n)
+        H = np.vstack([self.gains.W @ self.model.C2, rows])
+        return solve_stein(self.F.T, H.T @ H)

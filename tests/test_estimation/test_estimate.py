@@ -1,0 +1,212 @@
+"""Recorded data in, POI out: against the dense normal equations of all samples at once."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman
+from machines import stage
+from oracles_estimation import batch, error_covariance
+
+LAGS = {
+    "predictor": (Predictor(), 0),
+    "filter": (Filter(), 1),
+    "lag 5": (FixedLag(5), 6),
+    "smoother": (Smoother(), 10_000),
+}
+
+
+@cache
+def observer(**changes):
+    return design_kalman(stage(sensor_asd=1e-8, **changes))
+
+
+def dense(model):
+    names = ("A", "B", "C1", "D1", "C2", "D2", "Q", "R", "V", "N", "S")
+    return {name: getattr(model, name) for name in names}
+
+
+def prior(model):
+    """Covariance of the elastic states at rest, delay lines known, and the rigid-body states."""
+    n = model.A.shape[0]
+    P, elastic = np.zeros((n, n)), np.arange(2, 8)
+    at = np.ix_(elastic, elastic)
+    P[at] = error_covariance(model.A[at], model.Q[at])
+    return P, np.eye(n)[:, :2]
+
+
+def run(model, count, seed, *, first=None):
+    """Measurements, commands and motions of a machine whose rigid body starts anywhere."""
+    rng = np.random.default_rng(seed)
+    n, ny = model.C2.T.shape
+    nz = model.C1.shape[0]
+    P, Z = prior(model)
+    x = Z @ np.array([1e-4, -1e-3]) + np.linalg.cholesky(P + 1e-40 * np.eye(n)) @ rng.normal(size=n)
+    x = x if first is None else first
+    joint = np.block([[model.R, model.N.T], [model.N, model.V + 1e-12 * np.diag(np.diag(model.V))]])
+    size = np.sqrt(np.diag(model.Q)) + 1e-300
+    values, vectors = np.linalg.eigh(model.Q / size / size[:, None])
+    root = size[:, None] * vectors * np.sqrt(np.maximum(values, 0))
+    half = np.linalg.cholesky(joint) if nz and np.any(model.V) else np.diag(np.sqrt(np.diag(joint)))
+    u = 0.1 * rng.standard_normal((count, model.B.shape[1]))
+    y, z = np.empty((count, ny)), np.empty((count, nz))
+    for k in range(count):
+        noise = half @ rng.standard_normal(ny + nz)
+        y[k] = model.C2 @ x + model.D2 @ u[k] + noise[:ny]
+        z[k] = model.C1 @ x + model.D1 @ u[k] + noise[ny:]
+        x = model.A @ x + model.B @ u[k] + root @ rng.standard_normal(n)
+    return y, u, z
+
+
+def records(model, y, u):
+    return dict(zip(model.sensors, y.T, strict=True)) | dict(zip(model.commands, u.T, strict=True))
+
+
+def agree(result, hat, variance, rel=1e-6):
+    known = np.isfinite(variance[:, 0])
+    np.testing.assert_array_equal(np.isfinite(result["die:hat"]), known)
+    np.testing.assert_array_equal(np.isinf(result.deviation("die:hat")), ~known)
+    deviation = np.sqrt(variance[known, 0])
+    np.testing.assert_allclose(result.deviation("die:hat")[known], deviation, rtol=rel, atol=0)
+    off = (result["die:hat"][known] - hat[known, 0]) / deviation
+    assert np.abs(off).max() < rel
+
+
+@pytest.mark.parametrize("lag", LAGS)
+@pytest.mark.parametrize("gaps", [False, True])
+def test_start_gaps_and_lags_are_the_normal_equations(lag, gaps):
+    """An unknown rigid-body motion of 0.1 mm, known inputs with a delay, samples missing."""
+    kalman = observer()
+    model = kalman.model
+    y, u, _ = run(model, 60, seed=3)
+    if gaps:
+        y[0] = y[20:26] = np.nan
+        y[1:4, 0] = y[40:45, 1] = y[-1, 0] = np.nan
+    method, later = LAGS[lag]
+    result = kalman.estimate(records(model, y, u), method)
+    P, Z = prior(model)
+    agree(result, *batch(dense(model), y, u, P, Z, np.arange(60) + later))
+    missing = np.isnan(result["y1:innovation"])
+    assert np.all(missing[np.isnan(y[:, 0])])
+
+
+def plain(kalman, y, u):
+    """The stationary filter, sample by sample."""
+    g = kalman.system
+    x, hats = np.zeros(g.n_states), []
+    for v in np.hstack([y, u]):
+        hats.append(g.C @ x + g.D @ v)
+        x = g.A @ x + g.B @ v
+    return np.array(hats), x
+
+
+def test_the_stationary_filter_in_blocks_is_the_plain_loop():
+    kalman = observer()
+    model = kalman.model
+    y, u, z = run(model, 3005, seed=1, first=np.zeros(model.A.shape[0]))
+    at_rest = np.zeros(model.A.shape[0])
+    result = kalman.estimate(records(model, y, u), start=at_rest)
+    hats, last = plain(kalman, y, u)
+    size = result.deviation("die:hat")
+    np.testing.assert_allclose(size, kalman.rms("die"), rtol=1e-9, atol=0)
+    assert np.abs(result["die:hat"] - hats[:, 0]).max() < 1e-10 * np.abs(hats).max()
+    scale = np.sqrt(np.diag(kalman.predicted_covariance)) + 1e-12
+    assert np.abs((result.state - last) / scale).max() < 1e-8
+    error = (result["die:hat"] - z[:, 0])[500:]
+    assert np.sqrt(np.mean(error**2)) == pytest.approx(size[0], rel=0.1, abs=0)
+    assert np.var(result.whitened[:, 500:]) == pytest.approx(1.0, rel=0.05, abs=0)
+    # a record in two parts is the record
+    one = kalman.estimate(records(model, y[:1111], u[:1111]), start=at_rest)
+    two = kalman.estimate(records(model, y[1111:], u[1111:]), start=one.state)
+    np.testing.assert_allclose(
+        two["die:hat"], result["die:hat"][1111:], rtol=0, atol=1e-9 * size[0]
+    )
+
+
+@pytest.mark.parametrize("method", [Predictor(), Filter(), FixedLag(7), FixedLag(60), Smoother()])
+def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatch):
+    kalman = observer()
+    model = kalman.model
+    y, u, _ = run(model, 1500, seed=2)
+    y[700:710] = y[1400:1402, 1] = np.nan
+    mixed = kalman.estimate(records(model, y, u), method)
+    for module in ("passage", "smoothing"):
+        monkeypatch.setattr(f"flexplant.estimation.{module}.SETTLED", -1.0)
+    slow = kalman.estimate(records(model, y, u), method)
+    for channel in ("die:hat", "y1:innovation", "y2:innovation"):
+        deviation, known = slow.deviation(channel), np.isfinite(slow[channel])
+        np.testing.assert_allclose(mixed.deviation(channel), deviation, rtol=1e-7, atol=0)
+        off = (mixed[channel] - slow[channel])[known] / deviation[known]
+        assert np.abs(off).max() < 1e-7
+    usual, gap = slow.deviation("die:hat")[600], slow.deviation("die:hat")[695:715].max()
+    assert gap > 1.2 * usual
+
+
+class Frame:
+    """What a data frame shows of itself."""
+
+    def __init__(self, columns):
+        self.columns = columns
+
+    def keys(self):
+        return self.columns.keys()
+
+    def __getitem__(self, name):
+        return self.columns[name]
+
+
+def test_what_counts_as_a_record_and_what_comes_out(tmp_path):
+    from flexplant.simulation import Response
+    from flexplant.store import load
+
+    kalman = observer()
+    model = kalman.model
+    y, u, _ = run(model, 50, seed=4)
+    channels = records(model, y, u)
+    time = 3.0 + model.dt * np.arange(50)
+    want = kalman.estimate(channels)
+    made = Response(time, np.array(list(channels.values())), list(channels))
+    for given in (made, Frame(channels), channels | {"extra": np.zeros(3)}):
+        np.testing.assert_array_equal(kalman.estimate(given)["die:hat"], want["die:hat"])
+    assert kalman.estimate(made).time[0] == 3.0
+    assert kalman.estimate(channels | {"time": time}).time[-1] == time[-1]
+    assert list(want) == ["die:hat", "y1:innovation", "y2:innovation"]
+    assert len(dict(want)) == len(want) == 3
+    assert "50 samples" in repr(want)
+    want.save(tmp_path / "e.npz")
+    again = load(tmp_path / "e.npz")
+    np.testing.assert_array_equal(again.innovations, want.innovations)
+    assert again.lag.__class__ is Filter
+    with pytest.raises(KeyError, match="no channel 'die'"):
+        want["die"]
+    with pytest.raises(ValueError, match="read-only"):
+        want["die:hat"][0] = 0.0
+
+
+def test_bad_records_are_refused():
+    kalman = observer()
+    model = kalman.model
+    channels = records(model, *run(model, 20, seed=5)[:2])
+    for change, error, match in (
+        ({"y1": np.zeros(19)}, ShapeError, "one length"),
+        ({"y1": np.zeros((2, 20))}, ShapeError, "one run"),
+        ({"u1": np.full(20, np.nan)}, ModelError, "channel 'u1' has a NaN"),
+        ({"y2": np.full(20, np.inf)}, ModelError, "channel 'y2' has a NaN or infinite"),
+        ({"y2": ["a"] * 20}, ModelError, "must hold numbers"),
+        ({"time": np.arange(20.0)}, ModelError, "at the rate of the record"),
+    ):
+        with pytest.raises(error, match=match):
+            kalman.estimate(channels | change)
+    for name, cure in (("y1", "array of NaN"), ("u2", "array of zeros")):
+        with pytest.raises(LabelError, match=cure):
+            kalman.estimate({k: v for k, v in channels.items() if k != name})
+    with pytest.raises(ModelError, match="channels by name"):
+        kalman.estimate(np.zeros((20, 4)))
+    with pytest.raises(ModelError, match="Predictor"):
+        kalman.estimate(channels, "smoother")
+    with pytest.raises(ShapeError, match="start"):
+        kalman.estimate(channels, start=np.zeros(3))
+    with pytest.raises(ModelError, match="samples"):
+        FixedLag(0)
