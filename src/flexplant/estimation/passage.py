@@ -12,8 +12,8 @@ from ..values import FloatArray
 from .records import Recorded
 from .sight import Sight
 from .start import Start
-from .steady import Gains, Steady, gains
-from .unknowns import Found, Unknowns
+from .steady import FilterGains, Steady, gains
+from .unknowns import KnownParameters, Unknowns
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances
@@ -25,13 +25,13 @@ _LOOK = 16
 class Moment(NamedTuple):
     """What a later pass needs of a sample at which the gain was not stationary."""
 
-    gains: Gains
+    gains: FilterGains
     T: FloatArray  # (nz, n), what the next adjoint adds to the estimate
     shown: FloatArray  # (ny, r), delta in the whitened innovation
     seen: FloatArray  # (nz, r), delta in the estimate
     hat: FloatArray  # (nz,), for delta = 0
     variance: FloatArray  # (nz,), for delta known
-    found: Found | None
+    found: KnownParameters | None
 
 
 class Passage(NamedTuple):
@@ -46,7 +46,7 @@ class Passage(NamedTuple):
     whitened: FloatArray  # (N, ny), NaN where missing
     moments: dict[int, Moment]
     stretches: list[tuple[int, int, bool]]  # (first, last + 1, stationary)
-    found: Found | None
+    found: KnownParameters | None
     state: FloatArray  # (n,), x[N|N-1]
 
     def whole(self) -> Iterator[tuple[int, int, bool]]:
@@ -99,7 +99,7 @@ class _Walk:
         self.innovations, self.deviation = np.full((N, ny), np.nan), np.full((N, ny), np.nan)
         self.whitened = np.full((N, ny), np.nan)
         self.moments: dict[int, Moment] = {}
-        self.found: Found | None = None
+        self.found: KnownParameters | None = None
 
     def done(self, start: Start | FloatArray) -> Passage:
         """Walk from a start to the end of the record."""
@@ -160,7 +160,9 @@ class _Walk:
             used = before if self.predict else after
             self.found = after
             if used is None:
-                used = Found(np.zeros(Z.shape[1]), np.zeros((Z.shape[1], 0)), np.eye(Z.shape[1]))
+                used = KnownParameters(
+                    np.zeros(Z.shape[1]), np.zeros((Z.shape[1], 0)), np.eye(Z.shape[1])
+                )
             self.hat[k] += seen @ used.value
             self.variance[k] += used.added(seen)
             self.hat[k][np.isinf(self.variance[k])] = np.nan
@@ -175,7 +177,7 @@ class _Walk:
         return x, 0.5 * (P + P.T), closed @ Z
 
     def _innovate(
-        self, k: int, e: FloatArray, S: FloatArray, C: FloatArray, found: Found | None
+        self, k: int, e: FloatArray, S: FloatArray, C: FloatArray, found: KnownParameters | None
     ) -> None:
         """Record the innovation with what is known of delta before the measurement."""
         there = np.flatnonzero(self.there[k])

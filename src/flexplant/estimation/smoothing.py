@@ -10,7 +10,7 @@ from ..values import FloatArray, IntArray
 from .passage import SETTLED, Moment, Passage
 from .sight import Sight
 from .steady import Steady
-from .unknowns import Found
+from .unknowns import KnownParameters
 
 #: samples whose later measurements are followed side by side
 _TOGETHER = 2048
@@ -216,7 +216,7 @@ def _followed(
             variance[k] += found.added(seen[i])
 
 
-def _last_found(passage: Passage, k: int) -> Found | None:
+def _last_found(passage: Passage, k: int) -> KnownParameters | None:
     """Return what is known of delta at a sample."""
     moment = passage.moments.get(k)
     return passage.found if moment is None or moment.found is None else moment.found

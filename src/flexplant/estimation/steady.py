@@ -12,7 +12,7 @@ from .filter_model import FilterModel
 from .sight import Sight
 
 
-class Gains(NamedTuple):
+class FilterGains(NamedTuple):
     """L, K and the whitening W of the innovations, zeros at sensors that are missing."""
 
     L: FloatArray
@@ -20,7 +20,7 @@ class Gains(NamedTuple):
     W: FloatArray
 
 
-def gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> Gains:
+def gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> FilterGains:
     """Return the gains of a covariance P before the measurement, for the sensors that are there."""
     M = P @ model.C2.T
     S = model.C2 @ M + model.R
@@ -31,7 +31,7 @@ def gains(model: FilterModel, P: FloatArray, seen: FloatArray) -> Gains:
         W[at] = np.linalg.inv(np.linalg.cholesky(0.5 * (S + S.T)[at]))
     weight = W.T @ W
     L = M @ weight
-    return Gains(L, model.A @ L + model.S @ weight, W)
+    return FilterGains(L, model.A @ L + model.S @ weight, W)
 
 
 class Steady:
@@ -42,7 +42,7 @@ class Steady:
         self.gains = gains(model, P, np.ones(model.C2.shape[0], dtype=bool))
         self.F = model.A - self.gains.K @ model.C2
 
-    def form(self, P: FloatArray, g: Gains, *, predict: bool) -> FloatArray:
+    def form(self, P: FloatArray, g: FilterGains, *, predict: bool) -> FloatArray:
         """Return the form omega of the error [x; b], b the estimate of n in units of N."""
         n, ny = self.model.C2.T.shape
         omega = np.zeros((n + ny, n + ny))
@@ -54,12 +54,12 @@ class Steady:
         omega[n:, n:] = -g.W.T @ g.W
         return omega
 
-    def entering(self, g: Gains, *, predict: bool) -> FloatArray:
+    def entering(self, g: FilterGains, *, predict: bool) -> FloatArray:
         """Return how an innovation enters [x; b] (n + ny, ny)."""
         both = np.vstack([g.L, g.W.T @ g.W])
         return np.zeros_like(both) if predict else both
 
-    def onward(self, P: FloatArray, g: Gains) -> FloatArray:
+    def onward(self, P: FloatArray, g: FilterGains) -> FloatArray:
         """Return the rows (n + ny, n) by which a later adjoint enters [x; b]."""
         closed = self.model.A - g.K @ self.model.C2
         return np.vstack([P @ closed.T, -g.K.T])

@@ -12,7 +12,7 @@ from ..values import FloatArray
 _FOUND = 1e-10
 
 
-class Found(NamedTuple):
+class KnownParameters(NamedTuple):
     """What is known of the parameters delta: their value, ``X X'`` their covariance.
 
     The columns of `open` are directions that no measurement has shown yet.
@@ -41,11 +41,11 @@ class Unknowns:
         both = np.vstack([self.root, np.column_stack([rows, values])])
         self.root = np.asarray(np.linalg.qr(both, mode="r"))
 
-    def found(self) -> Found:
+    def found(self) -> KnownParameters:
         """Return what is known by now."""
         R = self.root[: self.count, : self.count]
         U, sizes, V = np.linalg.svd(R, full_matrices=True)
         rank = int(np.count_nonzero(sizes > _FOUND * np.max(sizes, initial=0.0)))
         X = V[:rank].T / sizes[:rank]
         value = X @ (U[:, :rank].T @ self.root[: self.count, self.count])
-        return Found(value, X, V[rank:].T)
+        return KnownParameters(value, X, V[rank:].T)
