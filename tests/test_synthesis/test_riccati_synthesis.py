@@ -1,6 +1,7 @@
 """Riccati(): optima known in closed form, COMPleib, honest lower bounds, bounded work."""
 
 import csv
+import re
 import time
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from flexplant.errors import (
     SolverError,
 )
 from flexplant.lti import StateSpace, tustin
+from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.certificate import certified_norm
 from oracles_synthesis import (
@@ -215,7 +217,7 @@ def test_lower_stays_where_nothing_was_refuted(monkeypatch):
         return riccati._Attempt(None) if found.refuted else found
 
     monkeypatch.setattr(riccati, "_attempt", fragile)
-    found = design_hinf(scalar(1.0)[0], u=["u1"], y=["y1"])
+    found = Riccati().solve(prepared(*scalar(1.0)))
     assert found.gamma <= 1.055 * scalar_optimum(1.0)
     assert found.lower == 0.0
 
@@ -255,17 +257,25 @@ def test_compleib_with_full_rank(name):
 
 @needs_data
 @pytest.mark.parametrize("name", [n for n in problems() if n not in FULL_RANK])
-def test_compleib_without_full_rank_names_the_matrix(name):
+def test_compleib_without_full_rank(name):
+    """By default, with nothing chosen: within 5 % of the best known, and a bound within 1 %."""
     P, u, y = compleib(name)
-    with pytest.raises(AssumptionError, match=r"D12|D21") as error:
-        design_hinf(P, u=u, y=y)
+    best = problems()[name]
+    found = checked(P, u, y)
+    assert best * (1 - 2e-3) <= found.gamma <= 1.05 * best
+    assert 0.99 * best <= found.lower <= best * (1 + 1e-3)
     parts = split(P.A, P.B, P.C, P.D, len(u), len(y))
-    short = {
-        key: np.linalg.matrix_rank(parts[key]) < size
-        for key, size in (("D12", len(u)), ("D21", len(y)))
-    }
-    assert short[str(error.value)[:3]]
-    assert "Lmi()" in str(error.value)
+    for key, names in (("D12", u), ("D21", y)):
+        rank = np.linalg.matrix_rank(parts[key])
+        assert (f"{key} has rank {rank} of {len(names)}" in found.notes[0]) == (rank < len(names))
+    assert found.certificate["added noise"] in (1e-4, 1e-5, 1e-6, 1e-7)
+
+
+def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():
+    """y = w, and u enters as w does: u = -w cancels it, at no cost."""
+    P, u, y = named([[-1.0]], [[1.0, 1.0]], [[1.0], [0.0]], [[0.0, 0.0], [1.0, 0.0]], 1, 1)
+    with pytest.raises(InfeasibleError, match=r"the infimum is 0\. .*D12 has rank 0 of 1.*Weight"):
+        design_hinf(P, u=u, y=y)
 
 
 @needs_data
@@ -315,6 +325,24 @@ IMPOSSIBLE = {
         [[1, 0], [0, 0], [0, 1]],
         "y .* does not see .* of a weight .* give the weight finite gain",
     ),
+}
+
+
+@pytest.mark.parametrize("dt", [0.0, 0.01])
+@pytest.mark.parametrize("case", IMPOSSIBLE)
+def test_what_is_impossible_is_named_at_once(case, dt):
+    A, B, C, message = IMPOSSIBLE[case]
+    P, u, y = named(A, B, C, NOISY, 1, 1)
+    start = time.perf_counter()
+    if dt:  # Tustin bends frequencies
+        message = message.replace(r"3\.18", r"3\.1[78]")
+        P = tustin(P, 1 / dt)
+    with pytest.raises(AssumptionError, match=message):
+        design_hinf(P, u=u, y=y)
+    assert time.perf_counter() - start < 5.0
+
+
+MISSED = {
     "z misses an integrator": (
         [[0, 0], [0, -1]],
         [[1, 0, 1], [1, 0, 1]],
@@ -336,18 +364,14 @@ IMPOSSIBLE = {
 }
 
 
-@pytest.mark.parametrize("dt", [0.0, 0.01])
-@pytest.mark.parametrize("case", IMPOSSIBLE)
-def test_what_is_impossible_is_named_at_once(case, dt):
-    A, B, C, message = IMPOSSIBLE[case]
+@pytest.mark.parametrize("case", MISSED)
+def test_what_z_or_w_misses_is_stabilised_all_the_same(case):
+    """A plant of one's own, not a structure that would drift: solved, with a note."""
+    A, B, C, note = MISSED[case]
     P, u, y = named(A, B, C, NOISY, 1, 1)
-    start = time.perf_counter()
-    if dt:  # Tustin bends frequencies
-        message = message.replace(r"3\.18", r"3\.1[78]")
-        P = tustin(P, 1 / dt)
-    with pytest.raises(AssumptionError, match=message):
-        design_hinf(P, u=u, y=y)
-    assert time.perf_counter() - start < 5.0
+    found = checked(P, u, y)
+    assert re.search(note, found.notes[0])
+    assert found.gamma <= 1.06 * max(found.lower, 1e-9)
 
 
 def test_a_rigid_body_is_found_in_any_coordinates():

@@ -163,8 +163,8 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
     root = np.sqrt(speed)
     A, B, C = g.A / speed, g.B / root, g.C / root
     D12, D21 = g.D[:p1, m1:], g.D[p1:, :m1]
-    z_turn, u_scale = _normalised(D12, np.linalg.norm(B[:, m1:], axis=0))
-    w_turn, y_scale_t = _normalised(D21.T, np.linalg.norm(C[p1:], axis=1))
+    z_turn, u_scale = normalised(D12, np.linalg.norm(B[:, m1:], axis=0))
+    w_turn, y_scale_t = normalised(D21.T, np.linalg.norm(C[p1:], axis=1))
     y_scale = y_scale_t.T
     A, B, C = _balanced(
         A,
@@ -191,7 +191,7 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
     )
 
 
-def _normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray]:
+def normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank.
 
     Columns are brought to unit size first, so that rank does not depend on their units; those

@@ -6,3 +6,4 @@ from .lmi import Lmi as Lmi
 from .riccati import Riccati as Riccati
 from .servo import design_servo as design_servo
 from .servo import servo_bandwidth as servo_bandwidth
+from .structured_lmi import StructuredLmi as StructuredLmi

@@ -100,6 +100,18 @@ def _contraction(M: FloatArray, left: FloatArray, right: FloatArray) -> FloatArr
     return np.asarray(0.5 * W[:, reached] @ Xt[reached])
 
 
+def require_shown(p: Prepared) -> None:
+    """Raise AssumptionError when z or w misses an undamped mode, whatever D12 and D21 are."""
+    try:
+        _require_full_columns(p.A, p.B2, p.C1, p.D12)
+    except OnAxisError as found:
+        raise _missed_by_z(p, found) from found
+    try:
+        _require_full_columns(p.A.T, p.C2.T, p.B1.T, p.D21.T)
+    except OnAxisError as found:
+        raise _missed_by_w(p, found) from found
+
+
 def quadratic(p: Prepared) -> StateSpace:
     """Return the controller of least H2 norm, feedthrough apart (gamma without bound).
 
@@ -109,24 +121,15 @@ def quadratic(p: Prepared) -> StateSpace:
         When it does not exist, which no gamma mends: the message says where.
     """
     rows, columns = p.B2.shape[1], p.C2.shape[0]
+    require_shown(p)
     try:
-        _require_full_columns(p.A, p.B2, p.C1, p.D12)
         _, F = stabilising(p.A, p.B2, p.C1.T @ p.C1, np.eye(rows), p.C1.T @ p.D12)
     except OnAxisError as found:
-        raise AssumptionError(
-            f"z does not feel all that u moves at {_listed(p, found)}: an undamped (rigid-body or "
-            "integrating) mode there is left out of z, or hidden by a zero of its weight. Keep "
-            "that motion in z with a weight of finite gain, or give it damping."
-        ) from found
+        raise _missed_by_z(p, found) from found
     try:
-        _require_full_columns(p.A.T, p.C2.T, p.B1.T, p.D21.T)
         _, Ht = stabilising(p.A.T, p.C2.T, p.B1 @ p.B1.T, np.eye(columns), p.B1 @ p.D21.T)
     except OnAxisError as found:
-        raise AssumptionError(
-            f"w does not excite all that y sees at {_listed(p, found)}: an undamped (rigid-body or "
-            "integrating) mode there has no disturbance, or it is hidden by a zero of its weight. "
-            "Add a disturbance that reaches it, or give it damping."
-        ) from found
+        raise _missed_by_w(p, found) from found
     H = Ht.T
     return StateSpace(
         p.A + p.B2 @ F + H @ p.C2,
@@ -135,6 +138,22 @@ def quadratic(p: Prepared) -> StateSpace:
         np.zeros((rows, columns)),
         inputs=p.y,
         outputs=p.u,
+    )
+
+
+def _missed_by_z(p: Prepared, found: OnAxisError) -> AssumptionError:
+    return AssumptionError(
+        f"z does not feel all that u moves at {_listed(p, found)}: an undamped (rigid-body or "
+        "integrating) mode there is left out of z, or hidden by a zero of its weight. Keep "
+        "that motion in z with a weight of finite gain, or give it damping."
+    )
+
+
+def _missed_by_w(p: Prepared, found: OnAxisError) -> AssumptionError:
+    return AssumptionError(
+        f"w does not excite all that y sees at {_listed(p, found)}: an undamped (rigid-body or "
+        "integrating) mode there has no disturbance, or it is hidden by a zero of its weight. "
+        "Add a disturbance that reaches it, or give it damping."
     )
 
 

@@ -7,17 +7,23 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError
+from ..errors import AssumptionError, ModelError, SolverError
 from ..lti.preparation import Prepared, prepared
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import short
+from .central import require_shown
 from .certificate import certified_norm, reached_norms
 from .controller import Controller
-from .method import SynthesisMethod
+from .lower_bound import lower_bound
+from .method import SolvedController, SynthesisMethod
 from .riccati import Riccati
 from .spill_over import spill_over, unchecked
+from .structured_lmi import StructuredLmi
+
+#: problems of at most so many states go to the LMIs where the Riccati equations fail
+_SMALL = 40
 
 
 @one_thread()
@@ -41,7 +47,9 @@ def design_hinf(
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
         serves too: by the names of its channels, or with u and y named.
     method : Riccati or Lmi, optional
-        `Riccati()` unless given. `Lmi()` needs no full-rank D12 and D21, but suits small plants.
+        Unless given `Riccati()`, which adds a little noise and effort where D12 or D21 is
+        singular, and `StructuredLmi()` for small problems on which it fails. `StructuredLmi()`
+        needs none of it, up to some 60 states; `Lmi()` is its readable form for less than 30.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
@@ -52,9 +60,9 @@ def design_hinf(
     Returns
     -------
     Controller
-        `gamma` is the verified norm, `lower` a bound from below on what any controller reaches (by
-        `Lmi` for controllers whose X and Y are no larger than its own), `certificate` what
-        was checked, `reached` what is reached of each block of the weights, `left_out` the check
+        `gamma` is the verified norm, `lower` a bound from below on what any controller reaches
+        (where it comes from LMIs: with Lyapunov matrices up to ten times as large as those that
+        they found), `certificate` what was checked, `reached` what is reached of each block of the weights, `left_out` the check
         with the modes left out.
 
     Raises
@@ -85,10 +93,10 @@ def design_hinf(
         raise ModelError("a StandardPlant names its u and y: leave them out.")
     else:
         plant = StandardPlant.from_statespace(plant, u=u, y=y)
-    method = Riccati() if method is None else method
-    if not hasattr(method, "solve"):
+    if method is not None and not hasattr(method, "solve"):
         raise ModelError(
-            f"method must be Riccati(...) or Lmi(...), got {short(method)}. Pass one, or none."
+            f"method must be Riccati(...), StructuredLmi(...) or Lmi(...), got {short(method)}. "
+            "Pass one, or none."
         )
     if not plant.w or not plant.z or not plant.u or not plant.y:
         raise AssumptionError(f"H-infinity synthesis needs channels w, z, u and y, got {plant!r}.")
@@ -96,7 +104,9 @@ def design_hinf(
         plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
     _require_reach(problem)
-    found = method.solve(problem)
+    if plant.is_assembled:  # whatever a method makes of it: this motion would drift
+        require_shown(problem)
+    method, found = _solved(problem) if method is None else (method, method.solve(problem))
     controller = problem.restored(found.A, found.B, found.C, found.D).replace(
         name="hinf", units=plant.units
     )
@@ -107,12 +117,29 @@ def design_hinf(
         controller,
         f"H-infinity by {type(method).__name__}",
         gamma=certificate["norm"],
-        lower=found.lower,
-        certificate=certificate | (left_out.certificate if left_out is not None else {}),
+        lower=lower_bound(problem, certificate["norm"], found.lower),
+        certificate=certificate
+        | dict(found.certificate)
+        | (left_out.certificate if left_out is not None else {}),
         reached=reached,
         left_out=left_out,
-        notes=() if left_out is not None else unchecked(plant),
+        notes=(*found.notes, *(() if left_out is not None else unchecked(plant))),
     )
+
+
+def _solved(problem: Prepared) -> tuple[SynthesisMethod, SolvedController]:
+    """Return the answer by Riccati equations, of a small problem that they fail on by LMIs."""
+    first: SynthesisMethod = Riccati()
+    try:
+        return first, first.solve(problem)
+    except SolverError as error:
+        if problem.A.shape[0] > _SMALL:
+            raise
+        second = StructuredLmi()
+        try:
+            return second, second.solve(problem)
+        except SolverError:
+            raise error from None
 
 
 def _require_reach(problem: Prepared) -> None:

@@ -9,20 +9,11 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import FlexplantError, InfeasibleError, ModelError, SolverError
-from ..lti.interconnection import lft
-from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
-from ..lti.statespace import StateSpace
 from ..values import Value, positive, whole
-from .lmi_programs import (
-    Matrices,
-    Optimum,
-    Plant,
-    lqg_states,
-    moderate_controller,
-    same_states,
-    smallest_gamma,
-)
+from .lmi_plant import Plant, lqg_states, same_states
+from .lmi_programs import Optimum, moderate_controller, smallest_gamma
+from .lmi_solution import verified
 from .method import SolvedController
 
 #: gap between value and lower bound at which no other coordinates are tried
@@ -35,8 +26,6 @@ _ROUNDS = 4
 _NOTHING = 1e-7
 #: multiples of the back-off that are tried in turn
 _LOOSER = np.array([1.0, 2.0, 4.0, 8.0])
-#: what a closed loop may exceed its target by
-_EXCESS = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +100,7 @@ class Lmi(Value):
         for back_off in self.back_off * _LOOSER:
             try:
                 K = moderate_controller(found.plant, 1.0 + back_off, self._settings(self.tolerance))
-                norm = _verified(problem, K, found.value * (1.0 + back_off))
+                norm = verified(problem, K, found.value * (1.0 + back_off))
             except (FlexplantError, la.LinAlgError) as error:
                 failures.append(f"{100 * back_off:.3g} % above it: {error}")
                 continue
@@ -182,23 +171,3 @@ def _tightest(found: list[Optimum]) -> Optimum:
 def _settled(one: Optimum) -> bool:
     """Whether the bound is close, in a scale that resolves it."""
     return one.value - one.lower <= _GAP * one.value and one.value > 0.03 * one.scale
-
-
-def _verified(problem: Prepared, K: Matrices, target: float) -> float:
-    """Return the norm of the closed loop of a controller, computed anew.
-
-    Raises
-    ------
-    SolverError
-        When the loop is unstable or misses the target.
-    """
-    A, B, C, D = K
-    loop = lft(problem.system, StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u))
-    if not loop.is_stable:
-        raise SolverError(
-            f"its closed loop is unstable (largest real part {np.max(loop.poles().real):.3g})."
-        )
-    norm, _ = peak_gain(loop)
-    if not norm <= target * (1.0 + _EXCESS):
-        raise SolverError(f"its closed loop has the norm {norm:.6g}, not {target:.6g}.")
-    return norm

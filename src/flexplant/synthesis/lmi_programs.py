@@ -4,15 +4,14 @@ from __future__ import annotations
 
 import warnings
 from types import SimpleNamespace
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import InfeasibleError, SolverError
-from ..lti.preparation import Prepared
-from ..lti.riccati import control_care, solve_care
-from ..values import FloatArray
+from .lmi_plant import Plant, half, null_space
+from .lmi_solution import Matrices, dual_bound, reconstructed
 
 #: part of the back-off that goes into X Y >= (1 + ...)^2, away from the singular I - X Y
 APART = 0.6
@@ -27,97 +26,6 @@ ATTEMPTS: tuple[dict[str, Any], ...] = (
     {"static_regularization_constant": 1e-7},
 )
 
-#: A, B, C, D of a controller
-Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
-
-
-class Plant(NamedTuple):
-    """The eight matrices of ``[w; u] -> [z; y]``, D22 = 0."""
-
-    A: FloatArray
-    B1: FloatArray
-    B2: FloatArray
-    C1: FloatArray
-    C2: FloatArray
-    D11: FloatArray
-    D12: FloatArray
-    D21: FloatArray
-    #: its u is u_size times that of the problem, its y that of the problem over y_size
-    u_size: FloatArray
-    y_size: FloatArray
-    #: unit of its frequency, in that of the problem
-    speed: float = 1.0
-
-    @classmethod
-    def of(cls, p: Prepared) -> Plant:
-        """Return the plant of a prepared problem."""
-        matrices = (p.A, p.B1, p.B2, p.C1, p.C2, p.D11, p.D12, p.D21)
-        return cls(*matrices, np.ones(p.B2.shape[1]), np.ones(p.C2.shape[0])).with_unit_channels()
-
-    def with_unit_channels(self) -> Plant:
-        """Return the plant with u and y in units that make columns [B2; D12], rows [C2, D21] one.
-
-        What is not seen of noise or effort has no unit of its own.
-        """
-        u_size = np.linalg.norm(np.vstack([self.B2, self.D12]), axis=0)
-        y_size = np.linalg.norm(np.hstack([self.C2, self.D21]), axis=1)
-        u_size, y_size = (np.where(size > 0, size, 1.0) for size in (u_size, y_size))
-        return self._replace(
-            B2=self.B2 / u_size,
-            D12=self.D12 / u_size,
-            C2=self.C2 / y_size[:, None],
-            D21=self.D21 / y_size[:, None],
-            u_size=self.u_size * u_size,
-            y_size=self.y_size * y_size,
-        )
-
-    def timed(self, speed: float) -> Plant:
-        """Return the plant in a unit of frequency larger by speed; norms stay."""
-        root = np.sqrt(speed)
-        return self._replace(
-            A=self.A / speed,
-            B1=self.B1 / root,
-            B2=self.B2 / root,
-            C1=self.C1 / root,
-            C2=self.C2 / root,
-            speed=self.speed * speed,
-        )
-
-    def scaled(self, gamma: float) -> Plant:
-        """Return the plant whose norms w -> z are divided by gamma."""
-        root = np.sqrt(gamma)
-        return self._replace(
-            B1=self.B1 / root,
-            C1=self.C1 / root,
-            D11=self.D11 / gamma,
-            D12=self.D12 / root,
-            D21=self.D21 / root,
-        )
-
-    def balanced(self, X: FloatArray, Y: FloatArray) -> Plant:
-        """Return the plant in states where X (of x' X x) and Y (of its dual) are equal, diagonal.
-
-        Moore's balancing, of the LMIs' matrices instead of Gramians.
-        """
-        Lx, Ly = _factor(X), _factor(Y)
-        left, values, right = la.svd(Lx.T @ Ly)
-        root = np.sqrt(np.maximum(values, 1e-12 * values[0]))
-        T, back = (left / root).T @ Lx.T, Ly @ right.T / root
-        return self._replace(
-            A=T @ self.A @ back,
-            B1=T @ self.B1,
-            B2=T @ self.B2,
-            C1=self.C1 @ back,
-            C2=self.C2 @ back,
-        )
-
-    def size(self) -> float:
-        """Return a gamma of the plant's own size: its open gain beside its unit of frequency."""
-        shifted = (1.3 + 0.7j) * np.eye(self.A.shape[0]) - self.A
-        gain = float(np.linalg.norm(self.C1 @ np.linalg.solve(shifted, self.B1) + self.D11, 2))
-        bound = float(np.linalg.norm(self.C1) * np.linalg.norm(self.B1))
-        return max(gain, 1e-3 * bound) or 1.0
-
 
 class Optimum(NamedTuple):
     """The smallest gamma and its lower bound, and the plant of that size."""
@@ -130,52 +38,11 @@ class Optimum(NamedTuple):
     scale: float
 
 
-def same_states(p: Plant) -> Plant:
-    """Return the plant as it is."""
-    return p
-
-
-def lqg_states(p: Plant) -> Plant:
-    """Return the plant in LQG-balanced states, in the unit of frequency of the LQG loop.
-
-    The Riccati solutions stand in for X and Y.
-
-    Raises
-    ------
-    SolverError
-        When a Riccati equation has no solution.
-    """
-    n, nu, ny = p.A.shape[0], p.B2.shape[1], p.C2.shape[0]
-    # a little of everything: no rank of D12, D21 or observability of z is assumed
-    Q, W = p.C1.T @ p.C1, p.B1 @ p.B1.T
-    Q = Q + 1e-8 * np.linalg.norm(Q) * np.eye(n)
-    W = W + 1e-8 * np.linalg.norm(W) * np.eye(n)
-    try:
-        control = control_care(p.A, p.B2, Q=Q, R=p.D12.T @ p.D12 + 0.1 * np.eye(nu))
-        filtered = solve_care(p.A, p.C2, Q=W, R=p.D21 @ p.D21.T + 0.1 * np.eye(ny))
-    except la.LinAlgError as error:
-        raise SolverError(f"no LQG design for the choice of states: {error}.") from error
-    sizes = np.abs(np.concatenate([control.poles, filtered.poles]))
-    speed = float(np.exp(np.mean(np.log(np.maximum(sizes, 1e-300)))))
-    return p.balanced(control.P, filtered.P).timed(speed)
-
-
-def _factor(P: FloatArray) -> FloatArray:
-    """Return L with ``L L' = P``, P kept barely positive definite."""
-    values, vectors = la.eigh(half(P))
-    return np.asarray(vectors * np.sqrt(np.maximum(values, 1e-13 * max(values[-1], 1e-300))))
-
-
 def _cvxpy() -> Any:
     """Return cvxpy, which takes more than a second to import."""
     import cvxpy
 
     return cvxpy
-
-
-def half(M: Any) -> Any:
-    """Return the symmetric part."""
-    return 0.5 * (M + M.T)
 
 
 def symmetric_blocks(rows: list[list[Any]]) -> Any:
@@ -196,21 +63,14 @@ def symmetric_blocks(rows: list[list[Any]]) -> Any:
     return cp.bmat(full)
 
 
-def _null(M: FloatArray) -> FloatArray:
-    """Return an orthonormal basis of the null space."""
-    _, values, right = la.svd(M)
-    rank = int(np.count_nonzero(values > 1e-10 * max(float(values[0]), 1e-300)))
-    return np.asarray(right[rank:].T)
-
-
 def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimum:
     """Return the smallest gamma of the projected LMIs (Gahinet and Apkarian, theorem 4.3)."""
     cp = _cvxpy()
     n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))
     gamma = cp.Variable()
-    onto_u = la.block_diag(_null(np.hstack([p.B2.T, p.D12.T])), np.eye(nw))
-    onto_y = la.block_diag(_null(np.hstack([p.C2, p.D21])), np.eye(nz))
+    onto_u = la.block_diag(null_space(np.hstack([p.B2.T, p.D12.T])), np.eye(nw))
+    onto_y = la.block_diag(null_space(np.hstack([p.C2, p.D21])), np.eye(nz))
     AY, XA, w, z = p.A @ Y, X @ p.A, -gamma * np.eye(nw), -gamma * np.eye(nz)
     control = symmetric_blocks([[AY + AY.T, Y @ p.C1.T, p.B1], [z, p.D11], [w]])
     observe = symmetric_blocks([[XA + XA.T, X @ p.B1, p.C1.T], [w, p.D11.T], [z]])
@@ -232,37 +92,6 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
         p.scaled(value).balanced(X.value, Y.value).with_unit_channels(),
         scale,
     )
-
-
-def dual_bound(p: Plant, U: FloatArray, V: FloatArray, X: FloatArray, Y: FloatArray) -> float:
-    """Return a lower bound of gamma by weak duality, from the multipliers of the first two LMIs.
-
-    The third multiplier is chosen here, so that the dual equations hold exactly; what of it is
-    not positive semidefinite is paid for with the traces of X and Y.
-    """
-    n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
-    U, V = _positive_part(U)[0], _positive_part(V)[0]
-    total = np.trace(U[n:, n:]) + np.trace(V[n:, n:])
-    if not total > 0:
-        return 0.0
-    U, V = U / total, V / total
-    of_Y = 2 * half(U[:n, :n] @ p.A + U[:n, n : n + nz] @ p.C1)
-    of_X = 2 * half(p.A @ V[:n, :n] + p.B1 @ V[n : n + nw, :n])
-    (of_Y, less_Y), (of_X, less_X) = _positive_part(of_Y), _positive_part(of_X)
-    fixed = (
-        np.sum(p.B1 * U[:n, n + nz :])
-        + np.sum(p.D11 * U[n : n + nz, n + nz :])
-        + np.sum(p.C1.T * V[:n, n + nw :])
-        + np.sum(p.D11.T * V[n : n + nw, n + nw :])
-    )
-    coupling = np.sum(la.svdvals(_factor(of_Y).T @ _factor(of_X)))
-    paid = less_Y * np.trace(Y) + less_X * np.trace(X)
-    return max(float(2 * fixed + 2 * coupling - paid), 0.0)
-
-
-def _positive_part(M: FloatArray) -> tuple[FloatArray, float]:
-    values, vectors = la.eigh(half(M))
-    return (vectors * np.maximum(values, 0.0)) @ vectors.T, max(0.0, -float(values[0]))
 
 
 def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> Matrices:
@@ -290,36 +119,7 @@ def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> M
         cp.Problem(cp.Minimize(cp.trace(X) + cp.trace(Y) + MODERATION * gains), constraints),
         settings,
     )
-    return _reconstructed(p, gamma, X.value, Y.value, B.value, C.value, D.value)
-
-
-def _reconstructed(
-    p: Plant,
-    gamma: float,
-    X: FloatArray,
-    Y: FloatArray,
-    B: FloatArray,
-    C: FloatArray,
-    D: FloatArray,
-) -> Matrices:
-    """Return the controller from the changed variables, with ``N M' = I - X Y`` by SVD."""
-    n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
-    Bw, Cz = p.B1 + p.B2 @ D @ p.D21, p.C1 + p.D12 @ D @ p.C2
-    Dzw = p.D11 + p.D12 @ D @ p.D21
-    inner = np.block([[gamma * np.eye(nw), -Dzw.T], [-Dzw, gamma * np.eye(nz)]])
-    of_Y = np.hstack([Bw, (p.C1 @ Y + p.D12 @ C).T])
-    of_X = np.hstack([X @ p.B1 + B @ p.D21, Cz.T])
-    A = p.A + p.B2 @ D @ p.C2
-    # the off-diagonal block of Schur's complement is made zero
-    A_hat = -A.T - of_X @ np.linalg.solve(inner, of_Y.T)
-    left, values, right = la.svd(np.eye(n) - X @ Y)
-    N, M = left * np.sqrt(values), right.T * np.sqrt(values)
-    CK, BK = C - D @ p.C2 @ Y, B - X @ p.B2 @ D
-    AK = A_hat - X @ A @ Y - X @ p.B2 @ CK - BK @ p.C2 @ Y
-    root = np.sqrt(p.speed)
-    AK, BK, CK = la.solve(N, la.solve(M, AK.T).T), la.solve(N, BK), la.solve(M, CK.T).T
-    u_size = p.u_size[:, None]
-    return p.speed * AK, root * BK / p.y_size, root * CK / u_size, D / p.y_size / u_size
+    return reconstructed(p, gamma, X.value, Y.value, B.value, C.value, D.value)
 
 
 def _solve(problem: Any, settings: dict[str, float]) -> None:

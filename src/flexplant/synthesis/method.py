@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import NamedTuple, Protocol
 
 from ..lti.preparation import Prepared
@@ -17,6 +19,9 @@ class SolvedController(NamedTuple):
     D: FloatArray
     gamma: float
     lower: float
+    #: numbers for the certificate, and sentences, on how it was found
+    certificate: Mapping[str, float] = MappingProxyType({})
+    notes: tuple[str, ...] = ()
 
 
 class SynthesisMethod(Protocol):

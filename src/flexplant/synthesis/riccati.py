@@ -17,6 +17,7 @@ from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, positive
 from .central import OnAxisError, central, quadratic, riccati_solutions
 from .method import SolvedController
+from .singular import made_regular, missing_ranks
 
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
@@ -37,6 +38,11 @@ class Riccati(Value):
     gains below gamma. The controller is taken back_off above the smallest one (at the optimum it
     is fast and badly conditioned, and gains nothing) when the exact norm of its loop holds. The
     lower bound is the largest gamma that was refuted, not the largest that failed.
+
+    The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
+    boundary. A problem without these is solved with a little noise on each sensor and a little
+    effort of each actuator added, 1e-4 of the plant's own or less; the loop is verified without
+    them. The notes and the certificate say what was added and what it costs in gamma.
 
     Parameters
     ----------
@@ -66,13 +72,21 @@ class Riccati(Value):
         Raises
         ------
         AssumptionError
-            When D12 or D21 has not full rank, or z or w misses a mode on the stability boundary.
+            When z or w misses a mode on the stability boundary.
         InfeasibleError
             When gamma has a greatest lower bound that only infinite gain reaches.
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
-        _require_full_rank(problem)
+        lacking = missing_ranks(problem)
+        if not lacking:
+            try:
+                return self._regular(problem)
+            except AssumptionError as error:
+                lacking = (str(error),)
+        return made_regular(problem, self._regular, lacking)
+
+    def _regular(self, problem: Prepared) -> SolvedController:
         # the least quadratic cost stabilises: its norm is where the search for less begins
         try:
             least = quadratic(problem)
@@ -134,20 +148,6 @@ class Riccati(Value):
                     return controller, norm
             step = max(2.0 * step, self.tolerance)
         return None, 1.0
-
-
-def _require_full_rank(problem: Prepared) -> None:
-    for name, matrix, short, names in (
-        ("D12", problem.D12, "costs nothing in z at high frequencies", problem.u),
-        ("D21", problem.D21.T, "is free of noise in w at high frequencies", problem.y),
-    ):
-        needed = matrix.shape[1]
-        rank = int(np.linalg.matrix_rank(matrix, tol=1e-8)) if matrix.size else 0
-        if rank < needed:
-            raise AssumptionError(
-                f"{name} has rank {rank}, {needed} are needed: a combination of {', '.join(names)} "
-                f"{short}. Weight the efforts in z (or give each sensor noise in w), or use Lmi()."
-            )
 
 
 def _require_finite_gain(problem: Prepared, controller: StateSpace, gamma: float) -> None:

@@ -1,0 +1,82 @@
+"""Lower bounds on gamma that hold for every controller, whatever method found one."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import FlexplantError
+from ..lti.grid import climbed, resonance_grid
+from ..lti.preparation import Prepared
+from ..lti.responses import responses
+from ..values import ComplexArray, FloatArray
+from .structured_lmi import StructuredLmi
+
+#: points of the sweep, and times that it is refined
+_POINTS, _REFINEMENTS = 200, 2
+#: a gap between gamma and the bound that is left as it is
+_CLOSE = 0.06
+#: up to so many states, and for so long [s], the LMIs are solved for a bound
+_STATES, _SECONDS = 24, 5.0
+#: relative: a pole so close to the axis is taken for undamped, no point lies so close to it
+_UNDAMPED = 1e-6
+
+
+def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
+    """Return the best lower bound on what controllers reach, at most gamma.
+
+    The largest of the one that the method knows, the pointwise one, and for small problems where
+    these are far from gamma that of the LMIs.
+
+    Parameters
+    ----------
+    problem : Prepared
+        The problem.
+    gamma : float
+        What is reached.
+    known : float
+        A bound that the method proved.
+    """
+    found = max(known, pointwise_bound(problem))
+    if found * (1.0 + _CLOSE) < gamma and problem.A.shape[0] <= _STATES:
+        try:
+            found = max(found, StructuredLmi(time_limit=_SECONDS).smallest(problem).lower)
+        except FlexplantError:  # what is known stays
+            pass
+    return min(found, gamma)
+
+
+def pointwise_bound(problem: Prepared) -> float:
+    """Return what no controller undercuts at some frequency, nor by the feedthrough.
+
+    Parrott: at s = j omega the loop's gain is at least that of Pzw on the outputs which u cannot
+    reach, ``N_z' Pzw`` with N_z' Pzu = 0, and on the inputs which y does not show, ``Pzw N_w``
+    with Pyw N_w = 0.
+    """
+    m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
+    system = problem.system
+    poles = np.linalg.eigvals(problem.A)
+    grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=_POINTS)])
+    undamped = poles[np.abs(poles.real) <= _UNDAMPED * np.max(np.abs(poles), initial=1.0)]
+    apart = np.abs(2.0 * np.pi * grid[:, None] - np.abs(undamped.imag))
+    grid = grid[np.all(apart > _UNDAMPED * (1.0 + np.abs(undamped.imag)), axis=1)]
+
+    def bounds(freq: FloatArray) -> FloatArray:
+        P = np.moveaxis(responses(system, freq), 2, 0)
+        return np.array([_parrott(one, m1, p1) for one in P])
+
+    _, values = climbed(bounds, grid, _REFINEMENTS)
+    return max(float(np.max(values)), _parrott(np.asarray(system.D, complex), m1, p1))
+
+
+def _parrott(P: ComplexArray, m1: int, p1: int) -> float:
+    Pzw = P[:p1, :m1]
+    parts = (_left_null(P[:p1, m1:]).conj().T @ Pzw, Pzw @ _left_null(P[p1:, :m1].conj().T))
+    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
+
+
+def _left_null(M: ComplexArray) -> ComplexArray:
+    """Return an orthonormal basis of what is perpendicular to the columns of M.
+
+    Its dimension is that of M of full rank: more would hang on rounding.
+    """
+    return np.linalg.svd(M)[0][:, M.shape[1] :]

@@ -1,0 +1,297 @@
+"""H-infinity synthesis by the projected LMIs, their structure used."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import FlexplantError, InfeasibleError, ModelError, SolverError
+from ..lti.preparation import Prepared
+from ..parallel import Progress
+from ..values import FloatArray, Value, positive, whole
+from .interior_point import STEPS, Iterate, clock, smallest
+from .lmi_plant import Plant, half, lqg_states, same_states
+from .lmi_solution import Matrices, dual_bound, reconstructed, verified
+from .method import SolvedController
+from .projected_lmis import ProjectedLmis
+
+#: R, S, gamma and the blocks of the LMIs at the start, in a plant scaled to gamma near 1
+_START = 10.0
+#: the lower bound holds for controllers whose R and S are larger than those found by this factor
+LARGER = 10.0
+#: gamma, beside the scale it is sought in, that is sought again in its own scale
+_ROUGH = 0.1, 10.0
+#: relative to the plant's size: a gamma that is taken for zero
+_NOTHING = 1e-7
+#: multiples of the back-off that are tried in turn, and points tried for each
+_LOOSER, _POINTS = np.array([1.0, 2.0, 4.0, 8.0]), 3
+#: steps of the search for a weight of an eliminated variable, each by this factor
+_WEIGHTS, _FACTOR = 60, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class StructuredLmi(Value):
+    """Synthesis by linear matrix inequalities (LMIs), with an interior-point method of their own.
+
+    The projected LMIs in R, S and gamma (Gahinet and Apkarian), whose n (n + 1) + 1 unknowns
+    meet in one Cholesky factor of that size in each step. Needs a stabilising controller to exist
+    and nothing else: efforts without weight, sensors without noise and modes on the stability
+    boundary are allowed. About 1 s at 24 states and 15 s at 48.
+
+    The controller is that of a point on the central path, where R and S are moderate, with gamma
+    within back_off of the smallest.
+
+    Parameters
+    ----------
+    back_off : float
+        Relative distance of gamma from the smallest one, at which gains may be infinite. Doubled
+        up to three times where no controller keeps the target.
+    tolerance : float
+        Relative gap between gamma and its lower bound at which the search stops.
+    max_states : int
+        Larger problems are refused.
+    time_limit : float [s]
+        For the whole search.
+    progress : bool, optional
+        True shows a bar of the steps at once, False never; None after two seconds on a terminal.
+
+    Raises
+    ------
+    ModelError
+        When a value is not positive.
+
+    References
+    ----------
+    Gahinet, Apkarian, A linear matrix inequality approach to H-infinity control, Int. J. Robust
+    Nonlinear Control 4, 1994. Helmberg, Rendl, Vanderbei, Wolkowicz, An interior-point method for
+    semidefinite programming, SIAM J. Optim. 6, 1996. Iwasaki, Skelton, All controllers for the
+    general H-infinity control problem, Automatica 30, 1994 (the eliminated variables).
+    """
+
+    back_off: float = 0.05
+    tolerance: float = 1e-6
+    max_states: int = 80
+    time_limit: float = 120.0
+    progress: bool | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            back_off=positive(self.back_off, "back_off"),
+            tolerance=positive(self.tolerance, "tolerance"),
+            max_states=whole(self.max_states, "max_states"),
+            time_limit=positive(self.time_limit, "time_limit"),
+        )
+
+    def solve(self, problem: Prepared) -> SolvedController:
+        """Return the controller of a prepared problem.
+
+        `lower` is a bound by weak duality from multipliers repaired to satisfy their equations;
+        it holds for all controllers whose Lyapunov matrices are no more than ten times as large
+        as those found.
+
+        Raises
+        ------
+        ModelError
+            When the problem has no states, or more than max_states.
+        InfeasibleError
+            When no gamma is smallest.
+        SolverError
+            When the method stops early, or no controller keeps what the LMIs promise.
+        """
+        found = self.smallest(problem)
+        failures = []
+        for back_off in self.back_off * _LOOSER:
+            for point in found.points_below(1.0 + back_off)[:_POINTS]:
+                target = found.scale * float(point.y[-1])
+                try:
+                    K = _controller(found.plant, *found.program.matrices(point.y))
+                    norm = verified(problem, K, target)
+                except (FlexplantError, la.LinAlgError) as error:
+                    failures.append(f"{target:.6g}: {error}")
+                    continue
+                return SolvedController(*K, norm, min(found.lower, norm), {}, found.notes)
+        raise SolverError(
+            f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
+            + " ".join(failures[-3:])
+            + " Loosen weights, add a little noise to each sensor, or raise back_off."
+        )
+
+    def smallest(self, problem: Prepared) -> SmallestGamma:
+        """Return the smallest gamma of the LMIs with its lower bound, without a controller.
+
+        Raises
+        ------
+        ModelError, InfeasibleError, SolverError
+            As for `solve`.
+        """
+        n = problem.A.shape[0]
+        if not 0 < n <= self.max_states:
+            raise ModelError(
+                f"StructuredLmi takes plants of 1 to {self.max_states} states, got {n}: time "
+                "grows as n^6. Reduce the order first, use Riccati(), or raise max_states."
+            )
+        left = clock(self.time_limit)
+        plant = Plant.of(problem)
+        guess = scale = plant.size()
+        failures: list[FlexplantError] = []
+        for states in (lqg_states, same_states):
+            try:
+                start = states(plant)
+                for _ in range(3):
+                    found = self._solved(start.scaled(scale), scale, left)
+                    low, high = _ROUGH
+                    if low < found.value / scale < high or found.value < _NOTHING * guess:
+                        break
+                    scale = found.value
+                break
+            except (SolverError, la.LinAlgError) as error:
+                failures.append(SolverError(str(error)))
+        else:
+            raise failures[0]
+        if found.value < _NOTHING * guess:
+            raise InfeasibleError(
+                f"there is no smallest gamma: {found.value:.3g} is reached, where the plant's own "
+                f"size is {guess:.3g}. u cancels w in z, at no cost. Weight the efforts in z, or "
+                "give the sensors noise in w."
+            )
+        return found
+
+    def _solved(self, plant: Plant, scale: float, left: Callable[[], float]) -> SmallestGamma:
+        program = ProjectedLmis(plant)
+        with Progress(STEPS, "steps of the LMIs", progress=self.progress) as bar:
+            points, late = smallest(
+                program, program.start(_START), _START, self.tolerance, left, bar.advance
+            )
+        feasible = [one for one in points if _holds(program, one.y)]
+        if not feasible and late:
+            raise SolverError(
+                f"the time limit of {self.time_limit:.3g} s was reached after {len(points)} steps, "
+                f"before any gamma was found ({program.n} states). Raise time_limit or reduce the "
+                "order of the plant."
+            )
+        if not feasible:
+            raise SolverError(
+                f"the LMIs were not solved: no point satisfies them after {len(points)} steps "
+                f"(missed by {points[-1].primal_residual:.1e}, {program.n} states). Does u reach "
+                "and y see every unstable mode? If so, loosen weights or reduce the order."
+            )
+        best = min(feasible, key=lambda one: float(one.y[-1]))
+        R, S, value = program.matrices(best.y)
+        lower = max(_bound(program, plant, one.X, R, S) for one in points)
+        notes = ()
+        if late:
+            notes = (
+                f"the time limit of {self.time_limit:.3g} s was reached: gamma is within "
+                f"{100 * (value / max(lower, 1e-300) - 1):.2g} % of the smallest.",
+            )
+        return SmallestGamma(
+            scale * value, scale * min(lower, value), scale, plant, program, feasible, notes
+        )
+
+
+class SmallestGamma(NamedTuple):
+    """The smallest gamma, its lower bound, and the points on the way that satisfy the LMIs."""
+
+    value: float
+    lower: float
+    scale: float
+    plant: Plant
+    program: ProjectedLmis
+    points: Sequence[Iterate]
+    notes: tuple[str, ...]
+
+    def points_below(self, factor: float) -> list[Iterate]:
+        """Return the points with gamma at most factor times the smallest, the first one first."""
+        limit = factor * self.value / self.scale
+        return [one for one in self.points if one.y[-1] <= limit]
+
+
+def _holds(program: ProjectedLmis, y: FloatArray) -> bool:
+    """Return whether each block is positive definite at y."""
+    try:
+        for const, moved in zip(program.const, program.linear(y), strict=True):
+            la.cholesky(const + moved)
+    except la.LinAlgError:
+        return False
+    return True
+
+
+def _bound(
+    program: ProjectedLmis, plant: Plant, X: Sequence[FloatArray], R: FloatArray, S: FloatArray
+) -> float:
+    """Return the lower bound on gamma that multipliers give."""
+    U, V = (side.onto @ part @ side.onto.T for side, part in zip(program.sides, X, strict=False))
+    return dual_bound(plant, U, V, LARGER * S, LARGER * R)
+
+
+def _controller(plant: Plant, R: FloatArray, S: FloatArray, gamma: float) -> Matrices:
+    """Return a controller for R, S and gamma: D, then the columns of C, then the rows of B.
+
+    Each is eliminated from an LMI that the projected ones guarantee a solution of.
+    """
+    p, n = plant, plant.A.shape[0]
+    nw, nz = p.B1.shape[1], p.C1.shape[0]
+    inner = np.block([[-gamma * np.eye(nw), p.D11.T], [p.D11, -gamma * np.eye(nz)]])
+    D = _eliminated(
+        inner,
+        np.vstack([np.zeros((nw, p.D12.shape[1])), p.D12]),
+        np.hstack([p.D21, np.zeros((p.D21.shape[0], nz))]),
+    )
+    D11 = p.D11 + p.D12 @ D @ p.D21
+    B1, C1 = p.B1 + p.B2 @ D @ p.D21, p.C1 + p.D12 @ D @ p.C2
+    state = np.hstack([np.eye(n), np.zeros((n, nw + nz))])
+    C = _eliminated(
+        _bordered(p.A @ R + R @ p.A.T, B1, R @ p.C1.T, D11, gamma),
+        np.vstack([p.B2, np.zeros((nw, p.B2.shape[1])), p.D12]),
+        state,
+    )
+    B = _eliminated(
+        _bordered(S @ p.A + p.A.T @ S, S @ p.B1, C1.T, D11, gamma),
+        np.hstack([p.C2, p.D21, np.zeros((p.C2.shape[0], nz))]).T,
+        state,
+    ).T
+    return reconstructed(p, gamma, S, R, B, C, D)
+
+
+def _bordered(
+    corner: FloatArray, w: FloatArray, z: FloatArray, D: FloatArray, gamma: float
+) -> FloatArray:
+    nw, nz = w.shape[1], z.shape[1]
+    return np.block(
+        [
+            [half(corner), w, z],
+            [w.T, -gamma * np.eye(nw), D.T],
+            [z.T, D, -gamma * np.eye(nz)],
+        ]
+    )
+
+
+def _eliminated(Q: FloatArray, P: FloatArray, C: FloatArray) -> FloatArray:
+    """Return K with ``Q + P K C + (P K C)' < 0`` (Iwasaki and Skelton, theorem 2.3.12 there).
+
+    ``K = -r P' F C' (C F C')^-1`` with ``F = (r P P' - Q)^-1`` positive definite.
+
+    Raises
+    ------
+    SolverError
+        When no weight r makes it so: the projections do not hold.
+    """
+    size = float(np.linalg.norm(P, 2)) ** 2
+    if size == 0.0 or not np.any(C):
+        return np.zeros((P.shape[1], C.shape[0]))
+    weight = 1e-2 * float(np.linalg.norm(Q, 2)) / size
+    for _ in range(_WEIGHTS):
+        try:
+            factor = la.cho_factor(weight * P @ P.T - Q, lower=True)
+        except la.LinAlgError:
+            weight *= _FACTOR
+            continue
+        weight *= _FACTOR  # away from the boundary
+        factor = la.cho_factor(weight * P @ P.T - Q, lower=True)
+        moved = la.cho_solve(factor, C.T)
+        return np.asarray(-weight * np.linalg.lstsq(C @ moved, moved.T @ P, rcond=1e-13)[0].T)
+    raise SolverError("rounding hides the controller that the LMIs promise.")
