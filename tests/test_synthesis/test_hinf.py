@@ -1,10 +1,9 @@
 """design_hinf on the stage: updated model, virtual machine, other time, other doors."""
 
+import re
 from functools import cache
 
 import control
-import re
-
 import numpy as np
 import pytest
 

@@ -29,16 +29,17 @@ def named(A, B, C, D, nu, ny):
 
 
 def flexible(modes, seed=0):
-    """Modes of 0.1 % damping with a rigid body, forces and positions; noise, but no effort."""
+    """Modes of 0.1 % damping with a rigid body: forces, positions with noise, little effort."""
     rng = np.random.default_rng(seed)
     omega = np.concatenate([[0.0], np.geomspace(1.0, 30.0, modes - 1)])
     zero, one = np.zeros((modes, modes)), np.eye(modes)
     A = np.block([[zero, one], [-np.diag(omega**2), -np.diag(2e-3 * omega)]])
     B = np.vstack([np.zeros((modes, 6)), rng.normal(size=(modes, 6))])
     B[:, 2:4] = 0.0
-    C = np.hstack([rng.normal(size=(4, modes)), np.zeros((4, modes))])
-    D = np.zeros((4, 6))
-    D[2:, 2:4] = 1e-3 * np.eye(2)
+    C = np.hstack([rng.normal(size=(6, modes)), np.zeros((6, modes))])
+    C[2:4] = 0.0
+    D = np.zeros((6, 6))
+    D[4:, 2:4] = D[2:4, 4:] = 1e-2 * np.eye(2)
     return named(A, B, C, D, 2, 2)
 
 
@@ -131,13 +132,14 @@ def K_of(K):
 
 
 @pytest.mark.parametrize("modes", [4, pytest.param(12, marks=pytest.mark.slow)])
-def test_rigid_body_and_light_damping_without_weighed_effort(modes):
+def test_rigid_body_and_light_damping(modes):
     P, u, y = flexible(modes)
     found = design_hinf(P, StructuredLmi(), u=u, y=y)
     assert found.lower <= found.gamma <= 1.06 * found.lower
     other = design_hinf(P, u=u, y=y)
     assert other.gamma == pytest.approx(found.gamma, rel=0.06)
     assert other.lower <= found.gamma
+    assert found.lower <= other.gamma
 
 
 def test_the_pointwise_bound_by_hand():
@@ -163,7 +165,7 @@ def test_the_time_limit_is_for_everything_and_named():
 def test_a_limit_that_comes_late_leaves_the_gap_in_the_notes(monkeypatch):
     from flexplant.synthesis import structured_lmi
 
-    steps = iter([1.0] * 15 + [-1.0] * 10)
+    steps = iter([1.0] * 8 + [-1.0] * 90)
     monkeypatch.setattr(structured_lmi, "clock", lambda limit: lambda: next(steps))
     found = StructuredLmi().smallest(prepared(*flexible(2)))
     assert "the time limit of 120 s was reached: gamma is within" in found.notes[0]

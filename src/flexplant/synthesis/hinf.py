@@ -62,8 +62,8 @@ def design_hinf(
     Controller
         `gamma` is the verified norm, `lower` a bound from below on what any controller reaches
         (where it comes from LMIs: with Lyapunov matrices up to ten times as large as those that
-        they found), `certificate` what was checked, `reached` what is reached of each block of the weights, `left_out` the check
-        with the modes left out.
+        they found), `certificate` what was checked, `reached` what is reached of each block of
+        the weights, `left_out` the check with the modes left out.
 
     Raises
     ------

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
+
 import numpy as np
 
 from ..errors import FlexplantError
@@ -38,10 +40,8 @@ def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
     """
     found = max(known, pointwise_bound(problem))
     if found * (1.0 + _CLOSE) < gamma and problem.A.shape[0] <= _STATES:
-        try:
+        with suppress(FlexplantError):  # what is known stays
             found = max(found, StructuredLmi(time_limit=_SECONDS).smallest(problem).lower)
-        except FlexplantError:  # what is known stays
-            pass
     return min(found, gamma)
 
 
@@ -54,7 +54,7 @@ def pointwise_bound(problem: Prepared) -> float:
     """
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     system = problem.system
-    poles = np.linalg.eigvals(problem.A)
+    poles = system.poles()
     grid = np.concatenate([[0.0], resonance_grid(poles, 0.0, points=_POINTS)])
     undamped = poles[np.abs(poles.real) <= _UNDAMPED * np.max(np.abs(poles), initial=1.0)]
     apart = np.abs(2.0 * np.pi * grid[:, None] - np.abs(undamped.imag))

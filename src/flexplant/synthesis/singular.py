@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,9 @@ class Regularised:
             y_scale=self._y @ problem.y_scale,
         )
 
-    def restored(self, K: SolvedController) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    def restored(
+        self, K: SolvedController
+    ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return A, B, C, D of a controller of this problem, in the channels of the one given."""
         return K.A, K.B @ self._y, self._u @ K.C, self._u @ K.D @ self._y
 
@@ -171,7 +174,7 @@ def _require_positive_infimum(
     problem: Prepared, found: Sequence[_Found], lacking: Sequence[str]
 ) -> None:
     gammas = [one.gamma for one in found]
-    falls = all(b < _FALL * a for a, b in zip(gammas, gammas[1:], strict=False))
+    falls = all(b < _FALL * a for a, b in pairwise(gammas))
     if len(found) < 3 or not falls:
         return
     raise InfeasibleError(

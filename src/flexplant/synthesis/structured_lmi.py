@@ -117,7 +117,8 @@ class StructuredLmi(Value):
         raise SolverError(
             f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
             + " ".join(failures[-3:])
-            + " Loosen weights, add a little noise to each sensor, or raise back_off."
+            + " Loosen weights, raise back_off, or use Riccati(), which adds a little noise and "
+            "effort where sensors and actuators have none."
         )
 
     def smallest(self, problem: Prepared) -> SmallestGamma:
@@ -182,14 +183,19 @@ class StructuredLmi(Value):
         best = min(feasible, key=lambda one: float(one.y[-1]))
         R, S, value = program.matrices(best.y)
         lower = max(_bound(program, plant, one.X, R, S) for one in points)
-        notes = ()
-        if late:
-            notes = (
-                f"the time limit of {self.time_limit:.3g} s was reached: gamma is within "
-                f"{100 * (value / max(lower, 1e-300) - 1):.2g} % of the smallest.",
-            )
+        gap = 100.0 * (value / max(lower, 1e-300) - 1.0)
+        late_note = (
+            f"the time limit of {self.time_limit:.3g} s was reached: gamma is within {gap:.2g} % "
+            "of the smallest."
+        )
         return SmallestGamma(
-            scale * value, scale * min(lower, value), scale, plant, program, feasible, notes
+            scale * value,
+            scale * min(lower, value),
+            scale,
+            plant,
+            program,
+            feasible,
+            (late_note,) if late else (),
         )
 
 
