@@ -235,7 +235,7 @@ def test_units():
         (lambda: PointMass((0, 0, 0), 1, inertia=(1, 2, -1)), ModelError, "three"),
         (lambda: PointMass((0, 0), 1), LabelError, "must be at a DOF label"),
         (lambda: PointMass(None, 1), LabelError, "must be at a DOF label"),
-        (lambda: Spring("1:z", -1), ModelError, "stiffness of a spring"),
+        (lambda: Spring("1:z", np.nan), ModelError, "stiffness of a spring"),
         (lambda: Spring((0, 0, 0), 1, direction="up"), LabelError, "direction"),
         (lambda: Damper("1:z", -1), ModelError, "rate of a damper"),
         (lambda: make_plate().with_parts([3]), ModelError, "as parts"),

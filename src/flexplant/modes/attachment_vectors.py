@@ -158,7 +158,7 @@ def projected_zeta(D: Matrix | None, vectors: FloatArray, omega: FloatArray) -> 
     if D is None or not omega.size:
         return np.zeros(omega.size)
     rate = np.sum(vectors * np.asarray(D @ vectors), axis=0)
-    return np.asarray(rate / (2 * omega), dtype=np.float64)
+    return np.asarray(rate / (2 * np.abs(omega)), dtype=np.float64)
 
 
 def labels_of(at: Sequence[Place], dofs: DofSet) -> tuple[str, ...]:

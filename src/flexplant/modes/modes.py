@@ -10,6 +10,7 @@ import numpy as np
 
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet, Place
+from ..structure.negative_stiffness import signed_square
 from ..structure.placed import Placed, missed
 from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
 
@@ -28,6 +29,10 @@ class Modes(Placed, Value):
     ``q = phi p`` with ``p'' + 2 Z Omega p' + Omega^2 p = phi^T f``. Modes are numbered from 1,
     rigid-body modes included: mode 4 of a free plate is its first elastic one.
 
+    Springs of negative stiffness (magnets) make rigid-body modes unstable. Those follow the modes
+    at 0, with negative frequencies as finite-element programs print them: omega = -3 rad/s stands
+    for ``Omega^2 = -9 1/s^2`` and the real poles ``|omega| (-zeta +- sqrt(zeta^2 + 1))``.
+
     Residual attachment vectors extend the basis: what a unit force at a chosen place moves
     statically beyond the k modes. They are made M-orthogonal to the modes and diagonal among each
     other, so that (5) holds for the basis `[phi, vectors]` too, with `vector_omega` as frequencies.
@@ -35,12 +40,14 @@ class Modes(Placed, Value):
     Parameters
     ----------
     omega : (k,) array [rad/s]
-        Undamped frequencies; exactly 0 for the rigid-body modes, which come first.
+        Undamped frequencies; exactly 0 for the rigid-body modes, which come first, then negative
+        ones of unstable modes.
     zeta : (k,) array [-]
-        Damping ratios.
+        Damping ratios: damping rates over ``2 |omega|``.
     phi : (n, k) array [1/sqrt(kg)]
         Shapes. Complex for a structure whose damping is not proportional, then normalised to
-        ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``.
+        ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``; of an unstable mode as in `NormalForm`,
+        the shapes of its two poles are ``Re phi +- Im phi``.
     dofs : DofSet
         The n rows.
     n_rigid : int
@@ -88,8 +95,12 @@ class Modes(Placed, Value):
                 f"n_rigid is {self.n_rigid}, but the first frequencies of {k} are "
                 f"{omega[: max(self.n_rigid, 1)].tolist()} rad/s: rigid-body modes are exactly 0."
             )
-        if np.any(omega[self.n_rigid :] <= 0):
-            raise ModelError("elastic modes need frequencies above 0; rigid-body modes come first.")
+        held = omega[self.n_rigid :]
+        if np.any(held == 0) or np.any(held[int(np.count_nonzero(held < 0)) :] < 0):
+            raise ModelError(
+                "elastic modes need frequencies above 0: rigid-body modes, at 0, come first, then "
+                "unstable ones, with negative frequencies."
+            )
         places = (self.vector_dofs,) if isinstance(self.vector_dofs, str) else self.vector_dofs
         m = len(places)
         phi: FloatArray | ComplexArray = real_array(np.real(self.phi), "phi", (n, k))
@@ -119,8 +130,11 @@ class Modes(Placed, Value):
         )
 
     def __repr__(self) -> str:
-        freq = self.freq[self.n_rigid :]
+        freq = self.freq[self.n_rigid + self.n_unstable :]
         parts = [f"{self.n_rigid} rigid-body"] if self.n_rigid else []
+        if self.n_unstable:
+            growth = max(self.poles[self.n_rigid : self.n_rigid + self.n_unstable].real)
+            parts.append(f"{self.n_unstable} unstable growing at up to {growth:.4g} 1/s")
         if freq.size:
             to = f" to {freq[-1]:.4g}" if freq.size > 1 else ""
             parts.append(f"{freq.size} elastic at {freq[0]:.4g}{to} Hz")
@@ -143,6 +157,11 @@ class Modes(Placed, Value):
         return int(self.omega.size)
 
     @property
+    def n_unstable(self) -> int:
+        """Number of unstable modes, which stand between those at 0 and the elastic ones."""
+        return int(np.count_nonzero(self.omega < 0))
+
+    @property
     def n_vectors(self) -> int:
         """Number of attachment vectors m."""
         return len(self.vector_dofs)
@@ -156,10 +175,9 @@ class Modes(Placed, Value):
     def poles(self) -> ComplexArray:
         """Poles (k,) [rad/s] in the upper half plane; rigid-body ones exactly 0.
 
-        ``-zeta omega + i omega sqrt(1 - zeta^2)``.
+        ``-zeta omega + i omega sqrt(1 - zeta^2)``; of an unstable mode the one that grows.
         """
-        root = np.sqrt((1 - self.zeta**2).astype(np.complex128))
-        return np.asarray(self.omega * (-self.zeta + 1j * root), dtype=np.complex128)
+        return pole_pairs(self.omega, self.zeta)[0]
 
     @property
     def basis(self) -> FloatArray | ComplexArray:
@@ -171,6 +189,16 @@ class Modes(Placed, Value):
     def basis_omega(self) -> FloatArray:
         """Frequencies (k + m,) [rad/s] of the basis: equation (5) is diagonal in it."""
         return np.concatenate([self.omega, self.vector_omega])
+
+    @property
+    def basis_squares(self) -> FloatArray:
+        """Omega^2 (k + m,) [1/s^2] in equation (5), negative for unstable modes."""
+        return signed_square(self.basis_omega)
+
+    @property
+    def basis_rates(self) -> FloatArray:
+        """2 Z Omega (k + m,) [1/s] in equation (5)."""
+        return np.asarray(2.0 * self.basis_zeta * np.abs(self.basis_omega))
 
     @property
     def basis_zeta(self) -> FloatArray:
@@ -200,16 +228,22 @@ class Modes(Placed, Value):
         """M-orthonormal real shapes B (n, b) that span those of the modes.
 
         Complex modes give M on their span by how they answer at once: ``B B' = sum Re(phi phi'
-        lambda / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes.
+        lambda / (i Im lambda))``, with ``phi_r phi_r'`` for rigid-body modes and
+        ``(s1 v1 v1' - s2 v2 v2') / (s1 - s2)`` for unstable ones.
         """
         if not np.iscomplexobj(self.phi):
             return np.real(self.basis)
         phi, r = np.asarray(self.phi), self.n_rigid
-        rigid, elastic, poles = phi[:, :r].real, phi[:, r:], self.poles[r:]
-        Q = np.linalg.qr(np.hstack([rigid, elastic.real, elastic.imag]))[0]
+        free, pairs = slice(r), slice(r, r + self.n_unstable)
+        elastic, poles = phi[:, pairs.stop :], self.poles[pairs.stop :]
+        Q = np.linalg.qr(np.hstack([phi.real, phi[:, r:].imag]))[0]
         inner = Q.T @ elastic
         core = np.real((inner * (poles / (1j * poles.imag))) @ inner.T)
-        core = core + (Q.T @ rigid) @ (Q.T @ rigid).T
+        core = core + (Q.T @ phi[:, free].real) @ (Q.T @ phi[:, free].real).T
+        grow, decay = (part[pairs].real for part in pole_pairs(self.omega, self.zeta))
+        for sign, rate in ((1.0, grow), (-1.0, decay)):
+            own = Q.T @ (phi[:, pairs].real + sign * phi[:, pairs].imag)
+            core = core + sign * (own * (rate / (grow - decay))) @ own.T
         values, vectors = np.linalg.eigh(0.5 * (core + core.T))
         kept = values > _TRUNCATED * values[-1]
         return np.asarray((Q @ vectors[:, kept]) * np.sqrt(values[kept]))
@@ -243,3 +277,14 @@ class Modes(Placed, Value):
         """
         motion: FloatArray | ComplexArray = self.dofs.row(place, direction) @ self.phi
         return motion
+
+
+def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, ComplexArray]:
+    """Return both poles (k,) of modes ``p'' + 2 zeta |omega| p' + omega |omega| p = 0``.
+
+    The first is that in the upper half plane, or the one that grows.
+    """
+    size, unstable = np.abs(omega), omega < 0
+    root = np.sqrt((zeta**2 - np.where(unstable, -1.0, 1.0)).astype(np.complex128))
+    root = np.where(root.imag < 0, root.conj(), root)
+    return size * (-zeta + root), size * (-zeta - root)

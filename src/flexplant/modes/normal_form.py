@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -11,6 +12,7 @@ import scipy.linalg as la
 from ..errors import ModelError, SolverError
 from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
+from ..structure.negative_stiffness import signed_square
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray, Matrix, Value, real_array
 
@@ -33,20 +35,26 @@ class NormalForm(Value):
     Parameters
     ----------
     poles : (k,) complex array [rad/s]
-        In the upper half plane, by magnitude; the rigid-body ones first and exactly 0.
+        In the upper half plane, by magnitude; the rigid-body ones first and exactly 0, then the
+        growing poles s1 > 0 of unstable pairs (s1, s2).
     phi : (n, k) array
         Normalised to ``phi^T (2 lambda M + D) phi = 2i Im(lambda)``: mass-normalised and real when
-        D is proportional, complex else. Rigid-body shapes are real and M-orthonormal.
+        D is proportional, complex else. Rigid-body shapes are real and M-orthonormal. The shapes
+        of an unstable pair are ``v1 = Re phi + Im phi`` and ``v2 = Re phi - Im phi``, with
+        ``v1^T (2 s1 M + D) v1 = s1 - s2 = -v2^T (2 s2 M + D) v2``.
     n_rigid : int
         How many rigid-body modes there are.
+    decaying : (u,) array [1/s]
+        The decaying poles s2 < 0 of the unstable pairs.
     """
 
     poles: ComplexArray
     phi: FloatArray | ComplexArray
     n_rigid: int
+    decaying: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
-        self._set(poles=self.poles, phi=self.phi)
+        self._set(poles=self.poles, phi=self.phi, decaying=self.decaying)
 
     def __repr__(self) -> str:
         kind = "real" if self.is_real else "complex"
@@ -57,8 +65,33 @@ class NormalForm(Value):
         """Whether the damping is proportional, so that the shapes are real."""
         return not np.iscomplexobj(self.phi)
 
+    @property
+    def omega(self) -> FloatArray:
+        """Undamped frequencies (k,) [rad/s]; ``-sqrt(-s1 s2)`` of an unstable pair."""
+        omega, unstable = np.abs(self.poles), self._unstable
+        omega[unstable] = -np.sqrt(-self.decaying * self.poles[unstable].real)
+        return omega
 
-def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> NormalForm:
+    @property
+    def zeta(self) -> FloatArray:
+        """Damping ratios (k,): ``-(s1 + s2) / (2 |omega|)`` of an unstable pair."""
+        omega, rate = np.abs(self.omega), -self.poles.real
+        rate[self._unstable] = 0.5 * (rate[self._unstable] - self.decaying)
+        rate[: self.n_rigid] = 0.0
+        return np.asarray(rate / np.where(omega > 0, omega, 1.0))
+
+    @property
+    def _unstable(self) -> slice:
+        return slice(self.n_rigid, self.n_rigid + self.decaying.size)
+
+
+def normal_form(
+    M: Matrix,
+    D: Matrix | None,
+    K: Matrix,
+    rigid: FloatArray,
+    motions: Callable[[], FloatArray] | None = None,
+) -> NormalForm:
     """Return poles and shapes of a second-order model, rigid-body motions deflated.
 
     Parameters
@@ -67,6 +100,8 @@ def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> No
         Symmetric; M positive definite; D None for no damping.
     rigid : (n, r) array
         Independent vectors with ``K rigid = 0`` (up to rounding); (n, 0) for a held structure.
+    motions : function, optional
+        Gives the M-orthonormal rigid-body motions (n, m), held or not: K may be negative for them.
 
     Returns
     -------
@@ -76,8 +111,8 @@ def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> No
     Raises
     ------
     ModelError
-        When M is not positive definite, an elastic mode has no stiffness or is overdamped, or D
-        drags a rigid-body motion.
+        When M is not positive definite, an elastic mode has no stiffness or a negative one or is
+        overdamped, or D drags a rigid-body motion.
     SolverError
         When the eigenvalues found fail their check.
 
@@ -86,7 +121,7 @@ def normal_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> No
     Eigenvalues of (K, M) alone give rigid-body modes at rounding, some of them imaginary; here
     they are taken out of the problem first. Rigid-body modes are undamped by convention.
     """
-    real = real_form(M, D, K, rigid)
+    real = real_form(M, D, K, rigid, motions)
     if D is not None:
         check_drag(real.phi[:, : real.n_rigid], dense(D), real.omega[real.n_rigid :])
     return modal(real)
@@ -97,13 +132,15 @@ def modal(real: RealForm) -> NormalForm:
     r, rate = real.n_rigid, np.diag(real.C)[real.n_rigid :]
     zero, omega = np.zeros(r, dtype=np.complex128), real.omega[r:]
     if real.is_proportional:
-        root = omega**2 - 0.25 * rate**2
-        _check_oscillating(root > 0, omega)
-        poles = -0.5 * rate + 1j * np.sqrt(np.maximum(root, 0.0))
-        return NormalForm(np.concatenate([zero, poles]), real.phi, r)
-    poles, mix = _complex_modes(omega, real.C[r:, r:])
+        root = signed_square(omega) - 0.25 * rate**2
+        _check_oscillating((root > 0) | (omega < 0), omega)
+        swing = np.sqrt(np.abs(root))
+        poles = -0.5 * rate + np.where(omega < 0, 1.0, 1j) * swing
+        decaying = (-0.5 * rate - swing)[omega < 0]
+        return NormalForm(np.concatenate([zero, poles]), real.phi, r, decaying)
+    poles, decaying, mix = _complex_modes(omega, real.C[r:, r:])
     shapes = np.hstack([real.phi[:, :r], real.phi[:, r:] @ mix])
-    return NormalForm(np.concatenate([zero, poles]), shapes, r)
+    return NormalForm(np.concatenate([zero, poles]), shapes, r, decaying)
 
 
 class RealForm(NamedTuple):
@@ -137,8 +174,7 @@ class RealForm(NamedTuple):
     @property
     def drags(self) -> bool:
         """Whether D damps rigid-body motion more than the convention lets pass."""
-        first = self.omega[self.n_rigid] if self.omega.size > self.n_rigid else 0.0
-        return bool(self.drag > RIGID_DRAG * first)
+        return bool(self.drag > RIGID_DRAG * _first(self.omega))
 
     @property
     def drag(self) -> float:
@@ -154,19 +190,26 @@ class RealForm(NamedTuple):
         coalesce or one becomes critically damped.
         """
         r = self.n_rigid
-        mix = np.linalg.lstsq(self.phi[:, r:], form.phi[:, r:], rcond=None)[0]
-        poles = form.poles[r:]
+        swing = slice(r + form.decaying.size, None)  # real pairs +-s are always apart
+        mix = np.linalg.lstsq(self.phi[:, r:], form.phi[:, swing], rcond=None)[0]
+        poles = form.poles[swing]
         size = np.linalg.norm(self.omega[r:, None] * mix, axis=0) ** 2
         size += np.abs(poles) ** 2 * np.linalg.norm(mix, axis=0) ** 2
         return float((size / (2.0 * np.abs(poles) * poles.imag)).max(initial=1.0))
 
 
-def real_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> RealForm:
+def real_form(
+    M: Matrix,
+    D: Matrix | None,
+    K: Matrix,
+    rigid: FloatArray,
+    motions: Callable[[], FloatArray] | None = None,
+) -> RealForm:
     """Return a second-order model in its undamped modes, whatever its damping.
 
     Parameters
     ----------
-    M, D, K, rigid
+    M, D, K, rigid, motions
         As in `normal_form`.
 
     Returns
@@ -176,11 +219,11 @@ def real_form(M: Matrix, D: Matrix | None, K: Matrix, rigid: FloatArray) -> Real
     Raises
     ------
     ModelError
-        When M is not positive definite or an elastic mode has no stiffness.
+        When M is not positive definite, or an elastic mode has no stiffness or a negative one.
     """
     M, K = dense(M), dense(K)
     rigid = orthonormalised(M, real_array(rigid, "rigid", (M.shape[0], None)))
-    omega, phi = elastic_modes(M, K, rigid)
+    omega, phi = elastic_modes(M, K, rigid, motions=motions)
     phi = np.hstack([rigid, phi])
     omega = np.concatenate([np.zeros(rigid.shape[1]), omega])
     C = np.zeros((omega.size, omega.size)) if D is None else phi.T @ dense(D) @ phi
@@ -191,14 +234,20 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
     """Raise ModelError when D damps rigid-body motion too much to leave it at 0."""
     if not rigid.shape[1] or not omega.size:
         return
-    drag = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max())
-    if drag > RIGID_DRAG * omega[0]:
+    drag, first = float(np.abs(rigid.T @ np.asarray(D @ rigid)).max()), _first(omega)
+    if drag > RIGID_DRAG * first:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {RIGID_DRAG:g} of the first "
-            f"elastic frequency ({omega[0]:.4g} rad/s): dampers to ground, and those between "
+            f"elastic frequency ({first:.4g} rad/s): dampers to ground, and those between "
             f"places that a rigid rotation moves apart, leave no modes at 0. {_PLANT} Else let the "
             "damper act along the line between its ends, or close it as a loop."
         )
+
+
+def _first(omega: FloatArray) -> float:
+    """Return the lowest frequency above 0, or 0."""
+    above = omega[omega > 0]
+    return float(above[0]) if above.size else 0.0
 
 
 def _check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) -> None:
@@ -211,49 +260,78 @@ def _check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) -
         )
 
 
-def _complex_modes(omega: FloatArray, C: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-    """Return the poles (k,) and mixes (k, k) of ``p'' + C p' + Omega^2 p = 0``."""
-    k = omega.size
-    # states (Omega p, p'): all entries are rates, nothing to balance
-    A = np.block([[np.zeros((k, k)), np.diag(omega)], [-np.diag(omega), -C]])
+def _complex_modes(
+    omega: FloatArray, C: FloatArray
+) -> tuple[ComplexArray, FloatArray, ComplexArray]:
+    """Return poles (k,), decaying poles (u,) and mixes (k, k) of ``p'' + C p' + Omega^2 p = 0``.
+
+    The u unstable pairs come first, in the form of `NormalForm`.
+    """
+    k, size = omega.size, np.abs(omega)
+    # states (|Omega| p, p'): all entries are rates, nothing to balance
+    A = np.block([[np.zeros((k, k)), np.diag(size)], [-np.diag(omega), -C]])
     values, vectors = la.eig(A)
-    upper = np.flatnonzero(values.imag > 1e-9 * np.abs(values))
-    if upper.size < k:
-        real = np.abs(values.imag) <= 1e-9 * np.abs(values)
+    real = np.abs(values.imag) <= 1e-9 * np.abs(values)
+    upper = np.flatnonzero((values.imag > 0) & ~real)
+    up, down = np.flatnonzero(real & (values.real > 0)), np.flatnonzero(real & (values.real < 0))
+    u = int(np.count_nonzero(omega < 0))
+    if upper.size < k - u:
         share = np.sum(np.abs(vectors[:, real]) ** 2, axis=1)
-        _check_oscillating(np.arange(k) != np.argmax(share[:k] + share[k:]), omega)
-    upper = upper[np.argsort(np.abs(values[upper]), kind="stable")]
-    poles, mix = values[upper], vectors[k:, upper] / values[upper]
+        share = np.where(omega > 0, share[:k] + share[k:], -1.0)
+        _check_oscillating(np.arange(k) != np.argmax(share), omega)
+    # growing and decaying, the fastest first as in `elastic_modes`, then oscillating
+    size_of = np.abs(values)
+    up, down = (part[np.argsort(-size_of[part], kind="stable")] for part in (up, down))
+    upper = upper[np.argsort(size_of[upper], kind="stable")]
+    listed = np.concatenate([up, down, upper])
+    poles, mix = values[listed], vectors[k:, listed] / values[listed]
+    poles[: 2 * u] = poles[: 2 * u].real
     mix = mix / np.linalg.norm(mix, axis=0)
+    # what x^T (2 lambda + C) x is made: s1 - s2, s2 - s1 and 2 i Im(lambda)
+    apart = poles[:u].real - poles[u : 2 * u].real
+    scale = np.concatenate([apart, -apart, 2j * poles[2 * u :].imag])
     start = 0
-    for i in range(1, k + 1):
-        if i == k or abs(poles[i] - poles[i - 1]) > _CLUSTER * abs(poles[i]):
+    for i in range(1, listed.size + 1):
+        if i == listed.size or abs(poles[i] - poles[i - 1]) > _CLUSTER * abs(poles[i]):
             cluster = slice(start, i)
-            mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C)
+            mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C, scale[cluster])
             start = i
-    mix = _polished(poles, mix, C)
-    residual = mix * poles**2 + (C @ mix) * poles + omega[:, None] ** 2 * mix
+    mix = _polished(poles, mix, C, scale)
+    residual = mix * poles**2 + (C @ mix) * poles + signed_square(omega)[:, None] * mix
     worst = float(
         (np.linalg.norm(residual, axis=0) / np.linalg.norm(mix, axis=0) / np.abs(poles)).max()
-        / omega.max()
+        / size.max()
     )
     if not worst < 1e-10:
         raise SolverError(
             f"complex modes leave a relative residual of {worst:.2g} (limit 1e-10): the damping is "
             f"close to critical for two modes at once. {_PLANT} Else change D, or lower it."
         )
-    return poles, mix
+    if not u:
+        return poles, np.zeros(0), mix
+    if np.abs(mix[:, : 2 * u].imag).max() > 1e-9 * np.abs(mix[:, : 2 * u]).max():
+        raise SolverError(
+            f"the real poles of an unstable mode cannot be paired: damping and negative stiffness "
+            f"mix them with other motions. {_PLANT} Else lower the damping."
+        )
+    grow, decay = mix[:, :u].real, mix[:, u : 2 * u].real
+    decay = decay * np.where(np.sum(grow * decay, axis=0) < 0, -1.0, 1.0)
+    pairs = 0.5 * (grow + decay) + 0.5j * (grow - decay)
+    kept = np.concatenate([np.arange(u), np.arange(2 * u, poles.size)])
+    return poles[kept], poles[u : 2 * u].real, np.hstack([pairs, mix[:, 2 * u :]])
 
 
-def _normalised(poles: ComplexArray, mix: ComplexArray, C: FloatArray) -> ComplexArray:
-    """Return the shapes of one (nearly) repeated pole with ``x^T (2 lambda + C) x = 2i Im``."""
-    mean = poles.mean()
+def _normalised(
+    poles: ComplexArray, mix: ComplexArray, C: FloatArray, scale: ComplexArray
+) -> ComplexArray:
+    """Return the shapes of one (nearly) repeated pole with ``x^T (2 lambda + C) x = scale``."""
+    mean, goal = poles.mean(), scale.mean()
     gram = mix.T @ (2 * mean * mix + C @ mix)
     if poles.size == 1:
-        mix = mix * np.sqrt(2j * mean.imag / gram[0, 0])
+        mix = mix * np.sqrt(goal / gram[0, 0])
     else:
         try:
-            mix = mix @ la.inv(la.sqrtm(gram / (2j * mean.imag)))
+            mix = mix @ la.inv(la.sqrtm(gram / goal))
         except la.LinAlgError:
             raise SolverError(
                 f"the repeated pole {mean:.6g} rad/s has no complete set of shapes: two modes "
@@ -263,15 +341,18 @@ def _normalised(poles: ComplexArray, mix: ComplexArray, C: FloatArray) -> Comple
     return mix * np.where(mix[top, np.arange(poles.size)].real < 0, -1.0, 1.0)
 
 
-def _polished(poles: ComplexArray, mix: ComplexArray, C: FloatArray) -> ComplexArray:
+def _polished(
+    poles: ComplexArray, mix: ComplexArray, C: FloatArray, scale: ComplexArray
+) -> ComplexArray:
     """Return shapes with ``x_i^T (lambda_i + lambda_j + C) x_j = 0``, by one Newton step.
 
     Rounding mixes the shapes of slow modes that are close by far more than their own size: by that
     of the fastest mode over their distance.
     """
-    unit = mix / np.sqrt(2j * poles.imag)
+    root = np.sqrt(scale)
+    unit = mix / root
     gram = (unit.T @ unit) * np.add.outer(poles, poles) + unit.T @ (C @ unit)
     off = gram - np.eye(poles.size)
     if not np.abs(off).max() < _MIXED:
         return mix
-    return np.asarray((unit - 0.5 * unit @ off) * np.sqrt(2j * poles.imag))
+    return np.asarray((unit - 0.5 * unit @ off) * root)

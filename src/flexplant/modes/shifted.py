@@ -14,6 +14,7 @@ from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
 from ..structure.model import FEModel
+from ..structure.negative_stiffness import unstable_stiffness
 from ..values import FloatArray
 
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
@@ -49,6 +50,8 @@ class StiffnessFactor:
         self.rigid = model.rigid_body
         # of motions, not of single DOFs: next to no inertia in some of these says nothing
         self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
+        if model.n_unstable:  # below the lowest eigenvalue
+            self.sigma += 2.0 * float(unstable_stiffness(self.K, model.body_motions)[0])
         shifted = sp.csc_array(self.K - self.sigma * self.M)
         self.dissection = dissection_of(model)
         try:
@@ -63,7 +66,7 @@ class StiffnessFactor:
                 raise
             raise ModelError(
                 f"K has {negative} negative eigenvalue{'s' * (negative != 1)}: the structure is "
-                "unstable. Look for a sign in K."
+                "unstable, and not as a rigid body. Look for a sign in K."
             ) from error
 
     def __repr__(self) -> str:

@@ -15,6 +15,7 @@ from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import absolute, rounding_of
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.eigen import elastic_modes, signed
+from ..structure.negative_stiffness import signed_root, signed_square
 from ..values import FloatArray, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
@@ -69,13 +70,14 @@ def solve_modes(
         Complex where the model's own D is not proportional. Checked: residuals,
         M-orthonormality, and that no mode was left out. Each undamped frequency is right to 1e-8
         of itself or to its own `rounding`, whichever is larger: soft suspensions beside stiff
-        elements, fine meshes and stiff grounding springs included.
+        elements, fine meshes and stiff grounding springs included. Springs of negative stiffness
+        give unstable modes, with negative frequencies (see `Modes`).
 
     Raises
     ------
     ModelError
-        When the request does not fit the model, K is indefinite, or it has a zero-energy motion
-        that is not a rigid-body one.
+        When the request does not fit the model, K is indefinite for other motions than those of a
+        rigid body, or it has a zero-energy motion that is not a rigid-body one.
     SolverError
         When the answer fails its check.
     LabelError
@@ -109,6 +111,12 @@ def solve_modes(
         )
     kept, top = _asked(model, count, below)
     at = places(compliance_at)
+    if at and model.n_unstable:
+        raise ModelError(
+            "compliance_at needs a structure that is free or held: the static response on springs "
+            "of negative stiffness is no measure of what modes leave out. Solve the free structure "
+            "with compliance_at, then suspend(modes, springs)."
+        )
     names = labels_of(at, model.dofs)
     # one factor for the modes and for the attachment vectors, while it is held here
     held = stiffness_factor(model, factor) if at and _is_large(model) else None
@@ -192,13 +200,20 @@ def _undamped(
         count = min(count, max(modes_below(model, top), r))
     small = n <= DENSE_LIMIT or (n <= _DENSE_MANY and _MANY * count > n)
     if small or not sp.issparse(model.K) or not sp.issparse(model.M):
-        omega, phi = elastic_modes(dense(model.M), dense(model.K), rigid, count - r, model.dofs)
+        omega, phi = elastic_modes(
+            dense(model.M),
+            dense(model.K),
+            rigid,
+            count - r,
+            model.dofs,
+            motions=lambda: model.body_motions,
+        )
     elif count > r:
         squares, phi, certificate = counted_modes(model, count - r, top, method)
-        omega, phi = np.sqrt(squares), signed(phi) if squares.size else phi
+        omega, phi = signed_root(squares), signed(phi) if squares.size else phi
     else:
         omega, phi = np.zeros(0), np.zeros((n, 0))
-    keep = omega**2 <= top
+    keep = signed_square(omega) <= top
     return (
         np.concatenate([np.zeros(r), omega[keep]]),
         np.hstack([rigid, phi[:, keep]]),
@@ -220,7 +235,7 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[float, F
             "conditioned. Look for DOFs with next to no mass."
         )
     force = by_rows(model.K) @ phi
-    residual = force - mass * omega**2
+    residual = force - mass * signed_square(omega)
     # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more
     stiff = diagonal(model.K)
     weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
@@ -236,14 +251,14 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[float, F
             f"mode {i + 1} at {omega[i] / (2 * np.pi):.5g} Hz leaves a residual of {size[i]:.2g} "
             f"(limit {limit[i]:.2g}) in the eigenvalue problem: not a mode of this model."
         )
-    elastic = omega > 0
+    elastic = omega != 0
     scale = np.where(elastic, np.linalg.norm(force, axis=0), 1.0)
     return error, np.where(elastic, np.linalg.norm(residual, axis=0), 0.0) / scale
 
 
 def _rounding(model: FEModel, omega: FloatArray, phi: FloatArray) -> FloatArray:
     """Return the relative error of each frequency that rounding of K's entries may make."""
-    elastic = omega > 0
+    elastic = omega != 0
     found = np.zeros(omega.size)
     found[elastic] = rounding_of(model.K, phi[:, elastic]) / (2 * omega[elastic] ** 2)
     return found
@@ -282,9 +297,7 @@ def _complex_modes(model: FEModel, count: int, top: float, names: tuple[str, ...
             "the model's D is not proportional: its modes are complex and take no attachment "
             "vectors. Pass damping=ModalDamping(...) in place of D, or leave out compliance_at."
         )
-    form = normal_form(model.M, model.D, model.K, model.rigid_body)
-    size = np.abs(form.poles)
-    keep = np.flatnonzero(size**2 <= top)[:count]
-    zeta = np.zeros(keep.size)
-    zeta[form.n_rigid :] = -form.poles[keep].real[form.n_rigid :] / size[keep][form.n_rigid :]
-    return Modes(size[keep], zeta, form.phi[:, keep], model.dofs, n_rigid=form.n_rigid)
+    form = normal_form(model.M, model.D, model.K, model.rigid_body, lambda: model.body_motions)
+    omega = form.omega
+    keep = np.flatnonzero(signed_square(omega) <= top)[:count]
+    return Modes(omega[keep], form.zeta[keep], form.phi[:, keep], model.dofs, n_rigid=form.n_rigid)

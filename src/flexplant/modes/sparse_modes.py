@@ -13,6 +13,7 @@ from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import absolute, rayleigh_ritz, rounding_of
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
+from ..structure.negative_stiffness import are_rigid
 from ..values import FloatArray, Rng
 from .lanczos import FOUND, BlockLanczos
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
@@ -23,8 +24,6 @@ _EXTRA = 4
 _GAP, _GAP_ROUNDINGS = 1e-8, 4.0
 #: more modes than this are not looked for: their shapes and the basis fill the memory
 _MOST = 2000
-#: part of a shape that may be no rigid-body motion when springs alone hold it
-_BENT = 0.1
 #: searches with what is found locked, before giving up
 _SEARCHES = 8
 #: residuals, relative to ||K phi||, beyond which Lanczos goes on, unless they are rounding
@@ -98,8 +97,9 @@ def _counted(
         squares, phi = rayleigh_ritz(model.K, model.M, np.hstack([phi, more]))
         rounding = rounding_of(model.K, phi)
         # a motion of the geometry that is not free has springs, which rounding does not hide
-        least = np.where(_suspended(model, phi), 0.0, rounding)
-        check_stiffness(squares, phi, least, model.rigid_body, model.dofs)
+        suspended = are_rigid(model.M, model.body_motions, phi)
+        least = np.where(suspended, 0.0, rounding)
+        check_stiffness(squares, phi, least, model.rigid_body, model.dofs, suspended)
         # the count needs the memory
         factor, more = None, np.zeros((n, 0))
         if below == count and _apart(squares, count, top, rounding):
@@ -121,12 +121,6 @@ def _counted(
         f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count finds {counted + r} modes, "
         f"{sure + r} were found: closely repeated frequencies. Request some more or fewer modes."
     )
-
-
-def _suspended(model: FEModel, phi: FloatArray) -> Any:
-    """Return which shapes (k,) are rigid-body motions, which soft springs hold."""
-    part = model.body_motions.T @ (by_rows(model.M) @ phi)
-    return 1 - np.sum(part**2, axis=0) < _BENT**2
 
 
 def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:

@@ -66,6 +66,12 @@ class AssumptionReport(Value):
         lines += _lines(self.assumptions)
         if self.plant.form.startswith("dense"):
             lines.append(f"  note the plant is {self.plant.form}")
+        if self.plant.unstable_modes:
+            listed = ", ".join(self.plant.unstable_modes.values())
+            lines.append(
+                f"  note negative stiffness makes rigid-body motion unstable: {listed}; only a "
+                "controller holds it"
+            )
         weak = [text for mode in self.modes for text in mode.weak]
         lines += [f"  note {text}" for text in weak[:4]]
         if len(weak) > 4:

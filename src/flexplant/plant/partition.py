@@ -64,6 +64,9 @@ class Partition(Value):
             lines.append(f"  latencies that act once it is sampled: {shown}")
         if self.form.startswith("dense"):
             lines.append(f"  {self.form}")
+        if self.unstable_modes:
+            listed = ", ".join(self.unstable_modes.values())
+            lines.append(f"  unstable rigid-body pairs: {listed}")
         return "\n".join(lines)
 
     @classmethod
@@ -221,6 +224,15 @@ class Partition(Value):
     def modal_blocks(self) -> FloatArray:
         """The (b, 2, 2) blocks of the structure's modes [rad/s], before sampling; none without."""
         return self.assembled.realisation.pairs if self.is_assembled else np.zeros((0, 2, 2))
+
+    @property
+    def unstable_modes(self) -> dict[int, str]:
+        """Modes (counted from 1) that negative stiffness makes unstable, with their two poles."""
+        found = {}
+        for i in np.flatnonzero(np.linalg.det(self.modal_blocks) < 0).tolist():
+            low, high = np.sort(np.linalg.eigvals(self.modal_blocks[i]).real)
+            found[i + 1] = f"mode {i + 1} ({high:+.4g} and {low:+.4g} 1/s)"
+        return found
 
     @property
     def modal_states(self) -> IntArray:

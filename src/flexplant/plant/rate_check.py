@@ -80,7 +80,8 @@ def _meant(rate: float, lowest: float) -> str:
 def _elastic(plant: Any) -> FloatArray:
     """Return the frequencies [Hz] of the elastic modes of a plant."""
     if plant.is_assembled:
-        poles = [block_eigenvalues(block, (2,)) for block in plant.modal_blocks]
+        held = plant.modal_blocks[np.linalg.det(plant.modal_blocks) >= 0]
+        poles = [block_eigenvalues(block, (2,)) for block in held]
         size = np.array([float(np.sqrt(np.abs(p[0] * p[1]))) for p in poles])
     else:
         found = plant.system.poles()

@@ -57,9 +57,11 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
             text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
         else:
-            count = sum(pole.left.shape[1] for pole in poles) - rigid
+            pairs = len(bare.unstable_modes)
+            count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
             words = [f"all {rigid} rigid-body modes"] if rigid else []
-            words += [f"{count} other poles that are not stable"] if count else []
+            words += [f"{pairs} unstable rigid-body pair{'s' * (pairs != 1)}"] if pairs else []
+            words += [f"{count} other poles that are not stable"] if count > 0 else []
             text = f"{' and '.join(words)}, by {len(case.names)} channels."
             found.append(
                 Assumption(case.key, True, text if words else "every mode decays by itself.")
@@ -138,7 +140,8 @@ def _lacks(plant: Partition, pole: _Pole, case: _Case) -> list[str]:
     if rigid.size:
         shapes = (basis @ missing)[rigid].real
         return [f"{case.verb} the rigid-body {' and '.join(_described(plant, shapes))}"]
-    return [f"{case.verb} {_named(plant, pole.value)}, which does not decay"]
+    fate = "grows" if pole.value.real > 0 and not pole.value.imag else "does not decay"
+    return [f"{case.verb} {_named(plant, pole.value)}, which {fate}"]
 
 
 def _part(rows: FloatArray, basis: ComplexArray) -> ComplexArray:
@@ -153,6 +156,8 @@ def _named(plant: Partition, pole: complex) -> str:
     if plant.modal_blocks.size:
         own = np.linalg.eigvals(plant.modal_blocks)
         off = np.abs(own - pole).min(axis=1)
+        if off.min() < 1e-6 * abs(pole) and int(np.argmin(off)) + 1 in plant.unstable_modes:
+            return f"the unstable rigid-body {plant.unstable_modes[int(np.argmin(off)) + 1]}"
         if off.min() < 1e-6 * abs(pole):
             return f"mode {int(np.argmin(off)) + 1} ({abs(pole) / (2 * np.pi):.4g} Hz)"
     return f"the pole {pole:.4g}"

@@ -11,9 +11,11 @@ from ..errors import ModelError, SolverError
 from ..labels import Place
 from ..lti.discretisation import block_diagonal
 from ..modes import Modes, NormalForm
+from ..modes.modes import pole_pairs
 from ..modes.normal_form import PROPORTIONAL, RealForm, modal, real_form
 from ..reduction import ReducedModel
 from ..structure import FEModel
+from ..structure.negative_stiffness import signed_square
 from ..structure.placed import Structure as Structure
 from ..values import ComplexArray, FloatArray, Value
 
@@ -142,7 +144,7 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
         return model
     if isinstance(model, Modes):
         if np.iscomplexobj(model.phi):
-            return _complex(model, model.poles, np.asarray(model.phi), model.n_rigid)
+            return _complex(model, model.omega, model.zeta, np.asarray(model.phi), model.n_rigid)
         return _real(
             model,
             model.basis_omega,
@@ -159,7 +161,10 @@ def realised(model: Structure | ModalRealisation) -> ModalRealisation:
             )
         if isinstance(model, ReducedModel) and model.massless.size:
             return _at_once(model)
-        return _of_matrices(model, real_form(model.M, model.D, model.K, model.rigid_body))
+        return _of_matrices(
+            model,
+            real_form(model.M, model.D, model.K, model.rigid_body, lambda: model.body_motions),
+        )
     raise ModelError(
         f"a plant is assembled from an FEModel, Modes or ReducedModel, got {type(model).__name__}. "
         "A state-space model made elsewhere comes in through StandardPlant.from_statespace."
@@ -193,7 +198,7 @@ def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisat
         return _dense(model, real, why)
     if real.is_proportional:
         zeta = np.zeros_like(omega)
-        zeta[r:] = 0.5 * np.diag(real.C)[r:] / omega[r:]
+        zeta[r:] = 0.5 * np.diag(real.C)[r:] / np.abs(omega[r:])
         return _real(model, omega, zeta, real.phi, r, omega.size)
     # rigid-body motions are undamped by convention, in both forms alike
     C = real.C.copy()
@@ -207,7 +212,7 @@ def _of_matrices(model: FEModel | ReducedModel, real: RealForm) -> ModalRealisat
         return _dense(model, real, f"two poles coalesce {_where(real)}")
     if real.condition(form) > ILL_CONDITIONED:
         return _dense(model, real, f"two poles nearly coalesce {_where(real)}")
-    return _complex(model, form.poles, np.asarray(form.phi), r)
+    return _complex(model, form.omega, form.zeta, np.asarray(form.phi), r)
 
 
 def _where(real: RealForm, *, overdamped: bool = False) -> str:
@@ -215,7 +220,7 @@ def _where(real: RealForm, *, overdamped: bool = False) -> str:
     r = real.n_rigid
     omega, C = real.omega[r:], real.C[r:, r:]
     k = omega.size
-    A = np.block([[np.zeros((k, k)), np.diag(omega)], [-np.diag(omega), -C]])
+    A = np.block([[np.zeros((k, k)), np.diag(np.abs(omega))], [-np.diag(omega), -C]])
     values, left, right = la.eig(A, left=True)
     overlap = np.abs(np.sum(left.conj() * right, axis=0))
     if overdamped:
@@ -257,14 +262,17 @@ def _turned(drag: FloatArray, size: float) -> tuple[int, FloatArray]:
 def _real(
     model: Structure, omega: FloatArray, zeta: FloatArray, phi: FloatArray, rigid: int, modes: int
 ) -> ModalRealisation:
-    """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes."""
+    """Equation (5): states (omega q, dq/dt) of each mode; residual vectors are fast modes.
+
+    An unstable mode has the block ``[[0, |omega|], [|omega|, -2 zeta |omega|]]``.
+    """
     n, b = phi.shape
-    elastic = omega[rigid:]
-    scale = np.where(omega > 0, omega, elastic.min() if elastic.size else 1.0)
+    size = np.abs(omega)
+    scale = np.where(size > 0, size, size[rigid:].min(initial=np.inf) if size[rigid:].size else 1.0)
     pairs = np.zeros((b, 2, 2))
     pairs[:, 0, 1] = scale
-    pairs[:, 1, 0] = -(omega**2) / scale
-    pairs[:, 1, 1] = -2.0 * zeta * omega
+    pairs[:, 1, 0] = -signed_square(omega) / scale
+    pairs[:, 1, 1] = -2.0 * zeta * size
     inputs, outputs = np.zeros((n, b, 2)), np.zeros((n, b, 2))
     inputs[:, :, 1] = phi
     outputs[:, :, 0] = phi / scale
@@ -279,34 +287,62 @@ def _real(
 
 
 def _complex(
-    model: Structure, poles: ComplexArray, phi: ComplexArray, rigid: int
+    model: Structure, omega: FloatArray, zeta: FloatArray, phi: ComplexArray, rigid: int
 ) -> ModalRealisation:
     """Real 2 x 2 blocks [[s, w], [-w, s]] of complex modes lambda = s + i w.
 
     With ``phi' (2 lambda M + D) phi = 2 i w`` the displacement per force is the sum of
     ``phi phi' / (2 i w (s - lambda))`` and its conjugate; the states are scaled like those of a
-    real mode (omega q, dq/dt).
+    real mode (omega q, dq/dt). Rigid-body and unstable modes are blocks of real form.
     """
-    real = _real(model, np.zeros(rigid), np.zeros(rigid), phi[:, :rigid].real, rigid, rigid)
-    n, elastic = phi.shape[0], poles[rigid:]
-    omega, swing = np.abs(elastic), elastic.imag
-    first = float(omega.min()) if omega.size else 1.0
+    n, start = phi.shape[0], int(np.count_nonzero(omega <= 0))
+    elastic = pole_pairs(omega, zeta)[0][start:]
+    swing, size = elastic.imag, omega[start:]
+    first = float(np.abs(omega[rigid:]).min()) if omega.size > rigid else 1.0
+    real = _real(
+        model, np.append(omega[:start], first), np.append(zeta[:start], 0.0),
+        np.column_stack([phi[:, :start].real, np.zeros(n)]), rigid, start,
+    )  # fmt: skip
     pairs = np.zeros((elastic.size, 2, 2))
     pairs[:, 0, 0] = pairs[:, 1, 1] = elastic.real
     pairs[:, 0, 1], pairs[:, 1, 0] = swing, -swing
-    driven = -1j * phi[:, rigid:] * (omega / swing)
+    driven = -1j * phi[:, start:] * (size / swing)
     inputs = np.stack([driven.real, -driven.imag], axis=2)
-    outputs = np.stack([phi[:, rigid:].real, phi[:, rigid:].imag], axis=2) / omega[:, None]
-    rigid_pairs = real.pairs * first
-    rigid_outputs = real.outputs / first
-    return ModalRealisation(
+    outputs = np.stack([phi[:, start:].real, phi[:, start:].imag], axis=2) / size[:, None]
+    found = ModalRealisation(
         model,
-        np.concatenate([rigid_pairs, pairs]),
-        np.hstack([real.inputs, inputs.reshape(n, -1)]),
-        np.hstack([rigid_outputs, outputs.reshape(n, -1)]),
-        _state_names(poles.size, poles.size),
+        np.concatenate([real.pairs[:start], pairs]),
+        np.hstack([real.inputs[:, : 2 * start], inputs.reshape(n, -1)]),
+        np.hstack([real.outputs[:, : 2 * start], outputs.reshape(n, -1)]),
+        _state_names(omega.size, omega.size),
         rigid,
     )
+    return _with_two_shapes(found, omega, zeta, phi, slice(rigid, start))
+
+
+def _with_two_shapes(
+    found: ModalRealisation,
+    omega: FloatArray,
+    zeta: FloatArray,
+    phi: ComplexArray,
+    unstable: slice,
+) -> ModalRealisation:
+    """Return a realisation whose unstable blocks have a shape for each of their poles.
+
+    ``v1 v1' / ((s1 - s2) (s - s1)) - v2 v2' / ((s1 - s2) (s - s2))`` is the displacement per force;
+    the states (|omega| q, dq/dt) of a block are ``[[|omega|, |omega|], [s1, s2]]`` times those of
+    its two poles.
+    """
+    n = phi.shape[0]
+    inputs, outputs = found.inputs.reshape(n, -1, 2).copy(), found.outputs.reshape(n, -1, 2).copy()
+    grow, decay = (part.real for part in pole_pairs(omega, zeta))
+    for i in range(unstable.start, unstable.stop):
+        s1, s2 = grow[i], decay[i]
+        both = np.column_stack([phi[:, i].real + phi[:, i].imag, phi[:, i].real - phi[:, i].imag])
+        mix = np.array([[-omega[i], -omega[i]], [s1, s2]])
+        inputs[:, i] = (both * np.array([1.0, -1.0]) / (s1 - s2)) @ mix.T
+        outputs[:, i] = both @ np.linalg.inv(mix)
+    return found.replace(inputs=inputs.reshape(n, -1), outputs=outputs.reshape(n, -1))
 
 
 def _state_names(blocks: int, modes: int) -> tuple[str, ...]:

@@ -75,7 +75,9 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     plant = plant.continuous
     if not plant.is_assembled:
         return ()
-    g, n_rigid, count = plant.system, plant.n_rigid, plant.assembled.realisation.n_modes
+    # rigid-body modes and unstable ones come first
+    g, count = plant.system, plant.assembled.realisation.n_modes
+    n_rigid = plant.n_rigid + len(plant.unstable_modes)
     pairs = plant.modal_blocks[n_rigid:count]
     omega = np.sqrt(np.abs(np.linalg.det(pairs)))
     zeta = -0.5 * np.trace(pairs, axis1=1, axis2=2) / omega

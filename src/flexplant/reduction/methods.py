@@ -12,6 +12,7 @@ from ..errors import FlexplantError, ModelError, ShapeError
 from ..labels import DofSet
 from ..modes.modes import Modes
 from ..structure import FEModel
+from ..structure.negative_stiffness import refuse_unstable
 from ..values import FloatArray, Value
 from .criteria import PivotedQr
 from .projection import labels_given, shown
@@ -95,11 +96,10 @@ class DesiredDofs(ReductionMethod):
         condition = refused_partition(modes.dofs, basis, labels, what, _CONDITION_LIMIT)
         partition = basis[modes.dofs.indices(labels)]
         inverse = la.inv(partition)
-        omega, zeta = modes.basis_omega, modes.basis_zeta
         return ReducedModel(
             M=inverse.T @ inverse,
-            D=(inverse.T * (2 * zeta * omega)) @ inverse,
-            K=(inverse.T * omega**2) @ inverse,
+            D=(inverse.T * modes.basis_rates) @ inverse,
+            K=(inverse.T * modes.basis_squares) @ inverse,
             T=la.solve(partition.T, basis.T).T,
             dofs=modes.dofs.select(labels),
             full_dofs=modes.dofs,
@@ -204,4 +204,6 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
             f"{type(method).__name__}: reduce(solve_modes(model, count=24), DesiredDofs([...])), "
             "reduce(model, Guyan([...]))."
         )
+    if not isinstance(method, DesiredDofs):
+        refuse_unstable(model, f"reduction by {type(method).__name__}")
     return method.reduced(model)

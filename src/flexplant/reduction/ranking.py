@@ -14,6 +14,7 @@ from ..lti.hankel import hankel_values
 from ..lti.statespace import StateSpace
 from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
+from ..structure.negative_stiffness import refuse_unstable
 from ..values import FloatArray, IntArray, Value, name_list, real_array
 
 
@@ -141,6 +142,7 @@ def rank_modes(
     J. Guidance 7(6), 1984; W. Gawronski, Advanced Structural Dynamics and Active Control of
     Structures, Springer, 2004, chapter 4.
     """
+    refuse_unstable(modes, "a ranking of modes")
     into, out, B, C = channels(modes, inputs, outputs)
     r = modes.n_rigid
     omega, zeta = modes.omega[r:], modes.zeta[r:]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import scipy.linalg as la
@@ -13,12 +14,17 @@ from ..labels import DofSet, Place
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
 from ..structure import FEModel
+from ..structure.negative_stiffness import refuse_unstable, unstable_stiffness
 from ..structure.placed import missed
-from ..structure.rigid import rigid_motions
+from ..structure.rigid import orthonormalised, rigid_motions
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
 from .bounds import ErrorBound
 from .quality import ReductionQuality, quality_of
 
+#: relative: a rigid-body motion that T makes up to this is one of the model's
+_MADE = 1e-3
+#: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
+_DEFINITE = 1e-14
 #: how the names of coordinates begin that hold the static compliance of what was left out
 STATIC = "static "
 
@@ -113,9 +119,10 @@ class ReducedModel(Value):
         left = ""
         if self.truncated is not None:
             left = f", {self.truncated.n_modes} modes left out are known"
+        grows = f", {self.n_unstable} unstable" if self.n_unstable else ""
         return (
             f"<ReducedModel: {shown} by {self.method}, {self.rigid_body.shape[1]} rigid-body "
-            f"motions, cond({self.condition_of}) {self.condition:.3g}{left}>"
+            f"motions{grows}, cond({self.condition_of}) {self.condition:.3g}{left}>"
         )
 
     @property
@@ -127,6 +134,17 @@ class ReducedModel(Value):
     def is_physical(self) -> bool:
         """Whether all coordinates are DOFs of the structure."""
         return len(self.dofs) == self.n_dof
+
+    @cached_property
+    def n_unstable(self) -> int:
+        """How many rigid-body motions springs of negative stiffness make unstable."""
+        stiff = la.eigvalsh(self.K)
+        if not self.n_dof or stiff[0] > -_DEFINITE * stiff[-1]:
+            return 0
+        motions = self.body_motions
+        if self.rigid_body.shape[1] == motions.shape[1]:
+            return 0
+        return int(unstable_stiffness(self.K, motions).size)
 
     @property
     def massless(self) -> IntArray:
@@ -206,8 +224,8 @@ class ReducedModel(Value):
         omega = more.basis_omega
         return ReducedModel(
             M=la.block_diag(self.M[block], np.eye(omega.size)),
-            D=la.block_diag(self.D[block], np.diag(2 * more.basis_zeta * omega)),
-            K=la.block_diag(self.K[block], np.diag(omega**2)),
+            D=la.block_diag(self.D[block], np.diag(more.basis_rates)),
+            K=la.block_diag(self.K[block], np.diag(more.basis_squares)),
             T=np.hstack([self.T[:, kept], np.real(more.basis)]),
             dofs=self.full_dofs.select(()),
             full_dofs=self.full_dofs,
@@ -237,14 +255,11 @@ class ReducedModel(Value):
             overdamped.
         """
         model, _, _ = self.condensed()
-        form = normal_form(model.M, model.D, model.K, model.rigid_body)
-        omega = np.abs(form.poles)
-        r = form.n_rigid
-        zeta = np.concatenate([np.zeros(r), -form.poles[r:].real / omega[r:]])
+        form = normal_form(model.M, model.D, model.K, model.rigid_body, lambda: model.body_motions)
         phi, dofs = form.phi, model.dofs
         if not self.is_physical:
             phi, dofs = model.expand(phi), model.full_dofs
-        return Modes(omega, zeta, phi, dofs, n_rigid=r)
+        return Modes(form.omega, form.zeta, phi, dofs, n_rigid=form.n_rigid)
 
     def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
         """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
@@ -295,6 +310,12 @@ class ReducedModel(Value):
         full = self.full_dofs
         wanted = rigid_motions(full.replace(xyz=full.xyz - list(about), interpolation=None))
         return missed(self.T @ self.rigid_motions(about), wanted)
+
+    @property
+    def body_motions(self) -> FloatArray:
+        """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
+        made = self.missed_motions() < _MADE
+        return orthonormalised(self.M, self.rigid_motions()[:, made], dependent="drop")
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
@@ -355,6 +376,7 @@ class ReducedModel(Value):
         LabelError
             When a place is unknown.
         """
+        refuse_unstable(self, "a comparison of responses")
         return quality_of(self, full, band, inputs, outputs, count, freq, loss)
 
 

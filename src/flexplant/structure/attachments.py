@@ -82,7 +82,9 @@ class Spring(Value):
     at : str, (3,) array [m] or mapping
         One end.
     stiffness : float [N/m or N m/rad]
-        Not negative.
+        Negative where magnets attract, as in reluctance actuators: the force grows with the
+        displacement. Modes and plants take a negative stiffness that moves the structure as a
+        rigid body; one that bends it is refused when the modes are solved.
     direction : str
         The motion it feels at points: x, y, z, rx, ry, rz. A label carries its own.
     to : place, optional
@@ -90,8 +92,8 @@ class Spring(Value):
 
     Raises
     ------
-    ModelError
-        When the stiffness is negative.
+    ShapeError, ModelError
+        When the stiffness is no finite number.
     """
 
     at: Place
@@ -102,7 +104,7 @@ class Spring(Value):
     def __post_init__(self) -> None:
         self._set(
             at=checked_place(self.at, "a spring"),
-            stiffness=positive(self.stiffness, "stiffness of a spring", zero=True),
+            stiffness=float(real_array(self.stiffness, "stiffness of a spring", ())),
             direction=_checked_direction(self.direction),
             to=None if self.to is None else checked_place(self.to, "a spring"),
         )
@@ -198,6 +200,7 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
     """
     listed = [parts] if isinstance(parts, Part) else list(_iterated(parts))
     rows: dict[str, list[sp.csc_array]] = {}
+    signs: dict[str, list[float]] = {}
     for part in listed:
         if not isinstance(part, Part):
             raise ModelError(
@@ -206,12 +209,13 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
             )
         for name, row, weight in part.added(dofs):
             if weight:
-                scaled = np.sqrt(weight) * row
+                scaled = np.sqrt(abs(weight)) * row
                 rows.setdefault(name, []).append(sp.csc_array(scaled[:, None]))
+                signs.setdefault(name, []).append(float(np.sign(weight)))
     found = {}
     for name, columns in rows.items():
         spread = sp.hstack(columns, format="csc")
-        found[name] = sp.csc_array(spread @ spread.T)
+        found[name] = sp.csc_array(spread @ sp.diags_array(signs[name]) @ spread.T)
     return found
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import scipy.linalg as la
 
@@ -10,6 +12,7 @@ from ..labels import DofSet
 from ..sparse.factor import dense, unit_diagonal
 from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
 from ..values import FloatArray
+from .negative_stiffness import are_rigid, signed_root
 from .zero_energy import beyond, most_moved
 
 #: eigenvalues above this part of the largest one are right to 1e-9 when M is made the identity
@@ -26,8 +29,13 @@ def elastic_modes(
     rigid: FloatArray,
     count: int | None = None,
     dofs: DofSet | None = None,
+    motions: Callable[[], FloatArray] | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return the elastic frequencies (k,) [rad/s] and M-orthonormal shapes (n, k), ascending.
+
+    Where springs of negative stiffness act on a structure that `motions` gives the M-orthonormal
+    rigid-body motions (n, r) of, its unstable modes come first: those are rigid-body motions, and
+    their frequency is ``-sigma`` for the poles +-sigma, ``omega |omega|`` their omega^2.
 
     ``K phi = omega^2 M phi`` is solved in the M-orthogonal complement of the M-orthonormal
     rigid-body motions (n, r), so that these mix with no elastic mode. Each frequency is right to
@@ -42,7 +50,7 @@ def elastic_modes(
     Raises
     ------
     ModelError
-        When M is not positive definite or an elastic mode has no stiffness.
+        When M is not positive definite, an elastic mode has no stiffness, or a negative one.
     """
     n, r = rigid.shape
     kept = n - r if count is None else min(count, n - r)
@@ -78,8 +86,13 @@ def elastic_modes(
     else:
         phi = reach.T @ (elastic @ vectors)
     squares, phi = squares[:kept], phi[:, :kept]
-    check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs)
-    return np.sqrt(squares), signed(phi)
+    unstable = squares < 0
+    if np.any(unstable) and motions is not None:
+        unstable[unstable] = are_rigid(M, motions(), phi[:, unstable])
+    else:
+        unstable[:] = False
+    check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs, unstable)
+    return signed_root(squares), signed(phi)
 
 
 def _improved(
@@ -90,6 +103,7 @@ def _improved(
     values, soft = rayleigh_ritz(K, M, np.ascontiguousarray(phi[:, :end]))
     rounding = float(rounding_of(K, np.hstack([rigid, soft])).max())
     shift = _SHIFT * (rounding or float(np.finfo(np.float64).eps * squares[end]))
+    shift = max(shift, -2.0 * float(values[0]))
     scaled, scale = unit_diagonal(K + shift * M)
     try:
         factor = la.cho_factor(dense(scaled), lower=True)
@@ -119,20 +133,26 @@ def check_stiffness(
     rounding: FloatArray,
     rigid: FloatArray,
     dofs: DofSet | None = None,
+    unstable: np.ndarray | None = None,
 ) -> None:
     """Raise ModelError when an elastic omega^2 (k,) is not above its rounding (k,).
 
+    `unstable` (k,) says which are rigid-body motions on springs of negative stiffness: those may
+    be negative, by more than their rounding.
     The DOFs that the first such motion moves most are named as `check` names those of a mechanism.
     """
-    lost = np.flatnonzero(squares <= rounding)
+    meant = False if unstable is None else unstable & (squares < -rounding)
+    lost = np.flatnonzero((squares <= rounding) & ~np.asarray(meant))
     if not lost.size:
         return
     first, r = lost[0], rigid.shape[1]
     found = f"omega^2 = {squares[first]:.3g} 1/s^2, rounding is about {rounding[first]:.1g}"
     if squares[first] < -10 * rounding[first]:
         raise ModelError(
-            f"an elastic mode has a negative stiffness ({found}): K is indefinite, the structure "
-            "is unstable. Look for a sign in K."
+            f"an elastic mode has a negative stiffness ({found}): K is indefinite, and the motion "
+            "bends the structure. Negative stiffness is taken only where it moves the structure as "
+            "a rigid body, as magnets do. Look for a sign in K, or for springs of negative "
+            "stiffness that are too strong."
         )
     moved = ""
     if dofs is not None:

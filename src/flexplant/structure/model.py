@@ -18,6 +18,7 @@ from ..values import FloatArray, Matrix, Value, frozen, real_array
 from .attachments import HeldShape, Part, added_matrices, sum_of
 from .damping import Damping, ModalDamping, Rayleigh
 from .eigen import elastic_modes
+from .negative_stiffness import unstable_stiffness
 from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
 from .rigid import body_motions, rigid_body_basis
@@ -40,8 +41,9 @@ class FEModel(Placed, Value):
     M : (n, n) array or sparse matrix [kg, kg m, kg m^2]
         Mass: symmetric, positive definite.
     K : (n, n) array or sparse matrix [N/m, N, N m]
-        Stiffness: symmetric, positive semi-definite; singular for a free structure. Double
-        precision: what single precision loses is refused or warned of, and
+        Stiffness: symmetric, positive semi-definite; singular for a free structure, with negative
+        eigenvalues only where they belong to rigid-body motion (magnets). Double precision: what
+        single precision loses is refused or warned of, and
         ``FEMatrices(K, M, dofs=dofs).model(free=True)`` frees what only its rounding holds.
     D : (n, n) array or sparse matrix [N s/m, ...], optional
         Viscous damping: symmetric, positive semi-definite. None: damping is given later, by mode.
@@ -58,7 +60,8 @@ class FEModel(Placed, Value):
     ShapeError
         When the sizes of the matrices and of `dofs` differ.
     ModelError
-        When a matrix is not finite, not symmetric, or M, K, D are not (semi-)definite.
+        When a matrix is not finite, not symmetric, or M, K, D are not (semi-)definite; a K is
+        taken whose negative eigenvalues move the structure as a rigid body.
 
     Warns
     -----
@@ -97,16 +100,17 @@ class FEModel(Placed, Value):
                 f"M is not positive definite: {_lowest(M)}. Some motion would have no inertia, or "
                 "a negative one. Condense massless DOFs out, or look for a sign."
             )
+        self._set(M=M, K=K, D=D)
         try:
             _check_semidefinite(K, "K")
         except ModelError as error:
             held = None if digits is None else held_by_rounding(K, M, self.dofs, digits)
-            raise ModelError(
-                f"{error} {held[0].upper()}{held[1:]}" if held else str(error)
-            ) from None
+            if held:
+                raise ModelError(f"{error} {held[0].upper()}{held[1:]}") from None
+            if not self._has_negative_springs():
+                raise
         if D is not None:
             _check_semidefinite(D, "D")
-        self._set(M=M, K=K, D=D)
         if self.held_inertia is not None:
             self._set(held_inertia=real_array(self.held_inertia, "held_inertia", (n, 6)))
         if digits is not None:
@@ -124,6 +128,8 @@ class FEModel(Placed, Value):
         rigid = f"{r} rigid-body motion{'s' * (r != 1)}" if r else "no rigid-body motions"
         damping = "not given" if self.D is None else "given"
         size = f"{self.n_dof} DOF{'s' * (self.n_dof != 1)}"
+        if self.n_unstable:
+            rigid += f", {self.n_unstable} unstable (negative stiffness)"
         return f"<FEModel{named}: {size}, {kind}, {rigid}, D {damping}>"
 
     @property
@@ -151,6 +157,31 @@ class FEModel(Placed, Value):
         motions = body_motions(self.M, self.K, self.dofs)
         motions.flags.writeable = False
         return motions
+
+    @cached_property
+    def n_unstable(self) -> int:
+        """How many rigid-body motions springs of negative stiffness make unstable."""
+        if self.rigid_body.shape[1] == self.body_motions.shape[1]:
+            return 0
+        return int(unstable_stiffness(self.K, self.body_motions).size)
+
+    def _has_negative_springs(self) -> bool:
+        """Return whether all negative eigenvalues of K belong to rigid-body motion."""
+        count = self.n_unstable
+        if not count or self.n_dof > DENSE_LIMIT:
+            return False
+        more = min(self.n_dof, count + 1)
+        try:
+            elastic_modes(
+                dense(self.M),
+                dense(self.K),
+                self.rigid_body,
+                more,
+                motions=lambda: self.body_motions,
+            )
+        except ModelError:
+            return False
+        return True
 
     def inertia(self, motions: FloatArray) -> FloatArray:
         """Return the loads (n, r) ``M motions`` of motions (n, r)."""
@@ -214,6 +245,11 @@ class FEModel(Placed, Value):
             _check_semidefinite(D, "D")
             return self._with(D=frozen(D))
         free = self.rigid_body.shape[1] > 0
+        if isinstance(damping, Rayleigh) and damping.beta and self.n_unstable:
+            raise ModelError(
+                "Rayleigh damping beta K of a structure on springs of negative stiffness feeds "
+                "energy in. Damp the free structure and suspend it then, or use ModalDamping."
+            )
         if isinstance(damping, Rayleigh) and not (free and damping.alpha and not damping.rigid):
             return self._with(D=frozen(damping.alpha * self.M + damping.beta * self.K))
         if self.n_dof > _DENSE_DAMPING_LIMIT:
@@ -365,11 +401,11 @@ def _full_damping(model: FEModel, damping: Damping) -> FloatArray:
     if isinstance(damping, Rayleigh):
         D = damping.alpha * (M - loaded @ loaded.T) + damping.beta * K
         return np.asarray(0.5 * (D + D.T), dtype=np.float64)
-    elastic, phi = elastic_modes(M, K, rigid)
+    elastic, phi = elastic_modes(M, K, rigid, motions=lambda: model.body_motions)
     r = rigid.shape[1]
     zeta = damping.zeta(np.concatenate([np.zeros(r), elastic]))[r:]
     forces = M @ phi
-    D = (forces * (2 * zeta * elastic)) @ forces.T
+    D = (forces * (2 * zeta * np.abs(elastic))) @ forces.T
     if isinstance(damping, ModalDamping) and damping.rigid:
         D = D + damping.rigid * (loaded @ loaded.T)
     return np.asarray(0.5 * (D + D.T), dtype=np.float64)
@@ -381,6 +417,7 @@ def _check_semidefinite(matrix: Matrix, name: str) -> None:
             f"{name} is not positive semi-definite: {_lowest(matrix)}. The structure would "
             f"{'be unstable' if name == 'K' else 'feed energy in'}. Look for a sign or "
             "for swapped arguments (the order is M, K, D)."
+            + (" Magnets may only make rigid-body motions unstable." if name == "K" else "")
         )
 
 

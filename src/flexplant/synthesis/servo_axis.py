@@ -86,10 +86,11 @@ class Axis:
 def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
     """Return one motion of the body, held and delayed: acceleration commanded to error.
 
-    Its frequency is that of a suspension [Hz], 0 when free.
+    Its frequency is that of a suspension [Hz], 0 when free; negative where magnets make poles
+    +-2 pi |f| of it.
     """
     body = StateSpace(
-        [[0.0, 1.0], [-((2.0 * np.pi * suspension) ** 2), 0.0]],
+        [[0.0, 1.0], [-((2.0 * np.pi) ** 2) * suspension * abs(suspension), 0.0]],
         [[0.0], [1.0]],
         [[-1.0, 0.0]],
         [[0.0]],

@@ -133,7 +133,8 @@ def elastic(plant: StandardPlant) -> FloatArray:
     if not plant.is_assembled:
         return np.zeros(0)
     pairs = plant.modal_blocks[plant.n_rigid : plant.assembled.realisation.n_modes]
-    freq = np.sqrt(np.abs(np.linalg.det(pairs))) / (2.0 * np.pi)
+    freq = np.sqrt(np.maximum(np.linalg.det(pairs), 0.0)) / (2.0 * np.pi)
+    freq = freq[freq > 0]  # unstable pairs do not resonate
     return np.asarray(freq[freq * plant.dt < 0.45])
 
 

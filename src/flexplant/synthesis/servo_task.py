@@ -171,7 +171,7 @@ class ServoTask:
         SolverError
             When none does.
         """
-        slowest = max(3.0 * float(self.motions.freq.max()) * (1 + 1e-9), 2e-4 * self.rate)
+        slowest = max(3.0 * float(np.abs(self.motions.freq).max()) * (1 + 1e-9), 2e-4 * self.rate)
 
         def holds(bandwidth: float) -> bool:
             axis = self.axis(bandwidth)

@@ -14,6 +14,7 @@ import scipy.sparse as sp
 from ..errors import ModelError
 from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
+from ..structure.negative_stiffness import refuse_unstable
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray
 from .parameters.added import Parameter
@@ -80,6 +81,7 @@ class Family:
                 f"the model must have M, D, K, a rigid_body basis and dofs, as FEModel and "
                 f"ReducedModel do, got {type(model).__name__}. Pass one of them."
             )
+        refuse_unstable(model, "updating")
         M, D, K = (_dense(part, model) for part in (model.M, model.D, model.K))
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
         self.model = model

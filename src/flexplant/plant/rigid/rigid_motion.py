@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...errors import AssumptionError, FlexplantError, unknown_label
+from ...structure.negative_stiffness import signed_root
 from ...values import FloatArray, IntArray
 from ..partition import Partition
 from ..realisation import ModalRealisation
@@ -32,7 +33,7 @@ class RigidModes(NamedTuple):
     modes : (r,) array of int
         Which modes of the realisation they are, from 0: those at 0 Hz, then suspension modes.
     freq : (r,) array [Hz]
-        Of these modes; 0 of the free ones.
+        Of these modes; 0 of the free ones, negative where negative stiffness makes them unstable.
     """
 
     shapes: FloatArray
@@ -74,7 +75,7 @@ def rigid_modes(realisation: ModalRealisation) -> RigidModes:
         return free
     if not np.all(kept):
         shapes = shapes @ vectors[:, kept]
-    size = np.sqrt(np.abs(np.linalg.det(realisation.pairs[modes])))
+    size = signed_root(np.linalg.det(realisation.pairs[modes]))
     return RigidModes(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
 
 
@@ -99,7 +100,18 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
 
 
 def require_weak(motions: RigidModes, bandwidth: float, what: str) -> None:
-    """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz]."""
+    """Raise AssumptionError unless all suspension modes are well below a bandwidth [Hz].
+
+    Of an unstable pair the growth rate: a loop must cross 1 well above it to be stable.
+    """
+    grows = -float(motions.freq.min(initial=0.0))
+    if grows > bandwidth / _WEAK:
+        raise AssumptionError(
+            "negative stiffness makes the rigid-body motion unstable, with poles at +-"
+            f"{2.0 * np.pi * grows:.4g} 1/s ({grows:.4g} Hz): {what} of {bandwidth:g} Hz reacts "
+            f"too slowly, it holds poles up to a third of that, {bandwidth / _WEAK:.4g} Hz. Raise "
+            f"the bandwidth above {_WEAK * grows:.4g} Hz, or lower the negative stiffness."
+        )
     worst = float(motions.freq.max(initial=0.0))
     if worst > bandwidth / _WEAK:
         raise AssumptionError(

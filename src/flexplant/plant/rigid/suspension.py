@@ -13,12 +13,15 @@ from ...labels import Place
 from ...modes import Modes, normal_form
 from ...reduction import ReducedModel
 from ...structure import Damper, FEModel, Spring
-from ...values import FloatArray, Value, positive
+from ...structure.rigid import orthonormalised
+from ...values import FloatArray, Value, positive, real_array
 from ..port_checks import checked_direction, checked_place
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not
 _SLACK = 1e-9
+#: relative: a rigid-body motion that the shapes make up to this is one of theirs
+_MADE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,7 +33,7 @@ class GroundSpring(Value):
     at : str, (3,) array [m] or mapping
         A DOF label, a point, or a sum {label or point: weight}.
     stiffness : float [N/m or N m/rad]
-        Of the spring, above 0.
+        Of the spring; negative where a magnet attracts, as in reluctance actuators and maglev.
     damping : float [N s/m or N m s/rad]
         Of the damper beside it.
     direction : str
@@ -39,7 +42,7 @@ class GroundSpring(Value):
     Raises
     ------
     LabelError, ModelError
-        For a bad place or direction, a stiffness that is not positive or a negative damping.
+        For a bad place or direction, a stiffness of 0 or a negative damping.
     """
 
     at: Place
@@ -51,9 +54,19 @@ class GroundSpring(Value):
         self._set(
             at=checked_place("a ground spring", self.at),
             direction=checked_direction("a ground spring", self.direction),
-            stiffness=positive(self.stiffness, "stiffness of a ground spring"),
+            stiffness=_nonzero(self.stiffness),
             damping=positive(self.damping, "damping of a ground spring", zero=True),
         )
+
+
+def _nonzero(stiffness: float) -> float:
+    value = float(real_array(stiffness, "stiffness of a ground spring", ()))
+    if not value:
+        raise ModelError(
+            "the stiffness of a ground spring is 0: it holds nothing. Leave it out, or give it a "
+            "stiffness; a damper alone is model.with_parts([Damper(...)])."
+        )
+    return value
 
 
 def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) -> Suspended:
@@ -61,7 +74,8 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
 
     ``K + sum_s k_s r_s' r_s``, D likewise, r_s the row of a spring's motion. Rigid-body motions
     that stretch a spring become suspension modes, true oscillations at low frequency; those that
-    do not stay exactly at 0.
+    do not stay exactly at 0. Springs of negative stiffness make unstable real pairs of poles of
+    them, as long as they do not bend the structure.
 
     Parameters
     ----------
@@ -146,19 +160,27 @@ def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
             "complex modes cannot be suspended: suspend the FEModel, or reduce and suspend that."
         )
     basis = np.real(modes.basis)
-    omega, zeta = modes.basis_omega, modes.basis_zeta
-    b = omega.size
+    b = basis.shape[1]
     rows = np.array([modes.row(s.at, s.direction) for s in springs]) @ basis
     stiffness, damping = _matrices(rows, springs)
     free = np.zeros((b, 0))
     if modes.n_rigid:
         kept = _untouched(rows[:, : modes.n_rigid], rows)
         free = np.vstack([kept, np.zeros((b - modes.n_rigid, kept.shape[1]))])
+
+    def motions() -> FloatArray:
+        made = modes.missed_motions() < _MADE
+        part = np.linalg.lstsq(basis, modes.rigid_motions()[:, made], rcond=None)[0]
+        return orthonormalised(np.eye(b), part, dependent="drop")
+
     form = normal_form(
-        np.eye(b), np.diag(2.0 * zeta * omega) + damping, np.diag(omega**2) + stiffness, free
+        np.eye(b),
+        np.diag(modes.basis_rates) + damping,
+        np.diag(modes.basis_squares) + stiffness,
+        free,
+        motions,
     )
-    size = np.abs(form.poles)
-    ratio = np.where(size > 0, -form.poles.real / np.where(size > 0, size, 1.0), 0.0)
+    size, ratio = form.omega, form.zeta
     shapes = basis @ form.phi
     if not form.is_real or not modes.n_vectors:
         return Modes(size, ratio, shapes, modes.dofs, n_rigid=form.n_rigid)
