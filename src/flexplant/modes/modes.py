@@ -287,4 +287,5 @@ def pole_pairs(omega: FloatArray, zeta: FloatArray) -> tuple[ComplexArray, Compl
     size, unstable = np.abs(omega), omega < 0
     root = np.sqrt((zeta**2 - np.where(unstable, -1.0, 1.0)).astype(np.complex128))
     root = np.where(root.imag < 0, root.conj(), root)
-    return size * (-zeta + root), size * (-zeta - root)
+    first, second = size * (-zeta + root), size * (-zeta - root)
+    return first.astype(np.complex128), second.astype(np.complex128)
