@@ -129,7 +129,6 @@ def test_fewer_dofs_than_motions():
         ({"K": K3 + np.triu(np.full((3, 3), 1e-3), 1)}, ModelError, "not symmetric: entry"),
         ({"K": sp.csc_array(K3 + np.triu(np.ones((3, 3)), 1))}, ModelError, "not symmetric"),
         ({"K": -K3}, ModelError, "positive semi-definite"),
-        ({"K": K3 - 0.01 * np.eye(3)}, ModelError, "positive semi-definite"),
         ({"D": -np.eye(3)}, ModelError, "feed energy"),
         ({"K": 1j * K3}, ModelError, "complex"),
         ({"M": [["a"] * 3] * 3}, ModelError, "numbers"),

@@ -49,7 +49,7 @@ class StiffnessFactor:
         self.K: Any = sp.csc_array(model.K)
         self.rigid = model.rigid_body
         # of motions, not of single DOFs: next to no inertia in some of these says nothing
-        self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
+        near = self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
         if model.n_unstable:  # below the lowest eigenvalue
             self.sigma += 2.0 * float(unstable_stiffness(self.K, model.body_motions)[0])
         shifted = sp.csc_array(self.K - self.sigma * self.M)
@@ -61,7 +61,8 @@ class StiffnessFactor:
                 else PardisoCholesky(shifted, method)
             )
         except SolverError as error:
-            negative = multifrontal_inertia(shifted, self.dissection)
+            beside = sp.csc_array(self.K - near * self.M)
+            negative = multifrontal_inertia(beside, self.dissection)
             if not negative:
                 raise
             raise ModelError(

@@ -19,7 +19,7 @@ from .completion import completed as completed
 from .completion import square
 from .condense import condensed, no_mass
 from .local_axes import cosines
-from .model import FEModel
+from .model import SEMIDEFINITE, FEModel
 from .precision import digits_of, endangered, held_by_rounding
 from .singular_mass import left_out, null_motions, projected
 from .units import units
@@ -392,6 +392,8 @@ class FEMatrices(Value):
             raise ModelError(f"{error} {held[0].upper()}{held[1:]}") if held else error from None
         if self.digits is not None:
             held = None if free else ready._held_by_rounding(model)
+            if held and model.n_unstable and not is_positive_definite(model.K, SEMIDEFINITE):
+                raise ModelError(f"K is not positive semi-definite. {held[0].upper()}{held[1:]}")
             for said in (endangered(ready.K, ready.M, self.digits), held):
                 if said:
                     warnings.warn(f"{self.source or 'K'}: {said}", FlexplantWarning, 2)

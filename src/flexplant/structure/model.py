@@ -27,7 +27,7 @@ from .units import units
 #: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
 _SYMMETRY_TOLERANCE = 1e-9
 #: relative to the diagonal: K and D may have eigenvalues this far below zero
-_SEMIDEFINITE_TOLERANCE = 1e-9
+SEMIDEFINITE = 1e-9
 #: modal damping over all modes fills D; beyond this it would not fit the memory comfortably
 _DENSE_DAMPING_LIMIT = 5000
 
@@ -462,7 +462,7 @@ def _is_semidefinite(matrix: Matrix) -> bool:
     if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
         # the factorisation in solve_modes finds the rest; here it would double the cost
         return not np.any(diagonal(matrix) < 0)
-    return is_positive_definite(matrix, _SEMIDEFINITE_TOLERANCE)
+    return is_positive_definite(matrix, SEMIDEFINITE)
 
 
 def _lowest(matrix: Matrix) -> str:
