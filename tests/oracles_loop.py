@@ -119,3 +119,32 @@ def farthest(duration, bounds, intervals=120):
     )
     assert answer.status == 0, answer.message
     return float(rows[-1][0] @ answer.x * bounds[-1])
+
+
+def folded_spectrum(physical, loop, freq, asd, sensor_asd, aliases):
+    """Return the one-sided PSD of a sampled closed loop's error from continuous spectra alone.
+
+    `physical` holds A, B (force, then actuators), C (point, then sensors) of a continuous plant;
+    `loop` the sampled responses as functions of z: K (nu, ny), P (1 + ny, nu). White force noise
+    makes the continuous cross-spectrum of point and sensors without control, whose copies at all
+    multiples of the rate add up when it is sampled; the loop then acts on the samples.
+    """
+    rate = loop["rate"]
+    shown = len(physical["C"])
+    out = np.zeros(freq.size)
+    for i, f in enumerate(freq):
+        H = [
+            gain(
+                physical["A"], physical["B"][:, :1], physical["C"], 0.0, 2j * np.pi * (f + k * rate)
+            )
+            for k in range(-aliases, aliases + 1)
+        ]
+        # the intensity asd^2 / 2 on both sides of zero, times two for a one-sided density
+        S = sum(h @ h.conj().T for h in H) * asd**2
+        S = S + np.diag([0.0] + [sensor_asd**2] * (shown - 1))
+        z = np.exp(2j * np.pi * f / rate)
+        K, P = loop["K"](z), loop["P"](z)
+        back = np.linalg.solve(np.eye(K.shape[0]) - K @ P[1:], K)
+        row = np.concatenate([[1.0], (P[:1] @ back)[0]])
+        out[i] = (row @ S @ row.conj()).real
+    return out

@@ -1,7 +1,8 @@
 """Closing the loop by names, its sensitivities and margins."""
 
+from .budget import ErrorBudget as ErrorBudget
 from .closed import ClosedLoop as ClosedLoop
-from .closed import close_loop as close_loop
+from .closing import close_loop as close_loop
 from .comparison import LoopComparison as LoopComparison
 from .comparison import LoopFigures as LoopFigures
 from .comparison import compare_loops as compare_loops
@@ -11,4 +12,5 @@ from .sensitivity import complementary_sensitivity as complementary_sensitivity
 from .sensitivity import control_sensitivity as control_sensitivity
 from .sensitivity import loop_gain as loop_gain
 from .sensitivity import sensitivity as sensitivity
+from .spectrum import Spectrum as Spectrum
 from .spill_over import SpillOver as SpillOver

@@ -1,9 +1,8 @@
-"""close_loop: a plant and its controller blocks, connected by name."""
+"""The closed loop: a plant with its controller, and what is known of it in closed form."""
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -11,16 +10,18 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import FlexplantWarning, ModelError, unknown_label
+from ..errors import AssumptionError, ModelError
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft
 from ..lti.responses import Responder, remembered, responder
 from ..lti.stability import Obstacle, obstacle
-from ..lti.statespace import StateSpace, System
-from ..plant import StandardPlant, larger_plant, standard_plant
-from ..values import ComplexArray, FloatArray, Value, name_list
-from .blocks import as_block, check_inputs, drives, joined
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray, Value
 from .broken import BrokenLoop, moved
+from .budget import ErrorBudget, error_budget, source_variances
+from .noise import Source, check_direct, check_stationary, row_of, sources
+from .spectrum import Spectrum, densities
 from .spill_over import SpillOver, growing_modes, high
 
 
@@ -58,9 +59,9 @@ class ClosedLoop(Value):
         plant, controller = self.plant.system.n_states, self.controller.n_states
         lines = [f"<ClosedLoop: plant {plant} states, controller {controller} states, {kind}>"]
         if self.obstacle is None:
-            lines.append(f"  stable: {self._decay}, modulus margin {self.modulus_margin:.3g}")
+            lines.append(f"  stable: {self.decay}, modulus margin {self.modulus_margin:.3g}")
         else:
-            lines.append(f"  {self.obstacle.reason}; {self._decay}")
+            lines.append(f"  {self.obstacle.reason}; {self.decay}")
         lines.append(f"  driven: {' '.join(self.driven)}")
         if self.watched:
             shown = " ".join(self.watched[:8]) + (" ..." if len(self.watched) > 8 else "")
@@ -229,7 +230,8 @@ class ClosedLoop(Value):
         return float(np.max(self.monitored.poles().real, initial=-np.inf))
 
     @property
-    def _decay(self) -> str:
+    def decay(self) -> str:
+        """How fast it decays, in words: the spectral radius, or the abscissa in rad/s."""
         if self.plant.dt:
             return f"spectral radius {self.spectral_radius:.9g}"
         return f"spectral abscissa {self.spectral_abscissa:.6g} rad/s"
@@ -245,11 +247,18 @@ class ClosedLoop(Value):
         return obstacle(self.monitored)
 
     @cached_property
-    def left_out(self) -> SpillOver | None:
-        """Stability and margin with the modes left out; None: not known."""
+    def completed(self) -> ClosedLoop | None:
+        """The same controller closed around the plant with the modes left out; None: not known."""
         if self.larger is None:
             return None
-        whole = ClosedLoop(self.larger, self.blocks, self.controller, self.idle)
+        return ClosedLoop(self.larger, self.blocks, self.controller, self.idle)
+
+    @cached_property
+    def left_out(self) -> SpillOver | None:
+        """Stability and margin with the modes left out; None: not known."""
+        whole = self.completed
+        if self.larger is None or whole is None:
+            return None
         stability = whole.spectral_radius if self.plant.dt else whole.spectral_abscissa
         margin, without, peak = whole.modulus_margin, self.modulus_margin, float("nan")
         modes: tuple[int, ...] = ()
@@ -274,114 +283,110 @@ class ClosedLoop(Value):
         """
         return self.broken.modulus_margin
 
+    def rms(self, channel: str) -> float:
+        """Return the stationary rms of a signal under all white noises, in closed form.
 
-def close_loop(
-    plant: StandardPlant | System, *blocks: Any, idle: Iterable[str] = (), larger: Any = None
-) -> ClosedLoop:
-    """Return the closed loop of a plant with controller blocks, connected by name.
+        Of a sampled loop at the sample instants: disturbances act with their exact covariance over
+        a sample, so nothing that folds back from above half the rate is missing; a sensor's noise
+        has the variance ``asd^2 rate / 2`` of a sample. Modes left out of the plant are not in it:
+        `completed.rms(channel)` is the rms with them, where they are known.
 
-    An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
-    applied command of an actuator (plant.u), or an output of another block. An output of a block
-    that has an actuator's name drives it, and several such outputs add; every other output is
-    monitored.
+        Parameters
+        ----------
+        channel : str
+            A z, y, driven u or monitored output.
 
-    Parameters
-    ----------
-    plant : StandardPlant, StateSpace or control.StateSpace
-        The plant; a system whose channels are named like those of an assembled plant (see
-        `StandardPlant.from_statespace`) is one.
-    *blocks : StateSpace, or values with a `system` such as KalmanEstimator and Controller
-        The controller in any number of parts. Sampled at the plant's rate, or static gains.
-    idle : iterable of str
-        Actuators that stay without a drive on purpose.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`. The loop is then
-        checked there too (`ClosedLoop.left_out`); unless given, with those that the plant's reduced
-        model still has.
+        Returns
+        -------
+        float
+            In the channel's unit.
 
-    Returns
-    -------
-    ClosedLoop
-        Its repr says whether it is stable, with spectral radius and modulus margin.
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        AssumptionError
+            When the loop is not stable, or white noise reaches an output directly.
+        ModelError
+            When the noise of the plant is not known, or the variance is infinite.
+        CertificateError
+            When two Lyapunov equations give different variances.
+        """
+        row, noises = self._noises(channel)
+        variances, _ = source_variances(self.monitored, row, noises)
+        return float(np.sqrt(variances.sum()))
 
-    Warns
-    -----
-    FlexplantWarning
-        When the closed loop is unstable, or is with the modes that the plant left out; it is
-        returned all the same, for inspection. Marginal poles (a rigid-body mode that nothing
-        holds) are named by its repr alone.
+    def psd(self, channel: str, freq: npt.ArrayLike | None = None) -> Spectrum:
+        """Return the one-sided power spectral density of a signal under all white noises.
 
-    Raises
-    ------
-    LabelError
-        When the names of a system do not show which channels are w, u, z and y, an input is
-        connected to nothing, an actuator is driven by nothing (and not idle), or
-        a name other than an actuator's is driven twice.
-    ModelError
-        When there is no block, a block is no system, sampling times differ, or the algebraic loop
-        is ill-posed, or `larger` does not go with the plant.
+        Of a sampled loop it is that of the samples, up to half the rate: all that disturbances
+        excite above folds back into it, so that its integral is the variance ``rms(channel)^2``.
 
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from flexplant.plant import StandardPlant
-    >>> mass = StateSpace([[0, 1], [0, 0]], [[0, 0], [1, 1]], [[1, 0], [1, 0], [0, 1]],
-    ...     np.zeros((3, 2)), inputs=["f", "u"], outputs=["z", "y", "v"])
-    >>> plant = StandardPlant.from_statespace(mass, u=["u"], y=["y", "v"])
-    >>> pd = StateSpace([], [], [], [[-100.0, -20.0]], inputs=["y", "v"], outputs=["u"])
-    >>> loop = close_loop(plant, pd)
-    >>> loop.is_stable, round(loop.spectral_abscissa, 6)
-    (True, -10.0)
-    """
-    plant = standard_plant(plant)
-    systems = tuple(as_block(block, i, plant.dt) for i, block in enumerate(blocks, 1))
-    if not systems:
-        raise ModelError(
-            "close_loop needs at least one block that drives an actuator: pass a StateSpace, "
-            "a Controller, or an observer and a servo."
+        Parameters
+        ----------
+        channel : str
+            A z, y, driven u or monitored output.
+        freq : (n_freq,) array [Hz], optional
+            Not above half the rate; through all resonances when not given.
+
+        Returns
+        -------
+        Spectrum
+            Named tuple (freq [Hz], psd [unit^2/Hz]).
+
+        Raises
+        ------
+        LabelError, AssumptionError, ModelError
+            As for `rms`; or when a frequency is not allowed.
+        """
+        row, noises = self._noises(channel)
+        grid = self.broken.grid if freq is None else sampled_freq(freq, self.plant.dt)
+        return Spectrum(grid, densities(self.monitored, row, noises)(grid).sum(axis=0))
+
+    def budget(self, channel: str, *, residue: Any = None, start: float = 0.0) -> ErrorBudget:
+        """Return where the rms of a signal comes from: each source with its variance and stairs.
+
+        Parameters
+        ----------
+        channel : str
+            A z, y, driven u or monitored output.
+        residue : Response, mapping {channel: samples} or (n_time,) array, optional
+            A run of this loop without noise, ``simulate(loop, reference=move, noise=False, ...)``:
+            what is left of the set-point is a source of its own, with its mean square.
+        start : float [s]
+            Samples of the residue before this time are left out.
+
+        Returns
+        -------
+        ErrorBudget
+            Its repr is the table; `fx.plot.budget` draws it.
+
+        Raises
+        ------
+        LabelError, AssumptionError, ModelError
+            As for `rms`; or when the residue does not go with the loop.
+        CertificateError
+            When the Lyapunov equations or the integral of the spectrum give another variance.
+        """
+        row, noises = self._noises(channel)
+        left_out, whole = float("nan"), self.completed
+        if whole is not None:
+            left_out = whole.rms(channel) if whole.is_stable else float("inf")
+        return error_budget(
+            self.monitored, row, noises, residue=residue, start=start, left_out=left_out
         )
-    resting = name_list(idle, "idle actuators")
-    for name in resting:
-        if name not in plant.u:
-            raise unknown_label("actuator to leave idle", name, plant.u)
-    driven, watched = drives(plant, systems, resting)
-    check_inputs(plant, systems)
-    controller = joined(plant, systems, driven, watched)
-    loop = ClosedLoop(plant, systems, controller, resting, _completed(plant, larger))
-    found = loop.left_out
-    if not loop.is_stable:
-        if loop.obstacle and loop.obstacle.reason.startswith("unstable"):
-            warnings.warn(
-                f"the closed loop is {loop.obstacle.reason} ({loop._decay}): its signals grow, and "
-                "it has no margin, bandwidth or norm. Check the sign (u = K y), lower the "
-                "bandwidth, or notch the mode at that frequency.",
-                FlexplantWarning,
-                stacklevel=2,
+
+    def _noises(self, channel: str) -> tuple[int, list[Source]]:
+        """Return the row of a signal and the white noises of a loop that has a stationary state."""
+        if self.plant.is_weighted:
+            raise AssumptionError(
+                "the plant is weighted, so its z and w are not physical signals: close the loop "
+                "around plant.unweighted with the same blocks."
             )
-    elif found is not None and not found.is_stable:
-        warnings.warn(
-            f"the loop is stable on its plant, but with the modes left out it is {found.summary}. "
-            "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "
-            "controller roll off (or notch) before them.",
-            FlexplantWarning,
-            stacklevel=2,
-        )
-    return loop
-
-
-def _completed(plant: StandardPlant, larger: Any) -> StandardPlant | None:
-    """Return the plant with the modes left out, None where they are not known.
-
-    Raises
-    ------
-    ModelError
-        When the plant is seen through a block, which the larger one is not.
-    """
-    if not plant.is_weighted:
-        return larger_plant(plant, larger)
-    if larger is not None:
-        raise ModelError(
-            "the plant is weighted, or seen through a block, and the larger one is not: close the "
-            "loop on plant.unweighted (with that block first) to check it with the modes left out."
-        )
-    return None
+        row = row_of(self.monitored, channel)
+        check_stationary(self.obstacle, f"the rms of {channel!r}")
+        noises = sources(self.plant, self.monitored)
+        if not self.plant.dt:
+            for one in noises:
+                check_direct(one.D[row], one.name, channel)
+        return row, noises

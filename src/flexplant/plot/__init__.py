@@ -1,5 +1,6 @@
 """All pictures: functions that take values and `ax=`, and return the axes they drew on."""
 
+from .budget import budget as budget
 from .estimation import predictions as predictions
 from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..loop import Spectrum
 from ..values import FloatArray, IntArray, Value, check_names, known_units, positive, real_array
 
 #: one number, or one per run
@@ -196,6 +197,51 @@ class Response(Value, Mapping[str, FloatArray]):
             When nothing is left after `start`.
         """
         return _numbers(np.max(np.abs(self._from(channel, start)), axis=-1))
+
+    def psd(self, channel: str, *, start: float = 0.0, segment: float | None = None) -> Spectrum:
+        """Return the one-sided power spectral density of a channel, over all runs.
+
+        Welch's method: Hann windows that overlap by half, no mean removed, so that the integral is
+        the mean square.
+
+        Parameters
+        ----------
+        channel : str
+            Its name.
+        start : float [s]
+            Samples before this time are left out: transients.
+        segment : float [s], optional
+            Length of a window, the inverse of the resolution; an eighth of the record when not
+            given.
+
+        Returns
+        -------
+        Spectrum
+            Named tuple (freq [Hz], psd [unit^2/Hz]).
+
+        Raises
+        ------
+        LabelError
+            When there is no such channel.
+        ModelError
+            When nothing is left after `start`, or the segment is shorter than two samples or
+            longer than the record.
+        """
+        from scipy.signal import welch
+
+        signal = self._from(channel, start)
+        length = signal.shape[-1] * self.dt
+        count = round(positive(length / 8.0 if segment is None else segment, "segment") / self.dt)
+        if not 2 <= count <= signal.shape[-1]:
+            raise ModelError(
+                f"a segment of {count * self.dt:g} s is {count} samples, the record has "
+                f"{signal.shape[-1]} from {start:g} s on: choose one of 2 to that many samples."
+            )
+        unit = _unit(signal)
+        freq, density = welch(
+            signal / unit, fs=1.0 / self.dt, window="hann", nperseg=count, detrend=False
+        )
+        return Spectrum(freq, unit**2 * density.reshape(-1, freq.size).mean(axis=0))
 
     def moving_average(self, channel: str, *, window: float = 5e-3) -> FloatArray:
         """Return the mean of a channel over a window centred at each time (MA).

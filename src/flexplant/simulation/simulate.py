@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
+from ..loop.noise import WhiteNoise, white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..values import (
     FloatArray,
-    IntArray,
     flag,
     positive,
     real_array,
@@ -32,14 +32,6 @@ Signal: TypeAlias = "SetPoint | npt.ArrayLike | Callable[[FloatArray], npt.Array
 
 #: samples per stretch and runs side by side: what fits the cache of one core
 STRETCH, ABREAST = 128, 16
-
-
-class _Noise(NamedTuple):
-    """How white samples enter: `factor` (n, r) into x, `deviation` at the columns of w."""
-
-    factor: FloatArray
-    columns: IntArray
-    deviation: FloatArray
 
 
 def simulate(
@@ -127,7 +119,8 @@ def simulate(
         )
     time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
     given = _given(plant, reference, disturbance, time)
-    white = _noise(plant, flag(noise, "noise"))
+    silent = plant if flag(noise, "noise") else plant.replace(asd={})
+    white = white_noise(silent)
     numbers = _run_numbers(runs)
     state = _start(loop, start)
     generators = _generators(rng, numbers)
@@ -162,7 +155,7 @@ class _Group:
         self,
         loop: ClosedLoop,
         parts: Machine,
-        noise: _Noise,
+        noise: WhiteNoise,
         generators: list[np.random.Generator],
         start: FloatArray,
     ) -> None:
@@ -287,25 +280,6 @@ def _sampled(signal: Any, name: str, time: FloatArray) -> FloatArray:
         return signal.at(time).position
     values = real_array(signal(time) if callable(signal) else signal, name)
     return values if values.ndim == 0 else real_array(values, name, time.shape)
-
-
-def _noise(plant: StandardPlant, wanted: bool) -> _Noise:
-    none = np.zeros((plant.system.n_states, 0))
-    asd = {name: level for name, level in plant.asd.items() if level > 0} if wanted else {}
-    sensors = [name for name in asd if name.removesuffix(":noise") in plant.y]
-    white = [name for name in asd if name not in sensors]
-    direct = plant.system.select(inputs=white).D
-    if np.any(direct):
-        i, j = np.argwhere(direct)[0]
-        raise AssumptionError(
-            f"white noise {white[j]!r} reaches {plant.system.outputs[i]!r} directly: a sample of "
-            "it would have infinite variance. Give the disturbance a coloured spectrum, or sense "
-            "a displacement or velocity."
-        )
-    columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
-    deviation = np.array([asd[name] for name in sensors]) * np.sqrt(0.5 / plant.dt)
-    factor = plant.noise_factor if white else none
-    return _Noise(factor, columns, deviation)
 
 
 def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:

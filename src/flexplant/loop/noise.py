@@ -1,0 +1,179 @@
+"""The white noises of a plant, each by itself, and where they enter a closed loop."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..errors import AssumptionError, LabelError, ModelError
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import FloatArray, IntArray, short
+
+#: relative: the noise factors of single disturbances add up to the one that the plant has
+_ADDS_UP = 1e-6
+
+
+class WhiteNoise(NamedTuple):
+    """How white samples enter: `factor` (n, r) into x, `deviation` at the `columns` of w."""
+
+    factor: FloatArray
+    columns: IntArray
+    deviation: FloatArray
+
+
+class Source(NamedTuple):
+    """One white noise of unit intensity (continuous) or unit variance (sampled) in a closed loop.
+
+    ``x+ = A x + G n``, ``output = C x + D n`` with G (n, r) and D (n_output, r).
+    """
+
+    name: str
+    G: FloatArray
+    D: FloatArray
+
+
+def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
+    """Return the channels of w that are white noise: disturbances, then sensor noises.
+
+    Raises
+    ------
+    AssumptionError
+        When a disturbance reaches an output directly: its variance there would be infinite.
+    """
+    loud = [name for name, level in plant.asd.items() if level > 0]
+    sensors = [name for name in loud if name.removesuffix(":noise") in plant.y]
+    white = [name for name in loud if name not in sensors]
+    direct = plant.system.select(inputs=white).D
+    if np.any(direct):
+        i, j = np.argwhere(direct)[0]
+        raise AssumptionError(
+            f"white noise {white[j]!r} reaches {plant.system.outputs[i]!r} directly: a sample of "
+            "it would have infinite variance. Give the disturbance a coloured spectrum, or sense "
+            "a displacement or velocity."
+        )
+    return white, sensors
+
+
+def white_noise(plant: StandardPlant) -> WhiteNoise:
+    """Return the noises of a sampled plant, all disturbances together.
+
+    The disturbances' covariance over a sample is exact, so what they excite above half the rate
+    is in the samples; a sensor's noise has the variance ``asd^2 rate / 2`` of a sample.
+
+    Raises
+    ------
+    AssumptionError
+        When white noise reaches an output directly.
+    ModelError
+        When the plant's process noise is not known.
+    """
+    white, sensors = white_names(plant)
+    factor = plant.noise_factor if white else np.zeros((plant.system.n_states, 0))
+    columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
+    asd = np.array([plant.asd[name] for name in sensors])
+    return WhiteNoise(factor, columns, asd * np.sqrt(0.5 / plant.dt))
+
+
+def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
+    """Return the white noises of a plant as they enter its closed loop, each by itself.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Continuous or sampled.
+    monitored : StateSpace
+        Its closed loop; states of the plant first.
+
+    Raises
+    ------
+    AssumptionError
+        When white noise reaches an output directly (for a continuous loop: any output of
+        `monitored`).
+    ModelError
+        When the process noise of a sampled plant is not known.
+    """
+    white, sensors = white_names(plant)
+    size, rows = monitored.n_states, len(monitored.outputs)
+    if not plant.dt:
+        return [_continuous(plant, monitored, name) for name in (*white, *sensors)]
+    found = []
+    for name, factor in _factors(plant, white).items():
+        G = np.zeros((size, factor.shape[1]))
+        G[: factor.shape[0]] = factor
+        found.append(Source(name, G, np.zeros((rows, G.shape[1]))))
+    for name in sensors:
+        column = [monitored.inputs.index(name)]
+        sigma = plant.asd[name] * np.sqrt(0.5 / plant.dt)
+        found.append(Source(name, monitored.B[:, column] * sigma, monitored.D[:, column] * sigma))
+    return found
+
+
+def _continuous(plant: StandardPlant, monitored: StateSpace, name: str) -> Source:
+    column = [monitored.inputs.index(name)]
+    intensity = plant.asd[name] / np.sqrt(2.0)
+    return Source(name, monitored.B[:, column] * intensity, monitored.D[:, column] * intensity)
+
+
+def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
+    """Return G of each white disturbance; of all together where they cannot be separated."""
+    if not white:
+        return {}
+    total = plant.noise_factor
+    if len(white) == 1:
+        return {white[0]: total}
+    if plant.is_assembled:
+        ports = plant.assembled.ports
+        found = {}
+        for name in white:
+            alone = [d if d.name == name else d.replace(asd=0.0) for d in ports.w]
+            found[name] = plant.unweighted.with_ports(ports.replace(w=alone)).noise_factor
+        # a plant whose noise was changed since it was assembled keeps its own
+        if all(factor.shape[0] == total.shape[0] for factor in found.values()):
+            own = np.sum(total**2, axis=1)
+            added = np.sum([np.sum(factor**2, axis=1) for factor in found.values()], axis=0)
+            if np.allclose(added, own, rtol=_ADDS_UP, atol=0.0):
+                return found
+    return {" + ".join(white): total}
+
+
+def row_of(monitored: StateSpace, channel: str) -> int:
+    """Return the row of an output of a closed loop.
+
+    Raises
+    ------
+    LabelError
+        When it has no such output.
+    """
+    given: object = channel
+    if not isinstance(given, str):
+        raise LabelError(f"a channel is named by a str, got {short(given)}. Pass 'die:error'.")
+    return int(monitored.output_index([channel])[0])
+
+
+def check_stationary(problem: object, what: str) -> None:
+    """Raise AssumptionError when a closed loop has no stationary state.
+
+    Parameters
+    ----------
+    problem : Obstacle or None
+        The pole in the way.
+    what : str
+        What was to be computed.
+    """
+    if problem is not None:
+        raise AssumptionError(
+            f"{what} needs a stable closed loop, this one is {getattr(problem, 'reason', problem)}:"
+            " its noise grows without bound. Stabilise it first: see loop.is_stable."
+        )
+
+
+def check_direct(D: FloatArray, source: str, channel: str) -> None:
+    """Raise ModelError where continuous white noise passes to an output without rolling off."""
+    if np.any(D):
+        raise ModelError(
+            f"white noise {source!r} passes straight through to {channel!r}, so its variance in "
+            "continuous time is infinite. Close the loop around plant.discretized(rate), or let "
+            "the controller roll off."
+        )
