@@ -105,8 +105,11 @@ def test_soft_springs_beside_extended_precision(stiffness, route, monkeypatch):
 @pytest.mark.parametrize("stiffness", [1e-3, 0.1, 10.0, 1e3, 1e5])
 def test_a_large_plate_on_springs_from_a_thousandth_to_a_million_newtons_per_metre(stiffness):
     free = plate((24, 24))
-    modes = solve_modes(suspended(free, stiffness), count=60)
-    assert modes.n_rigid == 0
+    model = suspended(free, stiffness)
+    modes = solve_modes(model, count=60)
+    report = check(model)
+    assert modes.n_rigid == report.n_rigid == report.n_zero == 0
+    assert report.grounded == ("z", "rx", "ry") and report.ok
     assert modes.certificate["counted"] == modes.certificate["found"] >= 60
     expected = oracle.suspended_omega(free.mass, (0.6, 0.5), stiffness)
     # the plate bends on its springs: in proportion to their stiffness
@@ -117,6 +120,31 @@ def test_a_large_plate_on_springs_from_a_thousandth_to_a_million_newtons_per_met
     alone = solve_modes(free, count=60)
     np.testing.assert_allclose(modes.omega[3:], alone.omega[3:], rtol=2e-7 * stiffness + 1e-8)
     assert np.all(modes.omega[3:] > alone.omega[3:] * (1 - 1e-8))
+
+
+@pytest.mark.parametrize("total", [1e4, 10.0, 1.0])
+def test_a_bed_of_springs_under_every_node_holds_as_softly(total):
+    """No DOF has a larger force than rounding could make at it: all of them add up."""
+    free = plate((24, 24))
+    each = total / np.unique(free.dofs.nodes).size
+    model = free.with_parts([Spring(f"{node}:z", each) for node in np.unique(free.dofs.nodes)])
+    modes, report = solve_modes(model, count=5), check(model)
+    assert modes.n_rigid == report.n_rigid == report.n_zero == 0
+    expected = np.sqrt(total / free.mass)
+    assert abs(modes.omega[0] / expected - 1) < 1e-7 * total + modes.rounding[0] + 1e-3
+
+
+def test_what_is_free_says_how_soft_a_suspension_would_look_free():
+    free = plate((24, 24))
+    modes, report = solve_modes(free, count=5), check(free)
+    assert (modes.n_rigid, report.n_rigid, report.n_zero) == (3, 3, 3)
+    unseen = modes.certificate["rigid_rounding"]
+    K, R = abs(free.K), np.abs(modes.phi[:, :3])
+    bound = 2.0**-52 * np.diag(R.T @ (K @ R)).max()
+    assert unseen == pytest.approx(np.sqrt(bound) / (2 * np.pi), rel=1e-9, abs=0)
+    # springs far below this frequency are lost among the digits of K
+    lost = suspended(free, 1e-3 * (2 * np.pi * unseen) ** 2 * free.mass / 4)
+    assert solve_modes(lost, count=5).n_rigid == check(lost).n_rigid == 3
 
 
 @pytest.mark.slow
@@ -167,6 +195,9 @@ def test_every_body_has_its_own_rigid_body_motions(elements):
     held = model.with_parts([Spring(f"{node}:z", 50.0) for node in (1, 3, int(one.dofs.nodes[-1]))])
     assert held.rigid_body.shape[1] == 3
     found = solve_modes(held, count=8)
+    report = check(held)
+    assert (report.n_rigid, report.n_zero, report.mechanisms) == (3, 3, ())
+    assert report.ok and report.first_freq == pytest.approx(found.freq[3], rel=1e-2)
     R, rows = one.rigid_body, one.dofs.indices(["1:z", "3:z", f"{one.dofs.nodes[-1]}:z"])
     by_hand = np.sqrt(la.eigvalsh(50.0 * R[rows].T @ R[rows]))
     assert np.all(np.abs(found.omega[3:6] / by_hand - 1) < 1e-3 + found.rounding[3:6])
@@ -178,6 +209,7 @@ def test_a_soft_spring_between_two_bodies_leaves_the_motions_of_both():
     ends = [("1:z", "10001:z"), ("5:z", "10005:z"), ("400:z", "10400:z")]
     tied = model.with_parts([Spring(a, 20.0, to=b) for a, b in ends])
     assert tied.rigid_body.shape[1] == 3
+    assert (check(tied).n_zero, check(tied).mechanisms) == (3, ())
     modes = solve_modes(tied, count=12)
     R, rows = one.rigid_body, one.dofs.indices([a for a, _ in ends])
     # two rigid plates, one above the other, against each other
@@ -201,6 +233,20 @@ def test_a_mechanism_is_named_as_check_names_it(elements):
         solve_modes(model, count=12)
     assert "mechanism" in str(told.value)
     assert "The first moves " in str(told.value)
+
+
+@pytest.mark.parametrize("elements", [(6, 5), (24, 22)])
+def test_soft_springs_do_not_hide_a_mechanism(elements):
+    """One of two plates on springs of 10 N/m: it is held, the hinges of the other are named."""
+    one, other = plate(elements), plate(elements)
+    pair = joined(one, other, apart=0.6)
+    last = int(one.dofs.nodes[-1])
+    hinge = Spring(f"{last}:z", 1e6, to=f"{10000 + other.dofs.nodes[0]}:z")
+    soft = [Spring(f"{node}:z", 10.0) for node in (1, elements[0] + 1, last)]
+    report = check(pair.with_parts([hinge, *soft]))
+    assert (report.n_rigid, report.n_zero, len(report.mechanisms)) == (0, 2, 2)
+    moved = {int(label.split(":")[0]) for label in report.mechanisms[0][:4]}
+    assert min(moved) > 10000
 
 
 def test_the_one_mechanism_has_the_same_dofs_in_both():

@@ -65,8 +65,10 @@ class Modes(Placed, Value):
         solver can undo; empty where it is not known.
     certificate : mapping
         What `solve_modes` checked: `orthonormality` (largest entry of phi^T M phi - I),
-        `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||) and, for
-        a large model, the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
+        `rigid_residual` (||K R|| of the rigid-body motions R, relative to || |K| |R| ||),
+        `rigid_rounding` [Hz] (the frequency up to which rounding of K's entries could hold a
+        rigid-body motion, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: softer suspensions look free) and,
+        for a large model, the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
 
     Raises
     ------

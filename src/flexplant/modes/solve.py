@@ -119,18 +119,20 @@ def solve_modes(
         )
     names = labels_of(at, model.dofs)
     # one factor for the modes and for the attachment vectors, while it is held here
-    held = stiffness_factor(model, factor) if at and _is_large(model) else None
+    factored = stiffness_factor(model, factor) if at and _is_large(model) else None
     omega, phi, certificate = _undamped(model, kept, top, factor)
     orthonormality, residual = _check(model, omega, phi)
     certificate["orthonormality"] = orthonormality
     if model.rigid_body.shape[1]:
         certificate["rigid_residual"] = _rigid_residual(model)
+        held = float(rounding_of(model.K, model.rigid_body).max())
+        certificate["rigid_rounding"] = float(np.sqrt(held) / (2 * np.pi))
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _complex_modes(model, kept, top, names)
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
     if at:
         vectors, vector_omega = attachment_vectors(model, omega, phi, at)
-    del held
+    del factored
     r = model.rigid_body.shape[1]
     if damping is None:
         zeta = np.concatenate([np.zeros(r), projected_zeta(model.D, phi[:, r:], omega[r:])])

@@ -7,21 +7,20 @@ from typing import Any, cast
 
 import numpy as np
 import scipy.linalg as la
+import scipy.sparse as sp
+import scipy.sparse.csgraph as csgraph
 
 from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
 from ..sparse.rayleigh_ritz import absolute
-from ..values import FloatArray, Matrix
+from ..values import FloatArray, IntArray, Matrix
 from .components import bodies
+from .soft_springs import unheld
 
 #: ||K r|| below this part of || |K| |r| || is rounding: the motion r costs no energy
 _ENERGY_TOLERANCE = 1e-10
-#: part of all DOFs: forces at fewer are of springs, not of rounding
-_FEW, _FEW_ROWS = 0.02, 6
-#: times the usual rounding of a row: a force larger than this is of a spring
-_OUTLIER = 30.0
 #: the same for motions that coordinates of few digits keep from being free: worth a closer look
 _NEARLY = 1e-2
 #: largest force of such a motion at any DOF, of the largest that its parts make anywhere
@@ -104,8 +103,30 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     They are those of the `motions` of its pieces, from `body_motions`, that cost no energy. They
     come from the coordinates, not from an eigenvalue solver, so that they are exact. Partly held
     structures (a hinge, say) keep the combinations that cost none. Where coordinates have few
-    digits, rotations are the null vectors of K next to theirs.
+    digits, rotations are the null vectors of K next to theirs. Each body is judged by itself.
     """
+    parts = _bodies_of(motions)
+    if len(parts) < 2:
+        return _free(M, K, motions)
+    found, mass, stiffness = [], cast(Any, M), cast(Any, K)
+    for rows, columns in parts:
+        own = mass[rows][:, rows], stiffness[rows][:, rows], motions[np.ix_(rows, columns)]
+        free = _free(*own)
+        found.append(np.zeros((motions.shape[0], free.shape[1])))
+        found[-1][rows] = free
+    return np.hstack(found)
+
+
+def _bodies_of(motions: FloatArray) -> list[tuple[IntArray, IntArray]]:
+    """Return the rows and the columns of each body: motions of two bodies share no row."""
+    moved = (motions != 0).astype(np.float32)
+    count, label = csgraph.connected_components(sp.csr_array(moved.T @ moved), directed=False)
+    columns = [np.flatnonzero(label == number) for number in range(count)]
+    return [(np.flatnonzero(moved[:, one].any(axis=1)), one) for one in columns]
+
+
+def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
+    """Return the M-orthonormal motions of one body that cost no energy."""
     # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
     K = by_rows(K)
     size_of_K = absolute(K)
@@ -114,7 +135,7 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     force = np.asarray(K @ motions) / scale
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
     if np.all(free):
-        return _not_held(M, K, motions, force * scale, _sizes(size_of_K, motions))
+        return _not_held(M, K, motions)
     # of the small triangle: the left factor of all DOFs would be a full square matrix
     _, found, right = la.svd(la.qr(force, mode="economic")[1])
     values = np.zeros(scale.size)
@@ -123,7 +144,7 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     basis = motions[:, free]
     if null.shape[1] > basis.shape[1]:
         basis = orthonormalised(M, motions @ (null / scale[:, None]))
-    basis = _not_held(M, K, basis, np.asarray(K @ basis), _sizes(size_of_K, basis))
+    basis = _not_held(M, K, basis)
     near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
     if not near.shape[1]:
         return basis
@@ -131,46 +152,14 @@ def rigid_body_basis(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
 
 
-def _sizes(size_of_K: Any, motions: FloatArray) -> FloatArray:
-    """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest.
-
-    So that rounding is seen in proportion also where a motion passes through zero.
-    """
-    most = np.abs(motions).max(axis=0, initial=0.0)
-    whole: FloatArray = np.asarray(size_of_K.sum(axis=1), dtype=np.float64).reshape(-1, 1)
-    return np.asarray(whole * most)
-
-
-def _not_held(
-    M: Matrix, K: Matrix, motions: FloatArray, force: FloatArray, most: FloatArray
-) -> FloatArray:
-    """Return the combinations of almost force-free motions that no soft spring holds.
-
-    Rounding of K leaves forces at all DOFs, of about the same size relative to what cancels there.
-    Springs leave larger ones at a few DOFs, however soft they are.
-    """
-    n = motions.shape[0]
-    if not motions.size:
-        return motions
-    force = np.abs(force)
-    part = np.divide(force, most, out=np.zeros_like(force), where=most > 0)
-    usual = np.maximum(np.median(part, axis=0), np.finfo(float).eps)
-    rows = np.flatnonzero(np.any(part > _OUTLIER * usual, axis=1))
-    if not rows.size or rows.size > max(_FEW * n, min(_FEW_ROWS, n // 4)):
-        return motions
-    # each row in terms of its rounding, so that springs of any two stiffnesses compare
-    entries: Any = K
-    held = np.asarray(entries[rows] @ motions) / most[rows].max(axis=1, keepdims=True)
-    values = np.zeros(motions.shape[1])
-    _, found, right = la.svd(held)
-    values[: found.size] = found
-    null = right[values < _OUTLIER * usual.max() * np.sqrt(rows.size)].T
-    if null.shape[1] == motions.shape[1] or not null.shape[1]:
-        return motions[:, : null.shape[1]]
-    untouched = np.all(part[rows] <= _OUTLIER * usual, axis=0)
-    if np.count_nonzero(untouched) == null.shape[1]:
-        return motions[:, untouched]
-    return orthonormalised(M, motions @ null)
+def _not_held(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
+    """Return the almost force-free motions, or combinations, that no soft spring holds."""
+    mix = unheld(K, motions)
+    if np.array_equal(mix, np.eye(*mix.shape)[:, : mix.shape[1]]):
+        return motions[:, : mix.shape[1]]
+    if np.count_nonzero(mix) == mix.shape[1]:
+        return motions @ mix
+    return orthonormalised(M, motions @ mix)
 
 
 def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:

@@ -10,14 +10,19 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
-from ..sparse.factor import dense
+from ..sparse.factor import by_rows, dense
 from ..sparse.lowest import ROUNDING
 from ..values import FloatArray, IntArray
 from .components import bodies
 from .rigid import orthonormalised, rigid_motions
+from .soft_springs import PRECISION, unheld
 
 #: times the energy that rounding of the entries allows: free
 _MARGIN = 3.0
+#: a zero-energy motion within this cosine of the rigid-body motions is one of them
+_RIGID = 0.99
+#: a motion is in the space of others when less than this part of it is left over
+_LEFT = 1e-6
 #: a singular value below this part of the largest is none
 _RANK = 1e-8
 #: DOFs of a mechanism that move at least this part of the most moving one
@@ -45,8 +50,11 @@ class ZeroEnergy:
         Pieces that nothing joins, each with motions of its own.
     rigid : (n, n_rigid) array
         A basis of them.
+    n_suspended : int
+        Motions given as of zero energy that soft springs hold: the rounding of K exceeds their
+        energy, but not the forces of the springs.
     mechanisms : (n, m) array
-        Zero-energy motions beyond these.
+        Zero-energy motions beyond all these.
     length_factor : float or None
         By which the coordinates would have to be multiplied to fit K, when another unit explains
         why rotations cost energy.
@@ -58,6 +66,7 @@ class ZeroEnergy:
     n_rigid: int
     n_bodies: int
     rigid: FloatArray
+    n_suspended: int
     mechanisms: FloatArray
     length_factor: float | None
 
@@ -73,7 +82,8 @@ def zero_energy(
 ) -> ZeroEnergy:
     """Return the rigid-body motions of the geometry and the mechanisms among `zero_modes` (n, q).
 
-    Free are those whose energy is below three times the relative `rounding` of the entries of K.
+    Free are those whose energy is below three times the relative `rounding` of the entries of K,
+    unless soft springs hold them: judged by `unheld`, as the rigid-body motions of a model are.
     Rotations are left out where coordinates are not known. Pieces that neither K nor M joins have
     their own motions each.
     """
@@ -83,22 +93,12 @@ def zero_energy(
         motions = motions[:, :3]
     names = DIRECTIONS[: motions.shape[1]]
     present = np.any(motions != 0, axis=0)
-    size: Any = abs(K)
-    # by energy, not by force: the last digits of coordinates change it in second order only
-    most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
-    energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
-    free = (energy < _MARGIN * rounding * most) & present
     several = bodies(K, M, dofs)
-    if len(several) == 1:
-        basis = _free_motions(K, size, motions, _MARGIN * rounding)
-    else:
-        parts = []
-        for rows in several:
-            stiffness, sizes = (A[rows][:, rows] for A in (K, size))
-            found = _free_motions(stiffness, sizes, motions[rows], _MARGIN * rounding)
-            parts.append(np.zeros((len(dofs), found.shape[1])))
-            parts[-1][rows] = found
-        basis = np.hstack(parts)
+    almost, basis = _of_bodies(K, M, motions, several, rounding)
+    left = motions - basis @ (basis.T @ motions)
+    free = present & (np.linalg.norm(left, axis=0) < _RANK * np.linalg.norm(motions, axis=0))
+    suspended = _shared(zero_modes, almost) - _shared(zero_modes, basis)
+    extra = zero_modes.shape[1] - basis.shape[1] - suspended
     return ZeroEnergy(
         free=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
         grounded=tuple(
@@ -110,22 +110,60 @@ def zero_energy(
         n_rigid=basis.shape[1],
         n_bodies=len(several),
         rigid=basis,
-        mechanisms=beyond(zero_modes, basis),
+        n_suspended=suspended,
+        mechanisms=beyond(zero_modes, almost, extra),
         length_factor=_length_factor(K, dofs, motions, free),
     )
 
 
+def _of_bodies(
+    K: Any, M: Any, motions: FloatArray, several: list[IntArray], rounding: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return orthonormal motions of all bodies: without energy, and held by no spring either."""
+    almost: list[FloatArray] = []
+    free: list[FloatArray] = []
+    for rows in several:
+        whole = len(several) == 1
+        stiffness, mass = (A if whole or A is None else A[rows][:, rows] for A in (K, M))
+        own = own_motions(mass, motions[rows])
+        found = _free_motions(stiffness, abs(stiffness), own, _MARGIN * rounding)
+        mix = unheld(by_rows(stiffness), found, rounding * PRECISION / ROUNDING)
+        for part, kept in ((almost, _independent(found)), (free, _independent(found @ mix))):
+            part.append(np.zeros((motions.shape[0], kept.shape[1])))
+            part[-1][rows] = kept
+    return np.hstack(almost), np.hstack(free)
+
+
+def own_motions(M: Any, motions: FloatArray) -> FloatArray:
+    """Return independent motions (n, r) of a body: those of its model where M makes one."""
+    independent = _independent(motions[:, np.any(motions != 0, axis=0)])
+    if M is not None:
+        try:
+            found = orthonormalised(M, motions, dependent="drop")
+        except ModelError:
+            return independent
+        if found.shape == independent.shape:
+            return found
+    return independent
+
+
+def _shared(zero_modes: FloatArray, basis: FloatArray) -> int:
+    """Return how many directions of an orthonormal basis lie in the space of some modes."""
+    if not zero_modes.shape[1] or not basis.shape[1]:
+        return 0
+    space = la.qr(zero_modes, mode="economic")[0]
+    return int(np.count_nonzero(la.svdvals(space.T @ basis) > _RIGID))
+
+
 def _free_motions(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
-    """Return an orthonormal basis (n, r) of the motions, or combinations, without energy."""
-    motions = motions[:, np.any(motions != 0, axis=0)]
+    """Return those of some independent motions, or combinations, without energy (n, r)."""
     most = np.einsum("ij,ij->j", np.abs(motions), np.asarray(size @ np.abs(motions)))
     energy = np.abs(np.einsum("ij,ij->j", motions, np.asarray(K @ motions)))
     free = energy < allowed * most
-    basis = _independent(motions[:, free])
     if free.all():
-        return basis
+        return motions
     combined = _free_combinations(K, size, _independent(motions), allowed)
-    return combined if combined.shape[1] > basis.shape[1] else basis
+    return combined if combined.shape[1] > np.count_nonzero(free) else motions[:, free]
 
 
 def _free_combinations(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
@@ -190,9 +228,9 @@ def most_moved(motion: FloatArray) -> IntArray:
     return np.asarray(order[size[order] >= _MOVES * size[order[0]]], dtype=np.int64)
 
 
-def beyond(zero_modes: FloatArray, rigid: FloatArray) -> FloatArray:
-    """Return the part of a space that is not rigid-body motion, as orthonormal columns."""
-    extra = zero_modes.shape[1] - rigid.shape[1]
+def beyond(zero_modes: FloatArray, rigid: FloatArray, extra: int | None = None) -> FloatArray:
+    """Return the part of a space that is not rigid-body motion, as `extra` orthonormal columns."""
+    extra = zero_modes.shape[1] - rigid.shape[1] if extra is None else extra
     if extra <= 0:
         return np.zeros((zero_modes.shape[0], 0))
     space = la.qr(zero_modes, mode="economic")[0]

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
 from ...errors import ModelError, SolverError
-from ...sparse.factor import diagonal, is_positive_definite, unit_diagonal
+from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diagonal
 from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
 from ...values import FloatArray, IntArray
 from ..components import pieces
@@ -18,7 +18,8 @@ from ..matrices import FEMatrices
 from ..precision import loss
 from ..rigid import rigid_motions
 from ..singular_mass import left_out, null_motions
-from ..zero_energy import ZeroEnergy, zero_energy
+from ..soft_springs import PRECISION, unheld
+from ..zero_energy import ZeroEnergy, own_motions, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes
 _MODES = 10
@@ -91,7 +92,7 @@ def facts(given: FEMatrices) -> Facts:
     absent = no_stiffness & (no_mass if M is not None else True)
     there = np.flatnonzero(~absent)
     mass_definite, negative, weak = _mass_state(given, M, no_mass)
-    rounding = _rounding(K, given)
+    rounding = _rounding(K, M, given)
     lowest, scaled, failure = _lowest(K, M, there, bool(mass_definite), no_mass, rounding)
     motions, mechanisms = None, np.zeros((n, 0))
     if lowest is not None:
@@ -106,6 +107,7 @@ def facts(given: FEMatrices) -> Facts:
                 M=M,
             )
             mechanisms = motions.mechanisms
+            lowest = _held(lowest, motions.n_suspended)
     nothing = RigidMass(np.full(3, np.nan), np.full(3, np.nan), np.full((3, 3), np.nan))
     body = nothing if M is None or given.dofs is None else rigid_mass(M, given.dofs)
     if not given.located:
@@ -166,21 +168,29 @@ def _mass_state(given: FEMatrices, M: Any, no_mass: Any) -> tuple[bool | None, I
     return True, negative, kept[left_out(motions, part)] if motions.size else none
 
 
-def _rounding(K: Any, given: FEMatrices) -> float:
+def _rounding(K: Any, M: Any, given: FEMatrices) -> float:
     """Return the relative error of K's entries, from its digits or its free rigid motions."""
     written = 0.0 if given.digits is None else 10.0**-given.digits
     if given.dofs is None:
         return written
-    motions = rigid_motions(given.dofs)[:, : 6 if given.located else 3]
+    motions = own_motions(M, rigid_motions(given.dofs)[:, : 6 if given.located else 3])
     size: Any = abs(K)
     sizes = np.asarray(size @ np.abs(motions))
     force = np.asarray(K @ motions)
     scale = np.linalg.norm(sizes, axis=0)
     relative = np.linalg.norm(force, axis=0) / np.where(scale > 0, scale, 1.0)
-    free = (scale > 0) & (relative < _FREE)
-    work = np.einsum("ij,ij->j", np.abs(motions), np.abs(force))
-    most = np.einsum("ij,ij->j", np.abs(motions), sizes)
-    return max(written, 10 * float(np.max(work[free] / most[free], initial=0.0)))
+    motions = motions[:, (scale > 0) & (relative < _FREE)]
+    motions = motions @ unheld(by_rows(K), motions, max(PRECISION, written))
+    moved = np.abs(motions)
+    work = np.einsum("ij,ij->j", moved, np.abs(np.asarray(K @ motions)))
+    most = np.einsum("ij,ij->j", moved, np.asarray(size @ moved))
+    return max(written, 10 * float(np.max(work / most, initial=0.0)))
+
+
+def _held(lowest: Lowest, suspended: int) -> Lowest:
+    """Return the lowest modes, some of zero energy of which are held by soft springs."""
+    below = None if lowest.below is None else lowest.below - suspended
+    return replace(lowest, n_zero=lowest.n_zero - suspended, below=below)
 
 
 def _lowest(

@@ -1,0 +1,105 @@
+"""Which almost force-free motions soft springs hold: forces that rounding of K does not explain."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..sparse.rayleigh_ritz import absolute
+from ..values import FloatArray, Matrix
+
+#: relative error of an entry in double precision
+PRECISION = float(np.finfo(np.float64).eps)
+#: times the usual rounding of a row: a force larger than this is of a spring
+_OUTLIER = 30.0
+#: part of all DOFs: forces at fewer are of springs, not of rounding
+_FEW, _FEW_ROWS = 0.02, 6
+#: in relative roundings of the entries: an energy larger than this may be of springs
+ENERGY = 90.0
+#: times the root of the summed squares of the work at each DOF: springs everywhere add up, rounding
+#: of either sign does not
+_COHERENT = 4.0
+
+
+def unheld(K: Matrix, motions: FloatArray, rounding: float = PRECISION) -> FloatArray:
+    """Return the combinations (r, m) of almost force-free motions (n, r) that no spring holds.
+
+    Rounding of K leaves forces at all DOFs, of about the same size relative to what cancels there.
+    A few springs leave larger ones at a few DOFs, however soft they are; springs everywhere, a
+    bed, leave work of one sign, which sums to an energy above that of rounding.
+
+    Parameters
+    ----------
+    K : (n, n) matrix
+        Stiffness of one body.
+    motions : (n, r) array
+        Of zero energy, but for rounding and soft springs.
+    rounding : float
+        Relative error of the entries of K: of a text with few digits, say.
+    """
+    mix = np.eye(motions.shape[1])
+    if not motions.size:
+        return mix
+    size_of_K = absolute(K)
+    for free in (_beside_few_springs, _beside_many_springs):
+        if mix.shape[1]:
+            mix = mix @ free(K, size_of_K, motions @ mix, rounding)
+    return mix
+
+
+def _beside_few_springs(K: Any, size_of_K: Any, motions: FloatArray, rounding: float) -> FloatArray:
+    """Return the combinations (r, m) without outliers among the forces."""
+    n, r = motions.shape
+    force, most = np.abs(np.asarray(K @ motions)), _sizes(size_of_K, motions)
+    part = np.divide(force, most, out=np.zeros_like(force), where=most > 0)
+    usual = np.maximum(np.median(part, axis=0), rounding)
+    rows = np.flatnonzero(np.any(part > _OUTLIER * usual, axis=1))
+    if not rows.size or rows.size > max(_FEW * n, min(_FEW_ROWS, n // 4)):
+        return np.eye(r)
+    # each row in terms of its rounding, so that springs of any two stiffnesses compare
+    held = np.asarray(K[rows] @ motions) / most[rows].max(axis=1, keepdims=True)
+    values = np.zeros(r)
+    _, found, right = la.svd(held)
+    values[: found.size] = found
+    null = right[values < _OUTLIER * usual.max() * np.sqrt(rows.size)].T
+    return _in_their_order(null, np.all(part[rows] <= _OUTLIER * usual, axis=0))
+
+
+def _beside_many_springs(
+    K: Any, size_of_K: Any, motions: FloatArray, rounding: float
+) -> FloatArray:
+    """Return the combinations (r, m) without an energy that is more than rounding."""
+    moved = np.abs(motions)
+    most = np.sqrt(np.einsum("ij,ij->j", moved, np.asarray(size_of_K @ moved)))
+    most = np.where(most > 0, most, 1.0)
+    energy, mix = la.eigh(motions.T @ np.asarray(K @ motions) / most / most[:, None])
+    mix = mix / most[:, None]
+    held = _held_everywhere(K, motions @ mix, energy, rounding)
+    alone = np.einsum("ij,ij->j", motions, np.asarray(K @ motions)) / most**2
+    return _in_their_order(mix[:, ~held], ~_held_everywhere(K, motions, alone, rounding))
+
+
+def _held_everywhere(K: Any, motions: FloatArray, energy: FloatArray, rounding: float) -> Any:
+    """Return which motions (r,) cost a relative `energy` to which all DOFs add."""
+    work = motions * np.asarray(K @ motions)
+    coherent = work.sum(axis=0) > _COHERENT * np.linalg.norm(work, axis=0)
+    return (energy > ENERGY * rounding) & coherent
+
+
+def _in_their_order(null: FloatArray, untouched: Any) -> FloatArray:
+    """Return combinations (r, m): the motions themselves where as many of them are untouched."""
+    if np.count_nonzero(untouched) == null.shape[1]:
+        return np.eye(untouched.size)[:, untouched]
+    return null
+
+
+def _sizes(size_of_K: Any, motions: FloatArray) -> FloatArray:
+    """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest.
+
+    So that rounding is seen in proportion also where a motion passes through zero.
+    """
+    most = np.abs(motions).max(axis=0, initial=0.0)
+    whole: FloatArray = np.asarray(size_of_K.sum(axis=1), dtype=np.float64).reshape(-1, 1)
+    return np.asarray(whole * most)
