@@ -6,7 +6,14 @@ from functools import cache
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, ShapeError
+from flexplant.errors import (
+    AssumptionError,
+    CertificateError,
+    LabelError,
+    ModelError,
+    ShapeError,
+    SolverError,
+)
 from flexplant.estimation import check_gain, design_kalman
 from flexplant.lti import StateSpace
 from flexplant.modes import solve_modes
@@ -265,6 +272,21 @@ def test_certificate_refuses_a_wrong_gain():
         check_gain(plant, estimator.gain, estimator.covariance * (1 + 1e-5))
     with pytest.raises(ShapeError, match="gain must have shape"):
         check_gain(plant, estimator.gain[:, :2], estimator.covariance)
+
+
+@pytest.mark.parametrize("make", [stage, plate_plant])
+def test_noise_that_rounding_hides_is_named_with_the_least_that_works(make):
+    """Down to 1e-6 of the motion in a sample the filter is exact; less changes no estimate."""
+    with pytest.raises(SolverError, match=r"noise of sensor 'y\d' is .*data sheet") as caught:
+        design_kalman(make(asd=1.0, sensor_asd=1e-20))
+    least = float(str(caught.value).split("asd=")[1].split(")")[0])
+    plant = make(asd=1.0, sensor_asd=least)
+    found = design_kalman(plant)
+    assert found.certificate.difference < 1e-7
+    variance = observer_error(*dictionaries(plant, found))
+    assert np.sqrt(variance[0]) == pytest.approx(found.rms("die"), rel=1e-6, abs=0)
+    louder = design_kalman(make(asd=1.0, sensor_asd=3 * least)).rms("die")
+    assert louder == pytest.approx(found.rms("die"), rel=1e-4, abs=0)
 
 
 def test_one_disturbance_leaves_rigid_body_modes_unexcited():

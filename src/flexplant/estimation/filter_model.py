@@ -6,11 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import AssumptionError, ShapeError
+from ..errors import AssumptionError, ShapeError, SolverError
 from ..plant import StandardPlant
 from ..values import FloatArray, Value
 from .channels import poi_channels, sensors
 from .left_out import LeftOut
+
+#: noise of a sensor beside its motion in one sample that rounding may hide: its square is 1e-12
+_LOST = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -147,3 +150,21 @@ def check_noises(plant: StandardPlant) -> None:
             "acceleration sensor, say), so a sample of it would have infinite variance. Measure "
             "displacement or velocity, or shape the disturbance."
         )
+
+
+def check_precision(model: FilterModel, error: Exception) -> None:
+    """Raise SolverError when the noise of a sensor is why a filter could not be computed."""
+    moved = model.C2 @ model.Q @ model.C2.T
+    motion, noise = np.sqrt(moved.diagonal()), np.sqrt(model.R.diagonal())
+    part = np.where(motion > 0, noise / np.where(motion > 0, motion, 1.0), np.inf)
+    if np.min(part) > _LOST:
+        return
+    i = int(np.argmin(part))
+    raise SolverError(
+        f"the noise of sensor {model.sensors[i]!r} is {noise[i]:.2g} in a sample, {part[i]:.1e} "
+        f"of the {motion[i]:.2g} that the disturbances move it within a sample. Its square is lost "
+        f"in double precision, so that no filter can be computed ({error}). So little noise "
+        f"changes no estimate: give Sensor({model.sensors[i]!r}, asd="
+        f"{_LOST * motion[i] * np.sqrt(2.0 * model.dt):.1g}) or more, what the data sheet says, "
+        "and check the unit of asd."
+    ) from error

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import AssumptionError, CertificateError
+from ..errors import AssumptionError, CertificateError, SolverError
 from ..lti.riccati import solve_dare
 from ..lti.statespace import System
 from ..parallel import one_thread
@@ -17,7 +17,7 @@ from .certificate import AGREEMENT, KalmanCertificate, error_of
 from .channels import checked_plant
 from .error import error_variances
 from .estimator import KalmanEstimator
-from .filter_model import FilterModel, check_noises, filter_model
+from .filter_model import FilterModel, check_noises, check_precision, filter_model
 from .filter_system import filter_system
 from .left_out import left_out
 
@@ -73,7 +73,8 @@ def design_kalman(
     LabelError
         When the labels of a system do not name w, u, z and y, or the larger plant has others.
     SolverError
-        When no strictly stable filter exists for another reason.
+        When no strictly stable filter exists for another reason, or the noise of a sensor is so far
+        below the motion within a sample that rounding hides it.
     CertificateError
         When the check by the other route fails.
 
@@ -92,7 +93,11 @@ def design_kalman(
     whole = None if larger is plant else larger_plant(plant, larger)
     found = None if whole is None else left_out(plant, whole)
     model = filter_model(plant, found)
-    design = _designed(model)
+    try:
+        design = _designed(model)
+    except (SolverError, CertificateError) as error:
+        check_precision(model, error)
+        raise
     own = plant if found is None else found.plant
     system = filter_system(own, model, design.predictor, design.poi_gain, "kalman")
     if whole is None or found is None:

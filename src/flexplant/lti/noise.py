@@ -2,23 +2,67 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import scipy.linalg as la
 
 from ..values import FloatArray
-from .discretisation import diagonal_pairs, pair_expm
+from .discretisation import block_diagonal, diagonal_pairs, pair_expm
 from .statespace import StateSpace
+
+#: nodes that integrate ``e^(A s) B B' e^(A' s)`` to rounding over a piece of |A| s <= 1
+_NODES = 10
+
+
+def accumulated_noise(
+    at: Callable[[float], FloatArray], force: FloatArray, time: float, rate: float
+) -> FloatArray:
+    """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
+
+    Gauss-Legendre quadrature over a piece so short that ten nodes are exact to rounding, then
+    ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate) steps, however fast the modes are. Sums of
+    squares, so that G G' is positive semidefinite in any units; the block exponential of Van Loan
+    was seen to lose that on large models.
+
+    Parameters
+    ----------
+    at : function of a time
+        ``e^(A t)``.
+    force : (n, m) array
+        Noise of unit intensity enters by it.
+    time : float [s]
+        Length of the interval.
+    rate : float [rad/s]
+        Size of A.
+    """
+    doublings = max(0, int(np.ceil(np.log2(max(rate * time, 1e-300)))))
+    piece = time / 2**doublings
+    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    G = _compressed(
+        [
+            np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
+            for node, weight in zip(nodes, weights, strict=True)
+        ]
+    )
+    for k in range(doublings):
+        G = _compressed([G, at(piece * 2**k) @ G])
+    return G
+
+
+def _compressed(parts: list[FloatArray]) -> FloatArray:
+    """Return a factor (n, r <= n) of the sum of ``part part'``."""
+    G = np.hstack(parts)
+    if G.shape[1] <= G.shape[0]:
+        return G
+    return np.asarray(la.qr(G.T, mode="r")[0][: G.shape[0]].T)
 
 
 def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:
     """Return G with ``G G' = Q_d``, the covariance that white noise adds to x in one sample.
 
     ``Q_d = int_0^h e^(A s) B S B' e^(A' s) ds`` with S = diag(asd^2 / 2), the intensity of noise
-    with the one-sided amplitude spectral density asd. The integral is Gauss-Legendre quadrature
-    with the exact (closed-form) exponential at each node; the order is chosen from the fastest
-    eigenvalue so that the quadrature is exact to rounding. As a sum of squares Q_d is positive
-    semidefinite by construction, for any scaling of the states; the block exponential of Van Loan
-    was seen to lose that on large models.
+    with the one-sided amplitude spectral density asd (`accumulated_noise`).
 
     Parameters
     ----------
@@ -39,20 +83,9 @@ def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:
     if not n or not active.size:
         return np.zeros((n, 0))
     B = g.B[:, active] * (np.asarray(asd)[active] / np.sqrt(2.0))
-    turns = 2.0 * h * float(np.max(np.abs(g.poles()), initial=0.0))
-    # Gauss-Legendre of order N integrates e^(i t s) over [0, 1] to rounding once N > t / 4 + 12
-    nodes, weights = np.polynomial.legendre.leggauss(16 + int(np.ceil(0.35 * turns)))
-    times, weights = 0.5 * h * (nodes + 1.0), 0.5 * h * weights
     pairs = diagonal_pairs(g)
-    parts = []
-    for time, weight in zip(times, weights, strict=True):
-        if pairs is None:
-            moved = la.expm(g.A * time) @ B
-        else:
-            E = pair_expm(pairs, time)
-            moved = np.einsum("bij,bjm->bim", E, B.reshape(-1, 2, B.shape[1])).reshape(B.shape)
-        parts.append(np.sqrt(weight) * moved)
-    G = np.hstack(parts)
-    if G.shape[1] <= n:
-        return G
-    return np.asarray(la.qr(G.T, mode="r")[0][:n].T)
+    if pairs is None:
+        rate = float(np.linalg.norm(g.A, 1))
+        return accumulated_noise(lambda time: np.asarray(la.expm(g.A * time)), B, h, rate)
+    rate = float(np.max(np.abs(g.poles()), initial=0.0))
+    return accumulated_noise(lambda time: block_diagonal(pair_expm(pairs, time)), B, h, rate)

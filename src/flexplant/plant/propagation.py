@@ -6,6 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..lti.discretisation import pair_expm
+from ..lti.noise import accumulated_noise
 from ..values import FloatArray
 
 
@@ -57,11 +58,12 @@ class Flow:
         self.small[:, h : h + 2, h + 2 :] = driven * self.down
         #: modes that see each other: no sum over pairs, the exponential of the whole
         self.coupled = np.count_nonzero(A[self.modes, self.modes]) > np.count_nonzero(pairs)
+        size = np.ones(n)
+        size[self.head], size[self.tail] = self.up, 1.0 / self.down
+        self.size = size
+        self.whole = size[:, None] * A / size
+        self.rate = float(np.linalg.norm(self.whole, 1)) if n else 0.0
         if self.coupled:
-            size = np.ones(n)
-            size[self.head], size[self.tail] = self.up, 1.0 / self.down
-            self.size = size
-            self.whole = size[:, None] * A / size
             self.reached = _closure(A != 0)
 
     def at(self, time: float) -> FloatArray:
@@ -88,34 +90,8 @@ class Flow:
         return E
 
     def noise(self, force: FloatArray, time: float) -> FloatArray:
-        """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
-
-        Gauss-Legendre quadrature over a piece so short that ten nodes are exact to rounding, then
-        ``G(2 t) = [G(t), e^(A t) G(t)]``: sums of squares, so that G G' is positive semidefinite
-        in any units (the block exponential of Van Loan loses that on large models).
-        """
-        speed = float(np.linalg.norm(self.whole, 1)) * time
-        doublings = max(0, int(np.ceil(np.log2(max(speed, 1e-300)))))
-        piece = time / 2**doublings
-        nodes, weights = np.polynomial.legendre.leggauss(10)
-        G = _compressed(
-            [
-                np.sqrt(0.5 * piece * weight) * (self.at(0.5 * piece * (node + 1.0)) @ force)
-                for node, weight in zip(nodes, weights, strict=True)
-            ]
-        )
-        E = self.at(piece)
-        for _ in range(doublings):
-            G, E = _compressed([G, E @ G]), E @ E
-        return G
-
-
-def _compressed(parts: list[FloatArray]) -> FloatArray:
-    """Return a factor (n, r <= n) of the sum of ``part part'``."""
-    G = np.hstack(parts)
-    if G.shape[1] <= G.shape[0]:
-        return G
-    return np.asarray(la.qr(G.T, mode="r")[0][: G.shape[0]].T)
+        """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
+        return accumulated_noise(self.at, force, time, self.rate)
 
 
 def _closure(direct: np.ndarray) -> np.ndarray:

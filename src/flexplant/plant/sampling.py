@@ -217,8 +217,7 @@ def _noise(
 ) -> FloatArray:
     """Return G (N, r), ``G G'`` the covariance that white inputs add in one sample.
 
-    Gauss-Legendre quadrature as in `lti.noise`, piece by piece between the instants at which
-    late outputs are taken: a sum of squares, exact to rounding.
+    Piece by piece between the instants at which late outputs are taken (`lti.noise`).
     """
     loud = np.flatnonzero(asd)
     if not loud.size or not g.n_states:
@@ -229,32 +228,17 @@ def _noise(
     for j in np.flatnonzero(outputs.fraction > 0).tolist():
         taken.setdefault(h - float(outputs.fraction[j]), []).append(j)
     edges = np.unique([0.0, h, *taken])
-    fastest = float(np.max(np.abs(g.poles()), initial=0.0))
     states = slice(layout.first, layout.first + g.n_states)
     parts = []
     for start, end in pairwise(edges):
-        if flow.coupled:
-            G = flow.noise(force, end - start)
-            column = np.zeros((layout.size, G.shape[1]))
-            column[states] = flow.at(h - end) @ G
-            for instant, seen in taken.items():
-                if end <= instant:
-                    rows = [layout.line(j)[-1] for j in seen]
-                    column[rows] = g.C[seen] @ flow.at(instant - end) @ G
-            parts.append(column)
-            continue
-        count = 16 + int(np.ceil(0.7 * (end - start) * fastest))
-        nodes, weights = np.polynomial.legendre.leggauss(count)
-        for s, weight in zip(
-            start + 0.5 * (end - start) * (nodes + 1.0), 0.5 * (end - start) * weights, strict=True
-        ):
-            column = np.zeros((layout.size, loud.size))
-            column[states] = flow.at(h - s) @ force
-            for instant, seen in taken.items():
-                if s < instant:
-                    moved = flow.at(instant - s) @ force
-                    column[[layout.line(j)[-1] for j in seen]] = g.C[seen] @ moved
-            parts.append(np.sqrt(weight) * column)
+        G = flow.noise(force, end - start)
+        column = np.zeros((layout.size, G.shape[1]))
+        column[states] = flow.at(h - end) @ G
+        for instant, seen in taken.items():
+            if end <= instant:
+                rows = [layout.line(j)[-1] for j in seen]
+                column[rows] = g.C[seen] @ flow.at(instant - end) @ G
+        parts.append(column)
     G = np.hstack(parts)
     if G.shape[1] <= G.shape[0]:
         return G
