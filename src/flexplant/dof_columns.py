@@ -99,3 +99,21 @@ def direction_names(directions: Any) -> tuple[str, ...]:
     except TypeError:
         pass
     return tuple(str(direction) for direction in given)
+
+
+def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:
+    """Return the coordinates (n, 3) of some nodes out of a table of all.
+
+    Raises
+    ------
+    LabelError
+        When one is not there.
+    """
+    missing = np.setdiff1d(wanted, known)
+    if missing.size:
+        raise LabelError(
+            f"{source!r} has no coordinates for nodes {missing[:6].tolist()} ({missing.size} in "
+            "all). Is it the table of the same model?"
+        )
+    order = np.argsort(known, kind="stable")
+    return np.asarray(xyz[order[np.searchsorted(known[order], wanted)]], dtype=np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,7 @@ from .store import Value as Value
 from .store import frozen as frozen
 from .store import rebuild as rebuild
 
+T = TypeVar("T")
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -174,6 +175,46 @@ def flag(value: Any, name: str) -> bool:
     if not isinstance(value, bool | np.bool_):
         raise ModelError(f"{name} must be True or False, got {short(value)}. Pass one of them.")
     return bool(value)
+
+
+def instance(value: Any, kind: type[T], name: str, hint: str) -> T:
+    """Return `value`, which must be of a class.
+
+    Parameters
+    ----------
+    value : object
+        What was given.
+    kind : type
+        The class.
+    name : str
+        What the caller calls it.
+    hint : str
+        How to make one, a sentence.
+
+    Raises
+    ------
+    ModelError
+        When it is of another class.
+    """
+    if not isinstance(value, kind):
+        raise ModelError(
+            f"{name} must be of type {kind.__name__}, got {type(value).__name__}. {hint}"
+        )
+    return value
+
+
+def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
+    """Return `value`, which must be one of some texts.
+
+    Raises
+    ------
+    ModelError
+        When it is none of them.
+    """
+    listed = list(choices)
+    if not isinstance(value, str) or value not in listed:
+        raise ModelError(f"{name} must be one of {listed}, got {short(value)}. Pass one of them.")
+    return value
 
 
 def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:

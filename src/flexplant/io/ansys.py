@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
@@ -15,7 +16,7 @@ from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra, quiet
 from .formats import Format
 from .paths import file_path
-from .tables import at_nodes, read_nodes_table
+from .tables import read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none
 _STRAIGHT = 1e-9

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices, FEModel
@@ -26,7 +27,7 @@ from . import (
 )
 from .formats import HEAD, Elsewhere, Format, ends
 from .paths import file_path
-from .tables import at_nodes, read_dofs, read_nodes_table
+from .tables import read_dofs, read_nodes_table
 
 FORMATS: tuple[Format, ...] = (
     matrix_market.MATRIX_MARKET,

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
@@ -131,24 +132,6 @@ def read_nodes_table(path: str | Path) -> tuple[IntArray, FloatArray]:
         When it has another form.
     """
     return _nodes(_table(path, plain=("node", "x", "y", "z")))
-
-
-def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:
-    """Return the coordinates (n, 3) of some nodes out of a table of all.
-
-    Raises
-    ------
-    LabelError
-        When one is not there.
-    """
-    missing = np.setdiff1d(wanted, known)
-    if missing.size:
-        raise LabelError(
-            f"{source!r} has no coordinates for nodes {missing[:6].tolist()} ({missing.size} in "
-            "all). Is it the table of the same model?"
-        )
-    order = np.argsort(known, kind="stable")
-    return np.asarray(xyz[order[np.searchsorted(known[order], wanted)]], dtype=np.float64)
 
 
 def _nodes(table: _Table) -> tuple[IntArray, FloatArray]:

@@ -5,9 +5,9 @@ from .attachments import HeldShape as HeldShape
 from .attachments import PointMass as PointMass
 from .attachments import Spring as Spring
 from .damping import Damping as Damping
-from .damping import Hysteretic as Hysteretic
 from .damping import ModalDamping as ModalDamping
 from .damping import Rayleigh as Rayleigh
+from .hysteretic import Hysteretic as Hysteretic
 from .inspection.check import ModelCheck as ModelCheck
 from .inspection.check import check as check
 from .interpolation import ScatteredShape as ScatteredShape

@@ -22,8 +22,22 @@ _SINGULAR = 1e-12
 
 def no_mass(M: Any) -> Any:
     """Return which DOFs (n,) have no mass at all: their rows are zero."""
-    sizes: Any = abs(M)
-    return np.asarray(sizes.sum(axis=1)).ravel() == 0
+    return _row_sums(M) == 0
+
+
+def held_rows(K: Any, M: Any, D: Any) -> Any:
+    """Return which rows (n,) a solver left for held DOFs: at most a diagonal of K, or empty."""
+    size = _row_sums(K)
+    held = size == 0 if M is None else size <= np.abs(K.diagonal())
+    for matrix in (M, D):
+        if matrix is not None:
+            held &= _row_sums(matrix) == 0
+    return held
+
+
+def _row_sums(matrix: Any) -> Any:
+    sizes: Any = abs(matrix)
+    return np.asarray(sizes.sum(axis=1)).ravel()
 
 
 def condensed(
@@ -43,8 +57,7 @@ def condensed(
     if not m.size:
         raise ModelError("no DOF has mass: M is zero. Was another matrix read as M?")
     if D is not None:
-        sizes: Any = abs(D)
-        damped = s[np.asarray(sizes.sum(axis=1)).ravel()[s] > 0]
+        damped = s[_row_sums(D)[s] > 0]
         if damped.size:
             raise ModelError(
                 f"damping acts on the massless DOFs {list(names(damped[:6]))}: they would not "

@@ -6,22 +6,23 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
 
+from ..dof_columns import at_nodes
 from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError
-from ..labels import DIRECTIONS, DofSet
+from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
-from ..values import FloatArray, IntArray, Value, name_list, real_array, short, whole
+from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, short, whole
 from .completion import completed as completed
 from .completion import square
-from .condense import condensed, no_mass
+from .condense import held_rows, no_mass
 from .local_axes import cosines
+from .massless import inertial
 from .model import SEMIDEFINITE, FEModel
 from .precision import digits_of, endangered, held_by_rounding
-from .singular_mass import left_out, null_motions, projected
 from .units import units
 from .zero_energy import freed
 
@@ -91,12 +92,13 @@ class FEMatrices(Value):
                     f"{name} must have shape ({n}, {n}) like K, got {others[name].shape}. Were "
                     "constraints applied to one matrix only?"
                 )
-        if self.dofs is not None and not isinstance(self.dofs, DofSet):
-            raise ModelError(
-                f"dofs must be a DofSet, got {type(self.dofs).__name__}. DofSet(nodes, directions, "
-                "xyz) makes one, DofSet.from_table(path) reads one."
+        if (
+            self.dofs is not None
+            and len(
+                instance(self.dofs, DofSet, "dofs", "DofSet(nodes, directions, xyz) makes one.")
             )
-        if self.dofs is not None and len(self.dofs) != n:
+            != n
+        ):
             raise ShapeError(
                 f"K has {n} rows, but the DofSet {len(self.dofs)} DOFs. Are constrained "
                 "DOFs in one of them only?"
@@ -111,11 +113,7 @@ class FEMatrices(Value):
         )
 
     def __repr__(self) -> str:
-        stored = [
-            f"{name} ({matrix.nnz} entries)"
-            for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D))
-            if matrix is not None
-        ]
+        stored = [f"{name} ({matrix.nnz} entries)" for name, matrix in self._matrices.items()]
         where = f" of {self.source!r}" if self.source else ""
         parts = [f"{self.n_dof} DOFs", *stored]
         if self.constrained:
@@ -127,6 +125,17 @@ class FEMatrices(Value):
         elif not self.located:
             parts.append("no coordinates")
         return f"<FEMatrices{where}: {', '.join(parts)}>"
+
+    @property
+    def _matrices(self) -> dict[str, Any]:
+        every = {"K": self.K, "M": self.M, "D": self.D}
+        return {name: matrix for name, matrix in every.items() if matrix is not None}
+
+    @property
+    def _named_dofs(self) -> DofSet:
+        if self.dofs is None:
+            raise LabelError("the rows have no names yet: with_dofs(dofs) gives names and places.")
+        return self.dofs
 
     @property
     def n_dof(self) -> int:
@@ -180,21 +189,13 @@ class FEMatrices(Value):
         LabelError
             When the DOFs are not named, or a node has no coordinates.
         """
-        if self.dofs is None:
-            raise LabelError("the rows have no names yet: with_dofs(dofs) gives these and places.")
+        dofs = self._named_dofs
         if not isinstance(nodes, Iterable) or isinstance(nodes, str):
             raise LabelError(f"nodes must be a list of node numbers, got {short(nodes)}.")
         numbers = np.array([whole(node, "a node number", minimum=0) for node in nodes], np.int64)
-        places = real_array(xyz, "xyz", (numbers.size, 3))
-        missing = np.setdiff1d(self.dofs.nodes, numbers)
-        if missing.size:
-            raise LabelError(
-                f"no coordinates for nodes {missing[:6].tolist()} ({missing.size} in all): every "
-                "node that has a DOF needs them. Is this the table of the same model?"
-            )
-        order = np.argsort(numbers, kind="stable")
-        rows = order[np.searchsorted(numbers[order], self.dofs.nodes)]
-        return self.replace(dofs=self.dofs.replace(xyz=places[rows]), located=True)
+        given = real_array(xyz, "xyz", (numbers.size, 3))
+        places = at_nodes(dofs.nodes, numbers, given, "nodes")
+        return self.replace(dofs=dofs.replace(xyz=places), located=True)
 
     def without(self, labels: Iterable[str]) -> FEMatrices:
         """Return what is left when DOFs are held: their rows and columns dropped.
@@ -209,11 +210,10 @@ class FEMatrices(Value):
         LabelError
             When the DOFs are not named, or one is not there.
         """
-        if self.dofs is None:
-            raise LabelError("the rows have no names yet: with_dofs(dofs) gives them.")
+        dofs = self._named_dofs
         held = name_list(labels, "DOFs to hold")
         keep = np.ones(self.n_dof, dtype=bool)
-        keep[self.dofs.indices(held)] = False
+        keep[dofs.indices(held)] = False
         return self._kept(np.flatnonzero(keep))
 
     def trimmed(self) -> FEMatrices:
@@ -222,30 +222,19 @@ class FEMatrices(Value):
         These are empty in every matrix, or hold no mass and nothing but a diagonal of K: such a
         DOF stays at rest, so that dropping it changes nothing.
         """
-        sizes = [
-            np.asarray(abs(A).sum(axis=1)).ravel()
-            for A in (self.K, self.M, self.D)
-            if A is not None
-        ]
-        lonely = sizes[0] <= np.abs(self.K.diagonal())
-        for size in sizes[1:]:
-            lonely &= size == 0
-        if self.M is None:
-            lonely = sizes[0] == 0
-        if not lonely.any() or lonely.all():
+        held = held_rows(self.K, self.M, self.D)
+        if not held.any() or held.all():
             return self
-        note = f"{int(lonely.sum())} rows of held DOFs dropped"
-        left = self._kept(np.flatnonzero(~lonely))
+        note = f"{int(held.sum())} rows of held DOFs dropped"
+        left = self._kept(np.flatnonzero(~held))
         return left.replace(notes=(*left.notes, note))
 
     def _kept(self, rows: IntArray) -> FEMatrices:
         dropped = np.setdiff1d(np.arange(self.n_dof), rows)
-        parts: dict[str, Any] = {
-            name: None if matrix is None else matrix[rows][:, rows]
-            for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D))
-        }
+        parts = {name: matrix[rows][:, rows] for name, matrix in self._matrices.items()}
         constrained = (*self.constrained, *self.names(dropped))
-        return self.replace(**parts, dofs=taken(self.dofs, rows), constrained=constrained)
+        dofs = None if self.dofs is None else self.dofs._taken(rows)
+        return self.replace(**parts, dofs=dofs, constrained=constrained)
 
     def converted(
         self, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
@@ -268,7 +257,9 @@ class FEMatrices(Value):
         Raises
         ------
         ModelError
-            When a unit is unknown, or the DOFs are (rotations convert differently).
+            When a unit is unknown.
+        LabelError
+            When the DOFs are not named: rotations convert differently.
 
         Examples
         --------
@@ -277,17 +268,12 @@ class FEMatrices(Value):
         >>> float(si.K[0, 0]), si.mass, float(si.dofs.xyz[0, 0])
         (12000.0, 2.0, 0.5)
         """
-        system = units(length, mass, time)
-        if self.dofs is None:
-            raise ModelError(
-                "the rows have no names, so that rotations, which convert differently, are not "
-                "known. with_dofs(dofs) first."
-            )
+        system, dofs = units(length, mass, time), self._named_dofs
         return self.replace(
-            K=system.stiffness_matrix(self.K, self.dofs),
-            M=None if self.M is None else system.mass_matrix(self.M, self.dofs),
-            D=None if self.D is None else system.damping_matrix(self.D, self.dofs),
-            dofs=system.placed(self.dofs),
+            K=system.stiffness_matrix(self.K, dofs),
+            M=None if self.M is None else system.mass_matrix(self.M, dofs),
+            D=None if self.D is None else system.damping_matrix(self.D, dofs),
+            dofs=system.placed(dofs),
         )
 
     def rotated(self, rotations: Any) -> FEMatrices:
@@ -316,14 +302,11 @@ class FEMatrices(Value):
         >>> FEMatrices(np.diag([4.0, 1, 1]), dofs=dofs).rotated(turned).K.diagonal().tolist()
         [1.0, 4.0, 1.0]
         """
-        if self.dofs is None:
-            raise LabelError("the rows have no names yet: with_dofs(dofs) gives them.")
-        C = cosines(self.dofs, rotations)
+        C = cosines(self._named_dofs, rotations)
         turned: dict[str, Any] = {}
-        for name, matrix in (("K", self.K), ("M", self.M), ("D", self.D)):
-            if matrix is not None:
-                full: Any = C.T @ matrix @ C
-                turned[name] = 0.5 * (full + full.T)
+        for name, matrix in self._matrices.items():
+            full: Any = C.T @ matrix @ C
+            turned[name] = 0.5 * (full + full.T)
         return self.replace(**turned)
 
     def model(
@@ -355,8 +338,7 @@ class FEMatrices(Value):
             When few digits (a text, or single precision) endanger the first elastic eigenvalue, or
             hold rigid-body motions.
         """
-        if massless not in ("refuse", "condense"):
-            raise ModelError(f"massless must be 'refuse' or 'condense', got {short(massless)}.")
+        one_of(massless, "massless", ("refuse", "condense"))
         if self.M is None:
             raise ModelError("there is no M, hence no model. Read or export the mass matrix too.")
         if self.dofs is None:
@@ -366,16 +348,14 @@ class FEMatrices(Value):
                 "read_model."
             )
         ready = self
-        if not isinstance(free, bool | np.bool_):
-            raise ModelError(f"free must be True or False, got {short(free)}.")
-        if free and (self.digits is not None or not self.located):
+        if flag(free, "free") and (self.digits is not None or not self.located):
             ready = ready.freed()
-        without = no_mass(self.M)
-        if without.any():
-            ready = ready._condensed(without, massless)
-        motions = null_motions(ready.M, self.digits)
-        if motions.shape[1]:
-            ready = ready._projected(motions, massless)
+        K, M, D, rows, done = inertial(
+            ready.K, ready.M, ready.D, ready.names, digits=self.digits, massless=massless
+        )
+        if done:
+            dofs, notes = self.dofs._taken(rows), (*ready.notes, *done)
+            ready = ready.replace(K=K, M=M, D=D, dofs=dofs, notes=notes)
         # of few digits, the last one decides whether K is singular
         rounding = 1e-14 if self.digits is None else 10.0**-self.digits
         if not self.located and not is_positive_definite(ready.K, -rounding):
@@ -384,9 +364,8 @@ class FEMatrices(Value):
                 "its rigid-body rotations. Give them: located_at(nodes, xyz), or to the reader."
             )
         parts: Any = ready
-        label = name or self.source
         try:
-            model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=label)
+            model = FEModel(parts.M, parts.K, parts.D, dofs=parts.dofs, name=name or self.source)
         except ModelError as error:
             held = None if free else ready._held_by_rounding(None)
             raise ModelError(f"{error} {held[0].upper()}{held[1:]}") if held else error from None
@@ -424,37 +403,3 @@ class FEMatrices(Value):
             return None
         known = None if model is None else model.rigid_body
         return held_by_rounding(self.K, self.M, self.dofs, self.digits, known)
-
-    def _condensed(self, without: Any, massless: str) -> FEMatrices:
-        if massless == "refuse":
-            listed = ", ".join(repr(name) for name in self.massless[:6])
-            more = f" ({without.sum()} in all)" if without.sum() > 6 else ""
-            raise ModelError(
-                f"DOFs without mass: {listed}{more}. They have no motion of their own. Condense "
-                "them, which is exact: model(massless='condense'); or give them their mass."
-            )
-        K, M, D = condensed(self.K, cast(Any, self.M), self.D, without, self.names)
-        kept = np.flatnonzero(~without)
-        note = f"{int(without.sum())} massless DOFs condensed"
-        return self.replace(K=K, M=M, D=D, dofs=taken(self.dofs, kept), notes=(*self.notes, note))
-
-    def _projected(self, motions: FloatArray, massless: str) -> FEMatrices:
-        if massless == "refuse":
-            at = ", ".join(self.names(left_out(motions, self.M)[:6]))
-            raise ModelError(
-                f"{motions.shape[1]} motions have no inertia, turning {at} among others: offset "
-                "masses without rotary inertia, or rods that do not resist turning? Condense them, "
-                "which is exact: model(massless='condense'); or give them their inertia."
-            )
-        K, M, D, kept = projected(self.K, self.M, self.D, motions, self.names)
-        note = f"{motions.shape[1]} motions without inertia condensed"
-        dofs = taken(self.dofs, kept)
-        return self.replace(K=K, M=M, D=D, dofs=dofs, notes=(*self.notes, note))
-
-
-def taken(dofs: DofSet | None, rows: IntArray) -> DofSet | None:
-    """Return the DofSet of some rows (from 0), without interpolation; None of None."""
-    if dofs is None:
-        return None
-    names = np.array(DIRECTIONS, dtype=object)
-    return DofSet(dofs.nodes[rows], tuple(names[dofs.kinds[rows]]), dofs.xyz[rows])
