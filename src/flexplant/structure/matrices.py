@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..dof_columns import at_nodes
+from ..dof_columns import at_nodes, node_numbers
 from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
-from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, short, whole
+from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
 from .completion import completed as completed
 from .completion import square
 from .condense import held_rows, no_mass
@@ -170,8 +170,7 @@ class FEMatrices(Value):
             When their number is not that of the rows.
         """
         given = DofSet.from_table(dofs) if isinstance(dofs, str | Path) else dofs
-        if given is None:
-            raise ModelError("dofs must be a DofSet or the path of a table, got None.")
+        instance(given, DofSet, "dofs", "A path of a table does as well.")
         return self.replace(dofs=given, located=True)
 
     def located_at(self, nodes: Iterable[int], xyz: Any) -> FEMatrices:
@@ -190,9 +189,7 @@ class FEMatrices(Value):
             When the DOFs are not named, or a node has no coordinates.
         """
         dofs = self._named_dofs
-        if not isinstance(nodes, Iterable) or isinstance(nodes, str):
-            raise LabelError(f"nodes must be a list of node numbers, got {short(nodes)}.")
-        numbers = np.array([whole(node, "a node number", minimum=0) for node in nodes], np.int64)
+        numbers = node_numbers(nodes)
         given = real_array(xyz, "xyz", (numbers.size, 3))
         places = at_nodes(dofs.nodes, numbers, given, "nodes")
         return self.replace(dofs=dofs.replace(xyz=places), located=True)
