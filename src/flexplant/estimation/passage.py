@@ -199,7 +199,7 @@ class _Walk:
     def _settled(
         self, x: FloatArray, P: FloatArray, Z: FloatArray
     ) -> tuple[bool, FloatArray, FloatArray]:
-        """Tell whether the gain is stationary; delta is put into x once it fades from it."""
+        """Return whether the gain is stationary; delta is put into x once it fades from it."""
         weight, size = self._weight
         if Z.shape[1]:
             assert self.found is not None  # noqa: S101

@@ -79,8 +79,8 @@ def _back(
     added, r = _adjoint(steady, here, passage.white[at], [onward], r)
     hat[at] += added[0]
     C = g.W @ steady.model.C2
-    told = C.T @ C
-    settled = solve_stein(F.T, told)
+    information = C.T @ C
+    settled = solve_stein(F.T, information)
     size = np.sqrt(here.variances(steady.form(steady.P, g, predict=False)))
     some = (here.c @ onward / size[:, :, None]).reshape(-1, F.shape[0])
     weight = solve_stein(F, some.T @ some / here.c.shape[0])
@@ -89,7 +89,7 @@ def _back(
         k -= 1
         T = here.at(k - span[0]).c @ onward
         variance[k] -= np.einsum("zi,ij,zj->z", T, M, T)
-        M = F.T @ M @ F + told
+        M = F.T @ M @ F + information
     if k > span[0]:
         M, before = settled, slice(0, k - span[0])
         part = here.part(before)
