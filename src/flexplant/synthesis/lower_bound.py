@@ -26,7 +26,7 @@ _UNDAMPED = 1e-6
 def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
     """Return the best lower bound on what controllers reach, at most gamma.
 
-    The largest of the one that the method knows, the pointwise one, and for small problems where
+    The largest of the one that the method gives, the pointwise one, and for small problems where
     these are far from gamma that of the LMIs.
 
     Parameters
