@@ -15,14 +15,12 @@ from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
 from ..structure import FEModel
 from ..structure.negative_stiffness import refuse_unstable, unstable_stiffness
-from ..structure.placed import missed
+from ..structure.placed import SPANNED, missed
 from ..structure.rigid import orthonormalised, rigid_motions
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
 from .bounds import ErrorBound
 from .quality import ReductionQuality, quality_of
 
-#: relative: a rigid-body motion that T makes up to this is one of the model's
-_MADE = 1e-3
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
 _DEFINITE = 1e-14
 #: how the names of coordinates begin that hold the static compliance of what was left out
@@ -314,7 +312,7 @@ class ReducedModel(Value):
     @property
     def body_motions(self) -> FloatArray:
         """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
-        made = self.missed_motions() < _MADE
+        made = self.missed_motions() < SPANNED
         return orthonormalised(self.M, self.rigid_motions()[:, made], dependent="drop")
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:

@@ -11,7 +11,7 @@ from ...errors import AssumptionError, unknown_label
 from ...lti.statespace import StateSpace
 from ...values import FloatArray, Value, name_list
 from ..standard import StandardPlant, standard_plant
-from .rigid_body import RigidBody, rigid_body_of
+from .rigid_body import RigidBody, refuse_lost, rigid_body_of
 from .rigid_motion import projected
 
 #: relative: what the sensors show or the actuators push of other axes
@@ -96,7 +96,8 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     Raises
     ------
     AssumptionError
-        When the actuators or sensors do not reach or see an axis apart from the others.
+        When the actuators or sensors do not reach or see an axis apart from the others; when no
+        axes are given and they have part in one that the model's shapes do not make.
     LabelError
         When an axis is not one of the structure's.
     ModelError
@@ -105,6 +106,10 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     plant = standard_plant(plant)
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     body = rigid_body_of(realisation)
+    if axes is None:
+        rows = [s.static_row(realisation) for s in ports.y if s.order == 0]
+        rows += [port.static_push(realisation) for port in ports.u]
+        refuse_lost(body, realisation, rows, np.inf, "; or name the axes that count, axes=[...]")
     wanted = body.axes if axes is None else name_list(axes, "axes")
     for axis in wanted:
         if axis not in body.axes:

@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...errors import ModelError
+from ...errors import AssumptionError, ModelError
 from ...labels import DIRECTIONS
 from ...structure import FEModel
+from ...structure.placed import SPANNED
 from ...structure.rigid import turned_about
 from ...values import FloatArray, Value
 from ..realisation import ModalRealisation, Structure
 
-#: relative: a rigid-body motion that the shapes make up to this is one of theirs
-_SPANNED = 1e-7
+#: part of a channel's largest motion that counts as seen
+_SEEN = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +33,16 @@ class RigidBody(Value):
         ``motions' M motions``.
     centre : (3,) array [m]
         The centre of gravity; what the motions do not determine of it is 0.
+    lost : mapping {axis: float}
+        Axes along which the model has DOFs, but which its shapes do not make: by how much of the
+        motion they miss it.
     """
 
     axes: tuple[str, ...]
     motions: FloatArray
     mass: FloatArray
     centre: FloatArray
+    lost: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._set(motions=self.motions, mass=self.mass, centre=self.centre)
@@ -60,12 +66,13 @@ def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArra
     if isinstance(model, FEModel):
         return -model.ground_inertia(turned_about(direction, about))
     missed = model.missed_motions(about)[axis]
-    if missed > _SPANNED:
+    if missed > SPANNED:
         raise ModelError(
             f"the shapes of this {type(model).__name__} do not make the rigid-body motion "
             f"{direction!r} (they miss {missed:.2g} of it), so that its inertia against a base "
             "acceleration is not known: it is held, or has springs that were there before its "
-            "modes were solved. Pass the FEModel, or solve it free and suspend(model, springs)."
+            "modes were solved and that bend them. Pass the FEModel, more modes, or solve it free "
+            "and suspend(modes, springs)."
         )
     return np.asarray(-model.inertia(motion)[:, 0])
 
@@ -80,20 +87,66 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
     """
     model = realisation.model
     everywhere, missed = model.rigid_motions(), model.missed_motions()
-    exists = [
+    moving = [
         i
         for i, axis in enumerate(DIRECTIONS)
-        if np.any(everywhere[:, i])
-        and (axis in model.full_dofs.directions or axis.startswith("r"))
-        and missed[i] < _SPANNED
+        if np.any(everywhere[:, i]) and (axis in model.full_dofs.directions or axis.startswith("r"))
     ]
-    exists = _independent(everywhere, exists)
+    exists = _independent(everywhere, [i for i in moving if missed[i] < SPANNED])
+    lost = {DIRECTIONS[i]: float(missed[i]) for i in moving if missed[i] >= SPANNED}
     if not exists:
-        raise ModelError("this structure is held: it cannot move as a rigid body.")
+        raise ModelError(
+            "this structure is held: it cannot move as a rigid body. Its shapes miss "
+            f"{_listed(lost)} of these motions."
+        )
     axes = tuple(DIRECTIONS[i] for i in exists)
     centre = _centre(_mass(model, everywhere[:, exists]), axes)
     motions = model.rigid_motions(centre)[:, exists]
-    return RigidBody(axes, motions, _mass(model, motions), centre)
+    return RigidBody(axes, motions, _mass(model, motions), centre, lost)
+
+
+def refuse_lost(
+    body: RigidBody,
+    realisation: ModalRealisation,
+    rows: Iterable[FloatArray],
+    below: float,
+    do: str,
+) -> None:
+    """Raise AssumptionError when channels have part in a rigid-body axis that a model has lost.
+
+    Parameters
+    ----------
+    body : RigidBody
+        Of the model.
+    realisation : ModalRealisation
+        The model.
+    rows : rows (n,) over the model's DOFs
+        What the channels see or push.
+    below : float
+        Axes whose motion the shapes miss by more are held: there is nothing to lose.
+    do : str
+        What to do else, for the message.
+    """
+    lost = {axis: part for axis, part in body.lost.items() if part < below}
+    if not lost:
+        return
+    motions = realisation.model.rigid_motions(body.centre)
+    motions = motions[:, [DIRECTIONS.index(axis) for axis in lost]]
+    stacked = np.array(list(rows)).reshape(-1, motions.shape[0])
+    most = np.abs(stacked) @ np.abs(motions)
+    seen = np.any(np.abs(stacked @ motions) > _SEEN * most.max(axis=0, initial=0.0), axis=0)
+    if np.any(seen):
+        named = {axis: part for (axis, part), one in zip(lost.items(), seen, strict=True) if one}
+        raise AssumptionError(
+            f"the channels have part in rigid-body axes that this model has no shapes for: they "
+            f"miss {_listed(named)}, and the other axes ({', '.join(body.axes)}) would be mixed "
+            "with these. Stiff springs that were there before the modes were solved bend them: "
+            f"keep more modes, or solve the free structure and suspend(modes, springs){do}."
+        )
+
+
+def _listed(lost: Mapping[str, float]) -> str:
+    return ", ".join(f"{100 * part:.2g} % of {axis}" for axis, part in lost.items())
 
 
 def _independent(motions: FloatArray, exists: list[int]) -> list[int]:

@@ -13,7 +13,7 @@ from ...structure.negative_stiffness import signed_root
 from ...values import FloatArray, IntArray
 from ..partition import Partition
 from ..realisation import ModalRealisation
-from .rigid_body import rigid_body_of
+from .rigid_body import RigidBody, refuse_lost, rigid_body_of
 
 #: part of its kinetic energy that a suspension mode has in rigid-body motion, at least. Springs at
 #: the corners of a plate that put it at 0.4 of its first elastic frequency leave more, a clamped
@@ -41,8 +41,10 @@ class RigidModes(NamedTuple):
     freq: FloatArray
 
 
-def rigid_modes(realisation: ModalRealisation) -> RigidModes:
+def rigid_modes(realisation: ModalRealisation, body: RigidBody | None) -> RigidModes:
     """Return the rigid-body motions of a structure that is free, or on weak springs.
+
+    Its rigid body is None when it is held, or has no geometry.
 
     With R the motions of `rigid_body_of`, m their mass and S = R m^(-1/2), mode i has the part
     ``tr(S' M G_i M S)`` of its kinetic energy in them, G_i its velocities per impulse. Motions
@@ -52,11 +54,7 @@ def rigid_modes(realisation: ModalRealisation) -> RigidModes:
     place = np.arange(r) * 2
     swing = realisation.pairs[:r, 0, 1]
     free = RigidModes(realisation.outputs[:, place] * swing, np.arange(r), np.zeros(r))
-    try:
-        body = rigid_body_of(realisation)
-    except FlexplantError:  # held, or without a geometry: no rigid-body motion but modes at 0 Hz
-        return free
-    if len(body.axes) <= r:
+    if body is None or len(body.axes) <= r:
         return free
     root = np.linalg.cholesky(body.mass)
     shapes = la.solve_triangular(root, body.motions.T, lower=True).T
@@ -87,9 +85,19 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
     ModelError
         When it was not assembled from a structure.
     AssumptionError
-        When the structure is held.
+        When the structure is held, or stiff springs bend an axis that its channels have part in.
     """
-    motions = rigid_modes(plant.assembled.realisation)
+    realisation, ports = plant.assembled.realisation, plant.assembled.ports
+    try:
+        body = rigid_body_of(realisation)
+    except FlexplantError:  # held, or without a geometry: no rigid-body motion but modes at 0 Hz
+        body = None
+    if body is not None:
+        rows = [s.static_row(realisation) for s in ports.y if s.order == 0]
+        rows += [poi.row(realisation, axis) for poi in ports.z for axis in poi.axes]
+        rows += [port.static_push(realisation) for port in ports.u]
+        refuse_lost(body, realisation, rows, np.sqrt(1.0 - _RIGID), "")
+    motions = rigid_modes(realisation, body)
     if not motions.modes.size:
         raise AssumptionError(
             "the plant has no rigid-body modes and no suspension modes: it is constrained. This "

@@ -13,6 +13,7 @@ from ...labels import Place
 from ...modes import Modes, normal_form
 from ...reduction import ReducedModel
 from ...structure import Damper, FEModel, Spring
+from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
 from ...values import FloatArray, Value, positive, real_array
 from ..port_checks import checked_direction, checked_place
@@ -20,8 +21,6 @@ from ..port_checks import checked_direction, checked_place
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not
 _SLACK = 1e-9
-#: relative: a rigid-body motion that the shapes make up to this is one of theirs
-_MADE = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +168,7 @@ def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
         free = np.vstack([kept, np.zeros((b - modes.n_rigid, kept.shape[1]))])
 
     def motions() -> FloatArray:
-        made = modes.missed_motions() < _MADE
+        made = modes.missed_motions() < SPANNED
         part = np.linalg.lstsq(basis, modes.rigid_motions()[:, made], rcond=None)[0]
         return orthonormalised(np.eye(b), part, dependent="drop")
 
