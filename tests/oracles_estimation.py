@@ -208,3 +208,43 @@ def _root(covariance):
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(covariance / size / size[:, None])
     return size[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def unbiased_late(A, G, C, Q, R, steps=3000):
+    """P[k|k] and the input's covariance by Gillijns, De Moor, Automatica 43, 2007, 111-116.
+
+    Their recursion, sections 3 to 5, with alpha of eq. (25).
+    """
+    n, m = G.shape
+    P = np.eye(n)
+    for _ in range(steps):
+        before = A @ P @ A.T + Q
+        spread = C @ before @ C.T + R
+        F = C @ G
+        inverse = np.linalg.inv(spread)
+        M = np.linalg.solve(F.T @ inverse @ F, F.T @ inverse)
+        left = np.eye(n) - G @ M @ C
+        star = left @ before @ left.T + G @ M @ R @ M.T @ G.T
+        S_star = -G @ M @ R
+        R_star = C @ star @ C.T + R + C @ S_star + S_star.T @ C.T
+        root = np.linalg.inv(np.linalg.cholesky(spread))
+        U = np.linalg.svd(root @ F)[0]
+        alpha = U[:, m:].T @ root
+        K = (star @ C.T + S_star) @ alpha.T @ np.linalg.inv(alpha @ R_star @ alpha.T) @ alpha
+        P = star - K @ (star @ C.T + S_star).T
+    return P, np.linalg.inv(F.T @ inverse @ F)
+
+
+def unbiased_direct(A, G, C, H, Q, R, steps=3000):
+    """P[k|k] and the input's covariance by Gillijns, De Moor, Automatica 43, 2007, 934-937."""
+    P = np.eye(A.shape[0])
+    for _ in range(steps):
+        spread = C @ P @ C.T + R
+        inverse = np.linalg.inv(spread)
+        P_d = np.linalg.inv(H.T @ inverse @ H)
+        K = P @ C.T @ inverse
+        P_x = P - K @ (spread - H @ P_d @ H.T) @ K.T
+        P_xd = -K @ H @ P_d
+        both = np.block([[P_x, P_xd], [P_xd.T, P_d]])
+        P = np.hstack([A, G]) @ both @ np.hstack([A, G]).T + Q
+    return P_x, P_d

@@ -6,6 +6,10 @@ from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel
 from .hinf_filter import design_hinf_filter as design_hinf_filter
+from .input_estimator import InputCertificate as InputCertificate
+from .input_estimator import InputEstimator as InputEstimator
+from .invertibility import Invertibility as Invertibility
+from .invertibility import invertibility as invertibility
 from .kalman import design_kalman as design_kalman
 from .lags import Filter as Filter
 from .lags import FixedLag as FixedLag
@@ -18,3 +22,6 @@ from .robust import MinimaxCertificate as MinimaxCertificate
 from .robust import RobustFilter as RobustFilter
 from .static import StaticEstimator as StaticEstimator
 from .static import design_static as design_static
+from .unknown_inputs import Augmented as Augmented
+from .unknown_inputs import Unbiased as Unbiased
+from .unknown_inputs import design_input_estimator as design_input_estimator

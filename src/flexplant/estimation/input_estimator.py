@@ -1,0 +1,102 @@
+"""What an estimator of unknown inputs is: its gains, and what it predicts of its errors."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import FloatArray, Value
+from .channels import poi_channels, row_of
+from .invertibility import Invertibility
+
+
+@dataclass(frozen=True, eq=False)
+class InputCertificate(Value):
+    """What was checked about an estimator of unknown inputs after it was computed.
+
+    Parameters
+    ----------
+    spectral_radius : float
+        Of the estimation error, below 1.
+    bias : float
+        How much of an unknown input enters the errors, relative: the largest entry of
+        ``M F - I`` and of ``(G - L F)`` beside G; 0 when inputs are assumed to be random walks.
+    difference : float
+        Largest relative difference between the variances with the P that the gains were computed
+        from and those with the P of the gains' own Stein equation, at most 1e-6.
+    """
+
+    spectral_radius: float
+    bias: float
+    difference: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class InputEstimator(Value):
+    """A stationary filter of the motions at the POIs and of unknown inputs d.
+
+    Parameters
+    ----------
+    system : StateSpace
+        From the sensors and the applied u to `die:hat`, ... and `amp1:hat`, ...
+    plant : StandardPlant
+        What it was designed on.
+    inputs : tuple of str
+        Names of d.
+    delay : int [samples]
+        The output `amp1:hat` at sample k is the estimate of the input at k - delay.
+    variances : (nz,) array [m^2 or rad^2]
+        Of the errors at the POIs.
+    input_variances : (m,) array [N^2 or (N m)^2]
+        Of the errors of the inputs.
+    invertibility : Invertibility
+        Whether the sensors determine the inputs without any assumption of them.
+    certificate : InputCertificate
+        What was checked.
+    """
+
+    system: StateSpace
+    plant: StandardPlant
+    inputs: tuple[str, ...]
+    delay: int
+    variances: FloatArray
+    input_variances: FloatArray
+    invertibility: Invertibility
+    certificate: InputCertificate
+
+    def __post_init__(self) -> None:
+        self._set(variances=self.variances, input_variances=self.input_variances)
+
+    def __repr__(self) -> str:
+        names = [*poi_channels(self.plant), *self.inputs]
+        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in names[:6])
+        late = "in their own sample" if not self.delay else f"{self.delay} sample late"
+        return (
+            f"<InputEstimator: {self.system.n_states} states, inputs {late}, spectral radius "
+            f"{self.certificate.spectral_radius:.6f};\n  rms error {rms}>"
+        )
+
+    def rms(self, channel: str) -> float:
+        """Return the rms of the error of a POI's motion or of an unknown input.
+
+        Parameters
+        ----------
+        channel : str
+            `die`, `die:z`, `die:hat`, or `amp1`, `amp1:hat`.
+
+        Returns
+        -------
+        float
+            In the channel's unit.
+
+        Raises
+        ------
+        LabelError
+            When it is neither.
+        """
+        row = row_of([*poi_channels(self.plant), *self.inputs], channel)
+        both = np.concatenate([self.variances, self.input_variances])
+        return float(np.sqrt(max(both[row], 0.0)))

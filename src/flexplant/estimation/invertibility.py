@@ -1,0 +1,225 @@
+"""Whether sensors determine forces that nothing is assumed of: ranks and invariant zeros."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import AssumptionError, unknown_label
+from ..lti.scaling import state_scale
+from ..lti.statespace import System
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray, Value, check_names, name_list
+from .channels import checked_plant
+from .filter_model import FilterModel, filter_model
+
+#: singular values below this part of the largest one, inputs and sensors of unit size, are rounding
+_RANK = 1e-9
+#: a zero closer to the unit circle than this is one on it
+_LIMIT = 1e-7
+#: smallest singular value of the scaled test matrix at which a mode is not seen
+_UNSEEN = 1e-9
+
+
+class Entry(NamedTuple):
+    """How unknown inputs enter: ``x+ = A x + B u + G d``, ``y = C2 x + D2 u + H d``."""
+
+    G: FloatArray
+    H: FloatArray
+    at_pois: FloatArray
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Invertibility(Value):
+    """Whether sensors determine unknown inputs d held over each sample, and how late.
+
+    Parameters
+    ----------
+    inputs, sensors : tuples of str
+        Names of d and y.
+    rank_direct : int
+        Of H: how many combinations of d reach y in their own sample.
+    rank_delayed : int
+        Of C2 G: how many reach y one sample later.
+    delay : int or None
+        Samples from an input to its estimate: 0 when H has full rank, 1 when H is zero and C2 G
+        has full rank; None when neither holds, so that no unbiased filter exists.
+    zeros : array of complex
+        Invariant zeros from d to y on or outside the unit circle, upper half plane: motions of d
+        and x together that leave y at rest and do not decay. Empty when delay is None.
+    dt : float [s]
+        Sampling time.
+    """
+
+    inputs: tuple[str, ...]
+    sensors: tuple[str, ...]
+    rank_direct: int
+    rank_delayed: int
+    delay: int | None
+    zeros: ComplexArray
+    dt: float
+
+    def __post_init__(self) -> None:
+        self._set(zeros=self.zeros)
+
+    def __repr__(self) -> str:
+        holds = "holds" if self.holds else "does not hold"
+        return f"<Invertibility {holds}: {self.text}>"
+
+    @property
+    def holds(self) -> bool:
+        """Whether a stable unbiased filter of x and d exists."""
+        return self.delay is not None and not self.zeros.size
+
+    @property
+    def text(self) -> str:
+        """The condition in words."""
+        m, names = len(self.inputs), ", ".join(self.inputs)
+        if m > len(self.sensors):
+            return f"{m} unknown inputs ({names}) need as many sensors, there are " + str(
+                len(self.sensors)
+            )
+        ranks = f"D has rank {self.rank_direct}, C B has rank {self.rank_delayed} of {m}"
+        if self.delay is None and self.rank_direct:
+            return (
+                f"{ranks}: some combinations of {names} reach the sensors at once and some later, "
+                "so no filter with one delay is unbiased"
+            )
+        if self.delay is None:
+            return f"{ranks}: combinations of {names} reach no sensor within one sample"
+        if self.zeros.size:
+            shown = "; ".join(self._described(zero) for zero in self.zeros[:3])
+            return f"{ranks}, but the sensors stay at rest for {shown}"
+        late = "in its own sample" if not self.delay else "one sample late"
+        return f"{ranks}: {names} is determined {late}, no zero on or outside the unit circle"
+
+    def _described(self, zero: complex) -> str:
+        size = abs(zero)
+        grows = f" that grows by {size:.6g} per sample" if size > 1 + _LIMIT else ""
+        if abs(zero - 1) < 1e-5:
+            return "a constant force (zero at 1: no sensor sees a displacement that it makes)"
+        if zero.real < 0 and abs(zero.imag) < 1e-6 * size:
+            return f"a force of alternating sign{grows} (zero at {zero.real:.6g}, by the sampling)"
+        if abs(zero.imag) < 1e-6 * size:
+            return f"a force{grows} (zero at {zero.real:.6g})"
+        freq = abs(np.angle(zero)) / (2 * np.pi * self.dt)
+        return f"a force of {freq:.4g} Hz{grows}"
+
+
+def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Invertibility:
+    """Return whether the sensors determine disturbances that nothing is assumed of.
+
+    With d held over each sample, ``x+ = A x + G d``, ``y = C x + H d``, an unbiased filter with
+    minimum variance exists when H has full column rank (d is then estimated in its own sample), or
+    when H = 0 and C G has (one sample late); it is stable when the invariant zeros
+
+    ``rank [z I - A, -G; C, H] < n + m``
+
+    all lie inside the unit circle. Displacement sensors see the square of the sampling time of a
+    force within a sample: with as many sensors as forces the sampling itself makes zeros near -1.
+    More sensors than forces, or an acceleration sensor beside displacement sensors, have none.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled.
+    inputs : sequence of str
+        Disturbances in w.
+
+    Returns
+    -------
+    Invertibility
+
+    Raises
+    ------
+    AssumptionError
+        When the plant is continuous, or has no sensor or POI.
+    LabelError
+        When a name is no disturbance of w.
+    ModelError
+        When the plant is weighted.
+    """
+    plant = checked_plant(plant)
+    names = unknown_names(plant, inputs)
+    return judged(filter_model(plant), entry(plant, names), names)
+
+
+def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...]:
+    """Return the names of unknown inputs, each a disturbance of w."""
+    if not plant.dt:
+        raise AssumptionError(
+            "the plant is continuous, unknown inputs are held over samples: use "
+            "plant.discretized(rate, delay=1)."
+        )
+    names = name_list(inputs, "unknown inputs")
+    check_names(names, "unknown inputs")
+    forces = [w for w in plant.w if w not in plant.y and not w.endswith(":noise")]
+    for name in names:
+        if name not in forces:
+            raise unknown_label("disturbance of w", name, forces)
+    if not names:
+        raise AssumptionError(
+            f"no unknown input is named: pass some of {', '.join(forces) or 'none'}."
+        )
+    return names
+
+
+def entry(plant: StandardPlant, names: Sequence[str]) -> Entry:
+    """Return how disturbances, held over each sample, enter states, sensors and POIs."""
+    g, m = plant.system, filter_model(plant)
+    columns = g.input_index(names)
+    rows = g.output_index(m.sensors), g.output_index(m.channels)
+    return Entry(g.B[:, columns], *(g.D[np.ix_(row, columns)] for row in rows))
+
+
+def judged(model: FilterModel, d: Entry, names: tuple[str, ...]) -> Invertibility:
+    """Return ranks and zeros; see `invertibility`."""
+    out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), 1e-300))[:, None]
+    C, H = out * model.C2, out * d.H
+    direct, delayed, m = _rank(H), _rank(C @ d.G), len(names)
+    delay = 0 if direct == m else 1 if not direct and delayed == m else None
+    zeros = np.zeros(0, dtype=np.complex128)
+    if delay is not None:
+        zeros = _zeros(model.A, d.G, C, H if delay == 0 else C @ d.G, delay)
+    return Invertibility(names, model.sensors, direct, delayed, delay, zeros, model.dt)
+
+
+def _rank(matrix: FloatArray) -> int:
+    """Return the rank, columns and rows of unit size."""
+    columns = np.linalg.norm(matrix, axis=0)
+    scaled = matrix / np.where(columns > 0, columns, 1.0)
+    rows = np.linalg.norm(scaled, axis=1, keepdims=True)
+    return int(np.linalg.matrix_rank(scaled / np.where(rows > 0, rows, 1.0), tol=_RANK))
+
+
+def _zeros(A: FloatArray, G: FloatArray, C: FloatArray, F: FloatArray, delay: int) -> ComplexArray:
+    """Return the zeros that do not decay: modes of A - G F^+ C (or ... C A) that C does not see.
+
+    With d eliminated by what it does first, ``d = -F^+ C x`` or ``-F^+ C A x``, they are the
+    modes of the rest that the sensors do not see.
+    """
+    size = np.linalg.norm(F, axis=0)
+    left = np.linalg.pinv(F / size) / size[:, None]
+    inner = A - G @ left @ (C if delay == 0 else C @ A)
+    seen = C - F @ left @ C if delay == 0 else C
+    d = state_scale(inner, G / size, C)
+    inner, seen = inner * d / d[:, None], seen * d
+    rows = np.linalg.norm(C * d, axis=1, keepdims=True)
+    seen = seen / np.where(rows > 0, rows, 1.0)
+    found: list[complex] = []
+    for value in la.eigvals(inner):
+        size_of = abs(value)
+        if size_of < 1 - 1e-5 or value.imag < -1e-9:
+            continue
+        near = 1.0 if abs(value - 1) < 1e-4 else value  # Jordan blocks come out at the root
+        if abs(near) < 1 - _LIMIT or any(abs(near - other) < 1e-6 for other in found):
+            continue
+        test = np.vstack([near * np.eye(len(inner)) - inner, seen])
+        columns = np.linalg.norm(test, axis=0)
+        if la.svdvals(test / np.where(columns > 0, columns, 1.0))[-1] < _UNSEEN:
+            found.append(complex(near))
+    return np.array(found, dtype=np.complex128)

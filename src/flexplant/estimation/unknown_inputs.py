@@ -1,0 +1,362 @@
+"""Joint estimation of the state and of inputs that nothing, or little, is known of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..lti.lyapunov import solve_stein
+from ..lti.riccati import solve_dare
+from ..lti.statespace import StateSpace, System
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, positive, short
+from .certificate import AGREEMENT
+from .channels import checked_plant, estimates
+from .filter_model import FilterModel, check_noises, filter_model
+from .input_estimator import InputCertificate, InputEstimator
+from .invertibility import Entry, Invertibility, entry, judged, unknown_names
+
+#: variance of white inputs at the start of the search, beside what the sensors resolve
+_LARGE = 1e6
+#: Newton steps, and the relative change of a variance at which they end
+_STEPS, _SETTLED = 30, 1e-12
+
+
+@dataclass(frozen=True)
+class Unbiased(Value):
+    """Nothing is assumed of the inputs: minimum-variance unbiased filters of Gillijns, De Moor."""
+
+
+@dataclass(frozen=True)
+class Augmented(Value):
+    """Inputs are states of the filter: random walks, or first-order noise with a corner.
+
+    ``d' = -2 pi corner d + drift xi``: sampled with ``a = exp(-2 pi corner / rate)``, its variance
+    per sample is ``drift^2 (1 - a^2) / (4 pi corner)``, ``drift^2 / rate`` for a random walk.
+
+    Parameters
+    ----------
+    drift : float [N/sqrt(s)]
+        Deviation of a random walk after one second.
+    corner : float [Hz]
+        Zero: a random walk.
+
+    Raises
+    ------
+    ModelError
+        When drift is not positive or corner is negative.
+    """
+
+    drift: float
+    corner: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._set(
+            drift=positive(self.drift, "drift"), corner=positive(self.corner, "corner", zero=True)
+        )
+
+    def step(self, dt: float) -> tuple[float, float]:
+        """Return the pole and the variance per sample."""
+        rate = 2 * np.pi * self.corner
+        spread = dt if not rate else -np.expm1(-2 * rate * dt) / (2 * rate)
+        return float(np.exp(-rate * dt)), float(self.drift**2 * spread)
+
+
+@one_thread()
+def design_input_estimator(
+    plant: StandardPlant | System,
+    inputs: Sequence[str],
+    method: Unbiased | Augmented = Unbiased(),
+) -> InputEstimator:
+    """Return a filter of the POIs that also estimates disturbances held over each sample.
+
+    With ``x+ = A x + B2 u + G d + w``, ``y = C2 x + D22 u + H d + v``:
+
+    `Unbiased()` assumes nothing of d. Where H has full column rank, ::
+
+        S = C2 P C2' + R,  M = (H' S^-1 H)^-1 H' S^-1,  d_hat[k] = M (y - C2 x[k|k-1] - D22 u)
+        x[k|k] = x[k|k-1] + P C2' S^-1 (I - H M)(y - C2 x[k|k-1] - D22 u)
+
+    where H = 0 and F = C2 G has, the same with F, one sample later::
+
+        M = (F' S^-1 F)^-1 F' S^-1,  d_hat[k-1] = M (y - C2 x[k|k-1] - D22 u)
+        x[k|k] = x[k|k-1] + (P C2' S^-1 + (G - P C2' S^-1 F) M)(y - C2 x[k|k-1] - D22 u)
+
+    The stationary P is found by Newton steps: the Stein equation of the gains gives P, P the next
+    gains; each is unbiased. They start at the Kalman filter of white inputs with a large variance.
+
+    `Augmented(drift)` makes d a state; the Kalman filter of the larger model exists without any
+    condition on ranks, as long as no invariant zero lies at the pole of d.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled. The asd of the unknown inputs counts as zero.
+    inputs : sequence of str
+        Disturbances in w.
+    method : Unbiased or Augmented
+        What is assumed of them.
+
+    Returns
+    -------
+    InputEstimator
+
+    Raises
+    ------
+    AssumptionError
+        When the plant is continuous, a sensor has no noise, the inputs are not determined by the
+        sensors (the ranks and zeros are named), or a POI sees an input that is known late.
+    ModelError
+        When the plant is weighted, its noise is not known, or the method is none.
+    LabelError
+        When a name is no disturbance of w.
+    SolverError
+        When no stable filter exists for another reason.
+    CertificateError
+        When the filter is biased, not stable, or its variances fail the check.
+
+    References
+    ----------
+    Gillijns, De Moor, Unbiased minimum-variance input and state estimation for linear discrete-time
+    systems, Automatica 43, 2007, 111-116; ... with direct feedthrough, 934-937. Kitanidis, Unbiased
+    minimum-variance linear state estimation, Automatica 23, 1987.
+    """
+    if not isinstance(method, Unbiased | Augmented):
+        raise ModelError(
+            f"method must be Unbiased() or Augmented(drift), got {short(method)}. Pass one of them."
+        )
+    plant = checked_plant(plant)
+    names = unknown_names(plant, inputs)
+    quiet = _without(plant, names)
+    check_noises(quiet)
+    model, d = filter_model(quiet), entry(plant, names)
+    found = judged(model, d, names)
+    design = _unbiased(model, d, found) if isinstance(method, Unbiased) else None
+    if design is None:
+        design = _augmented(model, d, method, found)  # type: ignore[arg-type]
+    _check(design.certificate)
+    return InputEstimator(
+        _system(plant, model, design, names),
+        plant,
+        names,
+        int(design.gains.late),
+        design.variances,
+        design.input_variances,
+        found,
+        design.certificate,
+    )
+
+
+def _unbiased(model: FilterModel, d: Entry, found: Invertibility) -> _Design:
+    if not found.holds:
+        raise AssumptionError(
+            f"the unknown inputs are not determined by the sensors: {found.text}. Add a sensor, or "
+            "use Augmented(drift=...), which assumes how fast they change."
+        )
+    late = found.delay == 1
+    if late and (np.any(model.S) or np.any(d.at_pois)):
+        raise AssumptionError(
+            "inputs that the sensors show one sample late cannot be combined with noise that "
+            "reaches a sensor, or inputs that reach a POI, at once. Use Augmented(drift=...)."
+        )
+    gains = _late_gains if late else _direct_gains
+    P = _first(model, d, late)
+    try:
+        for _ in range(_STEPS):
+            found_gains = gains(model, d, P)
+            last, P = P, found_gains.covariance(model)
+            if _change(last, P) < _SETTLED:
+                break
+    except SolverError as error:
+        raise AssumptionError(
+            f"no unbiased filter is stable to working precision: {error} A zero from "
+            f"{', '.join(found.inputs)} to the sensors lies too close to the unit circle. Add a "
+            "sensor, or use Augmented(drift=...)."
+        ) from error
+    return _judged(model, found_gains, last, P)
+
+
+def _first(m: FilterModel, d: Entry, late: bool) -> FloatArray:
+    """Return a covariance to start at: that with white inputs of a large variance."""
+    F, spread = (m.C2 @ d.G, m.C2 @ m.Q @ m.C2.T + m.R) if late else (d.H, m.R)
+    left = _weighted(F, spread)
+    size = _LARGE * np.sum((left @ spread) * left, axis=1)
+    G, H = d.G * size, d.H * size
+    return solve_dare(m.A, m.C2, Q=m.Q + G @ d.G.T, R=m.R + H @ d.H.T, S=m.S + G @ d.H.T).P
+
+
+def _change(one: FloatArray, two: FloatArray) -> float:
+    size = np.where(two.diagonal() > 0, two.diagonal(), 1.0)
+    return float(np.max(np.abs(one - two).diagonal() / size))
+
+
+class _Gains(NamedTuple):
+    """``x+ = A x + B u + K e``, ``[hat; d_hat] = C x + D u + L e``, e = y - C2 x - D2 u.
+
+    `closed` is the dynamics of the error and `driven` its noise (of x[k|k] when `late`, of
+    x[k|k-1] otherwise), bias how much of d enters.
+    """
+
+    A: FloatArray
+    C: FloatArray
+    K: FloatArray
+    L: FloatArray
+    closed: FloatArray
+    driven: FloatArray
+    late: bool
+    bias: float
+
+    def covariance(self, m: FilterModel) -> FloatArray:
+        """Return the covariance of x[k|k-1] without the unknown input, by the Stein equation."""
+        X = solve_stein(self.closed, self.driven)
+        return m.A @ X @ m.A.T + m.Q if self.late else X
+
+
+def _direct_gains(m: FilterModel, d: Entry, P: FloatArray) -> _Gains:
+    """Return the gains with feedthrough; P is the covariance of x[k|k-1]."""
+    spread = m.innovation(P)
+    M = _weighted(d.H, spread)
+    rest = np.eye(len(spread)) - d.H @ M
+    L_x = _weighed(P @ m.C2.T, spread) @ rest
+    # noise that reaches state and sensors together: what the innovation shows of it beside d
+    K = m.A @ L_x + d.G @ M + _weighed(m.S, spread) @ rest
+    L = np.vstack([m.C1 @ L_x + d.at_pois @ M, M])
+    C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
+    bias = max(_largest(M @ d.H - np.eye(len(M))), _largest((K @ d.H - d.G) / _size(d.G)))
+    return _Gains(m.A, C, K, L, m.A - K @ m.C2, m.driven(K), False, bias)
+
+
+def _late_gains(m: FilterModel, d: Entry, P: FloatArray) -> _Gains:
+    """Return the gains without feedthrough; P is that of x[k|k-1], the input left out."""
+    spread, F = m.innovation(P), m.C2 @ d.G
+    M = _weighted(F, spread)
+    plain = _weighed(P @ m.C2.T, spread)
+    L_x = plain + (d.G - plain @ F) @ M
+    still = np.eye(len(P)) - L_x @ m.C2
+    L = np.vstack([m.C1 @ L_x, M])
+    C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
+    bias = max(_largest(M @ F - np.eye(len(M))), _largest((L_x @ F - d.G) / _size(d.G)))
+    driven = still @ m.Q @ still.T + L_x @ m.R @ L_x.T
+    return _Gains(m.A, C, m.A @ L_x, L, still @ m.A, driven, True, bias)
+
+
+def _augmented(m: FilterModel, d: Entry, method: Augmented, found: Invertibility) -> _Design:
+    """Return the Kalman filter of the plant with the inputs as states."""
+    n, k = d.G.shape
+    pole, variance = method.step(m.dt)
+    A = np.block([[m.A, d.G], [np.zeros((k, n)), pole * np.eye(k)]])
+    C2 = np.hstack([m.C2, d.H])
+    C = np.block([[m.C1, d.at_pois], [np.zeros((k, n)), np.eye(k)]])
+    larger = m.replace(
+        A=A, C2=C2, Q=la.block_diag(m.Q, variance * np.eye(k)), S=np.vstack([m.S, 0 * d.H.T])
+    )
+    try:
+        P = solve_dare(A, C2, Q=larger.Q, R=m.R, S=larger.S).P
+    except SolverError as error:
+        raise AssumptionError(
+            f"no filter holds {', '.join(found.inputs)} as states: {error} The condition without "
+            f"assumptions: {found.text}. Add a sensor, or give Augmented a corner above 0."
+        ) from error
+    spread = larger.innovation(P)
+    gain = _weighed(P @ C2.T, spread)
+    K = A @ gain + _weighed(larger.S, spread)
+    gains = _Gains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
+    return _judged(larger, gains, P, gains.covariance(larger))
+
+
+class _Design(NamedTuple):
+    gains: _Gains
+    C2: FloatArray
+    variances: FloatArray
+    input_variances: FloatArray
+    certificate: InputCertificate
+
+
+def _judged(m: FilterModel, g: _Gains, claim: FloatArray, P: FloatArray) -> _Design:
+    """Return the design with the variances of its errors, and what was checked about it."""
+    left, noise = g.C - g.L @ m.C2, np.sum((g.L @ m.R) * g.L, axis=1)
+    both = [np.sum((left @ X) * left, axis=1) + noise for X in (claim, P)]
+    difference = float(np.max(np.abs(both[0] - both[1]) / np.where(both[1] > 0, both[1], 1.0)))
+    radius = float(np.max(np.abs(np.linalg.eigvals(g.closed)), initial=0.0))
+    nz = len(m.C1)
+    certificate = InputCertificate(radius, g.bias, difference)
+    return _Design(g, m.C2, both[1][:nz], both[1][nz:], certificate)
+
+
+def _check(found: InputCertificate) -> None:
+    if found.spectral_radius >= 1 or max(found.bias, found.difference) > AGREEMENT:
+        raise CertificateError(
+            f"the estimator of unknown inputs fails its check: spectral radius "
+            f"{found.spectral_radius:.9f}, bias {found.bias:.1e}, variances differ by "
+            f"{found.difference:.1e} (allowed {AGREEMENT:.0e}). The sensors hardly determine the "
+            "inputs. Add a sensor, or use Augmented(drift=...)."
+        )
+
+
+def _system(
+    plant: StandardPlant, m: FilterModel, design: _Design, names: tuple[str, ...]
+) -> StateSpace:
+    (A, C, K, L, *_), k = design.gains, len(names)
+    more = len(A) - len(m.A)
+    B = np.vstack([m.B, np.zeros((more, m.B.shape[1]))])
+    D = np.vstack([m.D1, np.zeros((k, m.B.shape[1]))])
+    units = {name: plant.units[name] for name in names if name in plant.units}
+    return StateSpace(
+        A - K @ design.C2,
+        np.hstack([K, B - K @ m.D2]),
+        C - L @ design.C2,
+        np.hstack([L, D - L @ m.D2]),
+        plant.dt,
+        inputs=[*m.sensors, *m.commands],
+        outputs=[*estimates(m.channels), *(f"{name}:hat" for name in names)],
+        states=[*plant.system.states, *(f"{name}:state" for name in names[:more])],
+        name="input_estimator",
+        units={**plant.units, **{f"{name}:hat": unit for name, unit in units.items()}},
+    )
+
+
+def _without(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
+    """Return the plant without the white noise of some disturbances."""
+    loud = [name for name in names if plant.asd.get(name, 0.0) > 0]
+    if not loud:
+        return plant
+    if not plant.is_assembled:
+        raise ModelError(
+            f"unknown inputs {', '.join(loud)} have a noise density, which is part of the given "
+            "noise_factor. Give the plant a factor without them, and no asd of theirs."
+        )
+    ports = plant.assembled.ports
+    return plant.with_ports(
+        ports.replace(w=[p.replace(asd=0.0) if p.name in loud else p for p in ports.w])
+    )
+
+
+def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return ``(F' S^-1 F)^-1 F' S^-1``, sensors and inputs of unit size inside."""
+    size = np.sqrt(spread.diagonal())
+    scaled = F / size[:, None]
+    columns = np.linalg.norm(scaled, axis=0)
+    root = np.linalg.cholesky(spread / size / size[:, None])
+    whitened = la.solve_triangular(root, scaled / columns, lower=True)
+    inverse = np.linalg.pinv(whitened) @ la.solve_triangular(root, np.diag(1 / size), lower=True)
+    return np.asarray(inverse / columns[:, None])
+
+
+def _weighed(part: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return ``part S^-1``."""
+    size = np.sqrt(spread.diagonal())
+    return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
+
+
+def _size(G: FloatArray) -> FloatArray:
+    return np.asarray(np.maximum(np.abs(G).max(axis=0), 1e-300))
+
+
+def _largest(matrix: FloatArray) -> float:
+    return float(np.max(np.abs(matrix), initial=0.0))
