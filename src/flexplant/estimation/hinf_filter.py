@@ -114,12 +114,12 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
     )
 
 
-class _Gains(NamedTuple):
+class _HinfGains(NamedTuple):
     K: FloatArray
     L_z: FloatArray
 
 
-def _at(m: FilterModel, gamma: float) -> _Gains | None:
+def _at(m: FilterModel, gamma: float) -> _HinfGains | None:
     """Return the gains of the central filter of a level, None when there is none."""
     rows, nz = np.vstack([m.C2, m.C1]), len(m.C1)
     weight = la.block_diag(m.R, -(gamma**2) * np.eye(nz))
@@ -138,4 +138,4 @@ def _at(m: FilterModel, gamma: float) -> _Gains | None:
     left = m.C1 @ (P - gain @ m.C2 @ P) @ m.C1.T
     if np.max(np.linalg.eigvalsh(0.5 * (left + left.T))) >= gamma**2:
         return None
-    return _Gains(m.A @ gain + shift, m.C1 @ gain)
+    return _HinfGains(m.A @ gain + shift, m.C1 @ gain)

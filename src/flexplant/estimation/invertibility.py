@@ -25,7 +25,7 @@ _LIMIT = 1e-7
 _UNSEEN = 1e-9
 
 
-class Entry(NamedTuple):
+class InputEntry(NamedTuple):
     """How unknown inputs enter: ``x+ = A x + B u + G d``, ``y = C2 x + D2 u + H d``."""
 
     G: FloatArray
@@ -168,15 +168,15 @@ def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...
     return names
 
 
-def entry(plant: StandardPlant, names: Sequence[str]) -> Entry:
+def entry(plant: StandardPlant, names: Sequence[str]) -> InputEntry:
     """Return how disturbances, held over each sample, enter states, sensors and POIs."""
     g, m = plant.system, filter_model(plant)
     columns = g.input_index(names)
     rows = g.output_index(m.sensors), g.output_index(m.channels)
-    return Entry(g.B[:, columns], *(g.D[np.ix_(row, columns)] for row in rows))
+    return InputEntry(g.B[:, columns], *(g.D[np.ix_(row, columns)] for row in rows))
 
 
-def judged(model: FilterModel, d: Entry, names: tuple[str, ...]) -> Invertibility:
+def judged(model: FilterModel, d: InputEntry, names: tuple[str, ...]) -> Invertibility:
     """Return ranks and zeros; see `invertibility`."""
     out = 1.0 / np.sqrt(np.maximum(model.R.diagonal(), 1e-300))[:, None]
     C, H = out * model.C2, out * d.H

@@ -20,7 +20,7 @@ from .certificate import AGREEMENT
 from .channels import checked_plant, estimates
 from .filter_model import FilterModel, check_noises, filter_model
 from .input_estimator import InputCertificate, InputEstimator
-from .invertibility import Entry, Invertibility, entry, judged, unknown_names
+from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve
 _LARGE = 1e6
@@ -153,7 +153,7 @@ def design_input_estimator(
     )
 
 
-def _unbiased(model: FilterModel, d: Entry, found: Invertibility) -> _Design:
+def _unbiased(model: FilterModel, d: InputEntry, found: Invertibility) -> _InputDesign:
     if not found.holds:
         raise AssumptionError(
             f"the unknown inputs are not determined by the sensors: {found.text}. Add a sensor, or "
@@ -182,7 +182,7 @@ def _unbiased(model: FilterModel, d: Entry, found: Invertibility) -> _Design:
     return _judged(model, found_gains, last, P)
 
 
-def _first(m: FilterModel, d: Entry, late: bool) -> FloatArray:
+def _first(m: FilterModel, d: InputEntry, late: bool) -> FloatArray:
     """Return a covariance to start at: that with white inputs of a large variance."""
     F, spread = (m.C2 @ d.G, m.C2 @ m.Q @ m.C2.T + m.R) if late else (d.H, m.R)
     left = _weighted(F, spread)
@@ -196,7 +196,7 @@ def _change(one: FloatArray, two: FloatArray) -> float:
     return float(np.max(np.abs(one - two).diagonal() / size))
 
 
-class _Gains(NamedTuple):
+class _InputGains(NamedTuple):
     """``x+ = A x + B u + K e``, ``[hat; d_hat] = C x + D u + L e``, e = y - C2 x - D2 u.
 
     `closed` is the dynamics of the error and `driven` its noise (of x[k|k] when `late`, of
@@ -218,7 +218,7 @@ class _Gains(NamedTuple):
         return m.A @ X @ m.A.T + m.Q if self.late else X
 
 
-def _direct_gains(m: FilterModel, d: Entry, P: FloatArray) -> _Gains:
+def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains with feedthrough; P is the covariance of x[k|k-1]."""
     spread = m.innovation(P)
     M = _weighted(d.H, spread)
@@ -229,10 +229,10 @@ def _direct_gains(m: FilterModel, d: Entry, P: FloatArray) -> _Gains:
     L = np.vstack([m.C1 @ L_x + d.at_pois @ M, M])
     C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
     bias = max(_largest(M @ d.H - np.eye(len(M))), _largest((K @ d.H - d.G) / _size(d.G)))
-    return _Gains(m.A, C, K, L, m.A - K @ m.C2, m.driven(K), False, bias)
+    return _InputGains(m.A, C, K, L, m.A - K @ m.C2, m.driven(K), False, bias)
 
 
-def _late_gains(m: FilterModel, d: Entry, P: FloatArray) -> _Gains:
+def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains without feedthrough; P is that of x[k|k-1], the input left out."""
     spread, F = m.innovation(P), m.C2 @ d.G
     M = _weighted(F, spread)
@@ -243,10 +243,12 @@ def _late_gains(m: FilterModel, d: Entry, P: FloatArray) -> _Gains:
     C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
     bias = max(_largest(M @ F - np.eye(len(M))), _largest((L_x @ F - d.G) / _size(d.G)))
     driven = still @ m.Q @ still.T + L_x @ m.R @ L_x.T
-    return _Gains(m.A, C, m.A @ L_x, L, still @ m.A, driven, True, bias)
+    return _InputGains(m.A, C, m.A @ L_x, L, still @ m.A, driven, True, bias)
 
 
-def _augmented(m: FilterModel, d: Entry, method: Augmented, found: Invertibility) -> _Design:
+def _augmented(
+    m: FilterModel, d: InputEntry, method: Augmented, found: Invertibility
+) -> _InputDesign:
     """Return the Kalman filter of the plant with the inputs as states."""
     n, k = d.G.shape
     pole, variance = method.step(m.dt)
@@ -266,19 +268,19 @@ def _augmented(m: FilterModel, d: Entry, method: Augmented, found: Invertibility
     spread = larger.innovation(P)
     gain = _weighed(P @ C2.T, spread)
     K = A @ gain + _weighed(larger.S, spread)
-    gains = _Gains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
+    gains = _InputGains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
     return _judged(larger, gains, P, gains.covariance(larger))
 
 
-class _Design(NamedTuple):
-    gains: _Gains
+class _InputDesign(NamedTuple):
+    gains: _InputGains
     C2: FloatArray
     variances: FloatArray
     input_variances: FloatArray
     certificate: InputCertificate
 
 
-def _judged(m: FilterModel, g: _Gains, claim: FloatArray, P: FloatArray) -> _Design:
+def _judged(m: FilterModel, g: _InputGains, claim: FloatArray, P: FloatArray) -> _InputDesign:
     """Return the design with the variances of its errors, and what was checked about it."""
     left, noise = g.C - g.L @ m.C2, np.sum((g.L @ m.R) * g.L, axis=1)
     both = [np.sum((left @ X) * left, axis=1) + noise for X in (claim, P)]
@@ -286,7 +288,7 @@ def _judged(m: FilterModel, g: _Gains, claim: FloatArray, P: FloatArray) -> _Des
     radius = float(np.max(np.abs(np.linalg.eigvals(g.closed)), initial=0.0))
     nz = len(m.C1)
     certificate = InputCertificate(radius, g.bias, difference)
-    return _Design(g, m.C2, both[1][:nz], both[1][nz:], certificate)
+    return _InputDesign(g, m.C2, both[1][:nz], both[1][nz:], certificate)
 
 
 def _check(found: InputCertificate) -> None:
@@ -300,7 +302,7 @@ def _check(found: InputCertificate) -> None:
 
 
 def _system(
-    plant: StandardPlant, m: FilterModel, design: _Design, names: tuple[str, ...]
+    plant: StandardPlant, m: FilterModel, design: _InputDesign, names: tuple[str, ...]
 ) -> StateSpace:
     (A, C, K, L, *_), k = design.gains, len(names)
     more = len(A) - len(m.A)
