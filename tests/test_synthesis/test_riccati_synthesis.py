@@ -271,6 +271,32 @@ def test_compleib_without_full_rank(name):
     assert found.certificate["added noise"] in (1e-4, 1e-5, 1e-6, 1e-7)
 
 
+def turned(P, condition, seed=3, speed=1.0):
+    """The plant in random dense coordinates of a condition, and in another unit of time."""
+    rng, n = np.random.default_rng(seed), P.n_states
+    left, right = (np.linalg.qr(rng.normal(size=(n, n)))[0] for _ in range(2))
+    T = left @ np.diag(np.geomspace(1.0, condition, n)) @ right
+    back, root = np.linalg.inv(T), np.sqrt(speed)
+    return P.replace(A=speed * T @ P.A @ back, B=root * T @ P.B, C=root * P.C @ back, blocks=None)
+
+
+@needs_data
+@pytest.mark.parametrize("name", ["AC4", "HE1", "TMD", "WEC1", "BDT1", "CM1", "JE3"])
+def test_coordinates_and_units_of_time_change_nothing(name):
+    """0.1 % of gamma, or a message that blames the coordinates."""
+    P, u, y = compleib(name)
+    best = design_hinf(P, u=u, y=y).gamma
+    for condition, speed in ((1.0, 1.0), (1e3, 1.0), (1.0, 1e6), (1.0, 1e-6)):
+        found = design_hinf(turned(P, condition, speed=speed), u=u, y=y)
+        assert found.gamma == pytest.approx(best, rel=1e-3)
+    try:
+        found = design_hinf(turned(P, 1e6), u=u, y=y)
+    except SolverError as error:
+        assert "coordinates of the plant's states are badly conditioned" in str(error)
+    else:
+        assert found.gamma == pytest.approx(best, rel=1e-3)
+
+
 def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():
     """y = w, and u enters as w does: u = -w cancels it, at no cost."""
     P, u, y = named([[-1.0]], [[1.0, 1.0]], [[1.0], [0.0]], [[0.0, 0.0], [1.0, 0.0]], 1, 1)

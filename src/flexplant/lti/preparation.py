@@ -17,11 +17,14 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..values import FloatArray, Value
 from .discretisation import bilinear, tustin
+from .modal import modal_form
 from .scaling import bordered_scale, mean_speed, state_scale
 from .statespace import StateSpace
 
 #: a direction of D12 or D21 below this, beside columns of unit size, counts as missing
 _RANK = 1e-9
+#: departure from normal above which modal coordinates are taken; their largest condition beside it
+_MIXED, _CONDITION = 5.0, 1e3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -44,6 +47,9 @@ class Prepared(Value):
         Of the original plant.
     u, y : sequences of str
         Names of the controller's outputs and inputs.
+    departure : float
+        Size of the given A, its states balanced, beside that of its poles: 1 in modal coordinates,
+        large where the coordinates of the states mix modes, and rounding with them.
     """
 
     A: FloatArray
@@ -61,6 +67,7 @@ class Prepared(Value):
     dt: float
     u: Sequence[str]
     y: Sequence[str]
+    departure: float = 1.0
 
     def __repr__(self) -> str:
         return f"<Prepared: {self.A.shape[0]} states, unit of frequency {self.speed:.3g} rad/s>"
@@ -155,7 +162,12 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         When a sampled plant has a pole at z = -1.
     """
     # balanced first: whether I + A can be inverted must not depend on the units of the states
-    A, B, C = _balanced(P.A, P.B, P.C, np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles())))
+    s = np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles()))
+    A, B, C = _balanced(P.A, P.B, P.C, s)
+    departure = _departure(A)
+    if departure > _MIXED:
+        form = modal_form(P, largest_condition=_CONDITION * departure)
+        A, B, C = (A, B, C) if form.reason else _balanced(*_matrices(form.system), s)
     g = P.replace(A=A, B=B, C=C, blocks=None)
     g = bilinear(g, 1.0 / P.dt) if P.dt else g
     speed = mean_speed(g.poles())
@@ -188,6 +200,7 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         P.dt,
         tuple(u),
         tuple(y),
+        departure,
     )
 
 
@@ -209,6 +222,16 @@ def normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray
     Z = np.hstack([left[:, rank:], left[:, :rank]])
     S = right.T @ np.diag(1.0 / np.where(np.arange(m) < rank, sizes, 1.0))
     return Z, S / columns[:, None]
+
+
+def _matrices(g: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray]:
+    return g.A, g.B, g.C
+
+
+def _departure(A: FloatArray) -> float:
+    """Return the size of A beside that of its eigenvalues: 1 for a normal matrix (Henrici)."""
+    size = float(np.linalg.norm(np.linalg.eigvals(A))) if A.size else 0.0
+    return float(np.linalg.norm(A)) / size if size else 1.0
 
 
 def _balanced(

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError, SolverError
+from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.preparation import Prepared, prepared
-from ..lti.statespace import System
+from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import short
@@ -24,6 +24,8 @@ from .structured_lmi import StructuredLmi
 
 #: problems of at most so many states go to the LMIs where the Riccati equations fail
 _SMALL = 40
+#: A beside its poles, from which on coordinates are blamed for a failure
+_MIXED = 1e3
 
 
 @one_thread()
@@ -103,14 +105,10 @@ def design_hinf(
     if plant.is_assembled:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
-    _require_reach(problem)
-    if plant.is_assembled:  # whatever a method makes of it: this motion would drift
-        require_shown(problem)
-    method, found = _solved(problem) if method is None else (method, method.solve(problem))
-    controller = problem.restored(found.A, found.B, found.C, found.D).replace(
-        name="hinf", units=plant.units
-    )
-    certificate = certified_norm(plant.system, controller, found.gamma)
+    try:
+        method, found, controller, certificate = _certified(plant, problem, method)
+    except (AssumptionError, SolverError, CertificateError) as error:
+        raise _blamed(problem, error) from error
     reached = reached_norms(plant, controller)
     left_out = spill_over(plant, [controller], larger)
     return Controller(
@@ -124,6 +122,32 @@ def design_hinf(
         reached=reached,
         left_out=left_out,
         notes=(*found.notes, *(() if left_out is not None else unchecked(plant))),
+    )
+
+
+def _certified(
+    plant: StandardPlant, problem: Prepared, method: SynthesisMethod | None
+) -> tuple[SynthesisMethod, SolvedController, StateSpace, dict[str, float]]:
+    """Return the method, its answer, the controller and what was verified of its loop."""
+    _require_reach(problem)
+    if plant.is_assembled:  # whatever a method makes of it: this motion would drift
+        require_shown(problem)
+    method, found = _solved(problem) if method is None else (method, method.solve(problem))
+    controller = problem.restored(found.A, found.B, found.C, found.D).replace(
+        name="hinf", units=plant.units
+    )
+    return method, found, controller, certified_norm(plant.system, controller, found.gamma)
+
+
+def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
+    """Return the error, or one that blames the coordinates of the states where these are bad."""
+    if problem.departure < _MIXED:
+        return error
+    return SolverError(
+        f"the coordinates of the plant's states are badly conditioned: A is "
+        f"{problem.departure:.1e} times as large as its poles, and rounding of that size hides "
+        "what the plant is. Give it in modal, balanced or physical coordinates. "
+        f"(What was found in these: {error})"
     )
 
 
