@@ -90,12 +90,14 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> Any:
     """Return predicted errors and those of 5 runs of 2 s; a slow servo holds the machine."""
     nominal, fit = (plant_of(case, kind, force) for kind in case["models"])
     static = fx.design_static(fit, larger=case["full"]["updated"])
-    designs = {
-        "geometry alone": static,
-        "drawing": fx.design_kalman(nominal, larger=case["full"]["drawing"]),
-        "updated, 24 modes": fx.design_kalman(fit),
-        "updated, all modes": fx.design_kalman(fit, larger=case["full"]["updated"]),
-    }
+    with warnings.catch_warnings():  # this mesh is too coarse for rx and ry: die:z is compared
+        warnings.simplefilter("ignore", fx.FlexplantWarning)
+        designs = {
+            "geometry alone": static,
+            "drawing": fx.design_kalman(nominal, larger=case["full"]["drawing"]),
+            "updated, 24 modes": fx.design_kalman(fit),
+            "updated, all modes": fx.design_kalman(fit, larger=case["full"]["updated"]),
+        }
     servo = fx.design_servo(fit, bandwidth=10.0, observer=static)
     blocks = static, servo, *fx.reading_along(designs)
     run = case["machine"].run(ports(force), *blocks, duration=3.0, rng=seed, runs=5)

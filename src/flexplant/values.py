@@ -24,6 +24,17 @@ Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: a (n, n) matrix, dense or sparse
 Matrix: TypeAlias = "FloatArray | sp.csc_array"
 
+_PREFIXES = (
+    (1e-15, "f"),
+    (1e-12, "p"),
+    (1e-9, "n"),
+    (1e-6, "\N{MICRO SIGN}"),
+    (1e-3, "m"),
+    (1.0, ""),
+    (1e3, "k"),
+    (1e6, "M"),
+)
+
 
 def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
     """Return the units of some channels; those of other names are left out.
@@ -112,6 +123,19 @@ def short(value: Any) -> str:
         return f"an array of shape {value.shape}"
     text = " ".join(repr(value).split())
     return text if len(text) <= 80 else text[:77] + "..."
+
+
+def scale(size: float) -> tuple[float, str]:
+    """Return the factor and the letters of the SI prefix that bring a size to 1 .. 1000."""
+    return next((s for s in _PREFIXES if size < 1e3 * s[0]), _PREFIXES[-1]) if size else (1.0, "")
+
+
+def with_unit(value: float, unit: str | None) -> str:
+    """Return a number in words: `0.527 nm`; without a unit as it is."""
+    if not unit:
+        return f"{value:.3g}"
+    factor, prefix = scale(abs(value))
+    return f"{value / factor:.3g} {prefix}{unit}"
 
 
 def positive(value: Any, name: str, *, zero: bool = False) -> float:

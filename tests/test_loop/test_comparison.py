@@ -94,7 +94,7 @@ def test_an_unstable_loop_has_no_figures(loops):
     assert row.decay > 1
     assert np.isnan([row.bandwidth, row.peak, row.low]).all()
     assert row.margin == 0.0
-    assert "NO (1." in repr(found)
+    assert "NO (1." in repr(found) and "stable (spectral radius)" in repr(found)
 
 
 def test_loops_without_a_reference_show_the_margin_at_u():
@@ -106,6 +106,10 @@ def test_loops_without_a_reference_show_the_margin_at_u():
     law = StateSpace([], [], [], [[-100.0, -20.0]], inputs=["y", "v"], outputs=["u"])
     found = compare_loops({"pd": close_loop(plant, law)})
     assert found["pd"].decay == pytest.approx(-10.0)
+    assert "stable (largest real part [rad/s])" in repr(found)
+    sampled = plant.discretized(100.0)
+    with pytest.raises(ModelError, match="some continuous"):
+        compare_loops({"pd": close_loop(plant, law), "held": close_loop(sampled, law)})
     # |S_u| = |s^2 / (s + 10)^2| rises to 1, its value at infinite frequency
     assert found["pd"].margin == pytest.approx(1.0, rel=1e-3)
     assert np.isnan(found["pd"].bandwidth)

@@ -34,12 +34,16 @@ class KalmanCertificate(Value):
     left_out : int, optional
         How many modes left out are in the predicted error; None: none are known, truncation is not
         in the number.
+    unresolved : float, optional
+        Largest share of a predicted variance that is from modes left out with fewer than 4 nodes
+        of the larger model's mesh per wavelength; None: its mesh is not known.
     """
 
     spectral_radius: float
     residual: float
     difference: float
     left_out: int | None = None
+    unresolved: float | None = None
 
 
 def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -> float:

@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, with_unit
 from .certificate import KalmanCertificate
 from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
@@ -19,6 +19,7 @@ from .estimate import Estimate, estimated
 from .filter_model import FilterModel, filter_model
 from .lags import Filter, Lag
 from .left_out import LeftOut
+from .mesh import NODES, NOTED
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -66,7 +67,10 @@ class KalmanEstimator(Value):
 
     def __repr__(self) -> str:
         channels = poi_channels(self.plant)
-        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in channels[:4])
+        units = self.plant.units
+        rms = ", ".join(
+            f"{name} {with_unit(self.rms(name), units.get(name))}" for name in channels[:4]
+        )
         count = self.certificate.left_out
         counted = (
             "modes left out are not known: truncation is not in these numbers"
@@ -75,6 +79,12 @@ class KalmanEstimator(Value):
             if count
             else "as if no modes were left out"
         )
+        share = self.certificate.unresolved
+        if share is not None and share > NOTED:
+            counted += (
+                f"; up to {share:.0%} of a variance is from modes with fewer than {NODES:g} nodes "
+                "of the mesh a wavelength: a finer one for larger= would change it"
+            )
         return (
             f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
             f"spectral radius {self.certificate.spectral_radius:.6f};\n"

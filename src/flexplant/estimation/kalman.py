@@ -20,6 +20,7 @@ from .estimator import KalmanEstimator
 from .filter_model import FilterModel, check_noises, check_precision, filter_model
 from .filter_system import filter_system
 from .left_out import left_out
+from .mesh import unresolved_share
 
 
 @one_thread()
@@ -44,9 +45,10 @@ def design_kalman(
     of those modes included: on a plate of 0.6 m x 0.6 m 8 x 8 elements predict the error
     of z on finer ones within 6 %, that of rotations within 23 %; on one of 0.5 m x 0.3 m it
     predicts z 65 % too large, since other shapes mix in modes of almost one frequency above
-    10 kHz. 12 x 12 elements are within 5 % for z there, beside 24 x 24. Refine the mesh of
-    `larger` until the prediction stays. Without any delay of u the static compliance is left out:
-    it would close an algebraic loop from y to u to y.
+    10 kHz. 12 x 12 elements are within 5 % for z there, beside 24 x 24. Where `larger` is an
+    FEModel the certificate states which share of a variance is from modes with fewer than 4 nodes
+    per wavelength (`unresolved`); more than half warns. Without any delay of u the static
+    compliance is left out: it would close an algebraic loop from y to u to y.
 
     Parameters
     ----------
@@ -77,6 +79,12 @@ def design_kalman(
         below the motion within a sample that rounding hides it.
     CertificateError
         When the check by the other route fails.
+
+    Warns
+    -----
+    FlexplantWarning
+        When more than half of a predicted variance is from modes that the mesh of `larger`
+        resolves badly.
 
     References
     ----------
@@ -116,6 +124,7 @@ def design_kalman(
     certificate = design.certificate.replace(
         difference=max(design.certificate.difference, honest.difference),
         left_out=int(found.modes.size),
+        unresolved=unresolved_share(whole, found.modes, system, honest.values),
     )
     return KalmanEstimator(
         system, plant, design.gain, design.covariance, certificate, honest.values, found

@@ -58,10 +58,13 @@ class LoopComparison(Value):
         One for each loop.
     channel : str
         What S is: ``die:ref to die:error``; empty when the loops have no reference.
+    sampled : bool
+        Whether `decay` of the rows is a spectral radius.
     """
 
     rows: Mapping[str, LoopFigures]
     channel: str
+    sampled: bool = True
 
     def __post_init__(self) -> None:
         self._set(rows=dict(self.rows))
@@ -74,8 +77,9 @@ class LoopComparison(Value):
     def __repr__(self) -> str:
         width = max(map(len, self.rows)) + 2
         first = next(iter(self.rows.values()))
+        measure = f"stable ({'spectral radius' if self.sampled else 'largest real part [rad/s]'})"
         low = f"|S| at {first.low_freq:.3g} Hz" if self.channel else "|S| low"
-        head = ("stable", "|S| < 1 up to", "max |S|", "at", low, "max |S| at u")
+        head = (measure, "|S| < 1 up to", "max |S|", "at", low, "max |S| at u")
         cells = [_cells(row) for row in self.rows.values()]
         wide = [max(len(h), *(len(c[i]) for c in cells)) + 2 for i, h in enumerate(head)]
         lines = [f"{'':{width}s}" + "".join(f"{h:>{w}s}" for h, w in zip(head, wide, strict=True))]
@@ -109,7 +113,7 @@ def compare_loops(
     Raises
     ------
     ModelError
-        When there is no mapping of closed loops.
+        When there is no mapping of closed loops, or some are sampled and some continuous.
     LabelError
         When a loop lacks the channels.
     """
@@ -128,6 +132,12 @@ def compare_loops(
                 f"loop {name!r} has no {pair[0]!r} in w or no {pair[1]!r} in z. Compare loops of "
                 "the same Ports, or name the channels: reference=, error=."
             )
+    sampled = bool(next(iter(loops.values())).plant.dt)
+    if any(bool(loop.plant.dt) != sampled for loop in loops.values()):
+        raise ModelError(
+            "some of the loops are sampled and some continuous: their stability is measured "
+            "differently. Compare loops of one kind."
+        )
     curves = {
         name: error_sensitivity(loop, *pair) if pair and loop.is_stable else None
         for name, loop in loops.items()
@@ -139,7 +149,7 @@ def compare_loops(
         name: _figures(loop, curves[name], reached[name], low_freq, pair)
         for name, loop in loops.items()
     }
-    return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "")
+    return LoopComparison(rows, f"{pair[0]} to {pair[1]}" if pair else "", sampled)
 
 
 def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tuple[str, ...]:

@@ -12,16 +12,6 @@ from matplotlib.axes import Axes
 MEASURED, NOMINAL, UPDATED, FULL = "black", "0.55", "tab:blue", "tab:green"
 #: what is marked, and small differences
 MARK, DIFFERENCE = "tab:red", "tab:orange"
-_PREFIXES = (
-    (1e-15, "f"),
-    (1e-12, "p"),
-    (1e-9, "n"),
-    (1e-6, "\N{MICRO SIGN}"),
-    (1e-3, "m"),
-    (1.0, ""),
-    (1e3, "k"),
-    (1e6, "M"),
-)
 CYCLE = (UPDATED, "tab:orange", FULL, "tab:purple", "tab:brown", "tab:red")
 
 
@@ -42,11 +32,6 @@ def panel_axes(ax: Axes | None, count: int) -> list[Axes]:
         count, 1, sharex=True, squeeze=False, layout="constrained", figsize=(8.0, height)
     )
     return list(drawn[:, 0])
-
-
-def scale(size: float) -> tuple[float, str]:
-    """Return the factor and the letters of the SI prefix that bring a size to 1 .. 1000."""
-    return next((s for s in _PREFIXES if size < 1e3 * s[0]), _PREFIXES[-1]) if size else (1.0, "")
 
 
 def finish(ax: Axes, *, x: str, y: str, title: str = "") -> Axes:

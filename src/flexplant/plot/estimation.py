@@ -11,8 +11,8 @@ from matplotlib.lines import Line2D
 
 from ..errors import ModelError
 from ..simulation import EstimatorComparison
-from ..values import FloatArray, real_array, short
-from ._axes import CYCLE, MEASURED, axes, finish, scale
+from ..values import FloatArray, real_array, scale, short
+from ._axes import CYCLE, MEASURED, axes, finish
 
 
 def predictions(

@@ -9,8 +9,8 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
 from ..simulation import Response
-from ..values import name_list, real_array, short
-from ._axes import CYCLE, finish, panel_axes, scale
+from ..values import name_list, real_array, scale, short
+from ._axes import CYCLE, finish, panel_axes
 
 #: what a unit measures
 _QUANTITY = {
