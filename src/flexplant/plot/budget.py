@@ -7,8 +7,8 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError
 from ..loop import ErrorBudget
-from ..values import short
-from ._axes import CYCLE, axes, finish, scale
+from ..values import scale, short
+from ._axes import CYCLE, axes, finish
 
 
 def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes:
