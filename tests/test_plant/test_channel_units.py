@@ -63,6 +63,14 @@ def test_units_travel_with_the_channels(tmp_path):
     observer, servo = fx.design_kalman(sampled), fx.design_servo(sampled, bandwidth=50.0)
     loop = fx.close_loop(sampled, observer, servo)
     assert loop.system.units["die:error"] == "m"
+    S, KS = fx.loop.sensitivity(loop, at="y"), fx.loop.control_sensitivity(loop)
+    assert (S.unit("y1", "y2"), KS.unit("u1", "y1")) == ("1", "N/m")
+    assert "[1]" in repr(fx.loop.loop_gain(loop)) and "[N/m]" in repr(KS)
+    measured = fx.frequency_response(sampled.system.select(sampled.y, sampled.u), S.freq)
+    measured = measured.replace(units={}, quantity="displacement")
+    assert fx.loop.control_sensitivity((measured, loop)).unit("u1", "y1") == "N/m"
+    assert "0 dB = 1 N/m" in fx.plot.frf({"KS": KS}, "u1", "y1").get_ylabel()
+    assert "0 dB = 1]" in fx.plot.frf({"S": S}, "y1", "y1").get_ylabel()
     run = fx.simulate(loop, duration=0.01, rng=1)
     assert [run.units[n] for n in ("die:z", "die:rx", "u1", "die:rx:hat", "y1")] == [
         "m", "rad", "N", "rad", "m"

@@ -60,6 +60,37 @@ def test_frf():
         fx.plot.frf({"one": some_frf()}, "y2", "u1")
 
 
+def covered(ax):
+    """How many points of the lines lie under the legend."""
+    ax.figure.draw_without_rendering()
+    box = ax.get_legend().get_window_extent()
+    every = np.linspace(0.0, 1.0, 2000)
+    lines = [np.asarray(line.get_xydata(), dtype=float) for line in ax.get_lines()]
+    points = np.vstack(
+        [np.column_stack([np.interp(every, np.linspace(0, 1, len(p)), v) for v in p.T])
+         for p in lines]
+    )  # fmt: skip
+    inside = ax.bbox.contains
+    seen = [p for p in ax.transData.transform(points) if inside(*p)]
+    return sum(box.contains(*p) for p in seen)
+
+
+def test_legends_cover_no_line():
+    """New axes have theirs beside them, wherever the lines go; given ones in an empty corner."""
+    noise = np.random.default_rng(1).standard_normal((2, 50))
+    freq = np.geomspace(1.0, 100.0, 20)
+    for ax in (
+        fx.plot.response(run_of(noise), ["die:z", "die:error"]),
+        fx.plot.frf({"one": some_frf(), "two": some_frf(10.0)}, "y1", "u1"),
+        fx.plot.sensitivity({"model": (freq, freq), "other": (freq, 1 / freq)}),
+    ):
+        assert covered(ax) == 0
+        assert ax.get_legend().get_window_extent().x0 >= ax.bbox.x1
+    wave = np.where(np.arange(50) < 25, -1.0, noise[0])
+    run = run_of([wave, wave])
+    assert covered(fx.plot.response(run, ax=plt.subplots()[1])) == 0
+
+
 def test_sensitivity():
     freq = np.geomspace(1.0, 100.0, 20)
     ax = fx.plot.sensitivity({"model": (freq, np.full(20, 10.0))})

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
 
@@ -34,6 +34,8 @@ class BrokenLoop:
         Sampling time, 0 when continuous.
     measured : (n_freq,) array [Hz], optional
         The frequencies of a measured plant.
+    units : mapping {channel: unit}
+        Of the u and y where they are known.
     """
 
     u: tuple[str, ...]
@@ -43,6 +45,7 @@ class BrokenLoop:
     poles: Callable[[], ComplexArray]
     dt: float
     measured: FloatArray | None = None
+    units: Mapping[str, str] = field(default_factory=dict)
 
     def respond(self, freq: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Return K (n_freq, nu, ny) and P (n_freq, ny, nu)."""

@@ -200,6 +200,7 @@ class ClosedLoop(Value):
             responder(self.plant.system.select(self.fed_back, self.driven)),
             self.monitored.poles,
             self.plant.dt,
+            units=self.units,
         )
 
     @property

@@ -199,6 +199,7 @@ def _modelled(
     return BrokenLoop(
         tuple(plant.inputs), tuple(plant.outputs), remembered(responder(controller)),
         responder(plant), poles, dt,
+        units={**controller.units, **plant.units},
     )  # fmt: skip
 
 
@@ -250,6 +251,7 @@ def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) ->
         controller.poles,
         controller.dt,
         np.array(plant.freq),
+        {**controller.units, **plant.channel_units},
     )
 
 
@@ -280,4 +282,6 @@ def _checked(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
 
 def _frf(freq: FloatArray, data: ComplexArray, parts: BrokenLoop, to: str, fro: str) -> Frf:
     names = {"u": parts.u, "y": parts.y}
-    return Frf(freq, np.moveaxis(data, 0, -1), inputs=names[fro], outputs=names[to])
+    return Frf(
+        freq, np.moveaxis(data, 0, -1), inputs=names[fro], outputs=names[to], units=parts.units
+    )

@@ -23,7 +23,7 @@ from ..values import (
 )
 from .grid import default_freq as default_freq
 from .joining import short_list
-from .line_correlation import checked_overlap, checked_window, line_correlation
+from .line_correlation import checked_correlation, checked_overlap, checked_window, line_correlation
 from .responses import responses
 from .statespace import System, as_statespace
 
@@ -114,7 +114,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
                 raise ModelError("variance must not be negative: it is E|error|^2.")
         correlation = self.correlation
         if correlation is not None:
-            correlation = _checked_correlation(correlation, data.shape)
+            correlation = checked_correlation(correlation, data.shape)
         window, resolution = self.window, self.resolution
         if resolution is not None:
             resolution = positive(resolution, "resolution")
@@ -142,6 +142,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     def __repr__(self) -> str:
         sides = f"{short_list(self.inputs)} -> {short_list(self.outputs)}"
         span = f"{self.freq[0]:.4g} .. {self.freq[-1]:.4g} Hz" if self.freq.size else ""
+        units = {self.unit(*channel) for channel in self}
+        unit = units.pop() if len(units) == 1 else None
+        sides += f" [{unit}]" if unit is not None else ""
         return f"<Frf: {sides}, {self.freq.size} frequencies {span}>"
 
     def __getitem__(self, key: tuple[str, str]) -> ComplexArray:
@@ -229,7 +232,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         )
 
     def unit(self, output: str, input: str) -> str | None:
-        """Return the unit of a response, such as "rad/N"; None when it is not known.
+        """Return the unit of a response, such as "rad/N", "1" of a ratio; None when not known.
 
         By the units of the channels, else, of a measurement, by its quantity for one N.
 
@@ -244,12 +247,23 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             When a name is unknown.
         """
         self._place((output, input))
-        per = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}
-        above = self.units.get(output, per.get(self.quantity or ""))
-        below = self.units.get(input, "N" if self.quantity in per else None)
+        known = self.channel_units
+        above, below = known.get(output), known.get(input)
         if above is None or below is None:
             return None
+        if above == below:
+            return "1"
         return f"{above}/({below})" if set(below) & set(" /") else f"{above}/{below}"
+
+    @property
+    def channel_units(self) -> dict[str, str]:
+        """Units of the channels: as given, else, of a measurement, by its quantity for one N."""
+        per = {"displacement": "m", "velocity": "m/s", "acceleration": "m/s^2"}.get(
+            self.quantity or ""
+        )
+        if per is None:
+            return dict(self.units)
+        return dict.fromkeys(self.inputs, "N") | dict.fromkeys(self.outputs, per) | dict(self.units)
 
     def to_control(self, dt: float = 0.0) -> Any:
         """Return a `control.FrequencyResponseData` with the same names.
@@ -373,23 +387,6 @@ def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
     if np.any(np.diff(grid) <= 0):
         raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
     return grid
-
-
-def _checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
-    correlation = np.array(value, dtype=np.complex128)
-    if correlation.shape != (shape[0], shape[0], shape[2]):
-        raise ShapeError(
-            f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "
-            f"got {correlation.shape}."
-        )
-    unit = np.eye(shape[0])[:, :, None]
-    hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
-    wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
-    if not (np.all(np.abs(correlation) <= 1 + 1e-9) and np.all(wrong <= 1e-9)):
-        raise ModelError(
-            "correlation must be Hermitian with ones on the diagonal and none larger than one."
-        )
-    return correlation
 
 
 def _index(known: Sequence[str], name: str, side: str) -> int:

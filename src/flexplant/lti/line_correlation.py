@@ -1,4 +1,4 @@
-"""Correlation of the errors of neighbouring lines of an FRF averaged over windowed segments."""
+"""Correlation of the errors of an FRF: of its outputs, and of lines of windowed segments."""
 
 from __future__ import annotations
 
@@ -7,13 +7,38 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError
-from ..values import FloatArray, positive
+from ..errors import ModelError, ShapeError
+from ..values import ComplexArray, FloatArray, positive
 
 #: samples of a window that stand for all lengths
 SAMPLES = 256
 #: correlations below this are left out, and so are lines farther apart than this many
 LEAST, FARTHEST = 1e-3, 40
+
+
+def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
+    """Return the correlation (n_out, n_out, n_freq) of errors of outputs of responses of a shape.
+
+    Raises
+    ------
+    ShapeError, ModelError
+        When sizes do not match, or it is no correlation.
+    """
+    correlation = np.array(value, dtype=np.complex128)
+    if correlation.shape != (shape[0], shape[0], shape[2]):
+        raise ShapeError(
+            f"correlation must have shape ({shape[0]}, {shape[0]}, {shape[2]}), "
+            f"got {correlation.shape}: one row and column for each output."
+        )
+    unit = np.eye(shape[0])[:, :, None]
+    hermitian = np.abs(correlation - correlation.conj().transpose(1, 0, 2))
+    wrong = np.maximum(np.abs(correlation * unit - unit), hermitian)
+    if not (np.all(np.abs(correlation) <= 1 + 1e-9) and np.all(wrong <= 1e-9)):
+        raise ModelError(
+            "correlation must be Hermitian with ones on the diagonal and none larger than one. "
+            "Divide a covariance by the standard deviations of both outputs."
+        )
+    return correlation
 
 
 def checked_window(window: Any) -> str | tuple[Any, ...]:

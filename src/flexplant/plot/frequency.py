@@ -12,7 +12,7 @@ from ..loop import ClosedLoop
 from ..loop.comparison import error_sensitivity
 from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray, short
-from ._axes import CYCLE, axes, finish
+from ._axes import CYCLE, axes, finish, legend
 
 
 def frf(
@@ -72,7 +72,7 @@ def frf(
         )
     if reference is not None and reference not in responses:
         raise unknown_label("response", reference, responses)
-    ax = axes(ax, figsize=(8.0, 4.5))
+    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     for i, (label, response) in enumerate(responses.items()):
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
         thick = i == 0 and len(responses) > 1
@@ -83,8 +83,8 @@ def frf(
             error = _decibel(response[output, input] - base[output, input])
             text = f"{label} less {reference}"
             ax.semilogx(response.freq, error, ":", color=color, label=text, linewidth=1.1)
-    ax.legend(frameon=False)
-    one = f"1 {known.pop()}" if known else "1"
+    legend(ax, given=given)
+    one = f"1 {known.pop()}".removesuffix(" 1") if known else "1"
     return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [dB, 0 dB = {one}]")
 
 
@@ -126,7 +126,7 @@ def sensitivity(
             f"need a mapping of labels to (freq, size), got {short(curves)}. Type "
             "{'model': (freq, size)}."
         )
-    ax = axes(ax, figsize=(8.0, 4.5))
+    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     for i, (label, curve) in enumerate(curves.items()):
         freq, size = error_sensitivity(curve) if isinstance(curve, ClosedLoop) else curve
         color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
@@ -135,5 +135,5 @@ def sensitivity(
         ax.semilogx(freq, 20.0 * np.log10(size), color=color, label=label, **line)
     for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color="0.4", linestyle=style, linewidth=0.8)
-    ax.legend(frameon=False)
+    legend(ax, given=given)
     return finish(ax, x="frequency [Hz]", y="|S| [dB]")

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from ..errors import ModelError, unknown_label
 from ..simulation import Response
 from ..values import name_list, real_array, scale, short
-from ._axes import CYCLE, finish, panel_axes
+from ._axes import CYCLE, finish, legend, panel_axes
 
 #: what a unit measures
 _QUANTITY = {
@@ -85,7 +85,7 @@ def response(
         )
     drawn = panel_axes(ax, len(panels))
     for (own, group), panel in zip(panels.items(), drawn, strict=True):
-        _panel(panel, run, group, own, names, label=label, color=color)
+        _panel(panel, run, group, own, names, label=label, color=color, given=ax is not None)
     if len(drawn) > 1:
         for panel in drawn[:-1]:
             panel.set_xlabel("")
@@ -119,6 +119,7 @@ def _panel(
     *,
     label: str | None,
     color: str | None,
+    given: bool,
 ) -> None:
     """Draw channels of one unit; colours follow the place among all channels."""
     signals = [np.atleast_2d(run[name])[0] for name in group]
@@ -132,6 +133,6 @@ def _panel(
             label=_label(label, name, names),
             linewidth=0.8,
         )
-    ax.legend(frameon=False, loc="upper right")
+    legend(ax, given=given)
     quantity = f"{_QUANTITY.get(unit or '', 'signal')} [{prefix}{unit}]" if unit else "signal"
     finish(ax, x="time [s]", y=quantity)
