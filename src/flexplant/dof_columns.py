@@ -78,8 +78,8 @@ def node_numbers(nodes: Any) -> IntArray:
         numbers, whole = np.zeros(1), np.ones(1, dtype=np.int64)
     if numbers.dtype == bool or np.any(whole != numbers) or np.any(abs(whole) > LARGEST_NODE):
         raise LabelError(
-            f"node numbers must be whole numbers, got {nodes!r:.80}. Number the nodes, from 1 say, "
-            "and keep the foreign program's names elsewhere."
+            f"node numbers must be whole numbers, got {nodes!r:.80}. Give the nodes numbers, from "
+            "1 say, and keep the foreign program's names elsewhere."
         )
     return np.asarray(whole, dtype=np.int64)
 

@@ -216,7 +216,7 @@ class DofSet(Value):
         if corners.shape != (2, 3) or not np.all(corners[0] <= corners[1]):
             raise ShapeError(
                 f"box must be its lowest and its highest corner, [(x, y, z), (x, y, z)] in metres, "
-                f"got {box!r:.120}. Open sides are -inf and inf."
+                f"got {box!r:.120}. Use -inf and inf for open sides."
             )
         slack = 1e-9 * float(np.ptp(self.xyz, axis=0).max(initial=0.0))
         return np.all((self.xyz >= corners[0] - slack) & (self.xyz <= corners[1] + slack), axis=1)

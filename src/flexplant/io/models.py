@@ -194,7 +194,7 @@ def read_model(
     if len(sizes) != 3:
         raise ModelError(
             f"units must be three, of length, mass and time, got {short(units)}: "
-            "('mm', 't', 's') for instance."
+            "give ('mm', 't', 's') for instance."
         )
     found = read_matrices(
         path,

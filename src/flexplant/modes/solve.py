@@ -102,7 +102,7 @@ def solve_modes(
     if damping is not None and not isinstance(damping, Damping):
         raise ModelError(
             f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}: "
-            "1 % in all modes is ModalDamping(0.01)."
+            "give ModalDamping(0.01) for 1 % in all modes."
         )
     if factor is not None and not isinstance(factor, Pardiso):
         raise ModelError(

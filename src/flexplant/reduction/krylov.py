@@ -73,7 +73,8 @@ class Krylov(ReductionMethod):
         freq = np.atleast_1d(real_array(self.freq, "freq"))
         if freq.ndim > 1 or not freq.size or np.any(freq < 0):
             raise ModelError(
-                f"freq must be one or more frequencies [Hz] from 0 up, got {self.freq!r:.60}."
+                f"freq must be one or more frequencies [Hz] from 0 up, got {self.freq!r:.60}: "
+                "choose such, in the band of interest."
             )
         if np.unique(freq).size < freq.size:
             raise ModelError("an expansion frequency is there twice: choose more moments.")

@@ -201,8 +201,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     if not isinstance(model, FEModel | Modes) or not isinstance(method, ReductionMethod):
         raise ModelError(
             f"reduce needs an FEModel or Modes and a method, got {type(model).__name__} and "
-            f"{type(method).__name__}: reduce(solve_modes(model, count=24), DesiredDofs([...])), "
-            "reduce(model, Guyan([...]))."
+            f"{type(method).__name__}: call reduce(solve_modes(model, count=24), "
+            "DesiredDofs([...])) or reduce(model, Guyan([...]))."
         )
     if not isinstance(method, DesiredDofs):
         refuse_unstable(model, f"reduction by {type(method).__name__}")

@@ -142,7 +142,7 @@ def checked_damping(damping: object) -> Damping | None:
         return damping
     raise ModelError(
         f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}: "
-        "1 % in all modes is ModalDamping(0.01)."
+        "give ModalDamping(0.01) for 1 % in all modes."
     )
 
 

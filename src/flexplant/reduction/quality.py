@@ -186,7 +186,8 @@ def quality_of(
     if not isinstance(full, FEModel | Modes) or tuple(full.dofs) != tuple(reduced.full_dofs):
         what = f"{full!r:.80}" if isinstance(full, FEModel | Modes) else type(full).__name__
         raise ModelError(
-            f"a reduced model is judged against the FEModel or Modes it was made of, got {what}."
+            f"a reduced model is compared with the FEModel or Modes it was made of, got {what}: "
+            "pass that."
         )
     low, high = _band(band)
     pushed, watched = _channels(reduced, inputs, outputs)

@@ -180,7 +180,7 @@ def channels(
     if not isinstance(modes, Modes) or np.iscomplexobj(modes.phi):
         kind = "complex modes" if isinstance(modes, Modes) else type(modes).__name__
         raise ModelError(
-            f"channels are ranked by real Modes, got {kind}: solve_modes(model, count=..., "
+            f"channels are ranked by real Modes, got {kind}: pass solve_modes(model, count=..., "
             "damping=ModalDamping(...))."
         )
     pushed = places(inputs)

@@ -100,12 +100,13 @@ def select_dofs(
     if not isinstance(modes, Modes):
         raise ModelError(
             f"select_dofs distinguishes modes, got {type(modes).__name__}: "
-            "select_dofs(solve_modes(model, count=24), 24)."
+            "call select_dofs(solve_modes(model, count=24), 24)."
         )
     rule = PivotedQr() if criterion is None else criterion
     if not isinstance(rule, SelectionCriterion):
         raise ModelError(
-            f"criterion must be PivotedQr(), EffectiveIndependence() or Greedy(), got {rule!r:.60}."
+            f"criterion must be PivotedQr(), EffectiveIndependence() or Greedy(), got "
+            f"{rule!r:.60}: pass one."
         )
     if np.iscomplexobj(modes.phi):
         raise ModelError("select_dofs needs real modes: solve with damping=ModalDamping(...).")

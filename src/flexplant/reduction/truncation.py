@@ -72,7 +72,9 @@ class ModalTruncation(ReductionMethod):
 
     def __post_init__(self) -> None:
         if (self.count is None) == (self.modes is None):
-            raise ModelError("ModalTruncation needs count= (the lowest modes) or modes=, not both.")
+            raise ModelError(
+                "ModalTruncation needs count= (the lowest modes) or modes=, not both: give one."
+            )
         self._set(
             count=None if self.count is None else whole(self.count, "count"),
             modes=None if self.modes is None else mode_numbers(self.modes),

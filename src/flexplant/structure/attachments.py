@@ -251,7 +251,7 @@ def checked_place(at: Any, owner: str) -> Any:
     except ValueError:
         raise LabelError(
             f"{owner} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "
-            f"{{label: weight}}, got {at!r:.80}. dofs.nearest((x, y, z)) finds a label."
+            f"{{label: weight}}, got {at!r:.80}. Use dofs.nearest((x, y, z)), which finds a label."
         ) from None
 
 

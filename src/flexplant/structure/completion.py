@@ -25,11 +25,13 @@ def square(given: Any, name: str) -> sp.csc_array:
     if not sp.issparse(given):
         array = real_array(given, name)
         if array.ndim != 2 or array.shape[0] != array.shape[1]:
-            raise ShapeError(f"{name} must be square, got shape {array.shape}.")
+            raise ShapeError(
+                f"{name} must be square, got shape {array.shape}. Pass an (n, n) array."
+            )
         return sp.csc_array(array)
     listed: Any = stored.tocoo()
     if listed.ndim != 2 or listed.shape[0] != listed.shape[1]:
-        raise ShapeError(f"{name} must be square, got shape {listed.shape}.")
+        raise ShapeError(f"{name} must be square, got shape {listed.shape}. Pass an (n, n) array.")
     data: FloatArray = real_array(listed.data, f"stored entries of {name}")
     matrix: Any = sp.csc_array((data, (listed.row, listed.col)), shape=listed.shape)
     matrix.sum_duplicates()

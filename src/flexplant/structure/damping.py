@@ -210,7 +210,7 @@ class Rayleigh(Damping):
         )
         if not isinstance(self.rigid, bool | np.bool_):
             raise ModelError(
-                f"rigid must be True or False, got {short(self.rigid)}: whether alpha slows "
+                f"rigid must be True or False, got {short(self.rigid)}: say whether alpha slows "
                 "rigid-body motions down too."
             )
 

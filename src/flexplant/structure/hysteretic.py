@@ -53,7 +53,7 @@ class Hysteretic(Damping):
         if eta >= 2:
             raise ModelError(
                 f"loss_factor must be below 2, got {eta:g}: the equivalent damping ratio is half "
-                "of it, and from 1 on there is no oscillation left. 2 % is 0.02."
+                "of it, and from 1 on there is no oscillation left. Give 0.02 for 2 %."
             )
         self._set(loss_factor=eta)
 

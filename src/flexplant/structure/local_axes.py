@@ -26,8 +26,8 @@ def cosines(dofs: DofSet, rotations: Any) -> Any:
     rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
     if not isinstance(rotations, Mapping):
         raise LabelError(
-            f"rotations must be {{node: (3, 3) direction cosines}}, got {short(rotations)}. Row i "
-            "holds the global components of local axis i."
+            f"rotations must be {{node: (3, 3) direction cosines}}, got {short(rotations)}. Give "
+            "matrices whose row i holds the global components of local axis i."
         )
     for node, given in rotations.items():
         matrix = real_array(given, f"rotations[{node}]", (3, 3))

@@ -170,7 +170,7 @@ class FEMatrices(Value):
             When their number is not that of the rows.
         """
         given = DofSet.from_table(dofs) if isinstance(dofs, str | Path) else dofs
-        instance(given, DofSet, "dofs", "A path of a table does as well.")
+        instance(given, DofSet, "dofs", "Pass one, or the path of a table.")
         return self.replace(dofs=given, located=True)
 
     def located_at(self, nodes: Iterable[int], xyz: Any) -> FEMatrices:

@@ -87,7 +87,7 @@ class FEModel(Placed, Value):
         if not isinstance(self.dofs, DofSet):
             raise ModelError(
                 f"dofs must be a DofSet, got {type(self.dofs).__name__}: it says what the rows of "
-                "M and K are. DofSet(nodes, directions, xyz) or DofSet.from_table(...)."
+                "M and K are. Use DofSet(nodes, directions, xyz) or DofSet.from_table(...)."
             )
         n = len(self.dofs)
         if not n:
@@ -239,7 +239,7 @@ class FEModel(Placed, Value):
             if not (sp.issparse(damping) or isinstance(damping, np.ndarray | list)):
                 raise ModelError(
                     f"damping must be a ModalDamping or Rayleigh (or Hysteretic, or a matrix D), "
-                    f"got {type(damping).__name__}. 1 % in all modes is ModalDamping(0.01)."
+                    f"got {type(damping).__name__}. Give ModalDamping(0.01) for 1 % in all modes."
                 )
             D = _symmetric(damping, "D", self.n_dof)
             _check_semidefinite(D, "D")

@@ -137,7 +137,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
     else:
         raise ModelError(
             f"check needs an FEModel or FEMatrices, got {type(model).__name__}. "
-            "FEMatrices(K, M, dofs=...) takes matrices of any quality."
+            "Pass FEMatrices(K, M, dofs=...), which takes matrices of any quality."
         )
     found = facts(matrices_)
     lines: list[Line] = [

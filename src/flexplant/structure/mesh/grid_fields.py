@@ -191,8 +191,8 @@ def poisson_of(value: Any, lengths: Sequence[float], counts: Sequence[int], pres
     if np.any(there <= -1) or np.any(there >= 0.5):
         worst = there.min() if np.any(there <= -1) else there.max()
         raise ModelError(
-            f"poisson_ratio must be above -1 and below 0.5, got {worst:g}. Metals have 0.25 to "
-            "0.35; incompressible materials need other elements."
+            f"poisson_ratio must be above -1 and below 0.5, got {worst:g}. Give that of "
+            "the material, 0.25 to 0.35 for metals; incompressible ones need other elements."
         )
     return found
 
@@ -233,7 +233,7 @@ def _missing(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any
             if given.shape != tuple(counts):
                 raise ShapeError(
                     f"holes must be a mask with one entry for each element, of shape "
-                    f"{tuple(counts)}, got {given.shape}. True is a missing element."
+                    f"{tuple(counts)}, got {given.shape}. Give True where an element is missing."
                 )
             return given.T.ravel()
     centres = centres_of(lengths, counts)
