@@ -9,6 +9,7 @@ import flexplant as fx
 from flexplant.errors import FlexplantError
 from flexplant.loop import close_loop
 from flexplant.placement import Exchange, Exhaustive
+from flexplant.simulation import error_map, exposure_errors, settling_time
 from flexplant.testbeds import wafer_stage
 from stages import RATE, ports, sampled, some_modes
 
@@ -138,6 +139,17 @@ CALLS = [
         ("none", "negative", "fraction", "bool")),
     ("setpoint", lambda x: fx.setpoint(x, velocity=1.0, acceleration=1.0, jerk=1.0),
         ("negative", "fraction", "bool")),
+    ("scan", lambda x: fx.scan(x, velocity=1.0, acceleration=1.0),
+     ("fraction", "negative", "bool")),
+    ("setpoint rate", lambda x: fx.setpoint(1.0, velocity=1.0, acceleration=1.0, rate=x),
+     ("none", "fraction")),
+    ("exposure errors", lambda x: exposure_errors(x), ()),
+    ("exposures", lambda x: exposure_errors(run(), exposures=x), ("none",)),
+    ("settling", lambda x: settling_time(run(), "die:error", ma=x), ("fraction",)),
+    ("error map", lambda x: error_map(loop(), x, duration=0.01), ()),
+    ("specification", lambda x: fx.Specification(ma=x), ("fraction", "none")),
+    ("specification check", lambda x: fx.Specification(noise=1.0).check(x), ()),
+    ("specification run", lambda x: fx.Specification(ma=1.0).check(loop(), x), ()),
     ("setpoint velocity", lambda x: fx.setpoint(1.0, velocity=x, acceleration=1.0, jerk=1.0),
         ("fraction",)),
     ("setpoint snap", lambda x: fx.setpoint(1.0, velocity=1.0, acceleration=1.0, jerk=1.0, snap=x),

@@ -80,8 +80,10 @@ from .reduction import rank_modes as rank_modes
 from .reduction import reduce as reduce
 from .reduction import select_dofs as select_dofs
 from .simulation import Response as Response
+from .simulation import Specification as Specification
 from .simulation import compare_estimators as compare_estimators
 from .simulation import reading_along as reading_along
+from .simulation import scan as scan
 from .simulation import setpoint as setpoint
 from .simulation import simulate as simulate
 from .store import load as load

@@ -19,6 +19,7 @@ from flexplant.estimation.left_out import LeftOut
 from flexplant.loop import close_loop
 from flexplant.modes import normal_form
 from flexplant.reduction import select_dofs
+from flexplant.simulation import error_map, exposure_errors
 from flexplant.store import load
 from flexplant.updating import eigenvalue_sensitivities
 from flexplant.values import Value
@@ -76,7 +77,10 @@ def made():
     yield fx.loop.SpillOver(0.99, True, 0.5, 0.6, 100.0, 490)
     yield LeftOut(np.array([25]), np.eye(4), np.eye(3), np.zeros((3, 4)), plant)
     point = fx.setpoint(distance=1e-3, velocity=0.1, acceleration=1.0, jerk=100.0)
-    response = fx.simulate(loop, reference=point, duration=0.05, rng=1)
+    response = fx.simulate(loop, reference=point, duration=0.1, rng=1)
+    yield exposure_errors(response, window=0.01)
+    yield error_map(loop, CORNERS, duration=0.02)
+    yield from (fx.Specification(noise=1e-6), fx.Specification(noise=1e-6).check(loop))
     along = fx.close_loop(sampled, static, servo, *fx.reading_along({"static": static}))
     runs = fx.simulate(along, duration=0.01, rng=1, runs=2)
     yield fx.compare_estimators({"static": static}, runs, "die:z")

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..lti.grid import resonance_grid
-from ..lti.responses import responder
+from ..lti.responses import continuous_poles, responder
 from ..lti.statespace import StateSpace
 from ..values import FloatArray
 from .noise import Source
@@ -96,9 +96,8 @@ def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) ->
         The size of each integral: errors are relative to it.
     """
     top = 0.5 / monitored.dt if monitored.dt else np.inf
-    grid = resonance_grid(monitored.poles(), monitored.dt, points=40)
-    centre = float(np.sqrt(grid[0] * grid[-1]))
-    grid = np.concatenate([[0.0], grid[grid < top], [top]])
+    grid = _starts(monitored, top)
+    centre = float(np.sqrt(grid[1] * grid[-2]))
     edges = grid if monitored.dt else np.append(grid[:-1] / (grid[:-1] + centre), 1.0)
     nodes, gauss, kronrod = _rule()
 
@@ -134,6 +133,16 @@ def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) ->
         ends = np.append(ends, np.inf)
     total = np.cumsum(fine[:, order], axis=1)
     return Integral(ends, np.concatenate([np.zeros((total.shape[0], 1)), total], axis=1))
+
+
+def _starts(monitored: StateSpace, top: float) -> FloatArray:
+    """Return edges from 0 to the top: some over all frequencies, five at each resonance."""
+    base = resonance_grid(monitored.poles(), monitored.dt, points=25)
+    s = continuous_poles(monitored)
+    s = s[(s.imag > 0) & (np.abs(s.real) < 0.1 * s.imag)]
+    near = (s.imag[:, None] - s.real[:, None] * np.array([-20, -3, 0, 3, 20])) / (2.0 * np.pi)
+    edges = np.concatenate([np.geomspace(base[0], base[-1], 25), near.ravel()])
+    return np.concatenate([[0.0], np.unique(edges[(edges > 0) & (edges < top)]), [top]])
 
 
 def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:

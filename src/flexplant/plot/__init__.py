@@ -1,6 +1,7 @@
 """All pictures: functions that take values and `ax=`, and return the axes they drew on."""
 
 from .budget import budget as budget
+from .error_map import error_map as error_map
 from .estimation import predictions as predictions
 from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity

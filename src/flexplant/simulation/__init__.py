@@ -1,9 +1,18 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error."""
 
+from .error_map import ErrorMap as ErrorMap
+from .error_map import error_map as error_map
 from .estimator_comparison import EstimatorComparison as EstimatorComparison
 from .estimator_comparison import compare_estimators as compare_estimators
 from .estimator_comparison import reading_along as reading_along
+from .exposure import ExposureErrors as ExposureErrors
+from .exposure import exposure_errors as exposure_errors
+from .exposure import settling_time as settling_time
+from .motion import Motion as Motion
+from .motion import SetPoint as SetPoint
 from .response import Response as Response
-from .setpoint import SetPoint as SetPoint
+from .setpoint import scan as scan
 from .setpoint import setpoint as setpoint
 from .simulate import simulate as simulate
+from .specification import Specification as Specification
+from .specification import Verdict as Verdict

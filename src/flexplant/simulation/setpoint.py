@@ -1,141 +1,15 @@
-"""Point-to-point set-points with bounded velocity, acceleration, jerk and snap, in closed form."""
+"""Moves and scans with bounded velocity, acceleration, jerk and snap."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..errors import ModelError
-from ..values import FloatArray, Value, positive, real_array
-
-
-class Motion(NamedTuple):
-    """Position and its derivatives at some times."""
-
-    position: FloatArray
-    velocity: FloatArray
-    acceleration: FloatArray
-    jerk: FloatArray
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class SetPoint(Value):
-    """A motion from rest to rest along one axis, made by `setpoint`.
-
-    Parameters
-    ----------
-    distance : float [m or rad]
-        Signed length of the motion.
-    velocity, acceleration, jerk : float [m/s, m/s^2, m/s^3]
-        Bounds.
-    snap : float or None [m/s^4]
-        Bound of the fourth derivative; None lets the jerk jump.
-    start : float [m]
-        Position before the motion.
-    rest : float [s]
-        Time at rest before the motion begins.
-    """
-
-    distance: float
-    velocity: float
-    acceleration: float
-    jerk: float
-    snap: float | None = None
-    start: float = 0.0
-    rest: float = 0.0
-
-    def __post_init__(self) -> None:
-        self._set(
-            distance=float(real_array(self.distance, "distance", ())),
-            velocity=positive(self.velocity, "velocity"),
-            acceleration=positive(self.acceleration, "acceleration"),
-            jerk=positive(self.jerk, "jerk"),
-            snap=None if self.snap is None else positive(self.snap, "snap"),
-            start=float(real_array(self.start, "start", ())),
-            rest=positive(self.rest, "rest", zero=True),
-        )
-        if not self.distance:
-            raise ModelError("distance must not be 0: a motion of no length needs no set-point.")
-
-    def __repr__(self) -> str:
-        end = self.start + self.distance
-        return (
-            f"<SetPoint {self.start:g} -> {end:g} in {self.duration:.6g} s, order "
-            f"{3 if self.snap is None else 4}, v {self.velocity:g}, a {self.acceleration:g}>"
-        )
-
-    @property
-    def duration(self) -> float:
-        """Time until the motion is over, the rest before it included [s]."""
-        return self.rest + float(self._times[-1]) * 2.0
-
-    @cached_property
-    def _phases(self) -> tuple[float, float, float, float]:
-        return _durations(
-            abs(self.distance), self.velocity, self.acceleration, self.jerk, self.snap
-        )
-
-    @cached_property
-    def _times(self) -> FloatArray:
-        """Ends of the eight phases of the first half, from the beginning of the motion."""
-        ramp, hold, steady, cruise = self._phases
-        pulse = (ramp, hold, ramp)
-        return np.cumsum([*pulse, steady, *pulse, 0.5 * cruise])
-
-    @cached_property
-    def _starts(self) -> FloatArray:
-        """Position, velocity, acceleration, jerk and snap (8, 5) at the start of each phase."""
-        ramp, hold, steady, _ = self._phases
-        peak = self.jerk if self.snap is None else self.snap * ramp
-        snap = 0.0 if self.snap is None else self.snap
-        snaps = (snap, 0.0, -snap, 0.0, -snap, 0.0, snap, 0.0)
-        jerks = (0.0, peak, peak, 0.0, 0.0, -peak, -peak, 0.0)
-        rows = np.zeros((8, 5))
-        rows[:, 4], rows[:, 3] = snaps, jerks
-        for i, length in enumerate((ramp, hold, ramp, steady, ramp, hold, ramp)):
-            rows[i + 1, :3] = _moved(rows[i], np.float64(length))[:3]
-        rows[7, 2] = 0.0  # its rounding error would grow over a long cruise
-        return rows
-
-    def at(self, t: npt.ArrayLike) -> Motion:
-        """Return position, velocity, acceleration and jerk at times t.
-
-        Parameters
-        ----------
-        t : array or float [s]
-            Any times; before and after the motion the set-point rests.
-
-        Returns
-        -------
-        Motion
-            Named tuple (position, velocity, acceleration, jerk) of arrays shaped like t.
-
-        Raises
-        ------
-        ModelError
-            When a time is not finite.
-        """
-        moving = real_array(t, "t") - self.rest
-        half = float(self._times[-1])
-        # the second half mirrors the first: the end is reached exactly
-        late = moving > half
-        early = np.clip(np.where(late, 2.0 * half - moving, moving), 0.0, half)
-        phase = np.minimum(np.searchsorted(self._times, early, side="right"), 7)
-        elapsed = early - np.concatenate([[0.0], self._times])[phase]
-        p, v, a, j = _moved(np.moveaxis(self._starts[phase], -1, 0), elapsed)
-        resting = (moving <= 0.0) | (moving >= 2.0 * half)
-        sign, length = np.sign(self.distance), abs(self.distance)
-        position = np.where(late, length - p, p)
-        return Motion(
-            self.start + sign * np.where(resting, np.where(late, length, 0.0), position),
-            sign * np.where(resting, 0.0, v),
-            sign * np.where(resting, 0.0, np.where(late, -a, a)),
-            sign * np.where(resting, 0.0, j),
-        )
+from ..values import positive, real_array
+from .motion import ON_GRID, SetPoint
+from .profile import Phase, flank, mirrored, on_grid, shortest, spans
 
 
 def setpoint(
@@ -143,41 +17,58 @@ def setpoint(
     *,
     velocity: float,
     acceleration: float,
-    jerk: float,
+    jerk: float | None = None,
     snap: float | None = None,
     start: float = 0.0,
     rest: float = 0.0,
+    settle: float = 0.0,
+    exposure: float = 0.0,
+    rate: float | None = None,
 ) -> SetPoint:
     """Return the fastest motion from rest to rest within the bounds, in closed form.
 
-    Third order (bounded jerk, piecewise constant) or, with `snap`, fourth order. Bounds that the
-    distance is too short to reach are not reached. The third order is time-optimal; so is the
-    fourth where the velocity bound is reached. Where it is not, acceleration and jerk still
-    return to zero between speeding up and slowing down, which takes at most 7.5 % longer than
-    the optimum.
+    Second order (acceleration jumps), third with `jerk` (jerk jumps) or fourth with `snap`. Bounds
+    that the distance is too short to reach are not reached. The second and third order are
+    time-optimal; so is the fourth where the velocity bound is reached. Where it is not,
+    acceleration and jerk still return to zero between speeding up and slowing down, which takes at
+    most 7.5 % longer than the optimum.
+
+    With `rate` all switching times are samples of a grid: the motion is a few samples longer, the
+    levels a little lower, so that all bounds hold and the end is exact; the samples of all
+    derivatives then belong together without any interpolation.
 
     Parameters
     ----------
     distance : float [m or rad]
         Signed length of the motion.
-    velocity, acceleration, jerk : float [m/s, m/s^2, m/s^3]
+    velocity, acceleration : float [m/s, m/s^2]
         Bounds on the magnitudes.
-    snap : float, optional [m/s^4]
-        Bound on the fourth derivative.
+    jerk, snap : float, optional [m/s^3, m/s^4]
+        Bounds on the third and fourth derivative; a bound on snap needs one on jerk.
     start : float [m]
         Position before the motion.
     rest : float [s]
         Time at rest before the motion begins.
+    settle, exposure : float [s]
+        Time to settle after the motion, and length of the exposure window after that.
+    rate : float, optional [Hz]
+        Of the controller, to switch on its samples; rests are rounded up to whole samples.
 
     Returns
     -------
     SetPoint
-        With `.at(t)` and `.duration`.
+        With `.at(t)`, `.duration`, `.exposures`, and `.then(other)` for chains.
 
     Raises
     ------
     ModelError
-        When a bound is not positive, or the distance is 0 or not finite.
+        When a bound is not positive, snap is given without jerk, or the distance is 0 or not
+        finite.
+
+    References
+    ----------
+    Lambrechts, Boerlage, Steinbuch, Trajectory planning and feedforward design for
+    electromechanical motion systems, Control Engineering Practice 13, 2005.
 
     Examples
     --------
@@ -187,65 +78,159 @@ def setpoint(
     >>> float(move.at(1.0).position)
     0.1
     """
-    return SetPoint(distance, velocity, acceleration, jerk, snap, start, rest)
+    signed = float(real_array(distance, "distance", ()))
+    bounds = _bounds(velocity, acceleration, jerk, snap)
+    if not signed:
+        raise ModelError("distance must not be 0: a motion of no length needs no set-point.")
+    grid = _Grid(rate)
+    length = abs(signed)
+    t = tuple(grid.tick * n for n in on_grid(length, bounds, 1.0 / grid.tick)) if grid else ()
+    t = t or shortest(length, bounds)
+    _, w = spans(t)
+    up = flank(t[:-1], length / w[-1])
+    waits = [grid.whole(one, name) for one, name in ((rest, "rest"), (settle, "settle"),
+             (exposure, "exposure"))]  # fmt: skip
+    return _assembled(up, t[-1], signed, length, grid, waits, start, len(bounds), False)
 
 
-def _durations(
-    distance: float, velocity: float, acceleration: float, jerk: float, snap: float | None
-) -> tuple[float, float, float, float]:
-    """Return how long snap, jerk, acceleration and velocity are held in one flank.
+def scan(
+    length: float,
+    *,
+    velocity: float,
+    acceleration: float,
+    jerk: float | None = None,
+    snap: float | None = None,
+    settle: float = 0.0,
+    start: float = 0.0,
+    rest: float = 0.0,
+    rate: float | None = None,
+) -> SetPoint:
+    """Return a scan: to constant velocity, settle, expose a length, and back to rest.
 
-    A jerk pulse lasts J = 2 ramp + hold and adds the acceleration a; the acceleration lasts
-    2 J + steady and adds the velocity a (J + steady). Each duration is the longest that the bounds
-    and the distance allow, from the highest derivative down.
+    Parameters
+    ----------
+    length : float [m or rad]
+        Signed length that is exposed at constant velocity.
+    velocity : float [m/s]
+        During the exposure; with a grid lowered so that the exposure takes whole samples.
+    acceleration, jerk, snap : float [m/s^2, m/s^3, m/s^4]
+        Bounds, as for `setpoint`.
+    settle : float [s]
+        At constant velocity before the exposure.
+    start : float [m]
+        Position before the scan. The exposure begins later: see ``at(exposures)``.
+    rest : float [s]
+        Time at rest before the scan begins.
+    rate : float, optional [Hz]
+        As for `setpoint`.
+
+    Returns
+    -------
+    SetPoint
+        With one exposure window.
+
+    Raises
+    ------
+    ModelError
+        As for `setpoint`.
+
+    Examples
+    --------
+    >>> one = scan(0.02, velocity=0.2, acceleration=5.0, jerk=500.0, settle=0.01, rate=1e4)
+    >>> begin, end = one.at(one.exposures[0]).position
+    >>> round(float(end - begin), 12)
+    0.02
     """
-    if snap is None:
-        ramp, peak = 0.0, jerk
-        hold = min(acceleration / jerk, np.sqrt(velocity / jerk), np.cbrt(distance / (2.0 * jerk)))
+    signed = float(real_array(length, "length", ()))
+    bounds = _bounds(velocity, acceleration, jerk, snap)
+    if not signed:
+        raise ModelError("length must not be 0: a scan of no length exposes nothing.")
+    grid = _Grid(rate)
+    wait = [grid.whole(rest, "rest"), grid.whole(settle, "settle")]
+    exposed = grid.whole(abs(signed) / bounds[0], "length / velocity")
+    speed = abs(signed) / exposed
+    if grid:
+        t = tuple(grid.tick * n for n in on_grid(speed, bounds[1:], 1.0 / grid.tick))
     else:
-        ramp = min(
-            jerk / snap,
-            np.sqrt(acceleration / snap),
-            np.cbrt(velocity / (2.0 * snap)),
-            (distance / (8.0 * snap)) ** 0.25,
+        t = shortest(speed, bounds[1:])
+    up = flank(t, speed)
+    total = speed * (spans(t)[0][-1] + wait[1]) + abs(signed)
+    waits = [wait[0], wait[1], exposed]
+    return _assembled(up, wait[1] + exposed, signed, total, grid, waits, start, len(bounds), True)
+
+
+class _Grid:
+    """The samples that a motion switches on; false without any."""
+
+    def __init__(self, rate: float | None) -> None:
+        self.tick = 1.0 if rate is None else 1.0 / positive(rate, "rate")
+        self.given = rate is not None
+
+    def __bool__(self) -> bool:
+        return self.given
+
+    def whole(self, time: Any, name: str) -> float:
+        """Return a time [s], rounded up to whole samples."""
+        length = positive(time, name, zero=True)
+        return float(np.ceil(length / self.tick - ON_GRID)) * self.tick if self else length
+
+
+def _bounds(velocity: Any, acceleration: Any, jerk: Any, snap: Any) -> tuple[float, ...]:
+    """Return the bounds that are given, from velocity upwards."""
+    found = [positive(velocity, "velocity"), positive(acceleration, "acceleration")]
+    if snap is not None and jerk is None:
+        raise ModelError(
+            "a bound on snap needs one on jerk, or the jerk would grow without bound: pass jerk=."
         )
-        peak = snap * ramp
-        hold = max(
-            0.0,
-            min(
-                acceleration / peak - ramp,
-                # peak (ramp + hold) (2 ramp + hold) = velocity
-                0.5 * (np.sqrt(ramp**2 + 4.0 * velocity / peak) - 3.0 * ramp),
-                _longest_pulse(ramp, distance / (2.0 * peak)) - 2.0 * ramp,
-            ),
-        )
-    pulse, reached = 2.0 * ramp + hold, peak * (ramp + hold)
-    steady = max(
-        0.0,
-        min(
-            velocity / reached - pulse,
-            # reached (pulse + steady) (2 pulse + steady) = distance
-            0.5 * (np.sqrt(pulse**2 + 4.0 * distance / reached) - 3.0 * pulse),
-        ),
-    )
-    flank = 2.0 * pulse + steady
-    cruise = max(0.0, distance / (reached * (pulse + steady)) - flank)
-    return float(ramp), float(hold), float(steady), float(cruise)
+    if jerk is not None:
+        found.append(positive(jerk, "jerk"))
+    if snap is not None:
+        found.append(positive(snap, "snap"))
+    return tuple(found)
 
 
-def _longest_pulse(ramp: float, volume: float) -> float:
-    """Return the root p > ramp of p^2 (p - ramp) = volume, by the hyperbolic form of Cardano's."""
-    third = ramp / 3.0
-    angle = np.arccosh(1.0 + 0.5 * volume / third**3) / 3.0
-    return float(third + 2.0 * third * np.cosh(angle))
+def _assembled(
+    up: list[Phase],
+    cruise: float,
+    signed: float,
+    total: float,
+    grid: _Grid,
+    waits: list[float],
+    start: Any,
+    order: int,
+    moving: bool,
+) -> SetPoint:
+    """Return rest, rise, cruise and fall as one value.
 
-
-def _moved(state: FloatArray, t: FloatArray | np.float64) -> tuple[FloatArray, ...]:
-    """Return position, velocity, acceleration and jerk after a time of constant snap."""
-    p, v, a, j, s = state
-    return (
-        p + t * (v + t / 2.0 * (a + t / 3.0 * (j + t / 4.0 * s))),
-        v + t * (a + t / 2.0 * (j + t / 3.0 * s)),
-        a + t * (j + t / 2.0 * s),
-        j + t * s,
+    `waits` are rest, settle and exposure; the last two at constant velocity when `moving`.
+    """
+    rest, settle, exposure = waits
+    rise = sum(row.length for row in up)
+    speed = total / (rise + cruise)
+    still, steady = np.zeros(5), np.zeros(5)
+    steady[0], steady[1] = 0.5 * speed * rise, speed
+    rows = [Phase(rest, False, still), *up, Phase(cruise, False, steady), *mirrored(up, total)]
+    after = rest + rise + settle if moving else rest + 2.0 * rise + cruise + settle
+    if not moving:
+        rows.append(Phase(settle + exposure, False, np.array([total, 0.0, 0.0, 0.0, 0.0])))
+    rows = [row for row in rows if row.length > 0]
+    ticks = np.array([row.length for row in rows]) / grid.tick
+    if grid:
+        ticks = np.round(ticks)
+    edges = np.concatenate([[0.0], np.cumsum(ticks)])
+    sign, begin = float(np.sign(signed)), float(real_array(start, "start", ()))
+    states = sign * np.array([row.state for row in rows])
+    states[:, 0] += begin
+    windows = [[after, after + exposure]] if exposure > 0 else np.zeros((0, 2))
+    return SetPoint(
+        edges,
+        np.array([row.length for row in rows]),
+        np.array([row.from_end for row in rows]),
+        states,
+        begin,
+        begin + sign * total,
+        order,
+        grid.tick,
+        bool(grid),
+        np.array(windows),
     )

@@ -23,8 +23,8 @@ from ..values import (
     short,
     whole,
 )
+from .motion import SetPoint
 from .response import Response
-from .setpoint import SetPoint
 from .stepping import Buffers, Machine, machine, step_through
 
 #: a signal over time: a set-point, one value per sample, a constant, or a function of time
@@ -277,9 +277,34 @@ def _given(
 def _sampled(signal: Any, name: str, time: FloatArray) -> FloatArray:
     """Return a signal at the sampling instants."""
     if isinstance(signal, SetPoint):
+        _check_setpoint(signal, name, time)
         return signal.at(time).position
     values = real_array(signal(time) if callable(signal) else signal, name)
     return values if values.ndim == 0 else real_array(values, name, time.shape)
+
+
+def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:
+    """Warn of a set-point that the run cuts off, or that switches between its samples."""
+    dt = float(time[1]) if time.size > 1 else 0.0
+    end = float(time[-1]) + dt
+    if move.duration > end * (1.0 + 1e-9):
+        warnings.warn(
+            f"{name} lasts {move.duration:.6g} s, longer than the run of {end:.6g} s: it is cut "
+            f"off at {float(move.at(end).position):.6g} on its way to {move.stop:.6g}. Simulate "
+            f"for duration={move.duration:.6g} or more.",
+            FlexplantWarning,
+            stacklevel=5,
+        )
+    if move.rate is not None and dt:
+        ratio = 1.0 / (move.rate * dt)
+        if abs(ratio - round(ratio)) > 1e-6 * ratio or round(ratio) < 1:
+            warnings.warn(
+                f"{name} switches on a grid of {move.rate:g} Hz, between the samples of the loop's "
+                f"{1.0 / dt:g} Hz: its derivatives are not in phase there. Make it with "
+                f"rate={1.0 / dt:g}.",
+                FlexplantWarning,
+                stacklevel=5,
+            )
 
 
 def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:

@@ -1,0 +1,53 @@
+"""Pictures of the error over a wafer."""
+
+from __future__ import annotations
+
+from matplotlib.axes import Axes
+
+from ..errors import ModelError
+from ..simulation import ErrorMap
+from ..values import short
+from ._axes import MARK, axes, finish, scale
+
+
+def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> Axes:
+    """Draw the error over a wafer, seen from above.
+
+    Parameters
+    ----------
+    found : ErrorMap
+        From `flexplant.simulation.error_map`; points that span an area.
+    what : str
+        "ma" or "msd".
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        Filled contours, the worst point marked.
+
+    Raises
+    ------
+    ModelError
+        When `found` is no ErrorMap, has fewer than three points, or `what` is neither.
+    """
+    if not isinstance(found, ErrorMap):
+        raise ModelError(f"need an ErrorMap, got {short(found)}. Pass what error_map returned.")
+    if what not in ("ma", "msd"):
+        raise ModelError(f"what must be 'ma' or 'msd', got {short(what)}. Pass one of them.")
+    if len(found.points) < 3:
+        raise ModelError("a picture needs at least three points that span an area: add some.")
+    ax = axes(ax, figsize=(6.0, 5.0))
+    values = found.ma if what == "ma" else found.msd
+    factor, prefix = scale(float(values.max())) if found.unit else (1.0, "")
+    x, y = found.points[:, 0], found.points[:, 1]
+    contours = ax.tricontourf(x, y, values / factor, levels=20, cmap="viridis")
+    label = f"{what.upper()} along {found.axis} [{prefix}{found.unit}]"
+    ax.figure.colorbar(contours, ax=ax, label=label)
+    ax.plot(x, y, ".", color="white", markersize=2.0)
+    worst = int(values.argmax())
+    ax.plot(x[worst], y[worst], "x", color=MARK, markersize=10, label="worst point")
+    ax.set_aspect("equal")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False)
+    return finish(ax, x="x [m]", y="y [m]")

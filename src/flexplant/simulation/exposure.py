@@ -1,0 +1,253 @@
+"""Errors over exposures: MA and MSD by POI and axis, and the time to settle to them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError, ShapeError, unknown_label
+from ..values import FloatArray, Value, name_list, positive, real_array, short
+from .moments import moving_moments, unit_of
+from .response import Numbers, Response
+
+#: share of the windows in the third column of the table: three standard deviations of a Gaussian
+SHARE = 0.997
+#: axes of a POI
+_AXES = ("x", "y", "z", "rx", "ry", "rz")
+
+
+class ExposureFigures(NamedTuple):
+    """Of one channel, over all exposures and runs, in its unit."""
+
+    ma: float
+    ma_most: float
+    msd: float
+    msd_most: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ExposureErrors(Value):
+    """Moving average and moving standard deviation of errors over exposures; prints as a table.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        The errors.
+    units : sequence of str
+        Their SI units.
+    values : (n, 4) array
+        Largest |MA|, the |MA| that 99.7 % of the windows do not exceed; the same of the MSD.
+    window : float [s]
+        Length of the moving window.
+    """
+
+    channels: tuple[str, ...]
+    units: tuple[str, ...]
+    values: FloatArray
+    window: float
+
+    def __post_init__(self) -> None:
+        self._set(channels=tuple(self.channels), units=tuple(self.units), values=self.values)
+
+    def __getitem__(self, channel: str) -> ExposureFigures:
+        if channel not in self.channels:
+            raise unknown_label("channel", channel, self.channels)
+        return ExposureFigures(*self.values[self.channels.index(channel)].tolist())
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.channels)) + 2
+        head = ("MA max", f"MA {SHARE:.1%}", "MSD max", f"MSD {SHARE:.1%}")
+        lines = [f"errors over windows of {1e3 * self.window:g} ms"]
+        lines.append(f"{'':{width}s}" + "".join(f"{h:>12s}" for h in head))
+        for name, unit, row in zip(self.channels, self.units, self.values, strict=True):
+            factor, shown = (1e9, f"n{unit}") if unit in ("m", "rad") else (1.0, unit)
+            cells = "".join(f"{factor * value:12.4g}" for value in row)
+            lines.append(f"{name:{width}s}{cells}  {shown}")
+        return "\n".join(lines)
+
+
+def exposure_errors(
+    run: Response,
+    channels: Any = None,
+    *,
+    window: float | None = 5e-3,
+    start: float = 0.0,
+    exposures: npt.ArrayLike | None = None,
+) -> ExposureErrors:
+    """Return MA and MSD of errors over the exposures of a run, by POI and axis.
+
+    The MA is the mean over a window (overlay), the MSD the deviation in it after this mean was
+    removed (fading). Windows lie wholly within an exposure and slide over it sample by sample, as
+    the slit does over the points of a die.
+
+    Parameters
+    ----------
+    run : Response
+        From `simulate`; all its runs count.
+    channels : sequence of str, optional
+        Which; the errors of all POIs, and their axes without a reference, when not given.
+    window : float [s]
+        The time for which one point is exposed; None: each exposure is one window.
+    start : float [s]
+        Without `exposures`: all after this time is exposed.
+    exposures : (k, 2) array [s], optional
+        Beginning and end of each, such as `SetPoint.exposures`.
+
+    Returns
+    -------
+    ExposureErrors
+
+    Raises
+    ------
+    ModelError
+        When `run` is no Response, has no error, or an exposure is not within it or shorter than
+        the window.
+    LabelError
+        When a channel is unknown.
+    ShapeError
+        When `exposures` are no pairs.
+    """
+    _check_run(run)
+    names = error_channels(run) if channels is None else name_list(channels, "channels")
+    if not names:
+        raise ModelError("the run has no error of a POI: name the channels, channels=['y1'].")
+    parts = _parts(run, start, exposures)
+    shortest = min(part.stop - part.start for part in parts)
+    count = shortest if window is None else round(positive(window, "window") / run.dt)
+    if not 1 <= count <= shortest:
+        raise ModelError(
+            f"a window of {count} samples does not fit an exposure of {shortest} samples of "
+            f"{run.dt:g} s: choose a shorter window, or a longer exposure."
+        )
+    values = np.zeros((len(names), 4))
+    for i, name in enumerate(names):
+        both = [_windows(run[name][..., part], count, window is None) for part in parts]
+        for j in (0, 1):
+            sizes = np.abs(np.concatenate([pair[j].ravel() for pair in both]))
+            values[i, 2 * j : 2 * j + 2] = sizes.max(), np.quantile(sizes, SHARE)
+    units = [run.units.get(name, "") for name in names]
+    return ExposureErrors(tuple(names), tuple(units), values, count * run.dt)
+
+
+def settling_time(
+    run: Response,
+    channel: str,
+    *,
+    ma: float,
+    msd: float | None = None,
+    window: float = 5e-3,
+    after: float = 0.0,
+) -> Numbers:
+    """Return how long an error takes to stay within its specification.
+
+    Parameters
+    ----------
+    run : Response
+        From `simulate`.
+    channel : str
+        The error.
+    ma, msd : float
+        Largest |MA| and MSD that are allowed, in the channel's unit.
+    window : float [s]
+        Of both.
+    after : float [s]
+        The time from which settling counts, such as the end of a move.
+
+    Returns
+    -------
+    float, or (n_runs,) array [s]
+        From `after` to the beginning of the first window from which on all windows are within;
+        infinite when the last one is not.
+
+    Raises
+    ------
+    LabelError
+        When there is no such channel.
+    ModelError
+        When a limit is not positive, nothing is left after `after`, or the window does not fit.
+    """
+    _check_run(run)
+    limit = positive(ma, "ma"), np.inf if msd is None else positive(msd, "msd")
+    part = _parts(run, after, None)[0]
+    count = round(positive(window, "window") / run.dt)
+    if not 1 <= count <= part.stop - part.start:
+        raise ModelError(
+            f"a window of {count} samples does not fit the {part.stop - part.start} samples after "
+            f"{after:g} s: choose a shorter window, or a longer run."
+        )
+    average, deviation = _windows(run[channel][..., part], count, False)
+    outside = (np.abs(average) > limit[0]) | (deviation > limit[1])
+    late = outside.shape[-1] - np.argmax(outside[..., ::-1], axis=-1)
+    steps = np.where(np.any(outside, axis=-1), late, 0).astype(np.float64)
+    steps[steps == outside.shape[-1]] = np.inf
+    found = steps * run.dt
+    return float(found) if np.ndim(found) == 0 else np.asarray(found)
+
+
+def error_channels(run: Response) -> tuple[str, ...]:
+    """Return the errors of all POIs in a run, and their axes that have no reference."""
+    found: list[str] = []
+    errors = [name.removesuffix(":error") for name in run if name.endswith(":error")]
+    tracked = set()
+    for name in run:
+        poi, _, axis = name.rpartition(":")
+        if axis == "error":
+            found.append(name)
+        elif axis in _AXES and poi:
+            # a reference is for the first axis of its POI
+            if poi in errors and poi not in tracked:
+                tracked.add(poi)
+            else:
+                found.append(name)
+    return tuple(sorted(found, key=lambda name: name.rpartition(":")[0]))
+
+
+def _check_run(run: object) -> None:
+    if not isinstance(run, Response):
+        raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+
+
+def _parts(run: Response, start: Any, exposures: Any) -> list[slice]:
+    """Return the samples of each exposure."""
+    if run.time.size < 2:
+        raise ModelError("the run has a single sample: there is no window in it. Run it longer.")
+    if exposures is None:
+        first = round((float(real_array(start, "start", ())) - float(run.time[0])) / run.dt)
+        if first >= run.time.size:
+            raise ModelError(
+                f"start={float(start):g} s leaves nothing: the response ends at "
+                f"{run.time[-1]:g} s. Choose an earlier start, or simulate for longer."
+            )
+        return [slice(max(first, 0), run.time.size)]
+    windows = real_array(exposures, "exposures")
+    if windows.ndim != 2 or windows.shape[1] != 2 or not windows.size:
+        raise ShapeError(
+            f"exposures must have shape (k, 2), begin and end of each, got {windows.shape}. Pass "
+            "those of a set-point: move.exposures."
+        )
+    edges = np.round((windows - run.time[0]) / run.dt).astype(int)
+    for (begin, end), given in zip(edges, windows, strict=True):
+        if begin < 0 or end > run.time.size or end <= begin:
+            raise ModelError(
+                f"the exposure from {given[0]:g} to {given[1]:g} s is not within the run of "
+                f"{run.time[-1] + run.dt:g} s. Simulate for longer."
+            )
+    return [slice(int(begin), int(end)) for begin, end in edges]
+
+
+def _windows(signal: FloatArray, count: int, whole: bool) -> tuple[FloatArray, FloatArray]:
+    """Return MA and MSD of all windows of `count` samples that lie within a stretch."""
+    unit = unit_of(signal)
+    # an offset would cost digits of the deviation: it is removed first
+    offset = np.mean(signal / unit, axis=-1, keepdims=True)
+    rest = signal / unit - offset
+    if whole:
+        deviation = np.sqrt(np.mean(rest**2, axis=-1, keepdims=True))
+        return unit * offset, unit * deviation
+    average, deviation = moving_moments(rest, count)
+    first = count // 2
+    inner = slice(first, first + signal.shape[-1] - count + 1)
+    return unit * (average[..., inner] + offset), unit * deviation[..., inner]

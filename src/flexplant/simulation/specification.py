@@ -1,0 +1,247 @@
+"""Specifications of a closed loop, and the table of what it reaches."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssumptionError, ModelError, unknown_label
+from ..loop import ClosedLoop, bandwidth
+from ..values import FloatArray, Value, positive, short
+from .exposure import exposure_errors, settling_time
+from .response import Response
+
+#: limits that need a run, in the order of the table
+_OF_RUNS = ("ma", "msd", "rms", "peak", "settling", "effort")
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Verdict(Value):
+    """What a loop reaches beside what is specified; prints as a table.
+
+    In a test: ``verdict = specification.check(loop, run)``, then
+    ``assert verdict.passed, str(verdict)``, whose message is the table.
+
+    Parameters
+    ----------
+    names, units : sequence of str
+        Of the requirements.
+    values, limits : (n,) arrays
+        What is reached, and what is allowed; NaN where there is nothing to measure.
+    at_least : (n,) bool array
+        Whether the limit is a lower one.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: FloatArray
+    limits: FloatArray
+    at_least: Any
+
+    def __post_init__(self) -> None:
+        self._set(
+            names=tuple(self.names),
+            units=tuple(self.units),
+            values=self.values,
+            limits=self.limits,
+            at_least=np.asarray(self.at_least, dtype=bool),
+        )
+
+    def __bool__(self) -> bool:
+        return self.passed
+
+    @property
+    def met(self) -> Any:
+        """Whether each requirement is met (n,); one without a value is not."""
+        above, below = self.values >= self.limits, self.values <= self.limits
+        return np.where(self.at_least, above, below)
+
+    @property
+    def passed(self) -> bool:
+        """Whether all requirements are met."""
+        return bool(np.all(self.met))
+
+    @property
+    def failed(self) -> tuple[str, ...]:
+        """The requirements that are not met."""
+        return tuple(name for name, met in zip(self.names, self.met, strict=True) if not met)
+
+    def __getitem__(self, name: str) -> float:
+        """Return what is reached of a requirement."""
+        if name not in self.names:
+            raise unknown_label("requirement", name, self.names)
+        return float(self.values[self.names.index(name)])
+
+    def __repr__(self) -> str:
+        width = max(map(len, self.names)) + 2
+        lines = ["specification: passed" if self.passed else
+                 f"specification: FAILED ({', '.join(self.failed)})"]  # fmt: skip
+        lines.append(f"{'':{width}s}{'reached':>12s}{'':4s}{'limit':<12s}")
+        rows = zip(
+            self.names, self.units, self.values, self.limits, self.at_least, self.met, strict=True
+        )
+        for name, unit, value, limit, least, met in rows:
+            sign = ">=" if least else "<="
+            lines.append(
+                f"{name:{width}s}{value:12.4g} {sign} {limit:<10.4g} {unit:5s}"
+                f"{'' if met else ' FAILED'}"
+            )
+        return "\n".join(line.rstrip() for line in lines)
+
+
+@dataclass(frozen=True, eq=False)
+class Specification(Value):
+    """Limits that a closed loop and its runs must keep; those that are not given are not checked.
+
+    Parameters
+    ----------
+    ma, msd : float, optional [m or rad]
+        Largest |MA| and MSD of the error over the exposures.
+    rms, peak : float, optional [m or rad]
+        Rms and largest magnitude of the error in the run, from `start` on.
+    settling : float, optional [s]
+        Time after `start` until |MA| (and MSD) stay within `ma` (and `msd`); with it, the
+        exposures begin that much later.
+    effort : float or mapping {actuator: float}, optional [N, N m]
+        Largest magnitude of a command, at any time of the run.
+    noise : float, optional [m or rad]
+        Stationary rms of the error under the white noises, in closed form.
+    bandwidth : float, optional [Hz]
+        At least; where |S| at u first crosses 0 dB.
+    modulus_margin : float, optional
+        At least; the smaller one of those with and without the modes left out, where these are
+        known.
+    channel : str
+        The error that is meant.
+    window : float [s]
+        Of MA and MSD.
+    start : float [s]
+        The end of the move: what is before is not exposed.
+
+    Raises
+    ------
+    ModelError
+        When a limit is not positive, none is given, or `settling` comes without `ma`.
+    """
+
+    ma: float | None = None
+    msd: float | None = None
+    rms: float | None = None
+    peak: float | None = None
+    settling: float | None = None
+    effort: float | Mapping[str, float] | None = None
+    noise: float | None = None
+    bandwidth: float | None = None
+    modulus_margin: float | None = None
+    channel: str = "die:error"
+    window: float = 5e-3
+    start: float = 0.0
+
+    def __post_init__(self) -> None:
+        single = ("ma", "msd", "rms", "peak", "settling", "noise", "bandwidth", "modulus_margin")
+        for name in single:
+            if getattr(self, name) is not None:
+                self._set(**{name: positive(getattr(self, name), name)})
+        if isinstance(self.effort, Mapping):
+            self._set(effort={n: positive(v, f"effort of {n}") for n, v in self.effort.items()})
+        elif self.effort is not None:
+            self._set(effort=positive(self.effort, "effort"))
+        window, start = positive(self.window, "window"), positive(self.start, "start", zero=True)
+        self._set(window=window, start=start)
+        if all(getattr(self, name) is None for name in (*single, "effort")):
+            raise ModelError("a specification needs at least one limit: Specification(ma=5e-9).")
+        if self.settling is not None and self.ma is None:
+            raise ModelError("settling is the time to reach ma (and msd): give ma as well.")
+
+    def check(
+        self, loop: ClosedLoop, run: Response | None = None, *, exposures: Any = None
+    ) -> Verdict:
+        """Return what a loop and a run of it reach, beside the limits.
+
+        Parameters
+        ----------
+        loop : ClosedLoop
+            On the machine, or on its model.
+        run : Response, optional
+            From `simulate`; for the limits on errors and efforts. All its runs count.
+        exposures : (k, 2) array [s], optional
+            As for `exposure_errors`; all after `start` (and `settling`) when not given.
+
+        Returns
+        -------
+        Verdict
+
+        Raises
+        ------
+        ModelError
+            When there is no loop, or no run although a limit needs one.
+        LabelError
+            When the channel or an actuator is unknown.
+        """
+        given: object = loop
+        if not isinstance(given, ClosedLoop):
+            raise ModelError(f"need a ClosedLoop, got {short(given)}. Use close_loop(plant, ...).")
+        needed = [name for name in _OF_RUNS if getattr(self, name) is not None]
+        if needed and not isinstance(run, Response):
+            raise ModelError(
+                f"the limits on {', '.join(needed)} need a run, got {short(run)}. Pass "
+                "simulate(loop, reference=move, duration=...)."
+            )
+        rows = [("stable", "", float(loop.is_stable), 1.0, True), *self._of_loop(loop)]
+        if run is not None:
+            rows += self._of_run(loop, run, exposures)
+        names, units, values, limits, least = zip(*rows, strict=True)
+        return Verdict(names, units, np.array(values), np.array(limits), np.array(least))
+
+    def _of_loop(self, loop: ClosedLoop) -> list[tuple[str, str, float, float, bool]]:
+        rows = []
+        if self.bandwidth is not None:
+            try:
+                reached = bandwidth(loop)
+            except AssumptionError:  # not stable, or |S| is nowhere below 0 dB
+                reached = float("nan")
+            rows.append(("bandwidth", "Hz", reached, self.bandwidth, True))
+        if self.modulus_margin is not None:
+            margin = loop.modulus_margin
+            if loop.left_out is not None:
+                margin = min(margin, loop.left_out.modulus_margin)
+            rows.append(("modulus margin", "", margin, self.modulus_margin, True))
+        if self.noise is not None:
+            unit = loop.units.get(self.channel, "")
+            reached = loop.rms(self.channel) if loop.is_stable else float("nan")
+            rows.append(("noise", unit, reached, self.noise, False))
+        return rows
+
+    def _of_run(
+        self, loop: ClosedLoop, run: Response, exposures: Any
+    ) -> list[tuple[str, str, float, float, bool]]:
+        unit = run.units.get(self.channel, "")
+        rows: list[tuple[str, str, float, float, bool]] = []
+        if self.ma is not None or self.msd is not None:
+            begin = self.start + (self.settling or 0.0)
+            found = exposure_errors(
+                run, [self.channel], window=self.window, start=begin, exposures=exposures
+            )[self.channel]
+            pairs = (("MA", found.ma, self.ma), ("MSD", found.msd, self.msd))
+            rows += [(n, unit, value, lim, False) for n, value, lim in pairs if lim is not None]
+        for name in ("rms", "peak"):
+            if (limit := getattr(self, name)) is not None:
+                worst = np.max(getattr(run, name)(self.channel, start=self.start))
+                rows.append((name, unit, float(worst), limit, False))
+        if self.settling is not None and self.ma is not None:
+            took = settling_time(
+                run, self.channel, ma=self.ma, msd=self.msd, window=self.window, after=self.start
+            )
+            rows.append(("settling", "s", float(np.max(took)), self.settling, False))
+        if self.effort is not None:
+            given = self.effort
+            each = given if isinstance(given, Mapping) else dict.fromkeys(loop.driven, given)
+            for name, limit in each.items():
+                if name not in loop.driven:
+                    raise unknown_label("driven actuator", name, loop.driven)
+                force = float(np.max(np.abs(run[name])))
+                rows.append((f"effort {name}", loop.units.get(name, ""), force, limit, False))
+        return rows
