@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import CertificateError, ModelError, unknown_label
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, real_array, short
+from ..values import FloatArray, Value, real_array, scale, short
 from .noise import Source
 from .spectrum import densities, integrated, periodogram
 
@@ -95,7 +95,8 @@ class ErrorBudget(Value):
         return float(self.freq[min(int(np.searchsorted(row, half)), self.freq.size - 1)])
 
     def __repr__(self) -> str:
-        factor, unit = (1e9, f"n{self.unit}") if self.unit in ("m", "rad") else (1.0, self.unit)
+        size, prefix = scale(self.rms) if self.unit else (1.0, "")
+        factor, unit = 1.0 / size, prefix + self.unit
         order = np.argsort(-self.variances, kind="stable")
         width = max(5, *map(len, self.names)) + 2 if self.names else 7
         head = f"rms of {self.channel}" + (f" [{unit}]" if unit else "")

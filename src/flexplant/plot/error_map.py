@@ -6,8 +6,8 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError
 from ..simulation import ErrorMap
-from ..values import short
-from ._axes import MARK, axes, finish, scale
+from ..values import scale, short
+from ._axes import MARK, axes, finish
 
 
 def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> Axes:
