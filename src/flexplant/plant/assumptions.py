@@ -7,6 +7,7 @@ from functools import cached_property
 
 from ..errors import AssumptionError, unknown_label
 from ..values import Value
+from .aliased_modes import aliased_modes
 from .assumption import Assumption
 from .partition import Partition
 from .rank_conditions import full_ranks, no_zeros
@@ -46,7 +47,7 @@ class AssumptionReport(Value):
     @cached_property
     def modes(self) -> tuple[ModeVisibility, ...]:
         """How well each elastic mode is reached and seen, and by which channel: information."""
-        return mode_visibility(self.plant.unweighted)
+        return mode_visibility(self.plant)
 
     @property
     def ok(self) -> bool:
@@ -72,6 +73,8 @@ class AssumptionReport(Value):
                 f"  note negative stiffness makes rigid-body motion unstable: {listed}; only a "
                 "controller holds it"
             )
+        folded = aliased_modes(self.plant)
+        lines += [f"  note {folded}"] if folded else []
         weak = [text for mode in self.modes for text in mode.weak]
         lines += [f"  note {text}" for text in weak[:4]]
         if len(weak) > 4:

@@ -20,6 +20,8 @@ _ABSENT = 1e-8
 _AXIS = 1e-9
 #: findings of one kind that are written out
 _SHOWN = 3
+#: poles whose samples are closer than this look alike
+_ALIKE = 1e-7
 
 
 class _Case(NamedTuple):
@@ -30,6 +32,8 @@ class _Case(NamedTuple):
     names: list[str]
     pushes: bool
     remedy: str
+    held: bool = True
+    block: StateSpace | None = None
 
 
 class _Pole(NamedTuple):
@@ -47,9 +51,12 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
         bare = bare.replace(system=evened(bare.system))
     poles = _persistent(bare.system)
     rigid = bare.n_rigid
+    rate = 1.0 / plant.dt if plant.dt and not bare.dt else 0.0
+    sampled, apart = _alike(poles, rate), [[pole] for pole in poles]
     found = []
-    for case in _cases(bare, poles):
-        texts = [text for pole in poles for text in _lacks(bare, pole, case)]
+    for case in _cases(bare, poles, plant):
+        groups = sampled if case.held else apart
+        texts = [text for group in groups for text in _lacks(bare, group, case, rate)]
         texts = list(dict.fromkeys([*texts, *_weights_without(plant, case.key)]))
         listed = f"(channels: {', '.join(case.names) or 'none'})"
         if texts:
@@ -69,24 +76,28 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
     return found
 
 
-def _cases(plant: Partition, poles: list[_Pole]) -> list[_Case]:
-    g = plant.system
-    noisy = [name for name in plant.w if plant.asd.get(name, 0.0) > 0]
-    pushing = [n for n in (noisy or plant.w) if np.any(g.B[:, g.input_index([n])])]
+def _cases(bare: Partition, poles: list[_Pole], plant: Partition) -> list[_Case]:
+    """Return the tests: of the channels that weights leave, y through the block that reads it."""
+    g, block = bare.system, plant.origin.reading
+    left = [name for name in bare.w if name in plant.w]
+    noisy = [name for name in left if bare.asd.get(name, 0.0) > 0]
+    pushing = [n for n in (noisy or left) if np.any(g.B[:, g.input_index([n])])]
 
-    def seeing(names: tuple[str, ...]) -> list[str]:
+    def seeing(names: list[str]) -> list[str]:
         rows = g.C[g.output_index(names)]
         sizes = [np.abs(_part(rows, pole.right)).max(axis=1, initial=0.0) for pole in poles]
         return [n for i, n in enumerate(names) if any(size[i] > 0 for size in sizes)]
 
     more = "Add a disturbance (with an asd) that does."
-    w = _Case("excited", "w does not excite", pushing, True, more)
+    w = _Case("excited", "w does not excite", pushing, True, more, held=not noisy)
     more = "Add or move a displacement sensor."
-    y = _Case("detectable", "y does not see", seeing(plant.y), False, more)
+    read = list(plant.y) if block is not None else seeing([n for n in bare.y if n in plant.y])
+    y = _Case("detectable", "y does not see", read, False, more, block=block)
     more = "Add an axis to a POI, or another POI."
-    z = _Case("performance", "z does not see", seeing(plant.z), False, more)
+    shown = seeing([name for name in bare.z if name in plant.z])
+    z = _Case("performance", "z does not see", shown, False, more)
     u = _Case("stabilisable", "u does not reach", list(plant.u), True, "Add or move an actuator.")
-    return [w, y, z, u] if plant.is_assembled else [u, y]
+    return [w, y, z, u] if bare.is_assembled else [u, y]
 
 
 def _persistent(g: StateSpace) -> list[_Pole]:
@@ -124,27 +135,89 @@ def _most(g: StateSpace, pole: complex, near: float) -> int:
     return max(most, 1)
 
 
-def _lacks(plant: Partition, pole: _Pole, case: _Case) -> list[str]:
-    """Return, in words, what the channels of a case have no part in at a pole."""
+def _alike(poles: list[_Pole], rate: float) -> list[list[_Pole]]:
+    """Return the poles, those together whose samples at a rate [Hz] are the same.
+
+    ``exp(lambda / rate)`` of poles that differ by a multiple of the rate is one pole of the sampled
+    plant: what channels have of one they must have apart from the others.
+    """
+    groups: list[tuple[complex, list[_Pole]]] = []
+    for pole in poles:
+        mirrored = _Pole(pole.value.conjugate(), pole.left.conj(), pole.right.conj())
+        z = _sample(pole.value, rate)
+        own = [pole]
+        if rate and pole.value.imag and abs(z.imag) < _ALIKE:
+            own = [pole, mirrored]
+        elif rate and z.imag < 0:
+            z, own = z.conjugate(), [mirrored]
+        same = [members for at, members in groups if rate and abs(at - z) < _ALIKE]
+        if same:
+            same[0].extend(own)
+        else:
+            groups.append((z, own))
+    return [members for _, members in groups]
+
+
+def _sample(value: complex, rate: float) -> complex:
+    return complex(np.exp(value / rate)) if rate else value
+
+
+def _held(value: complex, rate: float) -> float:
+    """Return what is left of an input that is held for a sample, ``|exp(a) - 1| / |a|``."""
+    a = value / rate if rate else 0.0
+    return abs(np.expm1(a) / a) if a else 1.0
+
+
+def _lacks(plant: Partition, group: list[_Pole], case: _Case, rate: float) -> list[str]:
+    """Return, in words, what the channels of a case have no part in at poles that look alike."""
     g = plant.system
-    basis = pole.left if case.pushes else pole.right
-    rigid = np.zeros(0, dtype=int)
-    if plant.n_rigid and not pole.value:
+    bases = [pole.left if case.pushes else pole.right for pole in group]
+    if len(group) == 1 and plant.n_rigid and not group[0].value:
         rigid = plant.modal_states[(1 if case.pushes else 0) : 2 * plant.n_rigid : 2]
-        if rigid.size == basis.shape[1]:  # one vector for each rigid-body mode
-            basis = basis @ np.linalg.inv(basis[rigid])
-    rows = g.B[:, g.input_index(case.names)].T if case.pushes else g.C[g.output_index(case.names)]
-    missing = _missing(_part(rows, basis).T)  # one column for each channel
+        if rigid.size == bases[0].shape[1]:  # one vector for each rigid-body mode
+            bases[0] = bases[0] @ np.linalg.inv(bases[0][rigid])
+    else:
+        rigid = np.zeros(0, dtype=int)
+    parts = []
+    for pole, basis in zip(group, bases, strict=True):
+        if case.block is not None:
+            seen = _part(g.C[g.output_index(case.block.inputs)], basis)
+            parts.append(_part(response_at(case.block, _sample(pole.value, rate)), seen))
+        elif case.pushes:
+            size = _held(pole.value, rate) if case.held else 1.0
+            part = _part(g.B[:, g.input_index(case.names)].T, basis)
+            parts.append(part * (size if size > _ALIKE else 0.0))
+        else:
+            parts.append(_part(g.C[g.output_index(case.names)], basis))
+    missing = _missing(np.hstack(parts).T)  # one column for each channel
     if not missing.shape[1]:
         return []
     if rigid.size:
-        shapes = (basis @ missing)[rigid].real
+        shapes = (bases[0] @ missing)[rigid].real
         return [f"{case.verb} the rigid-body {' and '.join(_described(plant, shapes))}"]
-    fate = "grows" if pole.value.real > 0 and not pole.value.imag else "does not decay"
-    return [f"{case.verb} {_named(plant, pole.value)}, which {fate}"]
+    grows = any(pole.value.real > 0 and not pole.value.imag for pole in group)
+    fate = "grows" if grows else "does not decay"
+    names = list(dict.fromkeys(_named(plant, pole.value) for pole in group))
+    if len(group) == 1:
+        return [f"{case.verb} {names[0]}, which {fate}"]
+    alike = "they look" if len(names) > 1 else "its two poles look"
+    said = f"{case.verb} {' and '.join(names)} apart, which {fate}: at {rate:g} Hz {alike} alike"
+    return [said]
 
 
-def _part(rows: FloatArray, basis: ComplexArray) -> ComplexArray:
+def response_at(block: StateSpace, at: complex) -> ComplexArray:
+    """Return the response of a block at a point of the plane; beside it where it has a pole."""
+    eye = np.eye(block.n_states)
+    for point in (at, at + 1e-6 * max(abs(at), 1.0)):
+        try:
+            found = block.D + block.C @ np.linalg.solve(point * eye - block.A, block.B)
+        except np.linalg.LinAlgError:
+            continue
+        return np.asarray(found, dtype=np.complex128)
+    return np.full(block.D.shape, np.nan, dtype=np.complex128)
+
+
+def _part(rows: FloatArray | ComplexArray, basis: ComplexArray) -> ComplexArray:
     """Return rows @ basis, rounding set to zero: a channel without part has exactly none."""
     product = np.asarray(rows @ basis, dtype=np.complex128)
     product[np.abs(product) < 1e-12 * np.linalg.norm(rows, axis=1)[:, None]] = 0.0
@@ -153,9 +226,11 @@ def _part(rows: FloatArray, basis: ComplexArray) -> ComplexArray:
 
 def _named(plant: Partition, pole: complex) -> str:
     """Return a pole as a mode and its frequency, or as a number."""
+    if plant.n_rigid and not pole:
+        return "the rigid-body motions"
     if plant.modal_blocks.size:
         own = np.linalg.eigvals(plant.modal_blocks)
-        off = np.abs(own - pole).min(axis=1)
+        off = np.minimum(np.abs(own - pole), np.abs(own - pole.conjugate())).min(axis=1)
         if off.min() < 1e-6 * abs(pole) and int(np.argmin(off)) + 1 in plant.unstable_modes:
             return f"the unstable rigid-body {plant.unstable_modes[int(np.argmin(off)) + 1]}"
         if off.min() < 1e-6 * abs(pole):

@@ -11,6 +11,7 @@ import scipy.linalg as la
 from ..lti.discretisation import block_diagonal
 from ..values import ComplexArray, FloatArray, Value
 from .partition import Partition
+from .reach_and_sight import response_at
 
 #: a mode reached or seen less than this, beside the channel's strongest mode, is called weak
 WEAK = 0.01
@@ -70,9 +71,10 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     Parameters
     ----------
     plant : StandardPlant
-        Not weighted; of a sampled plant the continuous one is used.
+        Of a weighted one the channels that are left count, y through the block that reads it; of
+        a sampled one the continuous modes.
     """
-    plant = plant.continuous
+    given, plant = plant, plant.unweighted.continuous
     if not plant.is_assembled:
         return ()
     # rigid-body modes and unstable ones come first
@@ -94,14 +96,23 @@ def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
     left, right = _vectors(g.A, wanted, 2 * n_rigid)
     sides: dict[str, tuple[Sequence[str], FloatArray]] = {}
     for side in "wu":
-        names = [n for n in getattr(plant, side) if np.any(g.B[:, g.input_index([n])])]
+        kept = [n for n in getattr(plant, side) if n in getattr(given, side)]
+        names = [n for n in kept if np.any(g.B[:, g.input_index([n])])]
         sides[side] = names, np.abs(left.conj().T @ g.B[:, g.input_index(names)])
     orders = {s.name: s.order for s in plant.assembled.ports.y}
     for side in "yz":
-        names = [n for n in getattr(plant, side) if np.any(g.C[g.output_index([n])])]
+        block = given.origin.reading if side == "y" else None
+        kept = [n for n in getattr(plant, side) if n in getattr(given, side)]
+        names = [n for n in kept if np.any(g.C[g.output_index([n])])]
+        names = names if block is None else list(block.inputs)
         power = np.array([1 - orders.get(name, 0) for name in names])
-        gains = np.abs(g.C[g.output_index(names)] @ right).T * omega[:, None] ** power
-        sides[side] = names, gains
+        motions = (g.C[g.output_index(names)] @ right).T * omega[:, None] ** power
+        if block is not None:
+            names = list(block.outputs)
+            points = np.exp(wanted * given.dt) if given.dt else wanted
+            seen = [response_at(block, z) @ m for z, m in zip(points, motions, strict=True)]
+            motions = np.array(seen).reshape(omega.size, len(names))
+        sides[side] = names, np.abs(motions)
     return tuple(
         _entry(n_rigid + 1 + k, float(omega[k]), float(zeta[k]), k, sides)
         for k in range(omega.size)
