@@ -248,3 +248,23 @@ def unbiased_direct(A, G, C, H, Q, R, steps=3000):
         both = np.block([[P_x, P_xd], [P_xd.T, P_d]])
         P = np.hstack([A, G]) @ both @ np.hstack([A, G]).T + Q
     return P_x, P_d
+
+
+def periodic_variances(plant, read, periods):
+    """POI variances (T, nz) of the Kalman recursion with rows read by phase, run for long."""
+    d = np.ones(plant["A"].shape[0])
+    A, C2, Q, R = plant["A"], plant["C2"], plant["Q"], plant["R"]
+    size = np.sqrt(np.diag(R))
+    C2, R = C2 / size[:, None], R / np.outer(size, size)
+    P = 1e3 * Q + 1e-30 * np.eye(len(d))
+    for _ in range(periods):
+        found = []
+        for rows in read:
+            C = C2[rows]
+            inverse = np.linalg.inv(C @ P @ C.T + R[np.ix_(rows, rows)])
+            K = P @ C.T @ inverse
+            left = np.eye(len(d)) - K @ C
+            after = left @ P @ left.T + K @ R[np.ix_(rows, rows)] @ K.T
+            found.append(np.diag(plant["C1"] @ after @ plant["C1"].T))
+            P = A @ after @ A.T + Q
+    return np.array(found)

@@ -1,5 +1,6 @@
 """Estimation: the motion at a point of interest from sensors elsewhere."""
 
+from .bias import check_bias as check_bias
 from .certificate import KalmanCertificate as KalmanCertificate
 from .certificate import check_gain as check_gain
 from .estimate import Estimate as Estimate
@@ -17,6 +18,9 @@ from .lags import Predictor as Predictor
 from .lags import Smoother as Smoother
 from .left_out import LeftOut as LeftOut
 from .minimax import design_minimax_filter as design_minimax_filter
+from .multirate import PeriodicCertificate as PeriodicCertificate
+from .multirate import PeriodicEstimator as PeriodicEstimator
+from .multirate import design_multirate as design_multirate
 from .robust import HinfFilterCertificate as HinfFilterCertificate
 from .robust import MinimaxCertificate as MinimaxCertificate
 from .robust import RobustFilter as RobustFilter

@@ -106,6 +106,8 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     E = np.hstack([C1[:, rest] - observer.D @ C2[:, rest], -observer.C])
     drive = np.zeros((n + m, factor.shape[1] + len(read)))
     drive[:n, : factor.shape[1]], drive[n:, factor.shape[1] :] = factor[rest], observer.B @ noise
+    at_once = plant.noise_direct[[plant.y.index(name) for name in read]]
+    drive[n:, : factor.shape[1]] += observer.B @ at_once
     if k:
         entering = np.vstack([g.A[np.ix_(rest, rigid)], observer.B @ C2[:, rigid]])
         V = _followed(A, n, entering, g.A[np.ix_(rigid, rigid)])
@@ -115,7 +117,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
         _check_seen(plant, seen, C1[:, rigid])
         A = A - V @ back
         drive[:, : factor.shape[1]] -= V @ factor[rigid]
-    direct = np.sum((observer.D @ noise) ** 2, axis=1)
+    direct = np.sum((observer.D @ np.hstack([noise, at_once])) ** 2, axis=1)
     return _Joint(A, drive, E, direct, n, _eigen(A[:n, :n], A[:n, n:]))
 
 

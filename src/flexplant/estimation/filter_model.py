@@ -119,21 +119,23 @@ def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterMo
     y, z = sensors(own), poi_channels(own)
     toward, at = g.select(y, own.u), g.select(z, own.u)
     rows = [own.y.index(name) for name in y]
-    R = own.sensor_noise[np.ix_(rows, rows)]
+    direct = own.noise_direct[rows]
+    R = own.sensor_noise[np.ix_(rows, rows)] + direct @ direct.T
     ny, nz = len(y), len(z)
     V, N = np.zeros((nz, nz)), np.zeros((nz, ny))
     if found is not None:
         R, V, N = R + found.sensors, found.pois, found.cross
     return FilterModel(
         g.A, toward.B, at.C, at.D, toward.C, toward.D, own.process_noise, R, V, N,
-        np.zeros((n, ny)), own.dt, z, y, tuple(own.u),
+        own.noise_factor @ direct.T, own.dt, z, y, tuple(own.u),
     )  # fmt: skip
 
 
 def check_noises(plant: StandardPlant) -> None:
     """Raise AssumptionError for a sensor without noise, or one that white noise reaches at once."""
     model = filter_model(plant)
-    silent = [name for name, v in zip(model.sensors, model.R.diagonal(), strict=True) if v <= 0]
+    own = [plant.sensor_noise[i, i] for i in map(plant.y.index, model.sensors)]
+    silent = [name for name, v in zip(model.sensors, own, strict=True) if v <= 0]
     if silent:
         raise AssumptionError(
             f"sensors {', '.join(silent)} have no noise (asd 0): the filter would trust them "
@@ -141,14 +143,19 @@ def check_noises(plant: StandardPlant) -> None:
             "says, in m/sqrt(Hz)."
         )
     inner = plant.system
-    loud = [name for name in plant.w if plant.asd.get(name, 0.0) > 0 and ":noise" not in name]
+    loud = [
+        name
+        for name in plant.w
+        if plant.asd.get(name, 0.0) > 0 and ":noise" not in name and name not in plant.held
+    ]
     direct = inner.D[np.ix_(inner.output_index(model.sensors), inner.input_index(loud))]
     if np.any(direct):
         row, column = (int(i) for i in np.argwhere(direct)[0])
         raise AssumptionError(
             f"white noise of {loud[column]!r} reaches {model.sensors[row]!r} at once (an "
             "acceleration sensor, say), so a sample of it would have infinite variance. Measure "
-            "displacement or velocity, or shape the disturbance."
+            "displacement or velocity, shape the disturbance, or let it be held over each sample: "
+            "Disturbance(..., held=True)."
         )
 
 

@@ -39,8 +39,8 @@ class MachineError(NamedTuple):
         Of the filter.
     back, driven : arrays
         ``V_o A_re`` and ``V_o G_r``: what moves the filter's part of the rigid-body motion.
-    root : (ny, ny) array
-        Of the sensor noise.
+    root : (ny, ny + r) array
+        Of the sensor noise: what each sensor has alone, then what disturbances add at once.
     sizes : (nz,) array
         Of the POI motions; their variances count relative to ``sizes^2``, their mean is the value.
     scale : (n + n_o,) array
@@ -89,8 +89,8 @@ class MachineError(NamedTuple):
         unit = np.sqrt(self.sizes.size) * self.sizes[:, None]
         to_F, to_N, to_E = 2 * (Y[n:] @ F) @ X, 2 * Y[n:] @ N, 2 * E @ X
         own, other = self.C * d[:n], self.C0 * d[n:]
-        K = to_F[:, :n] @ own.T - to_F[:, n:] @ other.T + to_N[:, -len(self.root) :] @ self.root
-        L_z = -to_E[:, :n] @ own.T + to_E[:, n:] @ other.T + 2 * direct @ self.root
+        K = to_F[:, :n] @ own.T - to_F[:, n:] @ other.T + to_N @ self.root.T
+        L_z = -to_E[:, :n] @ own.T + to_E[:, n:] @ other.T + 2 * direct @ self.root.T
         value = float(np.sum((E @ X) * E) + np.sum(direct**2))
         return value, Gains(K / d[n:, None], L_z / unit)
 
@@ -109,9 +109,10 @@ class MachineError(NamedTuple):
                 [K @ self.C - self.back, self.A0 - K @ self.C0],
             ]
         )
-        N = np.zeros((F.shape[0], self.G.shape[1] + len(self.root)))
-        N[:n, : -len(self.root)], N[n:, : -len(self.root)] = self.G, -self.driven
-        N[n:, -len(self.root) :] = K @ self.root
+        ny, r = len(self.root), self.G.shape[1]
+        N = np.zeros((F.shape[0], ny + r))
+        N[:n, ny:], N[n:, ny:] = self.G, -self.driven
+        N[n:] += K @ self.root
         E = np.hstack([self.C1e - L_z @ self.C, -(self.C1 - L_z @ self.C0)])
         unit = np.sqrt(self.sizes.size) * self.sizes[:, None]
         return F * d / d[:, None], N / d[:, None], E * d / unit, L_z @ self.root / unit
@@ -167,8 +168,11 @@ def machine_error(
                 f"The plant is {plant!r}; assemble both with the same ports, sampled alike."
             )
         back, driven = V @ re, V @ G_all[rigid]
+    rows = [machine.y.index(name) for name in own.sensors]
+    at_once = machine.noise_direct[rows]
+    alone = np.sqrt(machine.sensor_noise[np.ix_(rows, rows)])
     first = MachineError(
-        A, C, C1e, G, m.A, m.C2, m.C1, back, driven, np.sqrt(own.R), sizes,
+        A, C, C1e, G, m.A, m.C2, m.C1, back, driven, np.hstack([alone, at_once]), sizes,
         np.ones(rest.size + m.A.shape[0]),
     )  # fmt: skip
     F, N, *_ = first._joint(start)

@@ -35,7 +35,9 @@ class Source(NamedTuple):
 
 
 def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
-    """Return the channels of w that are white noise: disturbances, then sensor noises.
+    """Return the channels of w that are white noise: disturbances, then noises per sample.
+
+    The latter are those of sensors, and disturbances that are held over each sample.
 
     Raises
     ------
@@ -43,7 +45,8 @@ def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
         When a disturbance reaches an output directly: its variance there would be infinite.
     """
     loud = [name for name, level in plant.asd.items() if level > 0]
-    sensors = [name for name in loud if name.removesuffix(":noise") in plant.y]
+    held = plant.held if plant.dt else ()
+    sensors = [name for name in loud if name.removesuffix(":noise") in plant.y or name in held]
     white = [name for name in loud if name not in sensors]
     direct = plant.system.select(inputs=white).D
     if np.any(direct):
@@ -70,10 +73,16 @@ def white_noise(plant: StandardPlant) -> WhiteNoise:
         When the plant's process noise is not known.
     """
     white, sensors = white_names(plant)
-    factor = plant.noise_factor if white else np.zeros((plant.system.n_states, 0))
+    factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
     columns = np.array([plant.w.index(name) for name in sensors], dtype=np.int64)
     asd = np.array([plant.asd[name] for name in sensors])
     return WhiteNoise(factor, columns, asd * np.sqrt(0.5 / plant.dt))
+
+
+def continuous_factor(plant: StandardPlant) -> FloatArray:
+    """Return the noise factor of the disturbances that are not held over each sample."""
+    total = plant.noise_factor
+    return total[:, : total.shape[1] - len(plant.held)]
 
 
 def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
@@ -120,7 +129,7 @@ def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
     """Return G of each white disturbance; of all together where they cannot be separated."""
     if not white:
         return {}
-    total = plant.noise_factor
+    total = continuous_factor(plant)
     if len(white) == 1:
         return {white[0]: total}
     if plant.is_assembled:
@@ -128,7 +137,7 @@ def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
         found = {}
         for name in white:
             alone = [d if d.name == name else d.replace(asd=0.0) for d in ports.w]
-            found[name] = plant.unweighted.with_ports(ports.replace(w=alone)).noise_factor
+            found[name] = continuous_factor(plant.unweighted.with_ports(ports.replace(w=alone)))
         # a plant whose noise was changed since it was assembled keeps its own
         if all(factor.shape[0] == total.shape[0] for factor in found.values()):
             own = np.sum(total**2, axis=1)

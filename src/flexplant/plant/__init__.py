@@ -3,6 +3,9 @@
 from .assembly import assemble_plant as assemble_plant
 from .assumption import Assumption as Assumption
 from .assumptions import AssumptionReport as AssumptionReport
+from .force_spectra import FirstOrder as FirstOrder
+from .force_spectra import NarrowBand as NarrowBand
+from .force_spectra import RandomWalk as RandomWalk
 from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
@@ -25,6 +28,7 @@ from .rigid.stage import reference_errors as reference_errors
 from .rigid.stage import stage_weights as stage_weights
 from .rigid.suspension import GroundSpring as GroundSpring
 from .rigid.suspension import suspend as suspend
+from .rigid_force import RigidForce as RigidForce
 from .sensors import Poi as Poi
 from .sensors import Sensor as Sensor
 from .standard import StandardPlant as StandardPlant

@@ -110,7 +110,10 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         system = discretized(plant.system, rate, delay=delay, delayed=plant.u)
         return plant.replace(system=system, origin=Foreign(None, float(delay), plant))
     origin = plant.assembled
-    asd = np.array([plant.asd.get(name, 0.0) for name in origin.physical.inputs])
+    held = plant.held
+    asd = np.array(
+        [0.0 if name in held else plant.asd.get(name, 0.0) for name in origin.physical.inputs]
+    )
     if origin.ports.latencies or diagonal_pairs(origin.physical) is None:
         physical, factor = _with_own_delays(origin, rate, delay, asd)
     else:
@@ -118,6 +121,8 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         white = noise_factor(origin.physical, asd, physical.dt)
         lines = physical.n_states - origin.physical.n_states
         factor = np.vstack([white, np.zeros((lines, white.shape[1]))])
+    sizes = np.array([plant.asd[name] for name in held]) * np.sqrt(0.5 * rate)
+    factor = np.hstack([factor, physical.B[:, physical.input_index(held)] * sizes])
     return wired(
         type(plant),
         origin.replace(

@@ -33,6 +33,10 @@ class Disturbance(ForcePort):
     shape : StateSpace, optional
         A stable filter that the channel goes through on its way to the structure: the asd is then
         that of the white noise at its input, and its states join the plant's.
+    held : bool
+        Whether the noise is held over each sample, as that of a force from a digital output is:
+        of variance asd^2 rate / 2 per sample once the plant is sampled. It may then reach an
+        acceleration sensor at once: process and sensor noise are correlated.
 
     Raises
     ------
@@ -45,6 +49,7 @@ class Disturbance(ForcePort):
     direction: str = "z"
     asd: float = 0.0
     shape: StateSpace | None = None
+    held: bool = False
 
     @property
     def unit(self) -> str | None:

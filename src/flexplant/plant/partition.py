@@ -269,6 +269,22 @@ class Partition(Value):
         return found
 
     @property
+    def held(self) -> tuple[str, ...]:
+        """Disturbances whose noise is held over each sample: the last columns of `noise_factor`."""
+        ports = self.assembled.ports.w if self.is_assembled else ()
+        return tuple(p.name for p in ports if getattr(p, "held", False) and p.asd > 0)
+
+    @property
+    def noise_direct(self) -> FloatArray:
+        """H (ny, r): what the noises of `noise_factor` add to y in the same sample."""
+        found = np.zeros((len(self.y), self.noise_factor.shape[1]))
+        if held := self.held:
+            sizes = np.array([self.asd[name] for name in held]) * np.sqrt(0.5 / self.dt)
+            columns = [self.w.index(name) for name in held]
+            found[:, -len(held) :] = self.D21[:, columns] * sizes
+        return found
+
+    @property
     def process_noise(self) -> FloatArray:
         """Covariance (n, n) that white disturbances add to x in one sample."""
         return self.noise_factor @ self.noise_factor.T

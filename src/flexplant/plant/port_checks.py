@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace, as_statespace
-from ..values import check_names, positive, real_array, short
+from ..values import check_names, flag, positive, real_array, short
 
 #: [s] a latency from here on is taken for a number of samples
 _SAMPLES = 1.0
@@ -29,6 +29,7 @@ def checked_port(port: Any) -> dict[str, Any]:
         "shape": lambda name, shape: checked_filter(name, "shape", shape),
         "dynamics": lambda name, dynamics: checked_filter(name, "dynamics", dynamics),
         "latency": checked_latency,
+        "held": lambda name, held: flag(held, f"held of {name!r}"),
         "absolute": checked_choice,
     }
     given = port._fields()

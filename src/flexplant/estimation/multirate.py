@@ -1,0 +1,337 @@
+"""The Kalman filter of sensors that are sampled at different integer rates."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from math import lcm
+from typing import Any
+
+import numpy as np
+
+from ..errors import CertificateError, LabelError, ModelError, ShapeError, unknown_label
+from ..lti.riccati import solve_dare
+from ..lti.statespace import StateSpace, System
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, real_array, short, whole
+from .certificate import AGREEMENT
+from .channels import checked_plant, estimates, poi_channels, row_of, sensors
+from .filter_model import FilterModel, check_noises, filter_model
+from .records import recorded
+
+#: longest period [samples], and most measurements in one
+_LONGEST, _MOST = 1000, 2000
+
+
+@dataclass(frozen=True, eq=False)
+class PeriodicCertificate(Value):
+    """What was checked about a periodic filter after it was computed.
+
+    Parameters
+    ----------
+    spectral_radius : float
+        Of the estimation error over one period, below 1.
+    residual : float
+        Of the lifted Riccati equation, relative.
+    difference : float
+        Largest relative difference between the variances at the start of a period, from the
+        lifted equation, and those after one period of the recursion that it does not contain.
+    """
+
+    spectral_radius: float
+    residual: float
+    difference: float
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PeriodicEstimator(Value):
+    """A Kalman filter whose gains repeat after a period of samples.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        What it was designed on; its rate is that of the estimates.
+    period : int [samples]
+        Least common multiple of the sensors' intervals.
+    measured : (period, ny) array of bool
+        Which sensors are read in which sample of a period.
+    gains : (period, n, ny) array
+        L, columns of sensors that are not read are zero.
+    predictor_gains : (period, n, ny) array
+        K of ``x[k+1|k] = A x[k|k-1] + B2 u + K e``.
+    variances : (period, nz) array [m^2 or rad^2]
+        Of the errors at the POIs in each sample of a period.
+    certificate : PeriodicCertificate
+        What was checked.
+    """
+
+    plant: StandardPlant
+    period: int
+    measured: FloatArray
+    gains: FloatArray
+    predictor_gains: FloatArray
+    variances: FloatArray
+    certificate: PeriodicCertificate
+
+    def __post_init__(self) -> None:
+        names = ("measured", "gains", "predictor_gains", "variances")
+        self._set(**{name: getattr(self, name) for name in names})
+
+    def __repr__(self) -> str:
+        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in poi_channels(self.plant)[:4])
+        return (
+            f"<PeriodicEstimator: {self.gains.shape[1]} states, {len(self.sensors)} sensors, "
+            f"period {self.period} samples;\n  rms error {rms}>"
+        )
+
+    @property
+    def sensors(self) -> tuple[str, ...]:
+        """The sensors, in the order of the columns of the gains."""
+        return sensors(self.plant)
+
+    def rms(self, channel: str, phase: int | None = None) -> float:
+        """Return the rms of the estimation error, over a period or in one sample of it.
+
+        Parameters
+        ----------
+        channel : str
+            A POI's motion: `die`, `die:z`, `die:hat`.
+        phase : int, optional
+            Sample of the period, from 0; the whole period when not given.
+
+        Raises
+        ------
+        LabelError
+            When it is no motion of a POI.
+        ModelError
+            When there is no such sample in a period.
+        """
+        column = self.variances[:, row_of(poi_channels(self.plant), channel)]
+        if phase is not None:
+            at = whole(phase, "phase", minimum=0, maximum=self.period - 1)
+            column = column[at : at + 1]
+        return float(np.sqrt(np.mean(np.maximum(column, 0.0))))
+
+    def system(self, phase: int) -> StateSpace:
+        """Return the filter of one sample of a period, from sensors and u to the estimates.
+
+        Parameters
+        ----------
+        phase : int
+            Sample of the period, from 0.
+
+        Raises
+        ------
+        ModelError
+            When there is no such sample in a period.
+        """
+        k = whole(phase, "phase", minimum=0, maximum=self.period - 1)
+        m, K = filter_model(self.plant), self.predictor_gains[k]
+        L_z = m.C1 @ self.gains[k]
+        return StateSpace(
+            m.A - K @ m.C2,
+            np.hstack([K, m.B - K @ m.D2]),
+            m.C1 - L_z @ m.C2,
+            np.hstack([L_z, m.D1 - L_z @ m.D2]),
+            m.dt,
+            inputs=[*m.sensors, *m.commands],
+            outputs=estimates(m.channels),
+        )
+
+    def estimate(self, records: Any, *, start: Any = None) -> dict[str, FloatArray]:
+        """Return the estimates over a record whose first sample is the first one of a period.
+
+        Parameters
+        ----------
+        records : Response, mapping {channel: (N,) array} or data frame
+            All sensors and commands at the plant's rate. Samples in which a sensor is not read may
+            be NaN, or anything.
+        start : (n,) array, optional
+            x at the first sample; rest when not given.
+
+        Returns
+        -------
+        dict {name: (N,) array}
+            `die:hat`, ...
+
+        Raises
+        ------
+        LabelError, ShapeError, ModelError
+            When channels are missing or of different lengths, or a sample that is due is NaN.
+        """
+        model = filter_model(self.plant)
+        record = recorded(records, model)
+        due = np.resize(self.measured.astype(bool), record.y.shape)
+        if np.any(np.isnan(record.y) & due):
+            k, j = (int(i) for i in np.argwhere(np.isnan(record.y) & due)[0])
+            raise ModelError(
+                f"{self.sensors[j]!r} is read in sample {k}, where the record has NaN. Let the "
+                "record start at the first sample of a period, or design the filter without it."
+            )
+        y = np.where(due, record.y, 0.0)
+        n = model.A.shape[0]
+        x = np.zeros(n) if start is None else real_array(start, "start", (n,))
+        hat = np.empty((len(y), len(model.channels)))
+        for k, (measured, u) in enumerate(zip(y, record.u, strict=True)):
+            at = k % self.period
+            e = np.where(due[k], measured - model.C2 @ x - model.D2 @ u, 0.0)
+            hat[k] = model.C1 @ (x + self.gains[at] @ e) + model.D1 @ u
+            x = model.A @ x + model.B @ u + self.predictor_gains[at] @ e
+        return dict(zip(estimates(model.channels), hat.T, strict=True))
+
+
+@one_thread()
+def design_multirate(
+    plant: StandardPlant | System, every: Mapping[str, int | tuple[int, int]]
+) -> PeriodicEstimator:
+    """Return the periodic Kalman filter of sensors that are read at different integer rates.
+
+    The plant is sampled at the rate of the estimates; ``every={"y3": 10}`` is a sensor that is read
+    in samples 0, 10, 20, ..., ``(10, 3)`` one that is read in 3, 13, ... Over a period of T
+    samples the plant is lifted to one step, measurements stacked::
+
+        x[k+T] = A^T x[k] + sum A^(T-1-j) w[k+j]
+        Y[k]   = [C A^j x[k] + sum_i<j C A^(j-1-i) w[k+i] + v[k+j]],  rows that are read
+
+    whose Riccati equation has correlated noises; the recursion then gives the gains of each sample.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled, not weighted. A sensor's noise per sample is that of its asd at the plant's rate.
+    every : mapping {sensor: interval or (interval, offset)} [samples]
+        Sensors that are not named are read in each sample.
+
+    Returns
+    -------
+    PeriodicEstimator
+
+    Raises
+    ------
+    AssumptionError
+        As `design_kalman`.
+    LabelError
+        When a sensor is unknown.
+    ModelError, ShapeError
+        When intervals are not whole numbers, an offset is not below its interval, or the period or
+        the number of measurements in it is too large.
+    SolverError
+        When no stable filter exists: a mode is aliased to rest by the interval of all that see it.
+    CertificateError
+        When the recursion does not reproduce the lifted solution.
+
+    References
+    ----------
+    Bittanti, Colaneri, Periodic Systems, Springer, 2009, ch. 6 and 9.
+    """
+    plant = checked_plant(plant)
+    model = filter_model(plant)
+    check_noises(plant)
+    plant.check().require(("excited", "detectable"), "a stationary Kalman filter")
+    measured = _measured(model.sensors, every)
+    period = len(measured)
+    C, Q, R, S, A = _lifted(model, measured)
+    solution = solve_dare(A, C, Q=Q, R=R, S=S)
+    P = solution.P
+    gains, predictors, variances = [], [], []
+    moved = np.eye(len(P))
+    for read in measured:
+        gain, predictor, after, ahead = _step(model, P, read)
+        gains.append(gain)
+        predictors.append(predictor)
+        variances.append(np.sum((model.C1 @ after) * model.C1, axis=1))
+        moved = (model.A - predictor @ model.C2) @ moved
+        P = ahead
+    first = solution.P.diagonal()
+    known = first > 1e-300
+    difference = float(np.max(np.abs(P.diagonal() - first)[known] / first[known], initial=0.0))
+    radius = float(np.max(np.abs(np.linalg.eigvals(moved)), initial=0.0))
+    if radius >= 1 or not difference <= AGREEMENT:
+        raise CertificateError(
+            f"one period of the recursion changes the variances by {difference:.1e} (allowed "
+            f"{AGREEMENT:.0e}), spectral radius {radius:.9f}. The filter cannot be trusted. Choose "
+            "a shorter period."
+        )
+    return PeriodicEstimator(
+        plant,
+        period,
+        measured.astype(np.float64),
+        np.array(gains),
+        np.array(predictors),
+        np.array(variances),
+        PeriodicCertificate(radius, solution.residual, difference),
+    )
+
+
+def _measured(names: tuple[str, ...], every: Any) -> FloatArray:
+    """Return which sensors are read in which sample of the common period (T, ny)."""
+    if not isinstance(every, Mapping):
+        raise ModelError(
+            f"every must be a mapping {{sensor: samples}}, got {short(every)}. Pass such as "
+            "{'y3': 10}."
+        )
+    intervals, offsets = dict.fromkeys(names, 1), dict.fromkeys(names, 0)
+    for name, given in every.items():
+        if name not in names:
+            raise unknown_label("sensor", name, names)
+        pair = given if isinstance(given, tuple) else (given, 0)
+        if len(pair) != 2:
+            raise ShapeError(
+                f"{name!r} is read every so many samples, with an offset if any, got "
+                f"{short(given)}. Pass 10 or (10, 3)."
+            )
+        intervals[name] = whole(pair[0], f"interval of {name!r}", maximum=_LONGEST)
+        offsets[name] = whole(
+            pair[1], f"offset of {name!r}", minimum=0, maximum=intervals[name] - 1
+        )
+    period = lcm(*intervals.values())
+    k = np.arange(period)[:, None]
+    found = (k - np.array(list(offsets.values()))) % np.array(list(intervals.values())) == 0
+    if period > _LONGEST or found.sum() > _MOST:
+        raise ModelError(
+            f"the sensors repeat after {period} samples with {int(found.sum())} measurements, at "
+            f"most {_LONGEST} and {_MOST} are allowed. Choose intervals with a common multiple."
+        )
+    if not found.any():
+        raise LabelError("no sensor is read. Name one.")
+    return np.asarray(found)
+
+
+def _lifted(
+    m: FilterModel, measured: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return C, Q, R, S and A of one period as one step."""
+    n = m.A.shape[0]
+    A, Q = np.eye(n), np.zeros((n, n))
+    C, R, S = np.zeros((0, n)), np.zeros((0, 0)), np.zeros((n, 0))
+    for read in measured:
+        rows = np.flatnonzero(read)
+        C_k = m.C2[rows]
+        # the measurement of this sample: its noise, the part of w so far, and that of the others
+        cross = C_k @ S
+        R = np.block([[R, cross.T], [cross, C_k @ Q @ C_k.T + m.R[np.ix_(rows, rows)]]])
+        C = np.vstack([C, C_k @ A])
+        S = np.hstack([m.A @ S, m.A @ Q @ C_k.T + m.S[:, rows]])
+        Q = m.A @ Q @ m.A.T + m.Q
+        A = m.A @ A
+    return C, 0.5 * (Q + Q.T), 0.5 * (R + R.T), S, A
+
+
+def _step(
+    m: FilterModel, P: FloatArray, read: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return L, K, P[k|k] and P[k+1|k] of one sample, in Joseph's form."""
+    rows = np.flatnonzero(read)
+    gain, predictor = np.zeros(m.C2.T.shape), np.zeros(m.C2.T.shape)
+    if rows.size:
+        C, R = m.C2[rows], m.R[np.ix_(rows, rows)]
+        innovation = C @ P @ C.T + R
+        size = np.sqrt(innovation.diagonal())
+        unit = innovation / size / size[:, None]
+        gain[:, rows] = np.linalg.solve(unit, (P @ C.T / size).T).T / size
+        late = np.linalg.solve(unit, (m.S[:, rows] / size).T).T / size
+        predictor[:, rows] = m.A @ gain[:, rows] + late
+    closed = m.A - predictor @ m.C2
+    ahead = closed @ P @ closed.T + m.driven(predictor)
+    return gain, predictor, m.updated(P, gain), 0.5 * (ahead + ahead.T)

@@ -1,0 +1,212 @@
+"""Disturbances with a spectrum: first-order, narrow-band and almost constant forces as ports."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError
+from ..labels import Place
+from ..lti.statespace import StateSpace
+from ..values import Value, positive, short
+from .forces import BaseAcceleration, Disturbance
+from .rigid_force import RigidForce
+
+
+class _Spectrum(Value):
+    """White noise through a stable filter: `asd` of the noise, and the filter as `shape`."""
+
+    @property
+    def asd(self) -> float:
+        """One-sided amplitude spectral density of the white noise before the filter."""
+        raise NotImplementedError
+
+    @property
+    def shape(self) -> StateSpace:
+        """The filter."""
+        raise NotImplementedError
+
+    def force(self, name: str, at: Place, direction: str = "z") -> Disturbance:
+        """Return the force of this spectrum at a place: a channel of w.
+
+        Parameters
+        ----------
+        name : str
+            The channel's name.
+        at : str, (3,) array [m] or mapping
+            A DOF label, a point, or a sum {label or point: weight}.
+        direction : str
+            At points: x, y, z or rx, ry, rz.
+
+        Raises
+        ------
+        LabelError, ModelError
+            For a bad name, place or direction.
+        """
+        return Disturbance(name, at, direction, self.asd, self.shape)
+
+    def rigid(self, name: str, direction: str = "z") -> RigidForce:
+        """Return the force of this spectrum on a rigid-body axis, which bends nothing.
+
+        Parameters
+        ----------
+        name : str
+            The channel's name.
+        direction : str
+            x, y, z [N] or rx, ry, rz [N m].
+
+        Raises
+        ------
+        LabelError, ModelError
+            For a bad name or direction.
+        """
+        return RigidForce(name, direction, self.asd, self.shape)
+
+    def floor(self, name: str, direction: str = "z") -> BaseAcceleration:
+        """Return the base acceleration of this spectrum [m/s^2 or rad/s^2].
+
+        Parameters
+        ----------
+        name : str
+            The channel's name.
+        direction : str
+            x, y, z or rx, ry, rz.
+
+        Raises
+        ------
+        LabelError, ModelError
+            For a bad name or direction.
+        """
+        return BaseAcceleration(name, direction, self.asd, self.shape)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstOrder(_Spectrum):
+    """First-order noise: flat up to a corner, then falling with 20 dB per decade.
+
+    ``shape = omega / (s + omega)``; white noise of density asd has the variance
+    ``asd^2 omega / 4`` behind it.
+
+    Parameters
+    ----------
+    rms : float [N]
+        Its root mean square.
+    corner : float [Hz]
+        omega / (2 pi).
+
+    Raises
+    ------
+    ModelError
+        When one is not positive.
+    """
+
+    rms: float
+    corner: float
+
+    def __post_init__(self) -> None:
+        self._set(rms=positive(self.rms, "rms"), corner=positive(self.corner, "corner"))
+
+    @property
+    def asd(self) -> float:
+        """Density [N/sqrt(Hz)] far below the corner."""
+        return float(2.0 * self.rms / np.sqrt(2 * np.pi * self.corner))
+
+    @property
+    def shape(self) -> StateSpace:
+        """The low-pass."""
+        omega = 2 * np.pi * self.corner
+        return StateSpace([[-omega]], [[omega]], [[1.0]], [[0.0]], states=["force"])
+
+
+@dataclass(frozen=True, eq=False)
+class NarrowBand(_Spectrum):
+    """Narrow-band noise: hum, an imbalance, a pump.
+
+    ``shape = 2 zeta omega s / (s^2 + 2 zeta omega s + omega^2)``, 1 at its frequency; white noise
+    of density asd has the variance ``asd^2 zeta omega / 2`` behind it. The force forgets its phase
+    within 1 / (2 pi zeta) periods.
+
+    Parameters
+    ----------
+    rms : float [N]
+        Its root mean square.
+    freq : float [Hz]
+        omega / (2 pi).
+    zeta : float
+        Half the relative bandwidth, below 1.
+
+    Raises
+    ------
+    ModelError
+        When one is not positive, or zeta not below 1.
+    """
+
+    rms: float
+    freq: float
+    zeta: float = 0.01
+
+    def __post_init__(self) -> None:
+        zeta = positive(self.zeta, "zeta")
+        if zeta >= 1:
+            raise ModelError(
+                f"zeta must be below 1, got {short(zeta)}: no band is that wide. Use FirstOrder."
+            )
+        self._set(rms=positive(self.rms, "rms"), freq=positive(self.freq, "freq"), zeta=zeta)
+
+    @property
+    def asd(self) -> float:
+        """Density [N/sqrt(Hz)] at the frequency."""
+        return float(self.rms * np.sqrt(2.0 / (self.zeta * 2 * np.pi * self.freq)))
+
+    @property
+    def shape(self) -> StateSpace:
+        """The band-pass."""
+        omega = 2 * np.pi * self.freq
+        width = 2 * self.zeta * omega
+        return StateSpace(
+            [[0.0, omega], [-omega, -width]], [[0.0], [width]], [[0.0, 1.0]], [[0.0]],
+            states=["integral", "force"],
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, eq=False)
+class RandomWalk(_Spectrum):
+    """A force that drifts: a bias. Its rms after a time t is ``drift t^(1/2)``.
+
+    First-order noise with a corner far below everything else, so that it is stationary and no
+    variance of anything is infinite: above the corner nothing distinguishes it from a random walk.
+
+    Parameters
+    ----------
+    drift : float [N/sqrt(s)]
+        Deviation of its change in one second.
+    corner : float [Hz]
+        Below the inverse of the longest record.
+
+    Raises
+    ------
+    ModelError
+        When one is not positive.
+    """
+
+    drift: float
+    corner: float = 1e-4
+
+    def __post_init__(self) -> None:
+        self._set(drift=positive(self.drift, "drift"), corner=positive(self.corner, "corner"))
+
+    @property
+    def rms(self) -> float:
+        """Root mean square [N] that the corner leaves: drift / (4 pi corner)^(1/2)."""
+        return float(self.drift / np.sqrt(4 * np.pi * self.corner))
+
+    @property
+    def asd(self) -> float:
+        """Density [N/sqrt(Hz)] far below the corner."""
+        return FirstOrder(self.rms, self.corner).asd
+
+    @property
+    def shape(self) -> StateSpace:
+        """The low-pass."""
+        return FirstOrder(self.rms, self.corner).shape

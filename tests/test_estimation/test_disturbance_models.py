@@ -1,0 +1,149 @@
+"""Shaped, held and rigid-body forces: spectra, closed forms, dense oracles, detectability."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from test_kalman import CORNERS, INSET, modes, ports
+from test_unknown_inputs import by_hand
+
+from flexplant.errors import AssumptionError, ModelError
+from flexplant.estimation import check_bias, design_kalman
+from flexplant.estimation.filter_model import filter_model
+from flexplant.loop import close_loop
+from flexplant.lti import h2_norm
+from flexplant.plant import (
+    Disturbance,
+    FirstOrder,
+    NarrowBand,
+    RandomWalk,
+    RigidForce,
+    Sensor,
+    assemble_plant,
+)
+from flexplant.simulation import simulate
+from flexplant.synthesis import design_servo
+
+
+@pytest.mark.parametrize(
+    "spectrum", [FirstOrder(2.0, 3.0), NarrowBand(2.0, 50.0, 0.02), RandomWalk(2.0, 1e-3)]
+)
+def test_rms_is_that_of_the_filter(spectrum):
+    """White noise of density asd: variance asd^2 / 2 times the squared H2 norm."""
+    wanted = spectrum.asd / np.sqrt(2) * h2_norm(spectrum.shape)
+    assert spectrum.rms == pytest.approx(wanted, rel=1e-10, abs=0)
+    force = spectrum.force("pump", at=INSET[0])
+    assert (force.asd, force.shape.n_states) == (spectrum.asd, spectrum.shape.n_states)
+    assert spectrum.floor("floor").asd == spectrum.asd
+
+
+def test_a_random_walk_drifts_as_stated():
+    walk, dt = RandomWalk(3.0), 0.01
+    omega = -walk.shape.A[0, 0]
+    step = (walk.asd * walk.shape.B[0, 0]) ** 2 / 2 * -np.expm1(-2 * omega * dt) / (2 * omega)
+    assert step == pytest.approx(3.0**2 * dt, rel=1e-4, abs=0)
+
+
+def biased(axes=("z", "rx", "ry"), **options):
+    own = ports(**options)
+    w = [*own.w, *(RandomWalk(1e-2).rigid(f"bias:{axis}", axis) for axis in axes)]
+    return assemble_plant(modes(1e-2, 8), own.replace(w=w)).discretized(2e3, delay=1)
+
+
+def test_a_rigid_force_bends_nothing():
+    own = ports()
+    forces = [RigidForce("pull", "z", asd=1.0), RigidForce("turn", "rx", asd=1.0)]
+    plant = assemble_plant(modes(), own.replace(w=forces))
+    elastic = plant.modal_states[2 * plant.n_rigid :]
+    column = plant.system.B[:, plant.system.input_index(["pull", "turn"])]
+    assert np.abs(column[elastic]).max() < 1e-9 * np.abs(column).max()
+    # one newton accelerates the centre of the plate by 1 / m
+    mass, g = 2702 * 0.6 * 0.6 * 0.0272, plant.system
+    middle = plant.at(poi=(0.3, 0.3, 0.0)).system
+    row = middle.C[middle.output_index(["die:z"])]
+    assert (row @ g.A @ column[:, :1])[0, 0] == pytest.approx(1 / mass, rel=1e-9, abs=0)
+
+
+def test_bias_is_a_state_of_the_filter():
+    """The filter resolves the bias to a part of its prior; sensors on one line do not show rx."""
+    plant = biased()
+    check_bias(plant, ["bias:z", "bias:rx", "bias:ry"])
+    kalman = design_kalman(plant, larger=plant)
+    states = [i for i, name in enumerate(plant.system.states) if name.startswith("bias:")]
+    prior = RandomWalk(1e-2).rms ** 2
+    assert np.all(np.diag(kalman.covariance)[states] < 1e-2 * prior)
+    line = [Sensor(f"y{i}", at=(0.2 * i, 0.3, 0.0), asd=1e-12) for i in range(4)]
+    with pytest.raises(AssumptionError, match="y does not see the rigid-body rotation rx"):
+        check_bias(biased(y=line), ["bias:z", "bias:rx", "bias:ry"])
+
+
+def test_an_axis_on_springs_that_no_sensor_sees_is_named():
+    """Two masses on springs, the sensor on the first: a constant force on the second is unseen."""
+    one = np.array([[0.9, 0.1], [-0.2, 0.8]])
+    A, G = la.block_diag(one, one), np.zeros((4, 2))
+    G[1, 0] = G[3, 1] = 1.0
+    plant = by_hand(A, G, np.array([[1.0, 0, 0, 0]]), np.zeros((1, 2)))
+    check_bias(plant, ["d1"])
+    with pytest.raises(AssumptionError, match=r"constant forces along d2: such a bias"):
+        check_bias(plant, ["d1", "d2"])
+    # a sensor that sees both alike shows their sum only; a velocity shows none
+    plant = by_hand(A, G, np.array([[1.0, 0, 1.0, 0]]), np.zeros((1, 2)))
+    with pytest.raises(AssumptionError, match=r"along 1 d1 \+ -1 d2"):
+        check_bias(plant, ["d1", "d2"])
+    speed = np.array([[-0.1, 0.1, 0, 0]])  # x1+ = x1 + speed
+    with pytest.raises(AssumptionError, match="along d1; d2"):
+        check_bias(by_hand(A, G, speed, np.zeros((1, 2))), ["d1", "d2"])
+
+
+def held_ports(**options):
+    own = ports(**options)
+    w = [Disturbance(f"amp{i}", at=p, asd=1e-3, held=True) for i, p in enumerate(INSET, 1)]
+    fast = [
+        Sensor(f"a{i}", at=p, quantity="acceleration", asd=1e-6) for i, p in enumerate(CORNERS, 1)
+    ]
+    return own.replace(w=w, y=[*own.y, *fast])
+
+
+def with_accelerometers():
+    return assemble_plant(modes(1e-2, 8), held_ports()).discretized(2e3, delay=1)
+
+
+def test_accelerometers_by_the_textbook():
+    """Simon, Optimal State Estimation, section 7.1: correlated process and sensor noise, solved
+    by SciPy in states, sensors and noises of unit size."""
+    plant = with_accelerometers()
+    kalman = design_kalman(plant, larger=plant)
+    m = filter_model(plant)
+    assert np.abs(m.S).max() > 0
+    d, s = np.sqrt(np.diag(kalman.predicted_covariance)) + 1e-300, np.sqrt(np.diag(m.R))
+    d = np.where(d > 1e-200, d, 1.0)
+    A, C = m.A * d / d[:, None], m.C2 * d / s[:, None]
+    Q, R, S = m.Q / np.outer(d, d), m.R / np.outer(s, s), m.S / np.outer(d, s)
+    P = la.solve_discrete_are(A.T, C.T, Q, R, s=S)
+    P = P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)
+    C1 = m.C1 * d
+    np.testing.assert_allclose(kalman.variances, np.diag(C1 @ P @ C1.T), rtol=1e-6)
+    without = assemble_plant(modes(1e-2, 8), ports()).discretized(2e3, delay=1)
+    assert kalman.rms("die") < design_kalman(without, larger=without).rms("die")
+    # the correlation is in the error on another plant as well
+    assert kalman.rms("die", on=plant) == pytest.approx(kalman.rms("die"), rel=1e-6, abs=0)
+
+
+def test_accelerometers_without_held_noise_are_refused():
+    own = held_ports()
+    loud = own.replace(w=[w.replace(held=False) for w in own.w])
+    plant = assemble_plant(modes(1e-2, 8), loud).discretized(2e3, delay=1)
+    with pytest.raises(AssumptionError, match=r"held=True"):
+        design_kalman(plant)
+    with pytest.raises(ModelError, match="held of 'amp'"):
+        Disturbance("amp", at=INSET[0], held="yes")
+
+
+@pytest.mark.slow
+def test_simulated_accelerometers_give_the_predicted_error():
+    plant = with_accelerometers()
+    kalman = design_kalman(plant, larger=plant)
+    loop = close_loop(plant, kalman, design_servo(plant, bandwidth=20.0))
+    run = simulate(loop, duration=4.0, rng=3, runs=4)
+    error = run["die:z"] - run["die:hat"]
+    shown = np.sqrt(np.mean(error[:, 1000:] ** 2))
+    assert shown == pytest.approx(kalman.rms("die"), rel=0.03, abs=0)
