@@ -19,9 +19,10 @@ from ..values import IntArray, Value, flag, instance, name_list, one_of, real_ar
 from .completion import completed as completed
 from .completion import square
 from .condense import held_rows, no_mass
+from .definite import SEMIDEFINITE
 from .local_axes import cosines
 from .massless import inertial
-from .model import SEMIDEFINITE, FEModel
+from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding
 from .units import units
 from .zero_energy import freed

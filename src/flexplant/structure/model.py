@@ -6,30 +6,25 @@ import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self, cast
+from typing import Any, Self
 
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError, ShapeError
+from ..errors import FlexplantWarning, ModelError
 from ..labels import DofSet
-from ..sparse.factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
-from ..values import FloatArray, Matrix, Value, frozen, real_array
+from ..sparse.factor import DENSE_LIMIT, dense, is_positive_definite
+from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, sum_of
-from .damping import Damping, ModalDamping, Rayleigh
+from .damping import Damping, Rayleigh
+from .damping_matrix import damping_matrix
+from .definite import check_semidefinite, lowest, symmetric
 from .eigen import elastic_modes
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
 from .rigid import body_motions, rigid_body_basis
 from .units import units
-
-#: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
-_SYMMETRY_TOLERANCE = 1e-9
-#: relative to the diagonal: K and D may have eigenvalues this far below zero
-SEMIDEFINITE = 1e-9
-#: modal damping over all modes fills D; beyond this it would not fit the memory comfortably
-_DENSE_DAMPING_LIMIT = 5000
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -84,25 +79,20 @@ class FEModel(Placed, Value):
     held_inertia: FloatArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.dofs, DofSet):
-            raise ModelError(
-                f"dofs must be a DofSet, got {type(self.dofs).__name__}: it says what the rows of "
-                "M and K are. Use DofSet(nodes, directions, xyz) or DofSet.from_table(...)."
-            )
-        n = len(self.dofs)
+        n = len(instance(self.dofs, DofSet, "dofs", "DofSet(nodes, directions, xyz) makes one."))
         if not n:
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         digits = digits_of(self.K)
-        M, K = _symmetric(self.M, "M", n), _symmetric(self.K, "K", n)
-        D = None if self.D is None else _symmetric(self.D, "D", n)
+        M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
+        D = None if self.D is None else symmetric(self.D, "D", n)
         if not is_positive_definite(M):
             raise ModelError(
-                f"M is not positive definite: {_lowest(M)}. Some motion would have no inertia, or "
+                f"M is not positive definite: {lowest(M)}. Some motion would have no inertia, or "
                 "a negative one. Condense massless DOFs out, or look for a sign."
             )
         self._set(M=M, K=K, D=D)
         try:
-            _check_semidefinite(K, "K")
+            check_semidefinite(K, "K")
         except ModelError as error:
             held = None if digits is None else held_by_rounding(K, M, self.dofs, digits)
             if held:
@@ -110,7 +100,7 @@ class FEModel(Placed, Value):
             if not self._has_negative_springs():
                 raise
         if D is not None:
-            _check_semidefinite(D, "D")
+            check_semidefinite(D, "D")
         if self.held_inertia is not None:
             self._set(held_inertia=real_array(self.held_inertia, "held_inertia", (n, 6)))
         if digits is not None:
@@ -241,8 +231,8 @@ class FEModel(Placed, Value):
                     f"damping must be a ModalDamping or Rayleigh (or Hysteretic, or a matrix D), "
                     f"got {type(damping).__name__}. Give ModalDamping(0.01) for 1 % in all modes."
                 )
-            D = _symmetric(damping, "D", self.n_dof)
-            _check_semidefinite(D, "D")
+            D = symmetric(damping, "D", self.n_dof)
+            check_semidefinite(D, "D")
             return self._with(D=frozen(D))
         free = self.rigid_body.shape[1] > 0
         if isinstance(damping, Rayleigh) and damping.beta and self.n_unstable:
@@ -252,12 +242,10 @@ class FEModel(Placed, Value):
             )
         if isinstance(damping, Rayleigh) and not (free and damping.alpha and not damping.rigid):
             return self._with(D=frozen(damping.alpha * self.M + damping.beta * self.K))
-        if self.n_dof > _DENSE_DAMPING_LIMIT:
-            raise ModelError(
-                f"this damping gives a full D, too large for {self.n_dof} DOFs (limit "
-                f"{_DENSE_DAMPING_LIMIT}). Pass it to solve_modes(model, damping=...) instead."
-            )
-        return self._with(D=frozen(_full_damping(self, damping)))
+        D = damping_matrix(
+            self.K, self.M, self.rigid_body, damping, motions=lambda: self.body_motions
+        )
+        return self._with(D=frozen(D))
 
     def with_parts(self, parts: Iterable[Part] | Part) -> FEModel:
         """Return the model with point masses, springs and dampers added.
@@ -393,84 +381,3 @@ class FEModel(Placed, Value):
 
     def _with(self, **changes: Any) -> Self:
         return type(self)._proven(**(self._fields() | changes))
-
-
-def _full_damping(model: FEModel, damping: Damping) -> FloatArray:
-    M, K, rigid = dense(model.M), dense(model.K), model.rigid_body
-    loaded = M @ rigid
-    if isinstance(damping, Rayleigh):
-        D = damping.alpha * (M - loaded @ loaded.T) + damping.beta * K
-        return np.asarray(0.5 * (D + D.T), dtype=np.float64)
-    elastic, phi = elastic_modes(M, K, rigid, motions=lambda: model.body_motions)
-    r = rigid.shape[1]
-    zeta = damping.zeta(np.concatenate([np.zeros(r), elastic]))[r:]
-    forces = M @ phi
-    D = (forces * (2 * zeta * np.abs(elastic))) @ forces.T
-    if isinstance(damping, ModalDamping) and damping.rigid:
-        D = D + damping.rigid * (loaded @ loaded.T)
-    return np.asarray(0.5 * (D + D.T), dtype=np.float64)
-
-
-def _check_semidefinite(matrix: Matrix, name: str) -> None:
-    if not _is_semidefinite(matrix):
-        raise ModelError(
-            f"{name} is not positive semi-definite: {_lowest(matrix)}. The structure would "
-            f"{'be unstable' if name == 'K' else 'feed energy in'}. Look for a sign or "
-            "for swapped arguments (the order is M, K, D)."
-            + (" Magnets may only make rigid-body motions unstable." if name == "K" else "")
-        )
-
-
-def _symmetric(given: Any, name: str, n: int) -> Matrix:
-    value, matrix = given, cast(Any, None)
-    if sp.issparse(given):
-        if value.shape != (n, n):
-            raise ShapeError(f"{name} must have shape ({n}, {n}), got {value.shape}.")
-        matrix = sp.csc_array(value)
-        matrix = sp.csc_array(
-            (real_array(matrix.data, f"stored entries of {name}"), matrix.indices, matrix.indptr),
-            shape=(n, n),
-        )
-    else:
-        matrix = real_array(value, name, (n, n))
-    if sp.issparse(matrix) and _mirrored(matrix):
-        return cast(Matrix, matrix)
-    scaled, _ = unit_diagonal(matrix)
-    skew: Any = abs(scaled - scaled.T)
-    worst = float(skew.max()) if n else 0.0
-    if worst > _SYMMETRY_TOLERANCE:
-        i, j = (int(k) for k in np.unravel_index(skew.argmax(), (n, n)))
-        raise ModelError(
-            f"{name} is not symmetric: entry ({i}, {j}) is {matrix[i, j]:.6g} and ({j}, {i}) is "
-            f"{matrix[j, i]:.6g} (counted from 0). Reciprocity would not hold. Symmetrise it, "
-            f"0.5 * ({name} + {name}.T), when the difference is only rounding."
-        )
-    return cast(Matrix, matrix)
-
-
-def _mirrored(matrix: Any) -> bool:
-    """Return whether a sparse matrix equals its transpose to the bit, entry by entry."""
-    matrix.sum_duplicates()
-    other: Any = sp.csc_array(matrix.T)
-    return all(
-        np.array_equal(getattr(matrix, part), getattr(other, part))
-        for part in ("indptr", "indices", "data")
-    )
-
-
-def _is_semidefinite(matrix: Matrix) -> bool:
-    if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
-        # the factorisation in solve_modes finds the rest; here it would double the cost
-        return not np.any(diagonal(matrix) < 0)
-    return is_positive_definite(matrix, SEMIDEFINITE)
-
-
-def _lowest(matrix: Matrix) -> str:
-    entries = diagonal(matrix)
-    i = int(np.argmin(entries))
-    if entries[i] <= 0:
-        return f"its diagonal entry {i} (from 0) is {entries[i]:.3g}"
-    if matrix.shape[0] > DENSE_LIMIT:
-        return "its factorisation has negative pivots"
-    lowest = np.linalg.eigvalsh(dense(unit_diagonal(matrix)[0]))[0]
-    return f"scaled to a unit diagonal its lowest eigenvalue is {lowest:.3g}"

@@ -1,0 +1,93 @@
+"""Symmetric and positive (semi-)definite: what the matrices of a structure must be."""
+
+from __future__ import annotations
+
+from typing import Any, cast
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import ModelError, ShapeError
+from ..sparse.factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
+from ..values import Matrix, real_array
+
+#: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
+_SYMMETRY_TOLERANCE = 1e-9
+#: relative to the diagonal: K and D may have eigenvalues this far below zero
+SEMIDEFINITE = 1e-9
+
+
+def check_semidefinite(matrix: Matrix, name: str) -> None:
+    """Raise ModelError unless a symmetric matrix is positive semi-definite to rounding."""
+    if not _is_semidefinite(matrix):
+        raise ModelError(
+            f"{name} is not positive semi-definite: {lowest(matrix)}. The structure would "
+            f"{'be unstable' if name == 'K' else 'feed energy in'}. Look for a sign or "
+            "for swapped arguments (the order is M, K, D)."
+            + (" Magnets may only make rigid-body motions unstable." if name == "K" else "")
+        )
+
+
+def symmetric(given: Any, name: str, n: int) -> Matrix:
+    """Return a finite symmetric (n, n) matrix, dense or sparse.
+
+    Raises
+    ------
+    ShapeError
+        When its shape differs.
+    ModelError
+        When entries are not finite real numbers, or it is not symmetric.
+    """
+    value, matrix = given, cast(Any, None)
+    if sp.issparse(given):
+        if value.shape != (n, n):
+            raise ShapeError(f"{name} must have shape ({n}, {n}), got {value.shape}.")
+        matrix = sp.csc_array(value)
+        matrix = sp.csc_array(
+            (real_array(matrix.data, f"stored entries of {name}"), matrix.indices, matrix.indptr),
+            shape=(n, n),
+        )
+    else:
+        matrix = real_array(value, name, (n, n))
+    if sp.issparse(matrix) and _mirrored(matrix):
+        return cast(Matrix, matrix)
+    scaled, _ = unit_diagonal(matrix)
+    skew: Any = abs(scaled - scaled.T)
+    worst = float(skew.max()) if n else 0.0
+    if worst > _SYMMETRY_TOLERANCE:
+        i, j = (int(k) for k in np.unravel_index(skew.argmax(), (n, n)))
+        raise ModelError(
+            f"{name} is not symmetric: entry ({i}, {j}) is {matrix[i, j]:.6g} and ({j}, {i}) is "
+            f"{matrix[j, i]:.6g} (counted from 0). Reciprocity would not hold. Symmetrise it, "
+            f"0.5 * ({name} + {name}.T), when the difference is only rounding."
+        )
+    return cast(Matrix, matrix)
+
+
+def _mirrored(matrix: Any) -> bool:
+    """Return whether a sparse matrix equals its transpose to the bit, entry by entry."""
+    matrix.sum_duplicates()
+    other: Any = sp.csc_array(matrix.T)
+    return all(
+        np.array_equal(getattr(matrix, part), getattr(other, part))
+        for part in ("indptr", "indices", "data")
+    )
+
+
+def _is_semidefinite(matrix: Matrix) -> bool:
+    if sp.issparse(matrix) and matrix.shape[0] > DENSE_LIMIT:
+        # the factorisation in solve_modes finds the rest; here it would double the cost
+        return not np.any(diagonal(matrix) < 0)
+    return is_positive_definite(matrix, SEMIDEFINITE)
+
+
+def lowest(matrix: Matrix) -> str:
+    """Return in words why a symmetric matrix is not positive definite."""
+    entries = diagonal(matrix)
+    i = int(np.argmin(entries))
+    if entries[i] <= 0:
+        return f"its diagonal entry {i} (from 0) is {entries[i]:.3g}"
+    if matrix.shape[0] > DENSE_LIMIT:
+        return "its factorisation has negative pivots"
+    least = np.linalg.eigvalsh(dense(unit_diagonal(matrix)[0]))[0]
+    return f"scaled to a unit diagonal its lowest eigenvalue is {least:.3g}"
