@@ -449,7 +449,7 @@ def test_bad_arguments_are_refused(arguments, error, text):
 def test_bad_frfs_are_refused():
     freq = np.arange(20.0, 100.0, 1.0)
     H = np.ones((1, 1, 80), dtype=complex)
-    with pytest.raises(ModelError, match="from an Frf"):
+    with pytest.raises(ModelError, match="frf must be of type Frf"):
         identify_modes(H)
     with pytest.raises(ModelError, match="variance is zero"):
         identify_modes(Frf(freq, H, variance=np.zeros(H.shape)))

@@ -66,7 +66,7 @@ def test_what_stands_in_the_place_of_time(tmp_path):
         modes = read_exodus_modes(path, times=times, rigid_below=0.1)
         assert modes.omega == pytest.approx([0, 0, *omega[2:]])
         assert modes.dofs.nodes[-1] == 3
-    with pytest.raises(LabelError, match="times must be"):
+    with pytest.raises(ModelError, match="times must be one of"):
         read_exodus_modes(path, times="hertz")
 
 

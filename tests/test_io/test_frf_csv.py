@@ -110,7 +110,7 @@ def test_bad_numbers_and_arguments(tmp_path):
     path.write_text("frequency [Hz],y <- u real,y <- u imag\n2,nan,1\n")
     with pytest.raises(FlexplantError, match="line 2: 'nan' is no decimal number"):
         read_frf_csv(path)
-    with pytest.raises(ModelError, match="need an Frf, got list"):
+    with pytest.raises(ModelError, match="frf must be of type Frf, got list"):
         write_frf_csv(path, [1])
     with pytest.raises(LabelError, match="units name 'y9'"):
         write_frf_csv(path, an_frf(), units={"y9": "m"})

@@ -124,5 +124,5 @@ def test_a_search_is_a_class(make):
     assert best.value <= found.value == again.value
     assert (found.evaluations, found.chosen) == (200, again.chosen)
     assert found.bound <= best.value * (1 - 1e-12)
-    with pytest.raises(ModelError, match="must be a search"):
+    with pytest.raises(ModelError, match="must be of type Search"):
         place_sensors(plant, sensors, 4, method="drawn")

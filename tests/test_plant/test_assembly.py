@@ -242,7 +242,7 @@ def test_noise_per_sample_of_a_sensor():
 
 
 def test_refusals():
-    with pytest.raises(ModelError, match="ports must be a Ports value, got list"):
+    with pytest.raises(ModelError, match="ports must be of type Ports, got list"):
         assemble_plant(some_modes(), [])
     with pytest.raises(ModelError, match="FEModel, Modes or ReducedModel, got dict"):
         assemble_plant({}, ports())

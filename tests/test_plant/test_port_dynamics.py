@@ -453,7 +453,7 @@ def test_refusals():
         assemble_plant(model(), channels(w=[BaseAcceleration("b", "z")]))
     with pytest.raises(ModelError, match="order must be"):
         channels(u=[Actuator("u", at="1:x", latency=1e-3)]).with_pade(0)
-    with pytest.raises(ModelError, match=r"residual must be FastStates\(\)"):
+    with pytest.raises(ModelError, match="residual must be of type ResidualForm"):
         assemble_plant(model(), channels(), residual="fast")
     late = [Sensor("a", at="4:x", quantity="acceleration", latency=1e-5, asd=1e-3)]
     with pytest.raises(AssumptionError, match=r"'rub' reaches 'a' at once.*anti-alias"):

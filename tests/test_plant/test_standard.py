@@ -263,7 +263,7 @@ def test_other_kinds_are_refused_at_the_door(plant):
         (lambda: plant.discretized(1e4, delay=None), "delay must"),
         (lambda: plant.discretized(1e4, delay=True), "delay must be one number"),
         (lambda: plant.weighted(z="die:z"), r"mapping \{channel: weight\}, got 'die:z'"),
-        (lambda: plant.with_ports(["u1"]), r"ports must be a Ports value, got list.*Ports\(w="),
+        (lambda: plant.with_ports(["u1"]), r"ports must be of type Ports, got list.*Ports\(w="),
         (lambda: plant.at(None), "place of 'die'"),
         (lambda: plant.along("dye", [(0.1, 0.1, 0.0)]), "no POI 'dye'"),
         (lambda: plant.along("die", None), "points must"),

@@ -51,7 +51,7 @@ def test_wrong_use_is_refused(made):
         reading_along({"block": StateSpace([], [], [], [[1.0]])})
     with pytest.raises(LabelError, match=r"'other\|die:hat'.*reading_along"):
         compare_estimators({"other": designs["static"]}, run, "die:z")
-    with pytest.raises(ModelError, match="need a Response"):
+    with pytest.raises(ModelError, match="run must be of type Response"):
         compare_estimators(designs, dict(run), "die:z")
     with pytest.raises(ModelError, match="scatter between runs"):
         compare_estimators(designs, run.replace(data=run.data[:1]), "die:z")

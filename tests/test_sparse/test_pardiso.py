@@ -60,5 +60,5 @@ def test_what_to_install_is_said():
     assert repr(Pardiso()) == "Pardiso()"
     mesh = meshes.plate(3)
     model = FEModel(mesh[0], mesh[1], dofs=meshes.dofs_of(mesh))
-    with pytest.raises(ModelError, match="must be a Pardiso"):
+    with pytest.raises(ModelError, match="must be of type Pardiso"):
         solve_modes(model, count=4, factor="pardiso")

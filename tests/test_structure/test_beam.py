@@ -99,8 +99,8 @@ def test_reprs():
         ({"inertia": -1e-9}, ModelError, "inertia"),
         ({"inertia": lambda x: -x}, ModelError, "every element"),
         ({"ends": "free"}, ModelError, "two words"),
-        ({"ends": ("free", "loose")}, ModelError, "one of free"),
-        ({"ends": ("free", 3)}, ModelError, "one of free"),
+        ({"ends": ("free", "loose")}, ModelError, "must be one of"),
+        ({"ends": ("free", 3)}, ModelError, "must be one of"),
         ({"ends": 3}, ModelError, "two words"),
     ],
 )

@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import LabelError, ModelError, ShapeError, SolverError, unknown_label
 from ..lti.frequency import Frf
 from ..parallel import one_thread
-from ..values import positive, real_array, short, whole
+from ..values import instance, positive, real_array, short, whole
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
 from .leakage import leakage_warned, no_pole
@@ -194,8 +194,13 @@ def _identified(
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
     labels = checked_channels(dofs, frf)
     listed = _checked_orders(orders)
-    if start is not None and not isinstance(start, PoleSelection):
-        raise ModelError(f"start is a PoleSelection, got {type(start).__name__}.")
+    if start is not None:
+        instance(
+            start,
+            PoleSelection,
+            "start",
+            "Pass diagram.select(freq=[...]).",
+        )
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
     diagram = None

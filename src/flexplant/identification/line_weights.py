@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from ..errors import ModelError
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, real_array
+from ..values import ComplexArray, FloatArray, instance, real_array
 
 #: lines over which what a fit leaves is averaged to a variance
 WINDOW = 41
@@ -87,11 +87,7 @@ class PreparedLines:
 
 def prepared(frf: Any, band: Any) -> PreparedLines:
     """Return what is fitted of an FRF, checked."""
-    if not isinstance(frf, Frf):
-        raise ModelError(
-            f"modes are identified from an Frf, got {type(frf).__name__}. Make one of time data "
-            "with estimate_frf, or of arrays with Frf(freq, data)."
-        )
+    instance(frf, Frf, "frf", "Pass estimate_frf(...) of records, or Frf(freq, data).")
     low, high = checked_band(band, frf.freq)
     inside = (frf.freq >= low) & (frf.freq <= high) & (frf.freq > 0)
     if np.sum(inside) < 20:

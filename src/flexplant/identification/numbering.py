@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import LabelError, ModelError
 from ..labels import Place
 from ..modes import Modes
-from ..values import ComplexArray, FloatArray, positive
+from ..values import ComplexArray, FloatArray, instance, positive
 from .measured import MeasuredModes
 
 #: modes of a model nearer than this share are one family, whose shapes are known as a span only
@@ -73,8 +73,7 @@ def numbered(
     """
     import scipy.optimize as so
 
-    if not isinstance(measured, MeasuredModes):
-        raise ModelError(f"numbered takes MeasuredModes, got {type(measured).__name__}.")
+    instance(measured, MeasuredModes, "measured", "Pass identify_modes(frf).")
     modes = model.modes() if hasattr(model, "modes") and not isinstance(model, Modes) else model
     if not isinstance(modes, Modes):
         raise ModelError(

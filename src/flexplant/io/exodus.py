@@ -15,7 +15,7 @@ import scipy.io
 from ..errors import FlexplantError, LabelError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
-from ..values import FloatArray, Matrix, positive, real_array
+from ..values import FloatArray, Matrix, one_of, positive, real_array
 from .formats import Elsewhere
 from .paths import file_path
 
@@ -71,10 +71,7 @@ def read_exodus_modes(
     -----
     Format: Schoof and Yarberry, "EXODUS II: A Finite Element Data Model", SAND92-2137.
     """
-    if times not in ("frequency", "omega", "eigenvalue"):
-        raise LabelError(
-            f"times must be 'frequency', 'omega' or 'eigenvalue', got {times!r}. Choose one."
-        )
+    one_of(times, "times", ("frequency", "omega", "eigenvalue"))
     with opened(path) as file:
         xyz, ids = file.nodes()
         chosen = _chosen(file.variables(), variables, str(path))

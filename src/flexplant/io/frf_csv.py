@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import FlexplantError, LabelError, ModelError
+from ..errors import FlexplantError, LabelError
 from ..lti.frequency import Frf
 from ..store import written
-from ..values import FloatArray
+from ..values import FloatArray, instance
 from .numbers import decimal
 from .paths import file_path
 
@@ -52,8 +52,7 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
     OSError
         When the file cannot be written.
     """
-    if not isinstance(frf, Frf):
-        raise ModelError(f"need an Frf, got {type(frf).__name__}: frequency_response(sys) is one.")
+    instance(frf, Frf, "frf", "Pass frequency_response(sys).")
     given = dict(frf.units) | dict(units or {})
     for name in given:
         if name not in (*frf.inputs, *frf.outputs):

@@ -20,8 +20,6 @@ from ..values import FloatArray
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular
 _SHIFT = -3e3
-#: static responses solve K u = f to this part of the load
-_STATIC = 1e-13
 _held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]]
 _dissected: weakref.WeakKeyDictionary[FEModel, Dissection]
 

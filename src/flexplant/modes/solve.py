@@ -16,7 +16,7 @@ from ..sparse.rayleigh_ritz import absolute, rounding_of
 from ..structure import Damping, FEModel, ModalDamping
 from ..structure.eigen import elastic_modes, signed
 from ..structure.negative_stiffness import signed_root, signed_square
-from ..values import FloatArray, positive, short
+from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
@@ -99,16 +99,10 @@ def solve_modes(
             f"solve_modes needs an FEModel, got {type(model).__name__}."
             + (" A reduced model has .modes()." if hasattr(model, "modes") else "")
         )
-    if damping is not None and not isinstance(damping, Damping):
-        raise ModelError(
-            f"damping must be a ModalDamping or Rayleigh, got {type(damping).__name__}: "
-            "give ModalDamping(0.01) for 1 % in all modes."
-        )
-    if factor is not None and not isinstance(factor, Pardiso):
-        raise ModelError(
-            f"factor must be a Pardiso(), got {type(factor).__name__}: leave it out to use the "
-            "library's own factor."
-        )
+    if damping is not None:
+        instance(damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
+    if factor is not None:
+        instance(factor, Pardiso, "factor", "Leave it out for the library's own factor.")
     kept, top = _asked(model, count, below)
     at = places(compliance_at)
     if at and model.n_unstable:

@@ -11,7 +11,7 @@ import numpy as np
 
 from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
 from ..plant import StandardPlant
-from ..values import Rng, Value, name_list, whole
+from ..values import Rng, Value, instance, name_list, whole
 from .candidates import Port, Side, checked_plant, known_candidates, with_side
 from .criterion import Criterion
 from .exchange import Exchange
@@ -236,11 +236,7 @@ def _placed(
         )
     if method is None:
         method = Exhaustive() if problem.subsets <= _FEW else Exchange()
-    if not isinstance(method, Search):
-        raise ModelError(
-            "method must be a search such as Exchange(...) or Exhaustive(), got "
-            f"{type(method).__name__}. Pass one."
-        )
+    instance(method, Search, "method", "Pass Exchange(...) or Exhaustive().")
     found = method.search(problem, rng, executor, progress)
     if not np.isfinite(found.value):
         raise InfeasibleError(

@@ -13,7 +13,7 @@ from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, positive, short
+from ..values import FloatArray, instance, positive, short
 from .dynamics import structure_system, with_filters
 from .origin import Assembled, Foreign
 from .partition import Partition
@@ -85,11 +85,7 @@ def continuous_plant(cls: type[P], realisation: ModalRealisation, ports: Ports) 
         When the ports are no Ports value, or a side is empty.
     """
     given: object = ports
-    if not isinstance(given, Ports):
-        raise ModelError(
-            f"ports must be a Ports value, got {type(given).__name__}. "
-            "Put the channels in one: Ports(w=[...], u=[...], z=[...], y=[...])."
-        )
+    instance(given, Ports, "ports", "Pass Ports(w=[...], u=[...], z=[...], y=[...]).")
     physical = with_filters(structure_system(realisation, ports), realisation, ports)
     return wired(cls, Assembled(ports, realisation, physical))
 

@@ -183,11 +183,6 @@ class Ports(Value):
         """Densities of the white noise at the amplifiers' inputs, by channel `u1:disturbance`."""
         return {f"{port.name}:disturbance": port.asd for port in self.u if port.asd > 0}
 
-    @property
-    def has_dynamics(self) -> bool:
-        """Whether some port has a filter or a latency: states beside those of the structure."""
-        return bool(self.latencies) or any(port.filter for port in self.physical)
-
     def with_pade(self, order: int = 2) -> Ports:
         """Return the ports with every latency as an all-pass filter, for continuous designs.
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import FlexplantWarning, ModelError
-from ..values import Value, positive
+from ..values import Value, instance, positive
 from .realisation import MODAL, ModalRealisation, Structure, realised
 
 
@@ -118,10 +118,7 @@ def modes_of(
         When damping couples the modes so that blocks cannot hold it.
     """
     way = FastStates() if residual is None else residual
-    if not isinstance(way, ResidualForm):
-        raise ModelError(
-            f"residual must be FastStates() or Feedthrough(), got {type(residual).__name__}."
-        )
+    instance(way, ResidualForm, "residual", "Pass FastStates() or Feedthrough().")
     realisation = realised(model)
     if realisation.form != MODAL and realisation is not model:
         warnings.warn(

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..errors import ModelError
 from ..identification import IdentifiedModes, StabilisationDiagram
 from ..lti.frequency import Frf
+from ..values import instance
 from ._axes import DIFFERENCE, MARK, MEASURED, UPDATED, axes, finish
 
 #: marker, colour and legend of the flags 0 to 3
@@ -37,8 +37,7 @@ def stabilisation(
     -------
     Axes
     """
-    if not isinstance(diagram, StabilisationDiagram):
-        raise ModelError(f"a StabilisationDiagram is drawn, got {type(diagram).__name__}.")
+    instance(diagram, StabilisationDiagram, "diagram", "Pass what stabilisation_diagram returned.")
     ax = axes(ax, figsize=(9.0, 5.0))
     for flag, (marker, color, label) in enumerate(_MARKS):
         mine = diagram.flags == flag
@@ -83,10 +82,7 @@ def identified(
         Displacement per input; a dotted line at every pole, the standard deviation of the
         measurement in grey where known.
     """
-    if not isinstance(modes, IdentifiedModes):
-        raise ModelError(
-            f"identified draws what identify_modes returned, got {type(modes).__name__}."
-        )
+    instance(modes, IdentifiedModes, "modes", "Pass what identify_modes returned.")
     ax = axes(ax, figsize=(9.0, 5.0))
     if frf.quantity is not None:
         frf = frf.converted("displacement")

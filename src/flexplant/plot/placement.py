@@ -9,11 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Patch
 from matplotlib.patches import Rectangle as Box
 
-from ..errors import ModelError
 from ..placement import SensorMap
 from ..plant import Ports
 from ..structure import Disc, Rectangle
-from ..values import FloatArray, short
+from ..values import FloatArray, instance
 from ._axes import MARK, MEASURED, axes, finish
 
 
@@ -40,8 +39,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     ModelError
         When `found` is no SensorMap.
     """
-    if not isinstance(found, SensorMap):
-        raise ModelError(f"need a SensorMap, got {short(found)}. Pass what sensor_map returned.")
+    instance(found, SensorMap, "found", "Pass what sensor_map returned.")
     ax = axes(ax, figsize=(6.4, 5.4))
     ratio = np.sqrt(found.ratio)
     x, y = found.points[:, 0], found.points[:, 1]

@@ -10,11 +10,10 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
-from ..errors import ModelError
 from ..lti.frequency import Frf
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
 from ..updating.search import Objective
-from ..values import FloatArray
+from ..values import FloatArray, instance
 from ._axes import MEASURED, NOMINAL, UPDATED, finish
 
 #: parameters that are drawn by themselves; the rest are left to the repr
@@ -58,8 +57,7 @@ def update(
     ModelError
         When `fit` is no UpdateResult, or a residual does not fit the model.
     """
-    if not isinstance(fit, UpdateResult):
-        raise ModelError(f"update draws what update returned, got {type(fit).__name__}.")
+    instance(fit, UpdateResult, "fit", "Pass what update returned.")
     old, new = correlate(before, residuals), correlate(fit.model, residuals)
     names = ["frequencies", "damping"] if old.modes else []
     names += ["mac before", "mac after"] if old.mac.size else []

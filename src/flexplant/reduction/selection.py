@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
 from ..modes.modes import Modes
-from ..values import FloatArray, Value, name_list, positive, real_array, whole
+from ..values import FloatArray, Value, instance, name_list, positive, real_array, whole
 from .criteria import PivotedQr, SelectionCriterion
 
 
@@ -97,17 +97,14 @@ def select_dofs(
     >>> select_dofs(solve_modes(plate, count=3), 3, required=["1:z", "5:z"], candidates=near)
     <DofSelection: 3 DOFs (1:z, 5:z, 23:z), condition 1.93>
     """
-    if not isinstance(modes, Modes):
-        raise ModelError(
-            f"select_dofs distinguishes modes, got {type(modes).__name__}: "
-            "call select_dofs(solve_modes(model, count=24), 24)."
-        )
+    instance(modes, Modes, "modes", "Pass solve_modes(model, count=24).")
     rule = PivotedQr() if criterion is None else criterion
-    if not isinstance(rule, SelectionCriterion):
-        raise ModelError(
-            f"criterion must be PivotedQr(), EffectiveIndependence() or Greedy(), got "
-            f"{rule!r:.60}: pass one."
-        )
+    instance(
+        rule,
+        SelectionCriterion,
+        "criterion",
+        "Pass PivotedQr() or Greedy().",
+    )
     if np.iscomplexobj(modes.phi):
         raise ModelError("select_dofs needs real modes: solve with damping=ModalDamping(...).")
     basis = np.asarray(modes.basis, dtype=np.float64)

@@ -11,7 +11,7 @@ from ..errors import LabelError, ModelError, unknown_label
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.channels import estimates, poi_channels, row_of
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, short
+from ..values import FloatArray, Value, instance, short
 from .response import Response
 
 Estimator = KalmanEstimator | StaticEstimator
@@ -122,8 +122,7 @@ def compare_estimators(
         When the run lacks the motion or an estimate of it.
     """
     _check(designs)
-    if not isinstance(run, Response):
-        raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+    instance(run, Response, "run", "Pass what simulate returned.")
     rows = []
     for name, design in designs.items():
         channels = poi_channels(design.plant)

@@ -17,6 +17,7 @@ from ..plant import StandardPlant
 from ..values import (
     FloatArray,
     flag,
+    instance,
     positive,
     real_array,
     seed_sequence,
@@ -105,11 +106,7 @@ def simulate(
     >>> simulate(close_loop(plant, law), reference=1.0, duration=0.5)["e"]
     array([1.    , 0.5   , 0.25  , 0.125 , 0.0625])
     """
-    if not isinstance(loop, ClosedLoop):
-        raise ModelError(
-            f"simulate needs a ClosedLoop, got {type(loop).__name__}. "
-            "Make it by close_loop(plant, *blocks)."
-        )
+    instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
     plant = loop.plant
     _check_sampled(loop)
     steps = round(positive(duration, "duration") / plant.dt)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, ShapeError
-from ..values import FloatArray, Value, positive, real_array, short, whole
+from ..values import FloatArray, Value, flag, positive, real_array, short, whole
 
 
 class Damping(Value):
@@ -208,11 +208,7 @@ class Rayleigh(Damping):
             alpha=positive(self.alpha, "alpha", zero=True),
             beta=positive(self.beta, "beta", zero=True),
         )
-        if not isinstance(self.rigid, bool | np.bool_):
-            raise ModelError(
-                f"rigid must be True or False, got {short(self.rigid)}: say whether alpha slows "
-                "rigid-body motions down too."
-            )
+        flag(self.rigid, "rigid")
 
     @classmethod
     def fitted(cls, freq: Iterable[float], zeta: Iterable[float]) -> Rayleigh:

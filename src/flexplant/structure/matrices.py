@@ -95,9 +95,7 @@ class FEMatrices(Value):
                 )
         if (
             self.dofs is not None
-            and len(
-                instance(self.dofs, DofSet, "dofs", "DofSet(nodes, directions, xyz) makes one.")
-            )
+            and len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
             != n
         ):
             raise ShapeError(

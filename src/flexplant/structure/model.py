@@ -79,7 +79,7 @@ class FEModel(Placed, Value):
     held_inertia: FloatArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        n = len(instance(self.dofs, DofSet, "dofs", "DofSet(nodes, directions, xyz) makes one."))
+        n = len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
         if not n:
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         digits = digits_of(self.K)

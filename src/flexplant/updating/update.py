@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantError, FlexplantWarning, ModelError, SolverError
-from ..values import FloatArray, Rng, flag, generator, positive
+from ..values import FloatArray, Rng, flag, generator, instance, positive
 from .approach import approached
 from .judgement.covariance import covariance
 from .judgement.goodness import chance, chi_square, is_bad, worst
@@ -124,10 +124,12 @@ def update(
     """
     listed = checked_parameters(parameters)
     given = checked_residuals(residuals)
-    if method is not None and not isinstance(method, UpdateMethod):
-        raise ModelError(
-            f"method must be GaussNewton(), TrustRegion(), Tikhonov() or Lasso(), got {method!r}. "
-            "Pass one of them, or None."
+    if method is not None:
+        instance(
+            method,
+            UpdateMethod,
+            "method",
+            "Pass GaussNewton() or TrustRegion().",
         )
     if max_iterations is not None:
         _checked_count(max_iterations)

@@ -15,8 +15,6 @@ from ..precision import verdict
 from .check_facts import Facts, facts
 from .check_lines import Line, listed, masses, matrices, rigid, scales, spread, zero_rows
 
-_WIDTH = 100
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ModelCheck(Value):

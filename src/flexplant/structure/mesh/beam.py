@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError
-from ...values import positive, short
+from ...values import one_of, positive, short
 from ..model import FEModel
 from .assembly import Grid
 from .elements import beam_mass, beam_stiffness
@@ -101,8 +101,5 @@ def _ends(ends: Any) -> list[tuple[str, ...]]:
             '("clamped", "free"), say.'
         )
     for end in ends:
-        if not isinstance(end, str) or end not in _ENDS:
-            raise ModelError(
-                f"an end of a beam is one of {', '.join(_ENDS)}, got {end!r}. Use one."
-            )
+        one_of(end, "an end of a beam", _ENDS)
     return [_ENDS[end] for end in ends]

@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ...errors import LabelError, ModelError
 from ...identification import MeasuredModes
-from ...values import ComplexArray, FloatArray, positive, real_array
+from ...values import ComplexArray, FloatArray, instance, positive, real_array
 from ..family import Family, groups
 from ..point_model import Point
 from .mode_shapes import chosen_modes
@@ -53,11 +53,12 @@ class Eigenvalues(Residual):
     clusters: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.measured, MeasuredModes):
-            raise ModelError(
-                f"Eigenvalues compares with MeasuredModes, got {type(self.measured).__name__}. "
-                "Pass the poles as MeasuredModes(poles, modes=[...])."
-            )
+        instance(
+            self.measured,
+            MeasuredModes,
+            "measured",
+            "Pass MeasuredModes(poles, modes=[...]).",
+        )
         if self.measured.modes is None:
             raise LabelError(
                 f"{self.measured!r} has no mode numbers: which mode of the model each pole "

@@ -12,7 +12,7 @@ import scipy.sparse as sp
 from ...errors import ModelError, ShapeError
 from ...labels import Place
 from ...lti import Frf
-from ...values import ComplexArray, FloatArray, flag, positive, real_array, short
+from ...values import ComplexArray, FloatArray, flag, instance, positive, real_array, short
 from ..family import Family
 from ..parameters.added import checked_direction
 from ..point_model import Point
@@ -86,10 +86,7 @@ class FrfResidual(Residual):
 
     def __post_init__(self) -> None:
         frf = self.measured
-        if not isinstance(frf, Frf):
-            raise ModelError(
-                f"FrfResidual needs an Frf, got {type(frf).__name__}. Pass Frf(freq, data, ...)."
-            )
+        instance(frf, Frf, "frf", "Pass Frf(freq, data, ...).")
         if (frf.quantity or "displacement") not in ORDERS:
             raise ModelError(f"quantity {frf.quantity!r} is none of {', '.join(ORDERS)}.")
         variance = self.variance

@@ -12,7 +12,7 @@ import scipy.linalg as la
 from ...errors import LabelError, ModelError, ShapeError
 from ...identification import MeasuredModes
 from ...labels import Place
-from ...values import ComplexArray, FloatArray, flag, real_array, short, whole
+from ...values import ComplexArray, FloatArray, flag, instance, real_array, short, whole
 from ..family import Family, groups
 from ..pairing import CLUSTER, measured_pairs
 from ..parameters.added import checked_direction, checked_place
@@ -74,11 +74,12 @@ class ModeShapes(Residual):
 
     def __post_init__(self) -> None:
         name = type(self).__name__
-        if not isinstance(self.measured, MeasuredModes):
-            raise ModelError(
-                f"{name} needs MeasuredModes, got {type(self.measured).__name__}. Pass "
-                "MeasuredModes(poles, modes=[...])."
-            )
+        instance(
+            self.measured,
+            MeasuredModes,
+            "measured",
+            "Pass MeasuredModes(poles, modes=[...]).",
+        )
         if self.measured.modes is None:
             raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
         checked_direction(self.direction)

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError, SolverError
-from ...values import FloatArray, positive
+from ...values import FloatArray
 from .objective import Objective
 from .trust_region import TrustRegion
-from .update_method import SearchEnd, Trail, UpdateMethod, units
+from .update_method import PenalisedMethod, SearchEnd, Trail, units
 
 #: weights on the path
 PATH = 13
@@ -22,7 +22,7 @@ NOTHING = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
-class Lasso(UpdateMethod):
+class Lasso(PenalisedMethod):
     """Sparse change: penalty ``weight |(p - start) / unit|_1`` on a sequence of linear problems.
 
     Most parameters end at exactly their start: those are the ones without a change. The convex
@@ -40,15 +40,6 @@ class Lasso(UpdateMethod):
     """
 
     weight: float | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        if self.weight is not None:
-            self._set(weight=positive(self.weight, "weight"))
-
-    @property
-    def penalised(self) -> bool:
-        """Whether the answer is drawn towards the start."""
-        return True
 
     @property
     def least_squares(self) -> bool:

@@ -6,17 +6,17 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...values import FloatArray, positive
+from ...values import FloatArray
 from .objective import Objective
 from .trust_region import TrustRegion, minimised
-from .update_method import SearchEnd, UpdateMethod, units
+from .update_method import PenalisedMethod, SearchEnd, units
 
 #: weights tried for an L-curve
 PATH = 13
 
 
 @dataclass(frozen=True, eq=False)
-class Tikhonov(UpdateMethod):
+class Tikhonov(PenalisedMethod):
     """Trust region with a penalty ``weight^2 |(p - start) / unit|^2``.
 
     The unit of each parameter is its prior standard deviation, half the width of finite bounds, or
@@ -34,15 +34,6 @@ class Tikhonov(UpdateMethod):
     """
 
     weight: float | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        if self.weight is not None:
-            self._set(weight=positive(self.weight, "weight"))
-
-    @property
-    def penalised(self) -> bool:
-        """Whether the answer is drawn towards the start."""
-        return True
 
     @property
     def least_squares(self) -> bool:

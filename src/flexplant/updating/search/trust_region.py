@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from ...errors import ModelError
-from ...values import FloatArray, positive
+from ...values import FloatArray, one_of, positive
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod, units
 
@@ -43,10 +43,7 @@ class TrustRegion(UpdateMethod):
     scale: float = field(default=1.0, kw_only=True)
 
     def __post_init__(self) -> None:
-        if self.loss not in LOSSES:
-            raise ModelError(
-                f"loss must be one of {', '.join(LOSSES)}, got {self.loss!r}. Choose one."
-            )
+        one_of(self.loss, "loss", LOSSES)
         self._set(scale=positive(self.scale, "scale"))
 
     @property

@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ...values import FloatArray, Value
+from ...values import FloatArray, Value, positive
 from .objective import Objective
 
 
@@ -108,3 +108,18 @@ def units(objective: Objective, J: FloatArray) -> FloatArray:
     felt = 1 / np.where(length > 0, length, 1.0)
     unit = np.where(np.isfinite(width), width, felt)
     return np.asarray(np.where(objective.has_prior, objective.prior_std, unit), dtype=np.float64)
+
+
+class PenalisedMethod(UpdateMethod):
+    """A method with a penalty of some weight; None: the weight is chosen from the data."""
+
+    weight: float | None
+
+    def __post_init__(self) -> None:
+        if self.weight is not None:
+            self._set(weight=positive(self.weight, "weight"))
+
+    @property
+    def penalised(self) -> bool:
+        """Whether the answer is drawn towards the start."""
+        return True
