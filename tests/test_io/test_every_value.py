@@ -12,7 +12,7 @@ import pytest
 import scipy.sparse as sp
 
 import flexplant as fx
-from flexplant import lti, placement, structure, synthesis
+from flexplant import estimation, lti, placement, structure, synthesis
 from flexplant import plant as plants
 from flexplant.errors import FlexplantError
 from flexplant.estimation.left_out import LeftOut
@@ -98,11 +98,17 @@ def made():
     yield from of_reductions(fe, modes, rom)
     yield from (plant, sampled, sampled.weighted(z={"die:z": 2.0}), uncertain, plant.check())
     yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
-    yield from (static, fx.design_kalman(sampled), servo, loop, point, response)
+    yield from (static, servo, loop, point, response)
+    yield from of_estimators(sampled, small)
     yield from (fx.Riccati(), fx.testbeds.wafer_stage(), sensors, solution)
     more = a_system()
     yield from (lti.balanced(more, order=2), lti.modal_form(more), lti.norm_report(more))
-    yield from (lti.split_stable(more), synthesis.Lmi(), placement.Exchange())
+    yield from (
+        lti.split_stable(more),
+        synthesis.Lmi(),
+        synthesis.StructuredLmi(),
+        placement.Exchange(),
+    )
     yield from (placement.Exhaustive(), placement.PoiLqr("die"), placement.PoiVariance("die"))
     yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)
     yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)
@@ -113,6 +119,20 @@ def made():
     yield structure.interpolated(modes.dofs).interpolation
     yield from (g, fx.frequency_response(g, np.array([1.0, 2.0])))
     yield from of_structures()
+
+
+def of_estimators(plant, small):
+    """One of each way to estimate, and what is said of the answer."""
+    kalman, rng = fx.design_kalman(plant), np.random.default_rng(4)
+    records = {name: 1e-9 * rng.standard_normal(5) for name in (*plant.y, *plant.u)}
+    yield from (kalman, kalman.model, kalman.estimate(records))
+    yield from (estimation.Predictor(), estimation.Filter(), estimation.FixedLag(2))
+    yield from (estimation.Smoother(), estimation.Unbiased(), estimation.Augmented(1.0))
+    yield estimation.design_hinf_filter(small, accuracy=0.5)
+    yield estimation.design_minimax_filter(small, [small], iterations=2)
+    unknown = [name for name in small.w if not name.endswith(":noise")][:1]
+    yield estimation.invertibility(small, unknown)
+    yield estimation.design_input_estimator(small, unknown, estimation.Augmented(1.0))
 
 
 def of_reductions(fe, modes, rom):
