@@ -114,6 +114,8 @@ def made():
     yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)
     yield from (plants.GroundSpring(Z8, 1e3), plants.decouple(plant), plants.FastStates())
     yield plants.StandardPlant.from_statespace(plant.system)
+    yield from (plants.FirstOrder(1e-3, 10.0), plants.NarrowBand(1e-3, 50.0))
+    yield from (plants.RandomWalk(1e-3), plants.RigidForce("drag", asd=1e-3))
     yield from (plants.Feedthrough(), plants.OutputDisturbance("hum", "y1", asd=1e-12))
     yield from (plants.BaseAcceleration("floor", asd=1e-3), plant.along("die", CORNERS))
     yield structure.interpolated(modes.dofs).interpolation
@@ -130,6 +132,7 @@ def of_estimators(plant, small):
     yield from (estimation.Smoother(), estimation.Unbiased(), estimation.Augmented(1.0))
     yield estimation.design_hinf_filter(small, accuracy=0.5)
     yield estimation.design_minimax_filter(small, [small], iterations=2)
+    yield estimation.design_multirate(small, {"y1": 2})
     unknown = [name for name in small.w if not name.endswith(":noise")][:1]
     yield estimation.invertibility(small, unknown)
     yield estimation.design_input_estimator(small, unknown, estimation.Augmented(1.0))
