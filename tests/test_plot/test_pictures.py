@@ -307,3 +307,31 @@ def test_predictions_beside_what_was_found():
         fx.plot.predictions({"hopeful": [(1.0, 2.0)]})
     with pytest.raises(ModelError, match="positive"):
         fx.plot.predictions({"none": [(0.0, 1.0, 0.9, 1.1)]})
+
+
+def test_an_estimate_with_its_band_and_what_waiting_brings():
+    observer = fx.design_kalman(sampled(some_modes()))
+    report = observer.report()
+    ax = fx.plot.lag_report(report, "die:rx")
+    assert texts(ax) == {"estimate with this lag", "filter", "predictor", "smoother",
+                         "static relation"}  # fmt: skip
+    line = ax.get_lines()[0]
+    np.testing.assert_allclose(line.get_xdata(), 1e3 * report.lag[1:])
+    np.testing.assert_allclose(line.get_ydata(), 1e9 * report.curve[1:, 1], rtol=1e-12)
+    assert ax.get_ylabel() == "rms error of die:rx [nrad]"
+    assert ink(ax) > 0.005
+    rng = np.random.default_rng(0)
+    names = (*observer.sensors, *observer.plant.u)
+    result = observer.estimate({name: 1e-9 * rng.standard_normal(40) for name in names})
+    ax = fx.plot.estimate(result)
+    np.testing.assert_allclose(ax.get_lines()[0].get_xdata(), result.time)
+    assert ax.get_ylabel().startswith("die:hat [")
+    assert ink(ax) > 0.005
+    ax = fx.plot.estimate(result, "y1:innovation", deviations=3.0)
+    assert "\N{PLUS-MINUS SIGN} 3 deviations" in texts(ax)
+    ax = fx.plot.estimate(result, truth=np.nan_to_num(result["die:hat"]))
+    assert np.nanmax(np.abs(ax.get_lines()[0].get_ydata())) == 0.0
+    with pytest.raises(ModelError, match="Estimate"):
+        fx.plot.estimate(report)
+    with pytest.raises(ModelError, match="LagReport"):
+        fx.plot.lag_report(result)

@@ -12,6 +12,7 @@ from .input_estimator import InputEstimator as InputEstimator
 from .invertibility import Invertibility as Invertibility
 from .invertibility import invertibility as invertibility
 from .kalman import design_kalman as design_kalman
+from .lag_report import LagReport as LagReport
 from .lags import Filter as Filter
 from .lags import FixedLag as FixedLag
 from .lags import Predictor as Predictor

@@ -16,7 +16,7 @@ from .channels import estimates
 from .filter_model import FilterModel
 from .lags import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import Passage, passed
-from .records import Recorded, recorded
+from .records import recorded
 from .sight import Sight
 from .smoothing import lagged, smoothed
 from .start import Start, stationary_start
@@ -165,19 +165,17 @@ def estimated(
             "Filter(), FixedLag(samples) or Smoother()."
         )
     record = recorded(records, model)
-    d, s = scale_of(P.diagonal()), scale_of(model.innovation(P).diagonal())
-    unit = model.scaled(d, s)
-    steady = Steady(unit, P / d / d[:, None])
-    sight = Sight(
-        np.hstack([unit.C1, unit.N])[None], unit.D1[None], np.diagonal(unit.V)[None].copy()
-    )
+    steady, sight, d, s = in_unit_states(model, P)
     first: Start | FloatArray = (
-        stationary_start(unit) if start is None else real_array(start, "start", (d.size,)) / d
+        stationary_start(steady.model)
+        if start is None
+        else real_array(start, "start", (d.size,)) / d
     )
     later = isinstance(lag, FixedLag | Smoother)
     passage = passed(
         steady,
-        Recorded(record.time, record.y / s, record.u),
+        record,
+        s,
         sight,
         first,
         predict=isinstance(lag, Predictor),
@@ -187,17 +185,38 @@ def estimated(
     return Estimate(
         record.time,
         estimates(model.channels),
-        hat.T,
-        np.sqrt(np.maximum(variance, 0.0)).T,
+        _across(hat),
+        _across(np.sqrt(np.maximum(variance, 0.0))),
         model.sensors,
-        (passage.innovations * s).T,
-        (passage.deviation * s).T,
-        passage.whitened.T,
+        _across(passage.innovations),
+        _across(passage.deviation),
+        _across(passage.whitened),
         lag,
         passage.state * d,
         known_units(units, estimates(model.channels))
         | {f"{name}:innovation": units[name] for name in model.sensors if name in units},
     )
+
+
+def in_unit_states(
+    model: FilterModel, P: FloatArray
+) -> tuple[Steady, Sight, FloatArray, FloatArray]:
+    """Return the stationary filter and the POIs in states x / d and measurements y / s."""
+    d, s = scale_of(P.diagonal()), scale_of(model.innovation(P).diagonal())
+    unit = model.scaled(d, s)
+    sight = Sight(
+        np.hstack([unit.C1, unit.N])[None], unit.D1[None], np.diagonal(unit.V)[None].copy()
+    )
+    return Steady(unit, P / d / d[:, None]), sight, d, s
+
+
+def _across(columns: FloatArray) -> FloatArray:
+    """Return the transpose as a read-only array of its own, which a value takes without a copy."""
+    rows = columns.base
+    if rows is None or rows.strides != columns.strides[::-1]:
+        rows = np.array(columns.T, order="C")
+    rows.flags.writeable = False
+    return rows
 
 
 def _by(passage: Passage, sight: Sight, lag: Lag) -> tuple[FloatArray, FloatArray]:

@@ -9,14 +9,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ..errors import ModelError, ShapeError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, with_unit
+from ..values import FloatArray, Value, real_array, with_unit
 from .certificate import KalmanCertificate
 from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
-from .estimate import Estimate, estimated
+from .estimate import Estimate, estimated, in_unit_states
 from .filter_model import FilterModel, filter_model
+from .lag_report import LAGS, LagReport, lag_report
 from .lags import Filter, Lag
 from .left_out import LeftOut
 from .mesh import NODES, NOTED
@@ -160,7 +162,7 @@ class KalmanEstimator(Value):
         Until its gain is stationary the filter is the time-varying one, and so it is in and after
         gaps, where the sensors that are there go on to count; then it runs in blocks of samples.
         It counts as stationary when what is left changes all later estimates and innovations
-        together by less than 1e-8 of their variance.
+        together by less than 1e-6 of their variance.
 
         Parameters
         ----------
@@ -203,6 +205,94 @@ class KalmanEstimator(Value):
             start,
             self.plant.units,
         )
+
+    def step(
+        self, y: FloatArray, u: FloatArray, state: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the estimates at one sample and the state for the next: for loops in real time.
+
+        ::
+
+            state = None
+            for y, u in samples:
+                hat, state = observer.step(y, u, state)
+
+        Parameters
+        ----------
+        y : (ny,) array
+            The measurements, in the order of `sensors`.
+        u : (nu,) array
+            The commands of the same sample, in the order of `plant.u`.
+        state : (n,) array, optional
+            What the call before returned; a machine at rest when not given.
+
+        Returns
+        -------
+        tuple of arrays
+            The estimates (nz,) in the order of `system.outputs`, and the state x[k+1|k] (n,).
+
+        Raises
+        ------
+        ShapeError
+            When a size is another one.
+        ModelError
+            When a value is NaN: a missing sample needs another gain, which `estimate` finds.
+        """
+        matrix, sizes = self._stepper
+        x = np.zeros(sizes[0]) if state is None else state
+        parts = [x, y, u]
+        for i, name in enumerate(("state", "y", "u")):
+            part = parts[i]
+            if not (isinstance(part, np.ndarray) and part.dtype == np.float64):
+                part = parts[i] = real_array(part, name)
+            if part.shape != (sizes[i],):
+                raise ShapeError(
+                    f"{name} must have shape ({sizes[i]},), got {part.shape}. Pass one sample of "
+                    f"all channels: y of {', '.join(self.sensors)}; u of {', '.join(self.plant.u)}."
+                )
+        out = matrix @ np.concatenate(parts)
+        if out[-1] != out[-1]:  # NaN anywhere is NaN everywhere in a product
+            raise ModelError(
+                "a measurement, a command or the state is NaN: the stationary gain needs all "
+                "of them. Pass records with NaN to observer.estimate, which goes on without them."
+            )
+        nz = out.size - sizes[0]
+        return out[:nz], out[nz:]
+
+    @cached_property
+    def _stepper(self) -> tuple[FloatArray, tuple[int, int, int]]:
+        """``[hat; x+] = matrix [x; y; u]``, and the sizes of x, y and u."""
+        g, ny = self.system, len(self.sensors)
+        return np.block([[g.C, g.D], [g.A, g.B]]), (g.n_states, ny, len(g.inputs) - ny)
+
+    def report(self, lags: npt.ArrayLike = LAGS) -> LagReport:
+        """Return the rms errors at the POIs by lag, beside the static relation; prints as a table.
+
+        Predictor, filter, some lags and the smoother, all stationary: how much is gained by
+        knowing an estimate later. `fx.plot.lag_report` draws it.
+
+        Parameters
+        ----------
+        lags : (k,) array [s]
+            Rounded to samples; those below half a sample are left out.
+
+        Returns
+        -------
+        LagReport
+
+        Raises
+        ------
+        ModelError
+            When lags are not positive numbers.
+        """
+        steady, sight, _, _ = in_unit_states(self.model, self.predicted_covariance)
+        filtered = sight.variances(steady.form(steady.P, steady.gains, predict=False))[0]
+        whole = self.variances if self.left_out is not None else filtered
+        return lag_report(self.plant, steady, sight, np.sqrt(whole), lags, poi_channels(self.plant))
+
+    def to_control(self) -> Any:
+        """Return the filter as a `control.StateSpace`, sensors and u to estimates, same names."""
+        return self.system.to_control()
 
     def to_filterpy(self) -> Any:
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.

@@ -17,7 +17,7 @@ from .unknowns import KnownParameters, Unknowns
 
 #: the gain counts as stationary when all that its last changes would still do to the estimates and
 #: innovations, summed over time, is this part of their variances
-SETTLED = 1e-8
+SETTLED = 1e-6
 #: samples between two looks whether it is
 _LOOK = 16
 
@@ -57,6 +57,7 @@ class Passage(NamedTuple):
 def passed(
     steady: Steady,
     record: Recorded,
+    s: FloatArray,
     sight: Sight,
     start: Start | FloatArray,
     *,
@@ -70,7 +71,9 @@ def passed(
     steady : Steady
         The stationary filter, in states and sensors of unit variance.
     record : Recorded
-        In the same units.
+        In the units of the sensors.
+    s : (ny,) array
+        Units of the stationary filter's measurements.
     sight : Sight
         Of the POIs.
     start : Start or (n,) array
@@ -80,30 +83,44 @@ def passed(
     keep : bool
         Whether a later pass needs the moments at which the gain was not stationary.
     """
-    return _Walk(steady, record, sight, predict=predict, keep=keep).done(start)
+    return _Walk(steady, record, s, sight, predict=predict, keep=keep).done(start)
 
 
 class _Walk:
     """The walk through one record; its arrays are filled on the way."""
 
     def __init__(
-        self, steady: Steady, record: Recorded, sight: Sight, *, predict: bool, keep: bool
+        self,
+        steady: Steady,
+        record: Recorded,
+        s: FloatArray,
+        sight: Sight,
+        *,
+        predict: bool,
+        keep: bool,
     ) -> None:
+        self.s = s
         self.steady, self.model, self.sight = steady, steady.model, sight
         self.predict, self.keep = predict, keep
         self.there = np.asarray(np.isfinite(record.y))
-        self.y, self.u = np.where(self.there, record.y, 0.0), record.u
+        self.whole = np.all(self.there, axis=1, keepdims=True)[:, 0]
+        both = record.both
+        if not self.whole.all():
+            both = both.copy()
+            both[:, : record.ny][~self.there] = 0.0
+        self.both, self.y, self.u = both, both[:, : record.ny], record.u
         (N, ny), nz = record.y.shape, sight.c.shape[1]
-        self.hat, self.variance = np.empty((N, nz)), np.empty((N, nz))
-        self.white = np.zeros((N, ny))
-        self.innovations, self.deviation = np.full((N, ny), np.nan), np.full((N, ny), np.nan)
-        self.whitened = np.full((N, ny), np.nan)
+        # channel by channel in memory: so the estimate takes them
+        self.hat, self.variance = np.empty((nz, N)).T, np.empty((nz, N)).T
+        self.white = np.zeros((N, ny) if keep else (0, ny))
+        self.innovations, self.deviation = np.empty((ny, N)).T, np.empty((ny, N)).T
+        self.whitened = np.empty((ny, N)).T
         self.moments: dict[int, Moment] = {}
         self.found: KnownParameters | None = None
 
     def done(self, start: Start | FloatArray) -> Passage:
         """Walk from a start to the end of the record."""
-        N, whole = self.y.shape[0], np.all(self.there, axis=1, keepdims=True)[:, 0]
+        N, whole = self.y.shape[0], self.whole
         gaps = np.flatnonzero(~whole)
         stretches: list[tuple[int, int, bool]] = []
         if isinstance(start, Start):
@@ -141,7 +158,7 @@ class _Walk:
         m, there = self.model, self.there[k]
         g = gains(m, P, there)
         here = self.sight.at(k)
-        e = np.where(there, self.y[k] - m.C2 @ x - m.D2 @ self.u[k], 0.0)
+        e = np.where(there, self.y[k] / self.s - m.C2 @ x - m.D2 @ self.u[k], 0.0)
         enter = self.steady.entering(g, predict=self.predict)
         n = x.size
         form = self.steady.form(P, g, predict=self.predict)
@@ -151,7 +168,8 @@ class _Walk:
         C = m.C2 @ Z
         before = self.found if Z.shape[1] else None
         self._innovate(k, e, m.innovation(P), C, before)
-        self.white[k] = white
+        if self.keep:
+            self.white[k] = white
         shown, seen = g.W @ C, here.c[:, :n] @ Z - here.c @ (enter @ (C * there[:, None]))
         self.hat[k], self.variance[k] = hat, variance
         if Z.shape[1]:
@@ -181,6 +199,7 @@ class _Walk:
     ) -> None:
         """Record the innovation with what is known of delta before the measurement."""
         there = np.flatnonzero(self.there[k])
+        self.innovations[k] = self.deviation[k] = self.whitened[k] = np.nan
         if C.shape[1]:
             if found is None:
                 return
@@ -190,8 +209,8 @@ class _Walk:
             S = S + (C @ found.X) @ (C @ found.X).T
         else:
             known = there
-        self.innovations[k, known] = e[known]
-        self.deviation[k, known] = np.sqrt(S.diagonal()[known])
+        self.innovations[k, known] = (self.s * e)[known]
+        self.deviation[k, known] = (self.s * np.sqrt(S.diagonal()))[known]
         if known.size == there.size and there.size:
             root = np.linalg.cholesky(S[np.ix_(there, there)])
             self.whitened[k, there] = np.linalg.solve(root, e[there])
@@ -231,16 +250,26 @@ class _Walk:
         moved = np.zeros((see.shape[0], self.u.shape[1])) if not fixed else here.D1[0]
         system = Recursion(
             self.steady.F,
-            np.hstack([g.K, m.B - g.K @ m.D2]),
-            np.vstack([see[:, :n] - direct @ m.C2, -g.W @ m.C2]),
-            np.block([[direct, moved - direct @ m.D2], [g.W, -g.W @ m.D2]]),
-        )
-        out, x = system.run(np.hstack([self.y[at], self.u[at]]), x)
-        watched, white = out[:, :-ny], out[:, -ny:]
-        self.hat[at] = watched if fixed else here.applied(watched) + here.commanded(self.u[at])
+            np.hstack([g.K / self.s, m.B - g.K @ m.D2]),
+            np.vstack([see[:, :n] - direct @ m.C2, -m.C2 * self.s[:, None]]),
+            np.block([
+                [direct / self.s, moved - direct @ m.D2],
+                [np.eye(ny), -m.D2 * self.s[:, None]],
+            ]),
+        )  # fmt: skip
+        whiten = (g.W / self.s).T
+        for piece, out, state in system.pieces(self.both[at], x):
+            now, x = slice(first + piece.start, first + piece.stop), state
+            e = out[:, -ny:]
+            watched = out[:, :-ny]
+            if not fixed:
+                watched = here.part(piece).applied(watched)
+                watched += here.part(piece).commanded(self.u[now])
+            self.hat[now], self.innovations[now] = watched, e
+            white = e @ whiten
+            self.whitened[now] = white
+            if self.keep:
+                self.white[now] = white
         self.variance[at] = here.variances(self.steady.form(self.steady.P, g, predict=self.predict))
-        self.white[at] = self.whitened[at] = white
-        S = m.innovation(self.steady.P)
-        self.innovations[at] = white @ np.linalg.inv(g.W).T
-        self.deviation[at] = np.sqrt(S.diagonal())
+        self.deviation[at] = self.s * np.sqrt(m.innovation(self.steady.P).diagonal())
         return x

@@ -12,11 +12,24 @@ from .filter_model import FilterModel
 
 
 class Recorded(NamedTuple):
-    """A record: time (N,), measurements y (N, ny) with NaN where missing, commands u (N, nu)."""
+    """A record: time (N,), and measurements y with NaN where missing beside commands u.
+
+    `both` is [y u] (N, ny + nu).
+    """
 
     time: FloatArray
-    y: FloatArray
-    u: FloatArray
+    both: FloatArray
+    ny: int
+
+    @property
+    def y(self) -> FloatArray:
+        """Measurements (N, ny)."""
+        return self.both[:, : self.ny]
+
+    @property
+    def u(self) -> FloatArray:
+        """Commands (N, nu)."""
+        return self.both[:, self.ny :]
 
 
 def recorded(records: Any, model: FilterModel) -> Recorded:
@@ -67,8 +80,10 @@ def recorded(records: Any, model: FilterModel) -> Recorded:
     count = next(iter(sizes.values()))
     if not count:
         raise ShapeError("the record holds no samples: there is nothing to estimate from.")
-    commands = np.column_stack(u) if u else np.zeros((count, 0))
-    return Recorded(_time(records, known, count, model.dt), np.column_stack(y), commands)
+    both = np.empty((count, len(sizes)))
+    for i, part in enumerate((*y, *u)):
+        both[:, i] = part
+    return Recorded(_time(records, known, count, model.dt), both, len(y))
 
 
 def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
@@ -83,7 +98,7 @@ def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
             f"channel {name!r} must be (N,), one run over time, got {array.shape}. Of several runs "
             "take one: response.replace(data=response.data[0])."
         )
-    if missing and not np.any(np.isinf(array)):
+    if np.all(np.isfinite(array)) or (missing and not np.any(np.isinf(array))):
         return array
     return real_array(array, f"channel {name!r}")
 

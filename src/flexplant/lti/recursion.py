@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,8 @@ from ..values import FloatArray
 
 #: samples in a block; a block costs 2 _BLOCK^2 p m operations, a state 4 n^2 for each block
 _BLOCK = 8
+#: samples in a piece, whose arrays stay in the cache
+_PIECE = 4096
 
 
 class Recursion(NamedTuple):
@@ -21,28 +24,38 @@ class Recursion(NamedTuple):
     J: FloatArray
 
     def run(self, v: FloatArray, start: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return the outputs (N, p) for inputs (N, m) and a first state (n,), and the last state.
+        """Return the outputs (N, p) for inputs (N, m) from a first state (n,), and the last one."""
+        out, x = np.empty((v.shape[0], self.J.shape[0])), start
+        for piece, part, after in self.pieces(v, start):
+            out[piece], x = part, after
+        return out, x
+
+    def pieces(
+        self, v: FloatArray, start: FloatArray
+    ) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
+        """Yield samples, their outputs (k, p) and the state after them, piece by piece.
 
         With ``F^i`` and the Markov parameters over a block of b samples,
         ``out = O x + T v`` and ``x[k+b] = F^b x[k] + R v`` are products of large matrices. The
         states at the starts of blocks are found in chains of blocks side by side from zero, then
-        the starts of the chains one after the other.
+        the starts of the chains one after the other. A piece fits into the cache.
         """
-        count, (p, m) = v.shape[0], self.J.shape
-        n = self.F.shape[0]
-        blocks = count // _BLOCK
-        out = np.empty((count, p))
-        if not blocks:
-            return self._plain(v, start, out)
-        whole = blocks * _BLOCK
+        p, m = self.J.shape
+        n, x = self.F.shape[0], start
         enter, see, step = self._block()
-        inputs = np.ascontiguousarray(v[:whole]).reshape(blocks, _BLOCK * m)
-        states = _states(step, inputs @ enter.T, start)
-        joined = out[:whole].reshape(blocks, _BLOCK * p)
-        np.matmul(inputs, self._toeplitz().T, out=joined)
-        joined += states[:-1] @ see.reshape(_BLOCK * p, n).T
-        _, last = self._plain(v[whole:], states[-1], out[whole:])
-        return out, last
+        see, toeplitz = see.reshape(_BLOCK * p, n).T, self._toeplitz().T
+        whole = v.shape[0] // _BLOCK * _BLOCK
+        for first in range(0, whole, _PIECE):
+            piece = slice(first, min(first + _PIECE, whole))
+            inputs = np.ascontiguousarray(v[piece]).reshape(-1, _BLOCK * m)
+            states = _states(step, inputs @ enter.T, x)
+            out = inputs @ toeplitz
+            out += states[:-1] @ see
+            x = states[-1]
+            yield piece, out.reshape(-1, p), x
+        if whole < v.shape[0]:
+            rest, x = self._plain(v[whole:], x, np.empty((v.shape[0] - whole, p)))
+            yield slice(whole, v.shape[0]), rest, x
 
     def _plain(
         self, v: FloatArray, x: FloatArray, out: FloatArray
@@ -78,27 +91,23 @@ def _states(step: FloatArray, entering: FloatArray, start: FloatArray) -> FloatA
     length = max(int(np.sqrt(count)), 1)
     chains = count // length
     whole = chains * length
-    x = np.zeros((count + 1, n))
+    x = np.empty((count + 1, n))
     x[0] = start
     if chains > 1:
         parts = entering[:whole].reshape(chains, length, n)
-        own = np.empty((length + 1, chains, n))
-        own[0] = 0.0
-        for i in range(length):
-            np.matmul(own[i], step.T, out=own[i + 1])
-            own[i + 1] += parts[:, i]
-        powers = [np.eye(n)]
-        for _ in range(length):
-            powers.append(step @ powers[-1])
-        first = np.empty((chains + 1, n))
+        own = np.zeros((chains, n))
+        for i in range(length):  # the end of each chain when it starts from zero
+            own = own @ step.T + parts[:, i]
+        jump = np.linalg.matrix_power(step, length)
+        first = np.empty((chains, n))
         first[0] = start
-        for j in range(chains):
-            first[j + 1] = powers[length] @ first[j] + own[length, j]
-        moved = first[:-1] @ np.vstack(powers[:length]).T
-        x[:whole] = (moved.reshape(chains, length, n) + own[:length].transpose(1, 0, 2)).reshape(
-            whole, n
-        )
-        x[whole] = first[-1]
+        for j in range(chains - 1):
+            first[j + 1] = jump @ first[j] + own[j]
+        inside = x[:whole].reshape(chains, length, n)
+        inside[:, 0] = first
+        for i in range(1, length):
+            inside[:, i] = inside[:, i - 1] @ step.T + parts[:, i - 1]
+        x[whole] = step @ x[whole - 1] + entering[whole - 1]
     else:
         whole = 0
     for j in range(whole, count):

@@ -2,6 +2,8 @@
 
 from .budget import budget as budget
 from .error_map import error_map as error_map
+from .estimation import estimate as estimate
+from .estimation import lag_report as lag_report
 from .estimation import predictions as predictions
 from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity

@@ -10,9 +10,12 @@ from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
 from ..errors import ModelError
+from ..estimation import Estimate, LagReport
+from ..estimation.channels import row_of
+from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
-from ..values import FloatArray, real_array, scale, short
-from ._axes import CYCLE, MEASURED, axes, finish
+from ..values import FloatArray, positive, real_array, scale, short
+from ._axes import CYCLE, MEASURED, NOMINAL, UPDATED, axes, finish
 
 
 def predictions(
@@ -73,6 +76,115 @@ def predictions(
         handles=_legend(), frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2
     )
     return finish(ax, x=f"rms error{title} [{prefix}{unit}]", y="")
+
+
+def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None = None) -> Axes:
+    """Draw the rms error of an estimate over the lag after which it is known.
+
+    Parameters
+    ----------
+    report : LagReport
+        From `observer.report()`.
+    channel : str, optional
+        A POI's motion; the first when not given.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        The curve starts at one sample; predictor, smoother and static relation are level lines.
+
+    Raises
+    ------
+    ModelError
+        When it is no LagReport.
+    LabelError
+        When it has no such channel.
+    """
+    if not isinstance(report, LagReport):
+        raise ModelError(f"need a LagReport, got {short(report)}. Pass observer.report().")
+    row = row_of(report.channels, report.channels[0] if channel is None else channel)
+    name = report.channels[row]
+    unit = report.units.get(name, "")
+    factor, prefix = scale(float(report.curve[0, row])) if unit else (1.0, "")
+    ax = axes(ax, figsize=(7.0, 4.0))
+    later = report.lag > 0
+    ax.semilogx(1e3 * report.lag[later], report.curve[later, row] / factor, color=UPDATED,
+                label="estimate with this lag")  # fmt: skip
+    levels = (("filter", "tab:orange", "--"), (PREDICTOR, "tab:red", ":"),
+              (SMOOTHER, MEASURED, "--"), (STATIC, NOMINAL, "-."))  # fmt: skip
+    for level, color, style in levels:
+        value = float(report[level][row])
+        if np.isfinite(value):
+            ax.axhline(value / factor, color=color, linestyle=style, linewidth=1.2, label=level)
+    static = float(report[STATIC][row])
+    if np.isfinite(static) and static > 3 * report[PREDICTOR][row]:
+        ax.set_yscale("log")
+    else:
+        ax.set_ylim(bottom=0.0)
+    ax.legend(frameon=False, fontsize="small", loc="center right")
+    return finish(ax, x="lag [ms]", y=f"rms error of {name} [{prefix}{unit or '?'}]")
+
+
+def estimate(
+    result: Estimate,
+    channel: str | None = None,
+    *,
+    truth: npt.ArrayLike | None = None,
+    deviations: float = 2.0,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw an estimate over time with the band of its deviation.
+
+    Parameters
+    ----------
+    result : Estimate
+        From `observer.estimate(records)`.
+    channel : str, optional
+        `die:hat` or `y1:innovation`; the first estimate when not given.
+    truth : (N,) array, optional
+        The motion, where it is known: then the error of the estimate is drawn.
+    deviations : float
+        Half the width of the band.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ModelError
+        When it is no Estimate, or the truth or the width is no number.
+    ShapeError
+        When the truth has another length.
+    LabelError
+        When there is no such channel.
+    """
+    if not isinstance(result, Estimate):
+        raise ModelError(
+            f"need an Estimate, got {short(result)}. Pass what observer.estimate returned."
+        )
+    name = result.names[0] if channel is None else channel
+    signal, spread = result[name], positive(deviations, "deviations") * result.deviation(name)
+    middle = np.zeros_like(signal) if name.endswith(":innovation") else signal
+    label = name
+    if truth is not None:
+        signal = signal - real_array(truth, "truth", signal.shape)
+        middle, label = np.zeros_like(signal), f"error of {name}"
+    unit = result.units.get(name, "")
+    known = np.isfinite(signal) & np.isfinite(spread)
+    size = float(np.max(np.abs(signal[known]), initial=0.0))
+    factor, prefix = scale(size) if unit else (1.0, "")
+    ax = axes(ax, figsize=(8.0, 3.6))
+    low, high = (np.where(known, middle + s * spread, np.nan) / factor for s in (-1.0, 1.0))
+    ax.fill_between(result.time, low, high, color=UPDATED, alpha=0.25, linewidth=0.0,
+                    label=f"\N{PLUS-MINUS SIGN} {deviations:g} deviations")  # fmt: skip
+    ax.plot(result.time, signal / factor, color=UPDATED, linewidth=0.8, label=label)
+    ax.legend(frameon=False, loc="upper right")
+    return finish(ax, x="time [s]", y=f"{label} [{prefix}{unit or '?'}]")
 
 
 def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:

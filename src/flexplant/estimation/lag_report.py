@@ -1,0 +1,177 @@
+"""What waiting brings: the predicted error at the POIs by lag, beside the static relation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import FlexplantError, ModelError, unknown_label
+from ..lti.lyapunov import solve_stein
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, real_array
+from .channels import row_of
+from .sight import Sight
+from .static import design_static
+from .steady import Steady
+
+#: lags of the table [s]
+LAGS = (1e-4, 1e-3, 1e-2)
+#: points of the curve over the lag
+_POINTS = 60
+#: what the rows without a lag in seconds are called
+PREDICTOR, FILTER, SMOOTHER, STATIC = "predictor", "filter", "smoother", "static relation"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LagReport(Value):
+    """The stationary rms errors of one filter by lag; prints as a table.
+
+    On the filter's own model, where modes left out are white noise; `on_whole` holds the filter's
+    error on the plant with these modes.
+
+    Parameters
+    ----------
+    channels : sequence of str
+        The POI motions.
+    names : sequence of str
+        The rows: static relation, predictor, filter, lags such as "1 ms", smoother.
+    rms : (n_row, nz) array [m or rad]
+        Of the errors; NaN where there is no static relation.
+    lag : (n,) array [s]
+        Of the curve, from 0, which is the filter.
+    curve : (n, nz) array [m or rad]
+        The rms by lag.
+    on_whole : (nz,) array
+        Of the filter on the plant with the modes left out; equal to its row where none are known.
+    note : str
+        Why there is no static relation, or "".
+    units : mapping {channel: unit}
+        SI units.
+    """
+
+    channels: Sequence[str]
+    names: Sequence[str]
+    rms: FloatArray
+    lag: FloatArray
+    curve: FloatArray
+    on_whole: FloatArray
+    note: str = ""
+    units: Mapping[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        self._set(
+            channels=tuple(self.channels),
+            names=tuple(self.names),
+            rms=np.asarray(self.rms, dtype=np.float64),
+            lag=real_array(self.lag, "lag", (None,)),
+            curve=real_array(self.curve, "curve", (None, len(self.channels))),
+            on_whole=real_array(self.on_whole, "on_whole", (len(self.channels),)),
+            units=dict(self.units),
+        )
+
+    def __getitem__(self, row: str) -> FloatArray:
+        """Return the rms errors (nz,) of one row, such as "smoother" or "1 ms"."""
+        if row not in self.names:
+            raise unknown_label("row", row, self.names)
+        return np.asarray(self.rms[list(self.names).index(row)])
+
+    def recovered(self, row: str, channel: str) -> float:
+        """Return which part of the variance that smoothing can take away a row takes away.
+
+        Parameters
+        ----------
+        row : str
+            Such as "1 ms".
+        channel : str
+            A POI's motion.
+
+        Raises
+        ------
+        LabelError
+            When there is no such row or channel.
+        """
+        i = row_of(self.channels, channel)
+        filtered, smooth = self[FILTER][i] ** 2, self[SMOOTHER][i] ** 2
+        return float((filtered - self[row][i] ** 2) / (filtered - smooth))
+
+    def __repr__(self) -> str:
+        scaled = [self.units.get(name, "") in ("m", "rad") for name in self.channels]
+        heads = [
+            f"{name} [{'n' if small else ''}{self.units.get(name, '?')}]"
+            for name, small in zip(self.channels, scaled, strict=True)
+        ]
+        width = max(14, *(len(head) + 2 for head in heads))
+        lines = ["rms error at the POIs by lag"]
+        lines.append(f"{'':17s}" + "".join(f"{head:>{width}s}" for head in heads))
+        factor = np.where(scaled, 1e9, 1.0)
+        for name, row in zip(self.names, self.rms * factor, strict=True):
+            cells = ("-" if np.isnan(value) else f"{value:.4g}" for value in row)
+            lines.append(f"{name:17s}" + "".join(f"{cell:>{width}s}" for cell in cells))
+        if not np.allclose(self.on_whole, self[FILTER], rtol=1e-6, atol=0.0):
+            cells = (f"{value:.4g}" for value in self.on_whole * factor)
+            lines.append(f"{'filter *':17s}" + "".join(f"{cell:>{width}s}" for cell in cells))
+            lines.append("* on the plant with the modes left out, which are white noise above")
+        if self.note:
+            lines.append(f"no static relation: {self.note}")
+        return "\n".join(lines)
+
+
+@one_thread()
+def lag_report(
+    plant: StandardPlant,
+    steady: Steady,
+    sight: Sight,
+    on_whole: FloatArray,
+    lags: npt.ArrayLike,
+    channels: Sequence[str],
+) -> LagReport:
+    """Return the report of a stationary filter.
+
+    ``var(l) = var(filter) - T M_l T'``, M_l what l further samples say of the state, up to
+    ``M = F' M F + C2' S^-1 C2`` of the smoother.
+    """
+    wanted = real_array(lags, "lags", (None,))
+    if wanted.size and not np.min(wanted) > 0:
+        raise ModelError(f"lags must be positive times [s], got {np.min(wanted):g}. Try 1e-3.")
+    counts = {f"{1e3 * s:.4g} ms": round(s / plant.dt) for s in sorted(wanted.tolist())}
+    counts = {name: count for name, count in counts.items() if count}
+    g, F = steady.gains, steady.F
+    here = sight.at(0)
+    base = sight.variances(steady.form(steady.P, g, predict=False))[0]
+    predicted = sight.variances(steady.form(steady.P, g, predict=True))[0]
+    rows = here.c @ steady.onward(steady.P, g)
+    seen = g.W @ steady.model.C2
+    total = solve_stein(F.T, seen.T @ seen)
+    smooth = base - np.einsum("zi,ij,zj->z", rows, total, rows)
+    longest = max([*counts.values(), 10])
+    curve = np.empty((longest + 1, base.size))
+    curve[0] = base
+    w = rows
+    for k in range(1, longest + 1):
+        curve[k] = curve[k - 1] - np.sum((w @ seen.T) ** 2, axis=1)
+        w = w @ F.T
+    static, note = _static(plant, channels)
+    table = [static**2, predicted, base, *(curve[k] for k in counts.values()), smooth]
+    shown = np.unique(np.geomspace(1, longest + 1, _POINTS).astype(np.int64)) - 1
+    return LagReport(
+        channels,
+        (STATIC, PREDICTOR, FILTER, *counts, SMOOTHER),
+        np.sqrt(np.maximum(table, 0.0)),
+        np.asarray(plant.dt * shown, dtype=np.float64),
+        np.sqrt(np.maximum(curve[shown], 0.0)),
+        on_whole,
+        note,
+        {name: plant.units[name] for name in channels if name in plant.units},
+    )
+
+
+def _static(plant: StandardPlant, channels: Sequence[str]) -> tuple[FloatArray, str]:
+    try:
+        static = design_static(plant)
+        return np.array([static.rms(name) for name in channels]), ""
+    except FlexplantError as error:
+        return np.full(len(channels), np.nan), str(error)
