@@ -23,8 +23,9 @@ from .projected_lmis import ProjectedLmis
 _START = 10.0
 #: the lower bound holds for controllers whose R and S are larger than those found by this factor
 LARGER = 10.0
-#: gamma, beside the scale it is sought in, that is sought again in its own scale
-_ROUGH = 0.1, 10.0
+#: gamma, beside the scale it is sought in, that is sought again in its own scale, unless the
+#: relative gap to the lower bound is settled
+_ROUGH, _SETTLED = (0.1, 10.0), 1e-3
 #: relative to the plant's size: a gamma that is taken for zero
 _NOTHING = 1e-7
 #: multiples of the back-off that are tried in turn, and points tried for each
@@ -145,7 +146,10 @@ class StructuredLmi(Value):
                 for _ in range(3):
                     found = self._solved(start.scaled(scale), scale, left)
                     low, high = _ROUGH
-                    if low < found.value / scale < high or found.value < _NOTHING * guess:
+                    settled = found.value - found.lower <= _SETTLED * found.value
+                    if settled or low < found.value / scale < high:
+                        break
+                    if found.value < _NOTHING * guess:
                         break
                     scale = found.value
                 break
