@@ -14,6 +14,7 @@ from flexplant.loop import (
     modulus_margin,
     sensitivity,
 )
+from flexplant.loop.broken import sensitivity_size
 from flexplant.lti import StateSpace
 from flexplant.lti.frequency import Frf, frequency_response
 from machines import RATE, observer, servo, stage
@@ -189,3 +190,16 @@ def test_bad_input(loop):
     with pytest.raises(ModelError, match="discretise"):
         slow = loop.controller.replace(dt=1.0)
         sensitivity((loop.plant.Gyu, slow), freq=FREQ)
+
+
+@pytest.mark.parametrize("size", [3.0, 0.02])
+def test_frequencies_of_small_gain_hide_no_peak(size):
+    """They are left out of the singular values; where all gains are small none is."""
+    rng = np.random.default_rng(5)
+    L = rng.normal(size=(200, 3, 3)) + 1j * rng.normal(size=(200, 3, 3))
+    L *= size * np.geomspace(1e-4, 1.0, 200)[:, None, None] / 6
+    found = sensitivity_size(L)
+    exact = np.linalg.svd(np.linalg.inv(np.eye(3) - L), compute_uv=False)[:, 0]
+    assert found.max() == pytest.approx(exact.max(), rel=1e-12)
+    assert np.argmax(found) == np.argmax(exact)
+    assert np.all(found <= exact * (1 + 1e-12))
