@@ -127,7 +127,7 @@ def of_estimators(plant, small):
     """One of each way to estimate, and what is said of the answer."""
     kalman, rng = fx.design_kalman(plant), np.random.default_rng(4)
     records = {name: 1e-9 * rng.standard_normal(5) for name in (*plant.y, *plant.u)}
-    yield from (kalman, kalman.model, kalman.estimate(records))
+    yield from (kalman, kalman.model, kalman.estimate(records), kalman.report())
     yield from (estimation.Predictor(), estimation.Filter(), estimation.FixedLag(2))
     yield from (estimation.Smoother(), estimation.Unbiased(), estimation.Augmented(1.0))
     yield estimation.design_hinf_filter(small, accuracy=0.5)

@@ -93,11 +93,9 @@ class FEMatrices(Value):
                     f"{name} must have shape ({n}, {n}) like K, got {others[name].shape}. Were "
                     "constraints applied to one matrix only?"
                 )
-        if (
-            self.dofs is not None
-            and len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
-            != n
-        ):
+        if self.dofs is not None:
+            instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz).")
+        if self.dofs is not None and len(self.dofs) != n:
             raise ShapeError(
                 f"K has {n} rows, but the DofSet {len(self.dofs)} DOFs. Are constrained "
                 "DOFs in one of them only?"
