@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 
 from flexplant.errors import AssumptionError, LabelError, ModelError
-from flexplant.placement import PoiLqr, PoiVariance
-from flexplant.plant import StandardPlant
+from flexplant.estimation import design_kalman
+from flexplant.placement import Exchange, PoiLqr, PoiVariance, place_sensors, score_sensors
+from flexplant.plant import Sensor, StandardPlant
+from flexplant.reduction import ModalTruncation, reduce
 from flexplant.store import load
 from oracles_placement import kalman_variance, lqr_cost
+from stages import ports, sampled, some_modes
 
 
 def matrices(plant, axes):
@@ -88,3 +91,34 @@ def test_bad_input(make):
 def test_criteria_are_values(criterion, tmp_path):
     criterion.save(tmp_path / "c.npz")
     assert repr(load(tmp_path / "c.npz")) == repr(criterion)
+
+
+def test_modes_left_out_count_as_in_the_filter():
+    """The score of a choice is the claim of the filter on a plant assembled with these sensors."""
+    many = some_modes(count=40, attached=False)
+    few = many.select(range(12))
+    plant, own = sampled(few), ports().y
+    goal, candidates = PoiVariance("die", larger=many), [*own, Sensor("mid", at=(0.3, 0.0, 0.0))]
+    candidates[-1] = candidates[-1].replace(asd=own[0].asd)
+    names = [sensor.name for sensor in candidates]
+    sets = [names[:3], names[:4], names]
+    found = score_sensors(plant, sets, goal, candidates=candidates)
+    for layout, value in zip(found.layouts, found.values, strict=True):
+        chosen = ports(y=[s for s in candidates if s.name in layout])
+        claim = design_kalman(sampled(few, chosen), larger=many).rms("die")
+        assert np.sqrt(value) == pytest.approx(claim, rel=1e-9, abs=0.0)
+        on = design_kalman(sampled(few, chosen), larger=many).rms("die", on=sampled(many, chosen))
+        assert claim == pytest.approx(on, rel=1e-9, abs=0.0)
+    alone = score_sensors(plant, sets, PoiVariance("die", own_modes=True), candidates=candidates)
+    assert alone.values[0] < 0.5 * found.values[0]
+    # a reduced model's own modes left out count by default, and no bound is claimed
+    reduced = reduce(many, ModalTruncation(12))
+    default = sampled(reduced)
+    assert PoiVariance("die")(default) == pytest.approx(goal(default), rel=1e-9, abs=0.0)
+    search = Exchange(starts=1)
+    best = place_sensors(default, candidates, 4, PoiVariance("die"), method=search, rng=1)
+    assert best.bound == -np.inf and "no bound" in repr(best)
+    with pytest.raises(ModelError, match="larger must be a structure"):
+        PoiVariance("die", larger=plant)
+    with pytest.raises(ModelError, match="pass one"):
+        PoiVariance("die", larger=many, own_modes=True)

@@ -124,14 +124,14 @@ def test_response_chooses_a_prefix(size, prefix):
     ax = fx.plot.response(run_of([wave, 0.5 * wave]))
     factor = {"n": 1e-9, "\N{MICRO SIGN}": 1e-6, "m": 1e-3, "": 1.0, "k": 1e3}[prefix]
     np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), 0.5 * wave / factor)
-    assert ax.get_ylabel() == f"displacement [{prefix}m]"
+    assert ax.get_ylabel() == f"error [{prefix}m]"
     assert texts(ax) == {"die:error"}
     unknown = run_of([wave, wave]).replace(units={})
     both = fx.plot.response(unknown, ["die:z", "die:error"], unit="rad")
     assert len(both.get_lines()) == 2
     assert both.get_ylabel() == f"rotation [{prefix}rad]"
     bare = fx.plot.response(unknown)
-    assert bare.get_ylabel() == "signal"
+    assert bare.get_ylabel() == "error"
     np.testing.assert_allclose(bare.get_lines()[0].get_ydata(), wave)
     assert ink(ax) > 0.005
 
@@ -296,7 +296,11 @@ def test_predictions_beside_what_was_found():
     assert ink(ax) > 0.005
     values = np.array([rows["honest"][0], rows["hopeful"][0]])
     cases = [EstimatorComparison("die:z", ("a", "b"), k * values, 0.95) for k in (1.0, 3.0)]
-    ax = fx.plot.predictions(cases)
+    ax = fx.plot.predictions(cases, cases=["quiet", "loud"])
+    written = {text.get_text(): text.xy[0] for text in ax.texts}
+    assert written == pytest.approx({"quiet": 2.0, "loud": 6.0})
+    with pytest.raises(ShapeError, match="1 names of cases"):
+        fx.plot.predictions(cases, cases=["quiet"])
     diamonds = [line for line in ax.get_lines() if line.get_marker() == "D"]
     np.testing.assert_allclose(diamonds[0].get_xdata(), [2.0, 6.0])
     assert ax.get_xlabel() == "rms error of die:z [nm]"

@@ -8,10 +8,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError
+from ..errors import AssumptionError, ModelError
 from ..estimation import design_kalman
-from ..plant import StandardPlant
+from ..modes import Modes
+from ..plant import StandardPlant, larger_plant
 from ..plant.ground import followed
+from ..reduction import ReducedModel
+from ..structure import FEModel
+from ..values import flag, short
 from .criterion import Criterion, Scorer
 from .poi_axes import Axes, bare, checked_axes, factors_of, plain, shown, structure_part
 from .quadratic import quadratic
@@ -22,8 +26,9 @@ class PoiVariance(Criterion):
     """Variance of the stationary Kalman estimate's error at a POI: for sensors, smaller is better.
 
     ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, P after the measurement, at sample instants: the
-    square of `design_kalman(plant, larger=plant).rms(...)`, of the plant's own modes. More sensors
-    never make it larger.
+    square of `design_kalman(plant).rms(...)`. Of the plant's own modes more sensors never make it
+    larger, a score is one Riccati equation, and searches have a bound. With modes left out it is
+    the error on the plant with these modes: each choice is a filter of its own, without a bound.
 
     Parameters
     ----------
@@ -32,13 +37,19 @@ class PoiVariance(Criterion):
     axes : str, sequence of str or mapping {axis: factor}, optional
         The POI's axes to sum over; its first when not given. A rotation is turned into a
         displacement by a factor [m], such as half the width of the die.
+    larger : Modes, FEModel or ReducedModel, optional
+        The structure with the modes left out, as for `design_kalman`: best as Modes, which are
+        solved once. None: the modes of the plant's reduced model beyond those it kept, if it has
+        any.
+    own_modes : bool
+        Whether modes left out do not count, whatever the reduced model knows.
 
     Raises
     ------
     LabelError
         When an axis appears twice; when called, for a POI or an axis that the plant lacks.
     ModelError
-        When a factor is not positive.
+        When a factor is not positive, larger is no structure, or is given with own_modes.
 
     Examples
     --------
@@ -49,12 +60,24 @@ class PoiVariance(Criterion):
     sides = "y"
     poi: str | None = None
     axes: Axes = field(default=None)
+    larger: Any = field(default=None, kw_only=True)
+    own_modes: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        self._set(axes=checked_axes(self.axes))
+        self._set(axes=checked_axes(self.axes), own_modes=flag(self.own_modes, "own_modes"))
+        if self.larger is not None and self.own_modes:
+            raise ModelError("larger= gives modes left out, own_modes=True leaves them: pass one.")
+        if not isinstance(self.larger, FEModel | Modes | ReducedModel | None):
+            raise ModelError(
+                f"larger must be a structure, got {short(self.larger)}: every choice of sensors "
+                "gets a plant of its own. Pass Modes, an FEModel or a ReducedModel."
+            )
 
     def __repr__(self) -> str:
-        return f"PoiVariance({shown(self.poi, self.axes)})"
+        given = [shown(self.poi, self.axes)] if shown(self.poi, self.axes) else []
+        given += ["larger=..."] if self.larger is not None else []
+        given += ["own_modes=True"] if self.own_modes else []
+        return f"PoiVariance({', '.join(given)})"
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the variance [m^2] on a sampled plant, by its certified Kalman filter.
@@ -64,7 +87,7 @@ class PoiVariance(Criterion):
         AssumptionError
             When no stationary filter exists: the message names what the sensors miss.
         """
-        estimator = design_kalman(plant, larger=plant)
+        estimator = design_kalman(plant, larger=plant if self.own_modes else self.larger)
         factors = factors_of(plant, self.poi, self.axes, every=False)
         return float(sum((f * estimator.rms(name)) ** 2 for name, f in factors.items()))
 
@@ -95,9 +118,11 @@ class PoiVariance(Criterion):
         """Return the variance as a function of the sensors alone; all else is computed once.
 
         Delay lines of u are left out: their states are known exactly. Where ports have
-        filters or delays every choice has states of its own, and the plant is made anew.
+        filters or delays every choice has states of its own, and with modes left out the noise of
+        its sensors is correlated: the plant is made anew.
         """
-        if not plain(plant, candidates):
+        counted = not self.own_modes and larger_plant(plant, self.larger) is not None
+        if counted or not plain(plant, candidates):
             return super().scorer(plant, candidates)
         A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=False))
         realisation = plant.assembled.realisation

@@ -36,8 +36,8 @@ class Placement(Value):
     bound : float
         No choice of as many candidates is better than this: the value itself when the search was
         exhaustive; by convex relaxation, and never below what all candidates together reach, for
-        PoiVariance and PoiLqr (where no port has a filter or delay of its own); minus infinity for
-        any other criterion.
+        PoiVariance of the plant's own modes and PoiLqr (where no port has a filter or delay of its
+        own); minus infinity for any other criterion.
     evaluations : int
         Choices that were scored.
     history : tuple of tuples of float

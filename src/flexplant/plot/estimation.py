@@ -9,12 +9,12 @@ import numpy.typing as npt
 from matplotlib.axes import Axes
 from matplotlib.lines import Line2D
 
-from ..errors import ModelError
+from ..errors import ModelError, ShapeError
 from ..estimation import Estimate, LagReport
 from ..estimation.channels import row_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
-from ..values import FloatArray, positive, real_array, scale, short
+from ..values import FloatArray, name_list, positive, real_array, scale, short
 from ._axes import CYCLE, MEASURED, NOMINAL, UPDATED, axes, finish
 
 
@@ -22,6 +22,7 @@ def predictions(
     rows: Mapping[str, npt.ArrayLike] | Sequence[EstimatorComparison],
     *,
     colors: Mapping[str, str] | None = None,
+    cases: Sequence[str] = (),
     unit: str = "m",
     ax: Axes | None = None,
 ) -> Axes:
@@ -34,6 +35,8 @@ def predictions(
         rms error, the one found, and the ends of its confidence interval.
     colors : mapping {design: color}, optional
         Of the diamonds.
+    cases : sequence of str, optional
+        Names of the k cases, written above those of the first design.
     unit : str
         SI unit of the errors; a prefix is chosen.
     ax : Axes, optional
@@ -49,7 +52,7 @@ def predictions(
     ModelError
         When there is no such mapping, or an error is not positive.
     ShapeError
-        When a row has not four columns.
+        When a row has not four columns, or there are not as many names as cases.
     """
     title = ""
     if isinstance(rows, Sequence) and all(isinstance(c, EstimatorComparison) for c in rows):
@@ -69,6 +72,7 @@ def predictions(
     for i, (name, table) in enumerate(tables.items()):
         color = (colors or {}).get(name, CYCLE[i % len(CYCLE)])
         _row(ax, len(names) - 1 - i, table / factor, color)
+    _name_cases(ax, cases, next(iter(tables.values()))[:, 1] / factor, len(names) - 1)
     ax.set_xscale("log")
     ax.set_yticks(range(len(names)), names[::-1])
     ax.set_ylim(-0.6, len(names) - 0.4)
@@ -185,6 +189,15 @@ def estimate(
     ax.plot(result.time, signal / factor, color=UPDATED, linewidth=0.8, label=label)
     ax.legend(frameon=False, loc="upper right")
     return finish(ax, x="time [s]", y=f"{label} [{prefix}{unit or '?'}]")
+
+
+def _name_cases(ax: Axes, cases: Sequence[str], found: FloatArray, place: float) -> None:
+    """Write the names of cases above the row of the first design."""
+    named = name_list(cases, "cases")
+    if named and len(named) != found.size:
+        raise ShapeError(f"{len(named)} names of cases are given for {found.size}. Name each.")
+    for name, size in zip(named, found, strict=False):
+        ax.annotate(name, (size, place), (0, 11), textcoords="offset points", ha="center")
 
 
 def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:

@@ -134,5 +134,6 @@ def _panel(
             linewidth=0.8,
         )
     legend(ax, given=given)
-    quantity = f"{_QUANTITY.get(unit or '', 'signal')} [{prefix}{unit}]" if unit else "signal"
-    finish(ax, x="time [s]", y=quantity)
+    errors = all(name.endswith(":error") for name in group)
+    quantity = "error" if errors else _QUANTITY.get(unit or "", "signal")
+    finish(ax, x="time [s]", y=f"{quantity} [{prefix}{unit}]" if unit else quantity)
