@@ -42,7 +42,7 @@ class PoiVariance(Criterion):
         solved once. None: the modes of the plant's reduced model beyond those it kept, if it has
         any.
     own_modes : bool
-        Whether modes left out do not count, whatever the reduced model knows.
+        Whether modes left out do not count, whatever the reduced model has kept of them.
 
     Raises
     ------
