@@ -126,6 +126,7 @@ def made():
 def of_estimators(plant, small):
     """One of each way to estimate, and what is said of the answer."""
     kalman, rng = fx.design_kalman(plant), np.random.default_rng(4)
+    yield kalman.report([1])
     records = {name: 1e-9 * rng.standard_normal(5) for name in (*plant.y, *plant.u)}
     yield from (kalman, kalman.model, kalman.estimate(records), kalman.report())
     yield from (estimation.Predictor(), estimation.Filter(), estimation.FixedLag(2))
