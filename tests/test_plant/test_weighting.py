@@ -66,6 +66,31 @@ def test_check_looks_at_the_machine_behind_the_weights():
     assert heavy.check().ok
 
 
+def test_a_plant_says_what_was_done_to_it():
+    plant = assemble_plant(some_modes(), ports())
+    block = StateSpace([], [], [], [[0.5, 0.5]], inputs=["y1", "y2"], outputs=["mean"])
+    mean = plant.through(block)
+    both = mean.weighted(z={"die:z": 2.0})
+    for altered, words in ((mean, "read through a block"), (both, "weighted and read through"),
+                           (plant.weighted(z={"die:z": 2.0}), "weighted")):  # fmt: skip
+        assert words in repr(altered).splitlines()[0]
+        with pytest.raises(ModelError, match=f"the plant is {words}.*sample plant.unweighted"):
+            altered.discretized(RATE)
+    assert "weighted" not in repr(mean)
+    # w is physical still, and the noise of the two sensors is that of their mean
+    assert mean.asd == plant.asd
+    assert not both.asd
+    sampled = plant.discretized(RATE, delay=1).through(block)
+    alone = plant.asd["y1:noise"] ** 2 * RATE / 2
+    np.testing.assert_allclose(sampled.sensor_noise, [[0.5 * alone]], rtol=1e-12)
+    np.testing.assert_array_equal(sampled.process_noise, sampled.unweighted.process_noise)
+    slow = plant.discretized(RATE, delay=1).through(
+        tustin(lowpass(100.0), RATE).replace(inputs=["y1"], outputs=["slow"])
+    )
+    with pytest.raises(ModelError, match=r"block .* has 1 states"):
+        _ = slow.sensor_noise
+
+
 def test_refusals():
     plant = assemble_plant(some_modes(), ports()).discretized(RATE)
     with pytest.raises(LabelError, match=r"no channel of z 'dye:z'.*'die:z'"):

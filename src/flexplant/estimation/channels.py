@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
+import numpy as np
+
 from ..errors import AssumptionError, ModelError, unknown_label
 from ..lti.statespace import System
 from ..plant import StandardPlant, standard_plant
@@ -18,21 +20,41 @@ def checked_plant(given: StandardPlant | System) -> StandardPlant:
     Raises
     ------
     ModelError
-        When it is no plant, or weighted.
+        When it is no plant, weighted, or read through a block with dynamics or references.
     LabelError
         When it is a system whose channels do not name w, u, z and y.
     AssumptionError
         When it has no POI or no sensor.
     """
     plant = standard_plant(given)
-    if plant.is_weighted:
+    if plant.origin.scaled:
         raise ModelError(
-            "the plant is weighted: an estimator is of physical channels. Use plant.unweighted."
+            f"the plant is {plant.alteration}: an estimator is of physical channels. Use "
+            "plant.unweighted."
         )
+    _check_reading(plant)
     for side, names in (("POI in z", poi_channels(plant)), ("sensor in y", sensors(plant))):
         if not names:
             raise AssumptionError(f"the plant has no {side}: there is nothing to estimate with.")
     return plant
+
+
+def _check_reading(plant: StandardPlant) -> None:
+    """Raise ModelError unless y is a static combination of sensors alone."""
+    plain = plant.unweighted
+    mixed = [plain.y.index(name) for name in plain.y if name in plain.w]
+    rows = [plant.y.index(name) for name in sensors(plant)]
+    if np.any(plant.reading_gain[np.ix_(rows, mixed)]):
+        raise ModelError(
+            "the block that the plant is read through mixes references with sensors: a reference "
+            "would look like a motion. Estimate from the sensors, on plant.unweighted."
+        )
+
+
+def read_alike(plant: StandardPlant, other: StandardPlant) -> StandardPlant:
+    """Return another plant read through the block of the first, where that has one."""
+    reading = plant.origin.reading
+    return other if reading is None else other.through(reading)
 
 
 def sensors(plant: StandardPlant) -> tuple[str, ...]:
@@ -55,7 +77,7 @@ def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant
     ModelError
         When it is no plant, or has further POIs.
     """
-    other = standard_plant(on).unweighted
+    other = read_alike(plant, standard_plant(on).unweighted)
     for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
         for name in names:
             if name not in getattr(other, side):

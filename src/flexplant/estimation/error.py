@@ -95,7 +95,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     read = [name for name in observer.inputs if name in plant.y and name not in plant.w]
     observer = observer.select(observer.outputs, read)
     C1, C2 = g.C[g.output_index(poi_channels(plant))], g.C[g.output_index(read)]
-    noise = np.sqrt(plant.sensor_noise[np.ix_(*[[plant.y.index(name) for name in read]] * 2)])
+    noise = plant.sensor_noise_factor[[plant.y.index(name) for name in read]]
     rigid, rest = moving_parts(plant)
     if suspension is not None:
         rest = np.setdiff1d(rest, plant.modal_states.reshape(-1, 2)[suspension])
@@ -104,7 +104,7 @@ def _joint(plant: StandardPlant, observer: StateSpace, suspension: IntArray | No
     A[:n, :n], A[n:, n:] = g.A[np.ix_(rest, rest)], observer.A
     A[n:, :n] = observer.B @ C2[:, rest]
     E = np.hstack([C1[:, rest] - observer.D @ C2[:, rest], -observer.C])
-    drive = np.zeros((n + m, factor.shape[1] + len(read)))
+    drive = np.zeros((n + m, factor.shape[1] + noise.shape[1]))
     drive[:n, : factor.shape[1]], drive[n:, factor.shape[1] :] = factor[rest], observer.B @ noise
     at_once = plant.noise_direct[[plant.y.index(name) for name in read]]
     drive[n:, : factor.shape[1]] += observer.B @ at_once

@@ -14,7 +14,7 @@ from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from ..values import FloatArray
 from .certificate import AGREEMENT, KalmanCertificate, error_of
-from .channels import checked_plant
+from .channels import checked_plant, read_alike
 from .error import error_variances
 from .estimator import KalmanEstimator
 from .filter_model import FilterModel, check_noises, check_precision, filter_model
@@ -53,7 +53,8 @@ def design_kalman(
     Parameters
     ----------
     plant : StandardPlant
-        Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`. A system with labels
+        Sampled: `assemble_plant(model, ports).discretized(rate, delay=1)`, also read `through` a
+        static block, decoupled motions say: their noise is then correlated. A system with labels
         lacks noise densities: the error names what gives them.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         The structure with more modes, such as `solve_modes(fit.applied_to(model), count=100)`.
@@ -115,7 +116,7 @@ def design_kalman(
         return KalmanEstimator(
             system, plant, design.gain, design.covariance, certificate, design.variances
         )
-    honest = error_variances(whole, system)
+    honest = error_variances(read_alike(plant, whole), system)
     if not honest.difference <= AGREEMENT:
         raise CertificateError(
             f"the error on the plant with the modes left out and its dual differ by "

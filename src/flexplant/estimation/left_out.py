@@ -17,6 +17,7 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..values import ComplexArray, FloatArray, IntArray, Value
+from .channels import read_alike, sensors
 
 #: a mode of the plant is one of the larger plant's within this part of its frequency
 _SAME = 0.15
@@ -103,12 +104,17 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     flexibility[[len(flexibility) - len(ports.y) + i for i in moving]] = 0.0
     covariance = _covariance(all_modes, others, others_own.ports)
     nz = covariance.shape[0] - len(ports.y)
+    y = plant.unweighted.y
+    read = plant.reading_gain[np.ix_(
+        [plant.y.index(name) for name in sensors(plant)], [y.index(port.name) for port in ports.y]
+    )]  # fmt: skip
+    quiet = _quiet(with_flexibility(plant, flexibility), plant, stand_ins)
     return LeftOut(
         others + big.n_rigid + 1,
-        covariance[nz:, nz:],
+        read @ covariance[nz:, nz:] @ read.T,
         covariance[:nz, :nz],
-        covariance[:nz, nz:],
-        _quiet(with_flexibility(plant, flexibility), plant, stand_ins),
+        covariance[:nz, nz:] @ read.T,
+        read_alike(plant, quiet),
     )
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import AssumptionError
+from ..errors import AssumptionError, ModelError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
@@ -119,6 +119,11 @@ def design_static(
     The paper, section 5: "the static geometric relation".
     """
     plant = checked_plant(plant)
+    if plant.is_weighted:
+        raise ModelError(
+            f"the plant is {plant.alteration}: what a sensor sees of the rigid body is known of "
+            "sensors only. Use plant.unweighted."
+        )
     ports = plant.assembled.ports
     motions = rigid_modes_of(plant)
     orders = {s.name: s.order for s in ports.y}

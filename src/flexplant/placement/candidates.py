@@ -21,7 +21,9 @@ def checked_plant(plant: StandardPlant) -> None:
     plant = standard_plant(plant)  # a system with labels is one too, without a structure
     _ = plant.assembled
     if plant.is_weighted:
-        raise ModelError("placement needs the plant before weights: use plant.unweighted.")
+        raise ModelError(
+            f"the plant is {plant.alteration}, placement needs the one before: plant.unweighted."
+        )
     if not plant.dt:
         raise ModelError(
             "the plant is continuous, scores are of the sampled one: use "

@@ -98,8 +98,8 @@ def sampled(plant: P, rate: float, delay: float) -> P:
         )
     if plant.is_weighted:
         raise ModelError(
-            "the plant is weighted: sample it first, then weight it with sampled weights "
-            "(continuous weights would be distorted by the hold)."
+            f"the plant is {plant.alteration}: sample plant.unweighted, then do so again with "
+            "sampled weights and blocks (continuous ones would be distorted by the hold)."
         )
     check_rate(plant, rate, delay)
     if not plant.is_assembled:
@@ -161,7 +161,8 @@ def rebuilt(
     """
     if plant.is_weighted:
         raise ModelError(
-            "other ports or modes are for a plant that is not weighted: use plant.unweighted."
+            f"other ports or modes are for a plant as it was made, this one is {plant.alteration}: "
+            "use plant.unweighted."
         )
     own = plant.assembled
     fresh = continuous_plant(

@@ -73,7 +73,7 @@ def moved(ports: Ports, places: Any) -> Ports:
 def along(plant: Partition, name: str, points: npt.ArrayLike) -> Along:
     """Return what depends on the place of a POI or a force, at many points at once."""
     if plant.is_weighted:
-        raise ModelError("the plant is weighted: a port moves on plant.unweighted.")
+        raise ModelError(f"the plant is {plant.alteration}: a port moves on plant.unweighted.")
     places = real_array(points, "points", (None, 3))
     port = _port(plant.assembled.ports, name)
     if isinstance(port, Poi):

@@ -18,6 +18,7 @@ class _Unknown:
     structure: Any = None
     plain: Any = None
     reading: Any = None
+    scaled: bool = False
     #: the plant before sampling, the factor of its noise, and its delay
     continuous: Any = None
     noise_factor: FloatArray | None = None
@@ -95,10 +96,13 @@ class Weighted(_Unknown, Value):
         The plant before weights and blocks; its structure and its delay are this plant's too.
     reading : StateSpace, optional
         The block of `through`: from `plain.y` to y.
+    scaled : bool
+        Whether weights were applied: w and z are then no physical channels.
     """
 
     plain: Any
     reading: StateSpace | None = None
+    scaled: bool = False
 
 
 #: where a plant may have come from

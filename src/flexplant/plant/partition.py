@@ -53,7 +53,8 @@ class Partition(Value):
     def __repr__(self) -> str:
         kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
         named = f" {self.system.name!r}" if self.system.name else ""
-        lines = [f"<StandardPlant{named}: {self.system.n_states} states, {kind}>"]
+        how = f", {self.alteration}" if self.is_weighted else ""
+        lines = [f"<StandardPlant{named}: {self.system.n_states} states, {kind}{how}>"]
         for side in "wuzy":
             names = getattr(self, side)
             shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")
@@ -171,8 +172,37 @@ class Partition(Value):
 
     @property
     def is_weighted(self) -> bool:
-        """Whether it was made by `weighted` or `through`."""
+        """Whether it was made by `weighted` or `through`: `alteration` says which."""
         return self.origin.plain is not None
+
+    @property
+    def alteration(self) -> str:
+        """What was done to it since it was made, in words: nothing, or by `weighted`, `through`."""
+        done = ["weighted"] if self.origin.scaled else []
+        done += ["read through a block"] if self.origin.reading is not None else []
+        return " and ".join(done) or "as it was made"
+
+    @property
+    def reading_gain(self) -> FloatArray:
+        """The gain (ny, plain ny) of the static block that it is read through; I without one.
+
+        Raises
+        ------
+        ModelError
+            When the block has dynamics.
+        """
+        plain, reading = self.unweighted, self.origin.reading
+        if reading is None:
+            return np.eye(len(plain.y))
+        if reading.n_states:
+            raise ModelError(
+                f"the block that the plant is read through has {reading.n_states} states, so that "
+                "noise of its outputs is not white. Give the dynamics to the sensors, "
+                "Sensor(dynamics=...), or use plant.unweighted."
+            )
+        gain = np.zeros((len(self.y), len(plain.y)))
+        gain[:, [plain.y.index(name) for name in reading.inputs]] = reading.D
+        return gain
 
     @property
     def unweighted(self) -> Self:
@@ -259,6 +289,10 @@ class Partition(Value):
             When it is not known.
         """
         found = self.origin.noise_factor
+        if self.origin.reading is not None and not self.origin.scaled:
+            _ = self.reading_gain  # static: the states are those of the plain plant
+            plain: FloatArray = self.unweighted.noise_factor
+            return plain
         if found is None:
             raise ModelError(
                 "labels carry no noise density, so that the process noise of each sample is not "
@@ -291,11 +325,19 @@ class Partition(Value):
 
     @property
     def sensor_noise(self) -> FloatArray:
-        """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor."""
+        """Covariance (ny, ny) of a sample of y: asd^2 rate / 2 for each sensor.
+
+        Through a static block T, ``T R T'``.
+        """
+        return self.sensor_noise_factor @ self.sensor_noise_factor.T
+
+    @property
+    def sensor_noise_factor(self) -> FloatArray:
+        """F (ny, sensors), F F' the covariance of a sample of y."""
         if not self.dt:
             raise ModelError("sensor noise per sample needs a sampled plant: discretized(rate).")
-        variance = [0.5 * self.asd.get(f"{name}:noise", 0.0) ** 2 / self.dt for name in self.y]
-        return np.diag(variance)
+        asd = [self.asd.get(f"{name}:noise", 0.0) for name in self.unweighted.y]
+        return np.asarray(self.reading_gain * (np.array(asd) * np.sqrt(0.5 / self.dt)))
 
     def channel(self, name: str, side: str = "z") -> str:
         """Return the channel of `side` that a name means: `die` or `die:hat` mean `die:z`.

@@ -40,7 +40,7 @@ def weighted(plant: P, z: Any, w: Any) -> P:
         w=tuple(keep_w),
         z=tuple(keep_z),
         asd={},
-        origin=Weighted(plant.unweighted, plant.origin.reading),
+        origin=Weighted(plant.unweighted, plant.origin.reading, True),
     )
 
 
@@ -66,8 +66,7 @@ def measured_through(plant: P, block: System) -> P:
     return plant.replace(
         system=series(inner, after).replace(name=plant.system.name),
         y=tuple(g.outputs),
-        asd={},
-        origin=Weighted(plant.unweighted, block),
+        origin=Weighted(plant.unweighted, block, plant.origin.scaled),
     )
 
 

@@ -203,8 +203,8 @@ def _check_sampled(loop: ClosedLoop) -> None:
         )
     if plant.is_weighted:
         raise AssumptionError(
-            "the plant is weighted, so its z and w are not physical signals: close the loop "
-            "around plant.unweighted with the same blocks."
+            f"the plant is {plant.alteration}, so that its channels are not those of the machine: "
+            "close the loop around plant.unweighted with the same blocks."
         )
     D = plant.system.select(plant.y, loop.driven).D
     if np.any(D):

@@ -251,7 +251,8 @@ def _below_nyquist(freq: float, name: str, rate: float) -> None:
 def _poi(plant: StandardPlant, name: str | None) -> Poi:
     if plant.is_weighted:
         raise ModelError(
-            "the plant is weighted: a servo acts on physical channels. Use plant.unweighted."
+            f"the plant is {plant.alteration}: a servo acts on physical channels. Use "
+            "plant.unweighted."
         )
     ports = plant.assembled.ports
     if not ports.z:

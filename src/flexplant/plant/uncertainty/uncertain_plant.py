@@ -53,7 +53,9 @@ def modal_realisation(plant: Partition) -> ModalRealisation:
         When the plant is weighted or made elsewhere, or damping couples its modes.
     """
     if plant.is_weighted:
-        raise ModelError("the plant is weighted: uncertain modes are those of plant.unweighted.")
+        raise ModelError(
+            f"the plant is {plant.alteration}: uncertain modes are those of plant.unweighted."
+        )
     realisation = plant.assembled.realisation
     if plant.form != MODAL:
         raise ModelError(
