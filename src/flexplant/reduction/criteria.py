@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
-from ..values import FloatArray, Value
+from ..values import ComplexArray, FloatArray, Value
+
+#: shapes at DOFs, real or complex
+Rows: TypeAlias = FloatArray | ComplexArray
 
 #: downdates after which the information matrix is made anew, and dropped rows leave the arrays
 _REFRESH = 64
@@ -21,11 +25,11 @@ class SelectionCriterion(Value):
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
-    def chosen(self, required: FloatArray, pool: FloatArray, count: int) -> list[int]:
+    def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return which rows of the pool (p, k) to take beside the required ones (q, k)."""
         raise NotImplementedError
 
-    def values(self, rows: FloatArray) -> FloatArray:
+    def values(self, rows: Rows) -> FloatArray:
         """Return what the criterion says of each of the chosen rows, in their order."""
         raise NotImplementedError
 
@@ -37,18 +41,18 @@ class PivotedQr(SelectionCriterion):
     Its value for a DOF is the length of what those before it do not explain.
     """
 
-    def chosen(self, required: FloatArray, pool: FloatArray, count: int) -> list[int]:
+    def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return which rows of the pool to take."""
         if not count:
             return []
         if required.shape[0]:
             span = la.qr(required.T, mode="economic")[0]
             for _ in range(2):
-                pool = pool - (pool @ span) @ span.T
+                pool = pool - (pool @ span.conj()) @ span.T
         pivots = la.qr(pool.T, mode="r", pivoting=True)[1]
         return [int(i) for i in pivots[:count]]
 
-    def values(self, rows: FloatArray) -> FloatArray:
+    def values(self, rows: Rows) -> FloatArray:
         """Return the length of each row beyond the span of those before it."""
         return np.abs(np.diag(la.qr(rows.T, mode="r")[0]))
 
@@ -57,8 +61,8 @@ class PivotedQr(SelectionCriterion):
 class EffectiveIndependence(SelectionCriterion):
     """Effective independence: drop the DOF that adds least to the information on the modes.
 
-    Starts from all candidates. Their information is ``Q = phi^T phi``, of which row i holds the
-    share ``E_i = phi_i Q^-1 phi_i^T``, from 0 to 1 (without it, a mode is lost). One by one the
+    Starts from all candidates. Their information is ``Q = phi^H phi``, of which row i holds the
+    share ``E_i = phi_i Q^-1 phi_i^H``, from 0 to 1 (without it, a mode is lost). One by one the
     lowest goes, and Q^-1 follows by a rank-one downdate. Fewer DOFs than modes are chosen by
     `PivotedQr` from the last k.
 
@@ -68,7 +72,7 @@ class EffectiveIndependence(SelectionCriterion):
     structures, J. Guidance, Control and Dynamics 14(2), 1991.
     """
 
-    def chosen(self, required: FloatArray, pool: FloatArray, count: int) -> list[int]:
+    def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return which rows of the pool to take."""
         if not count:
             return []
@@ -90,25 +94,25 @@ class EffectiveIndependence(SelectionCriterion):
             return [int(left[i]) for i in PivotedQr().chosen(required, pool[left], count)]
         return [int(i) for i in left]
 
-    def values(self, rows: FloatArray) -> FloatArray:
+    def values(self, rows: Rows) -> FloatArray:
         """Return the share E_i of each row in the information of all."""
         vectors, size, _ = la.svd(rows, full_matrices=False)
-        return np.asarray(np.sum(vectors[:, size > _UNSEEN * size[0]] ** 2, axis=1))
+        return np.asarray(np.sum(np.abs(vectors[:, size > _UNSEEN * size[0]]) ** 2, axis=1))
 
 
-def _lowest(rows: FloatArray, fixed: int, drops: int) -> list[int]:
+def _lowest(rows: Rows, fixed: int, drops: int) -> list[int]:
     """Return the rows that effective independence drops, one after the other."""
-    inverse = la.inv(rows.T @ rows)
-    share = np.einsum("ij,ij->i", rows @ inverse, rows)
+    inverse = la.inv(rows.conj().T @ rows)
+    share = np.einsum("ij,ij->i", rows @ inverse, rows.conj()).real
     share[:fixed] = np.inf
     dropped: list[int] = []
     for _ in range(drops):
         worst = int(np.argmin(share))
         dropped.append(worst)
-        image = inverse @ rows[worst]
-        left = max(1.0 - float(rows[worst] @ image), _UNSEEN)
-        inverse += np.outer(image, image / left)
-        share += (rows @ (image / np.sqrt(left))) ** 2
+        image = inverse @ rows[worst].conj()
+        left = max(1.0 - float(np.real(rows[worst] @ image)), _UNSEEN)
+        inverse += np.outer(image, image.conj() / left)
+        share += np.abs(rows @ (image / np.sqrt(left))) ** 2
         share[worst] = np.inf
     return dropped
 
@@ -120,9 +124,10 @@ class Greedy(SelectionCriterion):
     Its value for a DOF is that singular value when it was taken.
     """
 
-    def chosen(self, required: FloatArray, pool: FloatArray, count: int) -> list[int]:
+    def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return which rows of the pool to take."""
-        taken, free = np.array(required), np.ones(pool.shape[0], dtype=bool)
+        taken: Any = np.array(required)
+        free = np.ones(pool.shape[0], dtype=bool)
         found: list[int] = []
         for _ in range(count):
             lowest = np.where(free, _smallest_with(taken, pool), -np.inf)
@@ -132,23 +137,23 @@ class Greedy(SelectionCriterion):
             taken = np.vstack([taken, pool[best]])
         return found
 
-    def values(self, rows: FloatArray) -> FloatArray:
+    def values(self, rows: Rows) -> FloatArray:
         """Return the smallest singular value of each row with those before it."""
         return np.array([la.svdvals(rows[: i + 1])[-1] for i in range(rows.shape[0])])
 
 
-def _smallest_with(taken: FloatArray, pool: FloatArray) -> FloatArray:
+def _smallest_with(taken: Rows, pool: Rows) -> FloatArray:
     """Return the smallest eigenvalue of the Gram matrix of the taken rows plus one of the pool.
 
     The root below all eigenvalues of the Gram matrix of the taken rows of the secular equation
     ``v'v - mu - sum_i w_i^2 / (lambda_i - mu) = 0``, w the products of v with their eigenvectors,
     bisected for all of the pool at once.
     """
-    size = np.einsum("ij,ij->i", pool, pool)
+    size = np.einsum("ij,ij->i", pool, pool.conj()).real
     if not taken.shape[0]:
         return np.asarray(size)
-    values, vectors = la.eigh(taken @ taken.T)
-    share = ((pool @ taken.T) @ vectors) ** 2
+    values, vectors = la.eigh(taken @ taken.conj().T)
+    share = np.abs((pool @ taken.conj().T) @ vectors) ** 2
     low, high = np.zeros(pool.shape[0]), np.minimum(size, max(values[0], 0.0))
     for _ in range(60):
         middle = 0.5 * (low + high)

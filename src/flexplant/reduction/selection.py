@@ -66,7 +66,7 @@ def select_dofs(
     Parameters
     ----------
     modes : Modes
-        Real modes, with their attachment vectors.
+        Modes, real or complex, with their attachment vectors.
     count : int
         Number of DOFs, at most modes plus vectors; `reduce` needs exactly as many.
     candidates : iterable of str, optional
@@ -85,7 +85,7 @@ def select_dofs(
     ShapeError
         When `count` does not fit.
     ModelError
-        When `count` is no whole number, the modes are complex, or no candidates distinguish them.
+        When `count` is no whole number, or no candidates distinguish them.
 
     Examples
     --------
@@ -105,9 +105,7 @@ def select_dofs(
         "criterion",
         "Pass PivotedQr() or Greedy().",
     )
-    if np.iscomplexobj(modes.phi):
-        raise ModelError("select_dofs needs real modes: solve with damping=ModalDamping(...).")
-    basis = np.asarray(modes.basis, dtype=np.float64)
+    basis = modes.basis
     kept = list(name_list(required, "required DOFs"))
     if len(set(kept)) != len(kept):
         raise LabelError(f"required DOFs appear twice: {kept}.")
