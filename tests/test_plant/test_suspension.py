@@ -1,23 +1,29 @@
 """Springs to ground: rigid-body modes become true oscillations near 1 Hz; residual compliance."""
 
+import re
+
 import numpy as np
 import pytest
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman
+from flexplant.labels import DofSet
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
 from flexplant.plant import (
+    Actuator,
     BaseAcceleration,
     FastStates,
     Feedthrough,
     GroundSpring,
+    Ports,
     Sensor,
     assemble_plant,
     suspend,
 )
 from flexplant.structure import FEModel, ModalDamping
 from oracles_plant import machine, motion_row, receptance, z_row
+from oracles_ports import chain
 from plates import make_plate
 from stages import AXES, CORNERS, INSET, RATE, Z8, L, full, ports, reduced, some_modes
 
@@ -123,9 +129,44 @@ def test_refusals():
         suspend(make_plate(), GroundSpring(Z8, 1e-6))
     with pytest.raises(ModelError, match="overdamped"):
         suspend(some_modes(), springs(1e3))
-    twice = suspend(some_modes(), springs())
-    with pytest.raises(ModelError, match="complex modes cannot be suspended"):
-        suspend(twice, springs())
+    once = suspend(some_modes(), springs())
+    with pytest.raises(ModelError, match="a mode would not oscillate"):
+        suspend(once, springs(1e3))
+
+
+def test_complex_modes_are_suspended_within_their_shapes():
+    """All modes of a chain: exact. Twice on half the springs is once on the springs."""
+    M, D, K = chain()
+    dofs = DofSet(range(1, 6), ["x"] * 5, np.outer(np.arange(5.0), [1.0, 0.0, 0.0]))
+    modes = solve_modes(FEModel(M, K, D, dofs=dofs), count=5)
+    assert np.iscomplexobj(modes.phi)
+    found = suspend(modes, [GroundSpring("1:x", 3e3, 5.0), GroundSpring("4:x", 2e2)])
+    K2, D2 = K + np.diag([3e3, 0, 0, 2e2, 0]), D + np.diag([5.0, 0, 0, 0, 0])
+    plant = assemble_plant(found, Ports(u=[Actuator("u", at="5:x")], y=[Sensor("y", at="2:x")]))
+    shown = frequency_response(plant.Gyu, FREQ[:4])["y", "u"]
+    wanted = [np.linalg.solve(s * s * M + s * D2 + K2, np.eye(5)[4])[1]
+              for s in 2j * np.pi * FREQ[:4]]  # fmt: skip
+    np.testing.assert_allclose(shown, wanted, rtol=1e-8)
+    half = [GroundSpring(p, 0.5 * s.stiffness, 0.5 * s.damping)
+            for p, s in zip(CORNERS, springs(), strict=True)]  # fmt: skip
+    once, twice = suspend(some_modes(), springs()), suspend(suspend(some_modes(), half), half)
+    np.testing.assert_allclose(twice.poles, once.poles, rtol=1e-7)
+    gains = [np.abs(m.phi) for m in (once, twice)]
+    np.testing.assert_allclose(gains[1], gains[0], rtol=1e-4, atol=1e-5 * gains[0].max())
+    # what no spring stretches stays at 0: a plate hinged at two corners turns
+    hinge = [GroundSpring(p, 50.0, 0.1) for p in CORNERS[:2]]
+    alone = suspend(some_modes(), hinge)
+    further = suspend(alone, [GroundSpring(CORNERS[0], 10.0)])
+    assert alone.n_rigid == further.n_rigid == 1
+    straight = suspend(some_modes(), [hinge[0].replace(stiffness=60.0), hinge[1]])
+    np.testing.assert_allclose(further.poles, straight.poles, rtol=1e-6)
+
+
+def test_undamped_suspension_modes_are_named_so():
+    soft = [GroundSpring(p, 40.0) for p in CORNERS]
+    plant = assemble_plant(suspend(some_modes(), soft), ports())
+    text = plant.check()["detectable"].finding
+    assert re.match(r"3 undamped suspension modes at 0\.\d+ to \d\.\d+ Hz, by 4 channels", text)
 
 
 # residual compliance ------------------------------------------------------------------------

@@ -13,6 +13,7 @@ from ..values import ComplexArray, FloatArray
 from .assumption import Assumption
 from .partition import Partition
 from .rank_conditions import evened
+from .rigid.rigid_motion import body_of, rigid_modes
 
 #: a motion weaker than this beside the strongest one counts as absent
 _ABSENT = 1e-8
@@ -50,9 +51,9 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
     if not bare.is_assembled:  # states of a system made elsewhere have any units
         bare = bare.replace(system=evened(bare.system))
     poles = _persistent(bare.system)
-    rigid = bare.n_rigid
     rate = 1.0 / plant.dt if plant.dt and not bare.dt else 0.0
     sampled, apart = _alike(poles, rate), [[pole] for pole in poles]
+    words = _counted(bare, poles)
     found = []
     for case in _cases(bare, poles, plant):
         groups = sampled if case.held else apart
@@ -64,16 +65,37 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
             text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
         else:
-            pairs = len(bare.unstable_modes)
-            count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
-            words = [f"all {rigid} rigid-body modes"] if rigid else []
-            words += [f"{pairs} unstable rigid-body pair{'s' * (pairs != 1)}"] if pairs else []
-            words += [f"{count} other poles that are not stable"] if count > 0 else []
             text = f"{' and '.join(words)}, by {len(case.names)} channels."
             found.append(
                 Assumption(case.key, True, text if words else "every mode decays by itself.")
             )
     return found
+
+
+def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
+    """Return, in words, how many modes of each kind do not decay."""
+    rigid, pairs = plant.n_rigid, len(plant.unstable_modes)
+    words = [f"all {rigid} rigid-body modes"] if rigid else []
+    words += [f"{pairs} unstable rigid-body pair{'s' * (pairs != 1)}"] if pairs else []
+    count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
+    known = np.zeros(0)
+    if plant.is_assembled:
+        own = plant.assembled.realisation
+        known = rigid_modes(own, body_of(own)).freq
+    kinds: dict[str, list[float]] = {"undamped suspension mode": [], "undamped mode": []}
+    for pole in poles:
+        size = abs(pole.value) / (2 * np.pi)
+        if plant.is_assembled and pole.value.imag and abs(pole.value.real) <= _AXIS * size:
+            weak = np.any(np.abs(known - size) <= 1e-6 * size)
+            kind = "undamped suspension mode" if weak else "undamped mode"
+            kinds[kind] += [size] * pole.left.shape[1]
+    for kind, freq in kinds.items():
+        if freq:
+            span = f"{min(freq):.4g}" + (f" to {max(freq):.4g}" if len(freq) > 1 else "")
+            words.append(f"{len(freq)} {kind}{'s' * (len(freq) > 1)} at {span} Hz")
+            count -= len(freq)
+    words += [f"{count} other poles that are not stable"] if count > 0 else []
+    return words
 
 
 def _cases(bare: Partition, poles: list[_Pole], plant: Partition) -> list[_Case]:

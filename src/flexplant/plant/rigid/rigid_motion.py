@@ -77,6 +77,14 @@ def rigid_modes(realisation: ModalRealisation, body: RigidBody | None) -> RigidM
     return RigidModes(shapes, modes, np.where(modes < r, 0.0, size) / (2.0 * np.pi))
 
 
+def body_of(realisation: ModalRealisation) -> RigidBody | None:
+    """Return the rigid body; None of a structure that is held or has no geometry."""
+    try:
+        return rigid_body_of(realisation)
+    except FlexplantError:  # no rigid-body motion but modes at 0 Hz
+        return None
+
+
 def rigid_modes_of(plant: Partition) -> RigidModes:
     """Return the rigid-body motions of a plant.
 
@@ -88,10 +96,7 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
         When the structure is held, or stiff springs bend an axis that its channels have part in.
     """
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
-    try:
-        body = rigid_body_of(realisation)
-    except FlexplantError:  # held, or without a geometry: no rigid-body motion but modes at 0 Hz
-        body = None
+    body = body_of(realisation)
     if body is not None:
         rows = [s.static_row(realisation) for s in ports.y if s.order == 0]
         rows += [poi.row(realisation, axis) for poi in ports.z for axis in poi.axes]

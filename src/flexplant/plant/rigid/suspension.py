@@ -17,6 +17,7 @@ from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
 from ...values import FloatArray, Value, positive, real_array
 from ..port_checks import checked_direction, checked_place
+from .complex_modes import suspended
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not
@@ -93,8 +94,8 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     Raises
     ------
     ModelError
-        When there are no springs, the model is of another kind or its modes are complex, or a
-        suspension mode would be overdamped.
+        When there are no springs, the model is of another kind, or a suspension mode of Modes
+        would be overdamped; of complex ones also when one would be unstable.
     LabelError
         When a place is not on the structure.
     """
@@ -110,7 +111,7 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
         return given.replace(  # type: ignore[return-value]
             K=given.K + stiffness,
             D=given.D + damping,
-            rigid_body=given.rigid_body @ _untouched(rows @ given.rigid_body, rows),
+            rigid_body=given.rigid_body @ _untouched(rows, given.rigid_body),
             method=f"{given.method}, {len(listed)} ground springs",
         )
     if isinstance(given, Modes):
@@ -126,11 +127,14 @@ def _matrices(rows: FloatArray, springs: list[GroundSpring]) -> tuple[FloatArray
     return rows.T @ (k[:, None] * rows), rows.T @ (d[:, None] * rows)
 
 
-def _untouched(stretch: FloatArray, rows: FloatArray) -> FloatArray:
-    """Return the combinations (r, left) of rigid-body motions that stretch no spring."""
-    r = stretch.shape[1]
+def _untouched(rows: FloatArray, rigid: FloatArray) -> FloatArray:
+    """Return the combinations (r, left) of rigid-body motions (n, r) that stretch no row (s, n)."""
+    r = rigid.shape[1]
     if not r:
         return np.zeros((0, 0))
+    stretch = rows @ rigid
+    most = np.abs(rows).sum(axis=1, keepdims=True) * np.abs(rigid).max()
+    stretch[np.abs(stretch) <= _SLACK * most] = 0.0  # a spring on the axis of a hinge
     size = np.linalg.norm(stretch, axis=1, keepdims=True)
     _, values, right = np.linalg.svd(stretch / np.where(size > 0, size, 1.0), full_matrices=True)
     rank = int(np.count_nonzero(values > _SLACK * max(values.max(initial=0.0), 1e-300)))
@@ -142,7 +146,7 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     stiff = [Spring(s.at, s.stiffness, direction=s.direction) for s in springs]
     suspended = model.with_parts([*stiff, *dampers])
     rows = np.array([model.row(s.at, s.direction) for s in springs])
-    expected = _untouched(rows @ model.rigid_body, rows).shape[1]
+    expected = _untouched(rows, model.rigid_body).shape[1]
     if suspended.rigid_body.shape[1] != expected:
         raise ModelError(
             "the springs are so weak that rounding of the structure's matrices exceeds them: "
@@ -155,16 +159,15 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
 
 def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
     if np.iscomplexobj(modes.phi):
-        raise ModelError(
-            "complex modes cannot be suspended: suspend the FEModel, or reduce and suspend that."
-        )
+        return _complex(modes, springs)
     basis = np.real(modes.basis)
     b = basis.shape[1]
-    rows = np.array([modes.row(s.at, s.direction) for s in springs]) @ basis
+    places = np.array([modes.row(s.at, s.direction) for s in springs])
+    rows = places @ basis
     stiffness, damping = _matrices(rows, springs)
     free = np.zeros((b, 0))
     if modes.n_rigid:
-        kept = _untouched(rows[:, : modes.n_rigid], rows)
+        kept = _untouched(places, basis[:, : modes.n_rigid])
         free = np.vstack([kept, np.zeros((b - modes.n_rigid, kept.shape[1]))])
 
     def motions() -> FloatArray:
@@ -198,3 +201,16 @@ def _modes(modes: Modes, springs: list[GroundSpring]) -> Modes:
         vector_zeta=ratio[extra],
         vector_dofs=modes.vector_dofs,
     )
+
+
+def _complex(modes: Modes, springs: list[GroundSpring]) -> Modes:
+    if modes.n_unstable:
+        raise ModelError(
+            "complex modes with an unstable pair cannot be suspended once more: suspend the "
+            "FEModel, or reduce and suspend that."
+        )
+    rows = np.array([modes.row(s.at, s.direction) for s in springs])
+    kept = _untouched(rows, np.real(modes.phi[:, : modes.n_rigid]))
+    stiffness = np.array([spring.stiffness for spring in springs])
+    damping = np.array([spring.damping for spring in springs])
+    return suspended(modes, rows, stiffness, damping, kept)
