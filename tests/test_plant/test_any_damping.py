@@ -369,7 +369,9 @@ def test_other_operations_of_a_dense_plant(tmp_path):
         again.discretized(RATE).noise_factor, plant.discretized(RATE).noise_factor
     )
     fit = fx.MeasuredModes([-1 + 1000j], modes=[1], covariance=np.eye(2))
-    with pytest.raises(ModelError, match=r"coupled by damping \(dense: an overdamped.*no Delta"):
+    with pytest.raises(
+        ModelError, match=r"coupled by damping \(dense: an overdamped.*plant.uncertain\(fit\)"
+    ):
         plant.uncertain(fit)
     foreign = StandardPlant.from_statespace(plant.system, u=plant.u, y=plant.y)
     assert foreign.form == "as given"

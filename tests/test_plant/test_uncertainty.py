@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 import oracles_uncertainty as oracle
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.identification import MeasuredModes
-from flexplant.lti import StateSpace, frequency_response, lft
-from flexplant.plant import Poi, Ports, Sensor, StandardPlant, assemble_plant
+from flexplant.lti import StateSpace, frequency_response, lft, lowpass
+from flexplant.plant import BaseAcceleration, Poi, Ports, Sensor, StandardPlant, assemble_plant
 from flexplant.testbeds import wafer_stage
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from stages import CORNERS, INSET, RATE, Z8, full, ports, reduced, some_modes
@@ -51,9 +51,9 @@ def _upper(pair):
 
 def closed(uncertain, values):
     """The LFT with its Deltas closed by hand; neglected modes left out."""
-    g, n = uncertain.system, len(uncertain.deltas)
-    names = [delta.name for delta in uncertain.deltas]
-    given = np.array([values.get(name, 0.0) for name in names])
+    g, channels = uncertain.system, uncertain.channels
+    n, names = len(channels), list(channels)
+    given = np.array([values.get(name, 0.0) for name in channels.values()])
     fro, to = ([f"{name}:{end}" for name in names] for end in "zw")
     block = StateSpace([], [], [], np.diag(given), inputs=fro, outputs=to)
     plant = uncertain.plant.continuous
@@ -351,17 +351,92 @@ def test_values_of_delta_are_checked():
         uncertain.sample("seed")
 
 
-def test_accelerations_of_complex_modes_are_refused():
+@pytest.mark.parametrize("filtered", [False, True])
+def test_accelerations_of_complex_modes_repeat_the_deltas(filtered):
+    """Exact: as the changed plant, and s^2 times what displacement sensors of it show."""
     fit, unknowns = fitted(0.5)
     damped = fit.replace(model=fit.model.replace(D=damped_unevenly(fit.model)))
-    y = [Sensor(f"y{i}", at=p, quantity="acceleration") for i, p in enumerate(CORNERS, 1)]
+    dynamics = lowpass(900.0, order=2) if filtered else None
+    y = [Sensor(f"y{i}", at=p, quantity="acceleration", dynamics=dynamics)
+         for i, p in enumerate(CORNERS, 1)]  # fmt: skip
     plant = assemble_plant(damped.model, ports(y=y))
-    with pytest.raises(ModelError, match=r"'y1' depends on products of Deltas.*not proportional"):
-        plant.uncertain(damped, unknowns, modes=[6])
+    uncertain = plant.uncertain(damped, unknowns, modes=[6, 7])
+    assert set(uncertain.channels) - {d.name for d in uncertain.deltas} == {
+        f"{d.name}:rate" for d in uncertain.deltas
+    }
+    found = closed(uncertain, VALUES)
+    assert same_response(found, uncertain.lft(VALUES).system)
+    still = [port.replace(quantity="displacement") for port in y]
+    places = assemble_plant(damped.model, ports(y=still)).uncertain(damped, unknowns, modes=[6, 7])
+    assert tuple(places.channels) == tuple(d.name for d in places.deltas)
+    freq = np.array([30.0, 240.0, 458.0, 640.0])
+    moved = frequency_response(closed(places, VALUES).select(["y2"], ["u1", "u3"]), freq).data
+    shown = frequency_response(found.select(["y2"], ["u1", "u3"]), freq).data
+    np.testing.assert_allclose(shown, (2j * np.pi * freq) ** 2 * moved, rtol=1e-8)
+
+
+def test_velocities_of_complex_modes_need_no_second_copy():
+    fit, unknowns = fitted(0.5)
+    damped = fit.replace(model=fit.model.replace(D=damped_unevenly(fit.model)))
     speeds = [Sensor(f"y{i}", at=p, quantity="velocity") for i, p in enumerate(CORNERS, 1)]
     plant = assemble_plant(damped.model, ports(y=speeds))
     uncertain = plant.uncertain(damped, unknowns, modes=[6])
+    assert len(uncertain.channels) == len(uncertain.deltas)
     assert same_response(closed(uncertain, VALUES6), uncertain.lft(VALUES6).system)
+
+
+def test_a_fit_of_a_mass_with_accelerometers():
+    """Every fit of mass and damper makes complex modes: the plant of the fit itself."""
+    fit, unknowns = fitted(0.5)
+    y = [Sensor(f"y{i}", at=p, quantity="acceleration") for i, p in enumerate(CORNERS, 1)]
+    plant = assemble_plant(fit.model, ports(y=y))
+    uncertain = plant.uncertain(fit, unknowns)
+    rng = np.random.default_rng(3)
+    values = {d.name: float(rng.uniform(-1, 1)) for d in uncertain.deltas}
+    assert same_response(closed(uncertain, values), uncertain.lft(values).system)
+
+
+def test_a_large_damper_to_ground_has_the_parameters_as_deltas():
+    """Against M, D, K changed by hand: mass and damper at z8, accelerometers, a moving floor."""
+    fit, unknowns = fitted(0.5)
+    at = fit.model.row((0.1, 0.2, 0.0))
+    dragged = fit.replace(model=fit.model.replace(D=fit.model.D + 900.0 * np.outer(at, at)))
+    y = [Sensor(f"y{i}", at=p, quantity="acceleration") for i, p in enumerate(CORNERS, 1)]
+    channels = ports(y=y, w=[BaseAcceleration("floor")], references=())
+    with pytest.warns(FlexplantWarning, match="drag rigid-body motion"):
+        plant = assemble_plant(dragged.model, channels)
+    uncertain = plant.uncertain(dragged, unknowns, deviations=3.0)
+    assert [d.name for d in uncertain.deltas] == list(fit.parameters)
+    assert "+-" in repr(uncertain)
+    assert "kg" in repr(uncertain)
+    std = 3.0 * np.sqrt(np.diag(fit.covariance))
+    rng = np.random.default_rng(4)
+    for signs in ([1.0, -0.5], rng.uniform(-1, 1, 2)):
+        values = dict(zip(fit.parameters, signs, strict=True))
+        found = closed(uncertain, values)
+        assert same_response(found, uncertain.lft(values).system)
+        M, D, K = (np.array(getattr(dragged.model, name)) for name in "MDK")
+        z8 = dragged.model.row(Z8)
+        M = M + signs[0] * std[0] * np.outer(z8, z8)
+        D = D + signs[1] * std[1] * np.outer(z8, z8)
+        rigid = dragged.model.rigid_motions()[:, 2]
+        see, push = dragged.model.row(CORNERS[1]), dragged.model.row(INSET[2])
+        freq = np.array([2.0, 240.0, 458.0])
+        s = 2j * np.pi * freq
+        wanted = [
+            [
+                p * p * see @ np.linalg.solve(p * p * M + p * D + K, f) + see @ carried
+                for f, carried in ((-M @ rigid, rigid), (push, 0 * rigid))
+            ]
+            for p in s
+        ]
+        shown = frequency_response(found.select(["y2"], ["floor", "u3"]), freq).data[0].T
+        np.testing.assert_allclose(shown, wanted, rtol=1e-7, atol=1e-9)
+    assert len(uncertain.sample(1, 2)) == 2
+    with pytest.raises(ModelError, match=r"Leave modes out"):
+        plant.uncertain(dragged, unknowns, modes=[6])
+    with pytest.raises(ModelError, match="another D than the fit's model"):
+        plant.uncertain(fit, unknowns)
 
 
 VALUES6 = {"mode6:freq": 0.9, "mode6:damping": -0.9}

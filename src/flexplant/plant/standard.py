@@ -206,7 +206,9 @@ class StandardPlant(Partition):
 
         The covariance of the parameters goes to the modes by the eigenvalue sensitivities,
         ``J C J'``; each chosen mode's stiffness omega^2 and damping 2 zeta omega becomes a channel
-        `mode6:freq`, `mode6:damping` with ``|delta| <= 1`` at some standard deviations.
+        `mode6:freq`, `mode6:damping` with ``|delta| <= 1`` at some standard deviations. Where
+        damping couples the modes (a large damper to ground, an overdamped pair), the parameters of
+        the fit themselves are the Deltas, and act on all modes and shapes.
 
         Parameters
         ----------

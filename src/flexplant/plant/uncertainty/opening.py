@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -17,10 +17,13 @@ from ..building import P
 from ..partition import Partition
 from ..realisation import ModalRealisation
 from .neglected import neglected_modes, opened
+from .parametric import by_parameters
 from .uncertain_plant import Delta, UncertainPlant, modal_realisation, with_changes
 
 #: relative standard deviations below this open no channel
 _KNOWN = 1e-12
+#: relative: a dependence on the rates of the states below this is rounding
+_AFFINE = 1e-8
 #: relative change at which the plant's dependence on a Delta is read off
 _PROBE = 0.25
 
@@ -35,8 +38,14 @@ def uncertain(
     neglected: Any = None,
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas; see `StandardPlant.uncertain`."""
-    realisation = modal_realisation(plant)
     many = positive(deviations, "deviations")
+    if (
+        isinstance(source, UpdateResult)
+        and not plant.is_weighted
+        and plant.form.startswith("dense")
+    ):
+        return _by_parameters(plant, source, parameters, modes, many, neglected)
+    realisation = modal_realisation(plant)
     if isinstance(source, UpdateResult):
         parameters = source.unknowns if parameters is None else parameters
         numbers, poles, covariance = _fitted_poles(realisation, source, parameters, modes)
@@ -66,7 +75,7 @@ def uncertain(
     weight = None
     if neglected is not None:
         weight = neglected_modes(plant, neglected)
-        system = opened(system, weight, len(deltas))
+        system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     return UncertainPlant(
         plant,
         system,
@@ -79,52 +88,165 @@ def uncertain(
     )
 
 
-def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
-    """Return the continuous plant with a channel for each Delta.
+def _by_parameters(
+    plant: P,
+    fit: UpdateResult,
+    parameters: Sequence[Parameter] | None,
+    modes: Sequence[int] | None,
+    deviations: float,
+    neglected: Any,
+) -> UncertainPlant[P]:
+    """Return a plant whose modes damping couples, with Deltas on the parameters of its fit."""
+    unknowns = tuple(fit.unknowns if parameters is None else parameters)
+    covariance = _checked_fit(fit, unknowns)
+    if modes is not None:
+        raise ModelError(
+            f"the modes of this plant are coupled by damping ({plant.form}): its Deltas are the "
+            "parameters of the fit, which act on all modes. Leave modes out."
+        )
+    system, deltas = by_parameters(plant.continuous, fit, unknowns, deviations)
+    weight = None
+    if neglected is not None:
+        weight = neglected_modes(plant, neglected)
+        system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
+    scale = deviations * np.sqrt(np.diag(covariance))
+    return UncertainPlant(
+        plant,
+        system,
+        deltas,
+        covariance / np.outer(scale, scale),
+        deviations,
+        weight,
+        fit,
+        unknowns,
+    )
 
-    All matrices are affine in the Deltas, [A B; C D] + sum delta_j L_j R_j: each L_j R_j is read
-    off the plant assembled with that mode changed, so it holds for any port.
+
+def _checked_fit(fit: UpdateResult, parameters: Sequence[Parameter]) -> FloatArray:
+    """Return the covariance of a fit whose parameters are given."""
+    names = tuple(parameter.name for parameter in parameters)
+    if names != tuple(fit.parameters):
+        raise LabelError(
+            f"the fit is of {list(fit.parameters)}, got the parameters {list(names)}: pass those "
+            "given to update, in the same order: plant.uncertain(fit, parameters)."
+        )
+    if fit.covariance is None:
+        raise ModelError(
+            "the fit has no covariance: as many numbers were measured as were fitted. Measure "
+            "another mode, or give MeasuredModes(covariance=...)."
+        )
+    return fit.covariance
+
+
+class _Channels(NamedTuple):
+    """How a plant depends on its Deltas: ``M0 + left W right + again W R (A0 + left_A W right)``.
+
+    With M = [A B; C D], W the diagonal of relative changes, and R the part of `right` (m, n + m)
+    over the states: accelerations see the rates of the states, which the Deltas change once more.
     """
-    base, g = _matrix(plant.system), plant.system
-    n, m = g.n_states, len(g.inputs)
-    left, right = np.zeros((base.shape[0], len(deltas))), np.zeros((len(deltas), n + m))
-    for j, delta in enumerate(deltas):
-        change = (_matrix(with_changes(plant, [(delta, _PROBE)]).system) - base) / _PROBE
-        sizes = np.linalg.norm(change, axis=1)
-        R = change[np.argmax(sizes)] / np.sqrt(sizes.max())
-        left[:, j] = change @ R / (R @ R) * np.sqrt(delta.scale)
-        right[j] = R * np.sqrt(delta.scale)
-    _check_affine(plant, deltas, left, right)
-    zero = np.zeros((len(deltas), len(deltas)))
+
+    base: FloatArray
+    left: FloatArray
+    right: FloatArray
+    again: FloatArray
+    n: int
+
+    @property
+    def rates(self) -> FloatArray:
+        """R [A0 B0] (m, n + m): what the second copies of the Deltas see."""
+        return np.asarray(self.right[:, : self.n] @ self.base[: self.n])
+
+    @property
+    def crossed(self) -> FloatArray:
+        """What they see of the first copies (m, m)."""
+        return np.asarray(self.right[:, : self.n] @ self.left[: self.n])
+
+    @property
+    def repeated(self) -> FloatArray:
+        """Which Deltas (m,) have a second copy."""
+        return np.asarray(np.any(self.again != 0, axis=0))
+
+    def at(self, amounts: FloatArray) -> FloatArray:
+        """Return M at some changes (m,) of the Deltas."""
+        once = amounts[:, None] * self.right
+        return np.asarray(
+            self.base
+            + self.left @ once
+            + (self.again * amounts) @ (self.rates + self.crossed @ once)
+        )
+
+
+def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
+    """Return the continuous plant with a channel for each Delta, two where accelerations need it.
+
+    A mode's A is affine in its Deltas, ``A0 + sum_j delta_j l_j R_j``, and so are displacements and
+    velocities. An acceleration ``S A (A x + N' f)`` holds products of them where the damping of a
+    mode is not proportional. With the rate ``x'`` of the states, which a first copy of the Deltas
+    drives, it is ``S A0 x' + sum_j (S l_j) delta_j R_j x'``: a second copy of each Delta that reads
+    ``R_j x'`` makes it exact. The columns are read off the plant assembled with one mode changed,
+    so that they hold for any port.
+    """
+    own, g = _channels(plant, deltas), plant.system
+    _check(plant, deltas, own)
+    n, m, twice = own.n, len(g.inputs), np.flatnonzero(own.repeated)
+    again = own.again[:, twice]
+    left = np.hstack([own.left, again])
+    right = np.vstack([own.right, own.rates[twice]])
+    feed = np.zeros((right.shape[0], right.shape[0]))
+    feed[len(deltas) :, : len(deltas)] = own.crossed[twice]
+    names = [d.name for d in deltas] + [f"{deltas[j].name}:rate" for j in twice.tolist()]
     return StateSpace(
         g.A,
         np.hstack([left[:n], g.B]),
         np.vstack([right[:, :n], g.C]),
-        np.block([[zero, right[:, n:]], [left[n:], g.D]]),
-        inputs=[*(f"{delta.name}:w" for delta in deltas), *g.inputs],
-        outputs=[*(f"{delta.name}:z" for delta in deltas), *g.outputs],
+        np.block([[feed, right[:, n : n + m]], [left[n:], g.D]]),
+        inputs=[*(f"{name}:w" for name in names), *g.inputs],
+        outputs=[*(f"{name}:z" for name in names), *g.outputs],
         states=g.states,
         name=g.name,
         blocks=g.blocks,
     )
 
 
-def _check_affine(
-    plant: Partition, deltas: Sequence[Delta], left: FloatArray, right: FloatArray
-) -> None:
+def _channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
+    """Return how the plant depends on its Deltas, read off with one mode changed at a time."""
+    base, n = _matrix(plant.system), plant.system.n_states
+    left, right = np.zeros((base.shape[0], len(deltas))), np.zeros((len(deltas), base.shape[1]))
+    again = np.zeros_like(left)
+    for j, delta in enumerate(deltas):
+        changed = _matrix(with_changes(plant, [(delta, _PROBE)]).system)
+        change = (changed - base) / _PROBE
+        # of a mode's block the second row changes
+        R = change[int(plant.modal_states[2 * delta.mode - 1])]
+        R = R / np.linalg.norm(R)
+        rate = R[:n] @ changed[:n]
+        rate_size = float(np.linalg.norm(rate))
+        seen = np.linalg.lstsq(np.array([R, rate / rate_size]).T, change.T, rcond=None)[0]
+        size = np.linalg.norm(change, axis=1)
+        plain = np.abs(seen[1]) <= _AFFINE * size
+        left[:, j] = np.where(plain, change @ R, seen[0])
+        again[:, j] = np.where(plain, 0.0, seen[1] / rate_size)
+        right[j] = R
+        even = np.sqrt(delta.scale * max(float(np.abs(left[:n, j]).max()), 1e-300))
+        right[j] *= even
+        left[:, j] *= delta.scale / even
+        again[:, j] *= delta.scale / even
+    return _Channels(base, left, right, again, n)
+
+
+def _check(plant: Partition, deltas: Sequence[Delta], own: _Channels) -> None:
+    """Raise ModelError unless the channels give the plant with all modes changed at once."""
     amounts = [_PROBE * (1.0 if j % 2 else -0.5) for j in range(len(deltas))]
     wanted = _matrix(with_changes(plant, list(zip(deltas, amounts, strict=True))).system)
-    weights = np.array(amounts) / np.array([delta.scale for delta in deltas])
-    off = np.abs(wanted - _matrix(plant.system) - (left * weights) @ right)
-    row = np.abs(wanted - _matrix(plant.system)).max(axis=1)
+    off = np.abs(wanted - own.at(np.array(amounts) / np.array([delta.scale for delta in deltas])))
+    row = np.abs(wanted - own.base).max(axis=1)
     bad = np.flatnonzero(off.max(axis=1) > 1e-6 * row + 1e-12 * np.abs(wanted).max(axis=1))
     if bad.size:
-        i = int(bad[0]) - plant.system.n_states
+        i = int(bad[0]) - own.n
         name = plant.system.outputs[i] if i >= 0 else plant.system.states[int(bad[0])]
         raise ModelError(
-            f"{name!r} depends on products of Deltas: an acceleration of a mode whose damping is "
-            "not proportional does. Measure displacement or velocity there, or assemble from "
-            "modes with proportional damping."
+            f"{name!r} does not depend on the modes as displacements, velocities and accelerations "
+            "do, so that no Deltas express it. Give the sensor a `row` and a quantity."
         )
 
 
@@ -139,22 +261,12 @@ def _fitted_poles(
     modes: Sequence[int] | None,
 ) -> tuple[tuple[int, ...], ComplexArray, FloatArray]:
     """Return mode numbers, poles and J C J', the covariance of [Re lambda; Im lambda]."""
-    names = tuple(parameter.name for parameter in parameters or ())
-    if names != tuple(fit.parameters):
-        raise LabelError(
-            f"the fit is of {list(fit.parameters)}, got the parameters {list(names)}: pass those "
-            "given to update, in the same order: plant.uncertain(fit, parameters)."
-        )
-    if fit.covariance is None:
-        raise ModelError(
-            "the fit has no covariance: as many numbers were measured as were fitted. Measure "
-            "another mode, or give MeasuredModes(covariance=...)."
-        )
+    covariance = _checked_fit(fit, tuple(parameters or ()))
     elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
     chosen = list(elastic if modes is None else modes)
     found = eigenvalue_sensitivities(fit.model, list(parameters or ()), modes=chosen)
     J = np.vstack([found.S.real, found.S.imag])
-    return found.modes, found.poles, J @ fit.covariance @ J.T
+    return found.modes, found.poles, J @ covariance @ J.T
 
 
 def _measured_poles(

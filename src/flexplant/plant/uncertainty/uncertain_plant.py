@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Literal
@@ -9,7 +10,7 @@ from typing import Any, Generic, Literal
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import ModelError, unknown_label
+from ...errors import FlexplantWarning, ModelError, unknown_label
 from ...lti.statespace import StateSpace
 from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
@@ -31,16 +32,17 @@ class Delta(Value):
     name : str
         Of the channels: `mode6:freq` has the input `mode6:freq:w` and the output `mode6:freq:z`.
     mode : int
-        Number of the mode, from 1, rigid-body modes included.
-    kind : {"freq", "damping"}
-        Stiffness ``omega^2 (1 + scale delta)`` or damping ``2 zeta omega (1 + scale delta)``.
+        Number of the mode, from 1, rigid-body modes included; 0 of a parameter.
+    kind : {"freq", "damping", "parameter"}
+        Stiffness ``omega^2 (1 + scale delta)`` or damping ``2 zeta omega (1 + scale delta)`` of a
+        mode; or a parameter of the fit, its value plus scale delta.
     scale : float
-        Relative change at delta = 1.
+        Change at delta = 1: relative, of a parameter in its own unit.
     """
 
     name: str
     mode: int
-    kind: Literal["freq", "damping"]
+    kind: Literal["freq", "damping", "parameter"]
     scale: float
 
 
@@ -60,8 +62,8 @@ def modal_realisation(plant: Partition) -> ModalRealisation:
     if plant.form != MODAL:
         raise ModelError(
             f"the modes of this plant are coupled by damping ({plant.form}): frequency and "
-            "damping of one mode are not its own, so that no Delta belongs to it. Draw machines "
-            "from the fit itself (its parameters and covariance), or lower the damping."
+            "damping of one mode are not its own, so that no Delta belongs to it. Deltas on the "
+            "parameters of a fit do: plant.uncertain(fit)."
         )
     return realisation
 
@@ -111,7 +113,9 @@ class UncertainPlant(Value, Generic[P]):
         The nominal plant, continuous or sampled.
     system : StateSpace
         Continuous: inputs [Delta channels `mode6:freq:w`; neglected modes `y1:neglected:w`; w; u],
-        outputs [`mode6:freq:z`; `u1:neglected:z`; z; y].
+        outputs [`mode6:freq:z`; `u1:neglected:z`; z; y]. A Delta that acts at several places has
+        further channels after the first ones of all: `mode6:freq:rate:w`, where accelerations need
+        it.
     deltas : sequence of Delta
         In the order of their channels.
     covariance : (m, m) array
@@ -138,12 +142,28 @@ class UncertainPlant(Value, Generic[P]):
     def __post_init__(self) -> None:
         self._set(covariance=self.covariance)
 
+    @property
+    def channels(self) -> dict[str, str]:
+        """The Delta of each of its channels: {`mode6:freq:rate`: `mode6:freq`, ...}, in order."""
+        names = [delta.name for delta in self.deltas]
+        inner = len(self.system.inputs) - len(self.plant.w) - len(self.plant.u)
+        found = {}
+        for channel in (name.removesuffix(":w") for name in self.system.inputs[:inner]):
+            for name in names:
+                if channel == name or channel.startswith(f"{name}:"):
+                    found[channel] = name
+        return found
+
     def __repr__(self) -> str:
         more = f", {self.neglected!r}" if self.neglected is not None else ""
         lines = [
             f"<UncertainPlant: {len(self.deltas)} real Deltas at {self.deviations:g} std{more}"
         ]
         for delta in self.deltas[:6]:
+            if delta.kind == "parameter":
+                unit = self.parameters[self.deltas.index(delta)].unit
+                lines.append(f"  {delta.name} +- {delta.scale:.3g} {unit}")
+                continue
             half = 0.5 if delta.kind == "freq" else 1.0
             lines.append(f"  {delta.name} +- {100 * half * delta.scale:.3g} %")
         if len(self.deltas) > 6:
@@ -183,7 +203,10 @@ class UncertainPlant(Value, Generic[P]):
                 raise unknown_label("Delta", name, known)
             amount = float(real_array(value, f"the value of {name!r}", ()))
             changes.append((known[name], known[name].scale * amount))
-        return with_changes(self.plant, changes)
+        if self.deltas[0].kind != "parameter":
+            return with_changes(self.plant, changes)
+        amounts = {delta.name: amount for delta, amount in changes}
+        return self._moved(np.array([amounts.get(delta.name, 0.0) for delta in self.deltas]))
 
     def sample(self, rng: Any, n: int = 1) -> list[P]:
         """Return machines within the uncertainty, ports and sampling those of the nominal plant.
@@ -224,8 +247,15 @@ class UncertainPlant(Value, Generic[P]):
             drawn = _normal(rng, self.covariance)
             names = (delta.name for delta in self.deltas)
             return self.lft(dict(zip(names, drawn.tolist(), strict=True)))
-        model = _moved(self.fit.model, self.parameters, _normal(rng, self.fit.covariance))
-        return rebuilt(self.plant, realisation=modes_of(model))
+        return self._moved(_normal(rng, self.fit.covariance))
+
+    def _moved(self, change: FloatArray) -> P:
+        """Return the plant of the fit's model with its parameters changed by some amounts."""
+        realisation = self.plant.assembled.realisation
+        model = _moved(realisation, self.fit.model, self.parameters, change)  # type: ignore[union-attr]
+        with warnings.catch_warnings():  # the nominal plant has said in which form it is
+            warnings.simplefilter("ignore", FlexplantWarning)
+            return rebuilt(self.plant, realisation=modes_of(model))
 
 
 def _normal(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
@@ -237,23 +267,33 @@ def _normal(rng: np.random.Generator, covariance: FloatArray) -> FloatArray:
     return np.asarray(std * (root @ rng.standard_normal(std.size)))
 
 
-def _moved(model: Any, parameters: Sequence[Parameter], change: FloatArray) -> Any:
-    """Return the fit's model with parameters changed by some amounts.
+def elastic_part(model: Any, realisation: ModalRealisation, D: FloatArray) -> FloatArray:
+    """Return what a damper does beside rigid-body motion, which is undamped by convention.
 
-    Rigid-body modes are undamped by convention: dampers change the elastic motions only.
+    All of it where the plant's own dampers slow rigid-body motion down.
     """
+    r = realisation.n_rigid
+    coupled = realisation.coupling is not None and np.any(realisation.coupling[:r])
+    if not model.rigid_body.shape[1] or coupled or np.any(realisation.pairs[:r, 1, 1]):
+        return D
+    rigid = orthonormalised(model.M, model.rigid_body)
+    elastic = np.eye(rigid.shape[0]) - rigid @ np.asarray(model.M @ rigid).T
+    return np.asarray(elastic.T @ D @ elastic)
+
+
+def _moved(
+    realisation: ModalRealisation, model: Any, parameters: Sequence[Parameter], change: FloatArray
+) -> Any:
+    """Return the fit's model with parameters changed by some amounts."""
     changed: dict[str, Any] = {name: getattr(model, name) for name in "MDK"}
     for parameter, amount in zip(parameters, change.tolist(), strict=True):
         for name, part in zip("MDK", parameter.matrices(model), strict=True):
             if part is None:
                 continue
-            if name == "D" and model.rigid_body.shape[1]:
-                rigid = orthonormalised(model.M, model.rigid_body)
-                elastic = np.eye(rigid.shape[0]) - rigid @ np.asarray(model.M @ rigid).T
-                part = elastic.T @ part @ elastic
+            moved: Any = elastic_part(model, realisation, part) if name == "D" else part  # type: ignore[arg-type]
             old = changed[name]
             if sp.issparse(old):
-                changed[name] = sp.csc_array(old + amount * sp.csc_array(part))
+                changed[name] = sp.csc_array(old + amount * sp.csc_array(moved))
             else:
-                changed[name] = amount * part if old is None else old + amount * part
+                changed[name] = amount * moved if old is None else old + amount * moved
     return model.replace(**changed)
