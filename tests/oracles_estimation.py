@@ -268,3 +268,13 @@ def periodic_variances(plant, read, periods):
             found.append(np.diag(plant["C1"] @ after @ plant["C1"].T))
             P = A @ after @ A.T + Q
     return np.array(found)
+
+
+def records_of(A, C2, C1, factor, R, steps, rng):
+    """Measurements (N, ny) and motions (N, nz) of x+ = A x + factor xi, y = C2 x + v, from rest."""
+    white = rng.standard_normal((steps, factor.shape[1])) @ factor.T
+    x = np.zeros((steps + 1, A.shape[0]))
+    for k in range(steps):
+        x[k + 1] = A @ x[k] + white[k]
+    noise = rng.standard_normal((steps, C2.shape[0])) * np.sqrt(np.diag(R))
+    return x[:-1] @ C2.T + noise, x[:-1] @ C1.T

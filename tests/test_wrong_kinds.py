@@ -92,6 +92,8 @@ CALLS = [
     ("NarrowBand zeta", lambda x: fx.plant.NarrowBand(1.0, 1.0, x), ()),
     ("RandomWalk drift", lambda x: fx.plant.RandomWalk(x), ("fraction",)),
     ("RigidForce direction", lambda x: fx.plant.RigidForce("a", x), ()),
+    ("consistency", lambda x: fx.estimation.consistency(x, x), ()),
+    ("consistency estimate", lambda x: fx.estimation.consistency(kalman(), x), ()),
     ("invertibility", lambda x: fx.estimation.invertibility(x, ["amp1"]), ()),
     ("invertibility inputs", lambda x: fx.estimation.invertibility(plant(), x), ()),
     ("input_estimator", lambda x: fx.estimation.design_input_estimator(x, ["amp1"]), ()),

@@ -3,6 +3,8 @@
 from .bias import check_bias as check_bias
 from .certificate import KalmanCertificate as KalmanCertificate
 from .certificate import check_gain as check_gain
+from .consistency import Consistency as Consistency
+from .consistency import consistency as consistency
 from .estimate import Estimate as Estimate
 from .estimator import KalmanEstimator as KalmanEstimator
 from .filter_model import FilterModel as FilterModel

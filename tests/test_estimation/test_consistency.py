@@ -1,0 +1,144 @@
+"""Verdicts on right and wrong models: shares of passes, power, the cause that is named."""
+
+import re
+from functools import cache
+
+import numpy as np
+import pytest
+from scipy.stats import binom
+from test_kalman import modes, ports
+from test_robust import one_state
+
+from flexplant.errors import LabelError, ModelError
+from flexplant.estimation import consistency, design_kalman
+from flexplant.estimation.whiteness import cumulative_periodogram, ljung_box, spectrum_of
+from flexplant.plant import assemble_plant
+from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
+from oracles_estimation import records_of
+
+RATE = 4e3
+
+
+@cache
+def plant(count=9, scale=1.0, sensor_scale=1.0):
+    own = ports(asd=1e-3 * scale, sensor_asd=3e-11 * sensor_scale)
+    return assemble_plant(modes(1e-2, count), own).discretized(RATE, delay=1)
+
+
+@cache
+def machine():
+    return plant(count=9)
+
+
+def recorded(truth, steps=20000, seed=1):
+    g = truth.system
+    y = [name for name in truth.y if name not in truth.w]
+    z = ["die:z", "die:rx", "die:ry"]
+    rows = [truth.y.index(name) for name in y]
+    records = records_of(
+        g.A, g.C[g.output_index(y)], g.C[g.output_index(z)], truth.noise_factor,
+        truth.sensor_noise[np.ix_(rows, rows)], steps, np.random.default_rng(seed),
+    )  # fmt: skip
+    motions = dict(zip(z, records[1].T, strict=True))
+    channels = dict(zip(y, records[0].T, strict=True))
+    return channels | {u: np.zeros(steps) for u in truth.u}, motions
+
+
+def judged(design, truth, **options):
+    observer = design_kalman(design, larger=design)
+    records, motions = recorded(truth, **options)
+    return consistency(observer, observer.estimate(records), truth=motions)
+
+
+def test_a_right_model_passes_as_often_as_stated():
+    """One state, 200 records of 1000 samples at 95 %: the share is binomial."""
+    design = one_state(0.9)
+    observer, passed = design_kalman(design, larger=design), 0
+    rng = np.random.default_rng(8)
+    for _ in range(200):
+        x = np.zeros(1000)
+        for k in range(1, 1000):
+            x[k] = 0.9 * x[k - 1] + rng.standard_normal()
+        y = x + np.sqrt(2.0) * rng.standard_normal(1000)
+        estimate = observer.estimate({"y1": y, "u1": np.zeros(1000)}, start=np.zeros(1))
+        passed += consistency(observer, estimate).holds
+    low, high = binom.ppf([0.001, 0.999], 200, 0.95)
+    assert low <= passed <= high
+
+
+def test_a_right_model_of_the_plate():
+    found = judged(machine(), machine())
+    assert found.holds, found
+    assert found.nis == pytest.approx(1.0, abs=0.02)
+    for mean, low, high in found.nees.values():
+        assert low < 1.0 < high
+        assert mean == pytest.approx(1.0, abs=0.3)
+
+
+@pytest.mark.parametrize(("factor", "word"), [(1.2, "larger"), (0.8, "smaller")])
+def test_all_noises_off_by_a_factor(factor, word):
+    found = judged(machine(), plant(scale=factor, sensor_scale=factor))
+    assert found.cause == "noise level"
+    assert word in found.text
+    assert found.nis == pytest.approx(factor**2, rel=0.03, abs=0)
+    assert found.nees["die:z"][0] == pytest.approx(factor**2, rel=0.25, abs=0)
+
+
+def test_process_noise_alone_is_off():
+    found = judged(machine(), plant(scale=3.0))
+    assert found.cause == "noise ratio"
+    process, sensors = map(float, re.findall(r"([\d.]+) times", found.text))
+    assert process == pytest.approx(3.0, rel=0.1, abs=0)
+    assert sensors == pytest.approx(1.0, rel=0.2, abs=0)
+    assert judged(plant(scale=3.0), machine()).cause == "noise ratio"
+
+
+@pytest.mark.parametrize("mode", [4, 6])
+def test_a_wrong_frequency_is_named_with_its_mode(mode):
+    moved = with_changes(machine(), [(Delta(f"mode{mode}:freq", mode, "freq", 1.0), 0.06)])
+    found = judged(machine(), moved)
+    assert found.cause == "frequency"
+    assert f"near mode {mode} " in found.text
+    omega = np.sqrt(np.linalg.det(moved.modal_blocks))[mode - 1]
+    assert found.peaks[0][0] == pytest.approx(omega / (2 * np.pi), rel=0.03, abs=0)
+
+
+def test_a_truncated_model_is_named():
+    found = judged(plant(count=8), machine())
+    assert found.cause == "truncation"
+    assert "above all modes" in found.text
+    assert found.peaks[0][0] == pytest.approx(modes(1e-2, 9).freq[8], rel=0.03, abs=0)
+
+
+def test_statistics_by_direct_sums():
+    rng = np.random.default_rng(1)
+    x = rng.standard_normal((300, 2))
+    N, lags = 300, 5
+    G0 = np.linalg.inv(x.T @ x / N)
+    total = 0.0
+    for lag in range(1, lags + 1):
+        G = x[lag:].T @ x[:-lag] / N
+        total += N * N / (N - lag) * np.trace(G.T @ G0 @ G @ G0)
+    assert ljung_box(x, lags).statistic == pytest.approx(total, rel=1e-10, abs=0)
+    found = spectrum_of(x)
+    line = np.exp(-2j * np.pi * found.freq[10] * np.arange(300)) @ x
+    assert found.density[10] == pytest.approx(np.mean(np.abs(line) ** 2) / N, rel=1e-10, abs=0)
+    distance = cumulative_periodogram(found).statistic
+    share = np.cumsum(found.density) / found.density.sum()
+    assert distance == pytest.approx(
+        np.abs(share - np.arange(1, share.size + 1) / share.size).max(), rel=1e-12, abs=0
+    )
+
+
+def test_refusals():
+    design = one_state(0.9)
+    observer = design_kalman(design, larger=design)
+    estimate = observer.estimate({"y1": np.zeros(50), "u1": np.zeros(50)}, start=np.zeros(1))
+    with pytest.raises(ModelError, match="at least 200 samples"):
+        consistency(observer, estimate)
+    with pytest.raises(ModelError, match="KalmanEstimator and its Estimate"):
+        consistency(observer, {})
+    records, _ = recorded(machine(), steps=300)
+    observer = design_kalman(machine(), larger=machine())
+    with pytest.raises(LabelError, match="POI channel"):
+        consistency(observer, observer.estimate(records), truth={"dye": np.zeros(300)})
