@@ -131,6 +131,9 @@ def of_estimators(plant, small):
     yield from (kalman, kalman.model, kalman.estimate(records), kalman.report())
     yield from (estimation.Predictor(), estimation.Filter(), estimation.FixedLag(2))
     yield from (estimation.Smoother(), estimation.Unbiased(), estimation.Augmented(1.0))
+    longer = {name: 1e-9 * rng.standard_normal(400) for name in (*small.y, *small.u)}
+    observer = fx.design_kalman(small)
+    yield estimation.consistency(observer, observer.estimate(longer))
     yield estimation.design_hinf_filter(small, accuracy=0.5)
     yield estimation.design_minimax_filter(small, [small], iterations=2)
     yield estimation.design_multirate(small, {"y1": 2})

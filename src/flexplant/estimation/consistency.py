@@ -17,9 +17,9 @@ from .channels import poi_channels, row_of
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .whiteness import (
-    Peak,
-    Spectrum,
-    Test,
+    ExcessPeak,
+    PooledSpectrum,
+    Statistic,
     cumulative_periodogram,
     level_test,
     ljung_box,
@@ -87,7 +87,7 @@ class Consistency(Value):
 
     @property
     def holds(self) -> bool:
-        """Whether nothing speaks against the model of the innovations."""
+        """Whether no test rejects the model of the innovations."""
         return self.cause == "none"
 
 
@@ -187,10 +187,10 @@ def consistency(
 
 
 class _Facts(NamedTuple):
-    nis: Test
-    box: Test
-    bartlett: Test
-    peaks: list[Peak]
+    nis: Statistic
+    box: Statistic
+    bartlett: Statistic
+    peaks: list[ExcessPeak]
     levels: FloatArray
     ratios: FloatArray
     samples: int
@@ -231,7 +231,7 @@ def _level_text(facts: _Facts, names: Any) -> str:
     return f"{text}. Scale the densities by this, or estimate them from the record."
 
 
-def _peak_verdict(plant: StandardPlant, found: list[Peak]) -> tuple[Cause, str]:
+def _peak_verdict(plant: StandardPlant, found: list[ExcessPeak]) -> tuple[Cause, str]:
     """Return the verdict for coloured innovations with peaks."""
     freq, first = _mode_freq(plant)
     rate = 1.0 / plant.dt
@@ -270,7 +270,7 @@ def _near(freq: FloatArray, at: float) -> int | None:
     return best if abs(freq[best] - at) <= _NEAR * freq[best] else None
 
 
-def _levels(observer: KalmanEstimator, found: Spectrum) -> tuple[FloatArray, FloatArray]:
+def _levels(observer: KalmanEstimator, found: PooledSpectrum) -> tuple[FloatArray, FloatArray]:
     """Return the levels (process, sensors) that explain a spectrum best, and what they predict.
 
     The sensors' noise reaches the whitened innovations by

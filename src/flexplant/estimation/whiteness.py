@@ -16,14 +16,14 @@ _LINES = 2000
 _STEADY = 64
 
 
-class Test(NamedTuple):
+class Statistic(NamedTuple):
     """A statistic and the probability of a larger one (or one further off) by chance."""
 
     statistic: float
     p_value: float
 
 
-class Spectrum(NamedTuple):
+class PooledSpectrum(NamedTuple):
     """Mean density of the channels over frequency, 1 for white noise of unit variance.
 
     Parameters
@@ -41,7 +41,7 @@ class Spectrum(NamedTuple):
     channels: int
 
 
-def level_test(squares: float, count: int) -> Test:
+def level_test(squares: float, count: int) -> Statistic:
     """Return the mean square of `count` numbers of unit variance, and how unlikely it is.
 
     The sum is chi-square; the probability is of both tails.
@@ -49,10 +49,10 @@ def level_test(squares: float, count: int) -> Test:
     from scipy.stats import chi2
 
     p = 2 * min(chi2.cdf(squares, count), chi2.sf(squares, count))
-    return Test(squares / count, float(min(p, 1.0)))
+    return Statistic(squares / count, float(min(p, 1.0)))
 
 
-def ljung_box(white: FloatArray, lags: int) -> Test:
+def ljung_box(white: FloatArray, lags: int) -> Statistic:
     """Return the portmanteau statistic of vectors (N, p) over some lags.
 
     ``N^2 sum_l tr(G_l' G_0^-1 G_l G_0^-1) / (N - l)``, chi-square with p^2 lags degrees of freedom;
@@ -74,21 +74,21 @@ def ljung_box(white: FloatArray, lags: int) -> Test:
     standard = root @ covariance[1:] @ root.T
     pairs = np.maximum(np.round(mask[1:]), 1.0)
     statistic = float(np.sum(count**2 / pairs * np.sum(standard**2, axis=(1, 2))))
-    return Test(statistic, float(chi2.sf(statistic, p * p * lags)))
+    return Statistic(statistic, float(chi2.sf(statistic, p * p * lags)))
 
 
-def spectrum_of(white: FloatArray) -> Spectrum:
+def spectrum_of(white: FloatArray) -> PooledSpectrum:
     """Return the periodogram of vectors (N, p), mean over the channels."""
     there = np.all(np.isfinite(white), axis=1)
     x = np.where(there[:, None], white, 0.0)
     power = np.abs(np.fft.rfft(x, axis=0)) ** 2 / max(int(there.sum()), 1)
     lines = slice(1, (len(x) - 1) // 2 + 1)
-    return Spectrum(
+    return PooledSpectrum(
         np.fft.rfftfreq(len(x))[lines].astype(np.float64), power[lines].mean(axis=1), x.shape[1]
     )
 
 
-def cumulative_periodogram(found: Spectrum) -> Test:
+def cumulative_periodogram(found: PooledSpectrum) -> Statistic:
     """Return the largest distance of the cumulative periodogram from a straight line.
 
     Bartlett's test; the distance times (m p)^(1/2), m lines of p channels, has Kolmogorov's
@@ -100,10 +100,10 @@ def cumulative_periodogram(found: Spectrum) -> Test:
     line = np.arange(1, total.size + 1) / total.size
     distance = float(np.max(np.abs(total / total[-1] - line)))
     statistic = distance * np.sqrt(found.density.size * found.channels)
-    return Test(distance, float(kstwobign.sf(statistic)))
+    return Statistic(distance, float(kstwobign.sf(statistic)))
 
 
-class Peak(NamedTuple):
+class ExcessPeak(NamedTuple):
     """Where a spectrum is above its mean.
 
     Parameters
@@ -121,7 +121,7 @@ class Peak(NamedTuple):
     p_value: float
 
 
-def peaks(found: Spectrum, alpha: float) -> list[Peak]:
+def peaks(found: PooledSpectrum, alpha: float) -> list[ExcessPeak]:
     """Return where the spectrum exceeds its mean, the most significant ones first.
 
     Averages over b lines of p channels are chi-square with 2 b p degrees of freedom; each of the
@@ -153,6 +153,6 @@ def peaks(found: Spectrum, alpha: float) -> list[Peak]:
     for start, end in edges.reshape(-1, 2):
         at = start + int(np.argmax(smooth[start:end]))
         listed.append(
-            Peak(float(found.freq[at]), float(smooth[at]), float(chance[start:end].min()))
+            ExcessPeak(float(found.freq[at]), float(smooth[at]), float(chance[start:end].min()))
         )
     return sorted(listed, key=lambda one: (one.p_value, -one.height))
