@@ -20,9 +20,16 @@ PORTS = fx.Ports(
     references=[fx.Reference("die")],
 )
 MOVE = fx.setpoint(
-    100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, settle=0.03, exposure=0.05, rate=RATE
+    100e-6,
+    velocity=5e-3,
+    acceleration=0.5,
+    jerk=100.0,
+    snap=4e4,
+    settle=0.02,
+    exposure=0.05,
+    rate=RATE,
 )
-EXPOSED = fx.Specification(ma=1e-6, msd=50e-9, effort=5.0, start=MOVE.exposures[0, 0])
+EXPOSED = fx.Specification(ma=40e-9, msd=20e-9, effort=5.0, start=MOVE.exposures[0, 0])
 LOOP = fx.Specification(bandwidth=40.0, modulus_margin=0.5, noise=1.5e-9)
 
 
@@ -38,7 +45,8 @@ def machine() -> fx.ClosedLoop:
     plant = fx.assemble_plant(modes, PORTS).discretized(RATE, delay=DELAY)
     static = fx.design_static(plant)
     servo = fx.design_servo(plant, bandwidth=60.0, observer=static)
-    return truth.loop(PORTS, static, servo)
+    feedforward = fx.design_feedforward(fx.close_loop(plant, static, servo))
+    return truth.loop(PORTS, static, servo, feedforward)
 
 
 @cache

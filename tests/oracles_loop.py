@@ -148,3 +148,25 @@ def folded_spectrum(physical, loop, freq, asd, sensor_asd, aliases):
         row = np.concatenate([[1.0], (P[:1] @ back)[0]])
         out[i] = (row @ S @ row.conj()).real
     return out
+
+
+def lifted_inverse(A, B, C, D, target, damping):
+    """Return u (n, r) that minimises ``|target - P u|^2 + sum damping u^2`` over n samples.
+
+    Dense least squares on the matrix of Markov parameters; target (n, q), damping (r,).
+    """
+    n, q = target.shape
+    r = B.shape[1]
+    markov, x = [D], B
+    for _ in range(n - 1):
+        markov.append(C @ x)
+        x = A @ x
+    P = np.zeros((n * q, n * r))
+    for k in range(n):
+        for i in range(k, n):
+            P[i * q : (i + 1) * q, k * r : (k + 1) * r] = markov[i - k]
+    # in units in which the damping is one
+    unit = np.tile(1.0 / np.sqrt(damping), n)
+    tall = np.vstack([P * unit, np.eye(n * r)])
+    right = np.concatenate([target.ravel(), np.zeros(n * r)])
+    return (unit * np.linalg.lstsq(tall, right, rcond=None)[0]).reshape(n, r)

@@ -9,7 +9,13 @@ import flexplant as fx
 from flexplant.errors import FlexplantError
 from flexplant.loop import close_loop
 from flexplant.placement import Exchange, Exhaustive
-from flexplant.simulation import error_map, exposure_errors, settling_time
+from flexplant.simulation import (
+    error_map,
+    exposure_errors,
+    inverse_forces,
+    learn_feedforward,
+    settling_time,
+)
 from flexplant.testbeds import wafer_stage
 from stages import RATE, ports, sampled, some_modes
 
@@ -25,6 +31,9 @@ KINDS = {
     "dict": {"a": 1},
     "list": [None],
 }
+
+
+MOVE = fx.setpoint(1e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rate=RATE)
 
 
 @cache
@@ -159,6 +168,18 @@ CALLS = [
     ("exposures", lambda x: exposure_errors(run(), exposures=x), ("none",)),
     ("settling", lambda x: settling_time(run(), "die:error", ma=x), ("fraction",)),
     ("error map", lambda x: error_map(loop(), x, duration=0.01), ()),
+    ("feedforward", lambda x: fx.design_feedforward(x), ()),
+    ("feedforward order", lambda x: fx.design_feedforward(plant(), order=x), ()),
+    ("feedforward along", lambda x: fx.design_feedforward(plant(), along=x), ("none",)),
+    ("feedforward reference", lambda x: fx.design_feedforward(plant(), reference=x), ("none",)),
+    ("feedforward term", lambda x: fx.design_feedforward(plant()).up_to(x), ()),
+    ("forces", lambda x: fx.design_feedforward(plant()).forces(MOVE, x), ()),
+    ("inverse bandwidth", lambda x: inverse_forces(loop(), MOVE, duration=0.1, bandwidth=x),
+     ("fraction",)),
+    ("inverse", lambda x: inverse_forces(x, MOVE, duration=0.1, bandwidth=100.0), ()),
+    ("learn", lambda x: learn_feedforward(x, lambda f: run(), loop(), MOVE, duration=0.1), ()),
+    ("learn step", lambda x: learn_feedforward(fx.design_feedforward(plant()), lambda f: run(),
+     loop(), MOVE, duration=0.01, step=x), ()),
     ("specification", lambda x: fx.Specification(ma=x), ("fraction", "none")),
     ("specification check", lambda x: fx.Specification(noise=1.0).check(x), ()),
     ("specification run", lambda x: fx.Specification(ma=1.0).check(loop(), x), ()),

@@ -82,6 +82,7 @@ from .reduction import select_dofs as select_dofs
 from .simulation import Response as Response
 from .simulation import Specification as Specification
 from .simulation import compare_estimators as compare_estimators
+from .simulation import design_feedforward as design_feedforward
 from .simulation import reading_along as reading_along
 from .simulation import scan as scan
 from .simulation import setpoint as setpoint

@@ -19,7 +19,7 @@ from flexplant.estimation.left_out import LeftOut
 from flexplant.loop import close_loop
 from flexplant.modes import normal_form
 from flexplant.reduction import select_dofs
-from flexplant.simulation import error_map, exposure_errors
+from flexplant.simulation import LearnedFeedforward, error_map, exposure_errors
 from flexplant.store import load
 from flexplant.updating import eigenvalue_sensitivities
 from flexplant.values import Value
@@ -80,6 +80,8 @@ def made():
     response = fx.simulate(loop, reference=point, duration=0.1, rng=1)
     yield exposure_errors(response, window=0.01)
     yield error_map(loop, CORNERS, duration=0.02)
+    forward = fx.design_feedforward(sampled)
+    yield from (forward, LearnedFeedforward(forward, np.ones(2), np.ones((2, 3, 5))))
     yield from (fx.Specification(noise=1e-6), fx.Specification(noise=1e-6).check(loop))
     along = fx.close_loop(sampled, static, servo, *fx.reading_along({"static": static}))
     runs = fx.simulate(along, duration=0.01, rng=1, runs=2)

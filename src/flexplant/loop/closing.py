@@ -12,6 +12,7 @@ from ..plant import StandardPlant, larger_plant, standard_plant
 from ..values import name_list
 from .blocks import as_block, check_inputs, drives, joined
 from .closed import ClosedLoop
+from .known import with_known
 
 
 def close_loop(
@@ -22,7 +23,9 @@ def close_loop(
     An input of a block is a measurement (plant.y: sensors, references such as `die:ref`), the
     applied command of an actuator (plant.u), or an output of another block. An output of a block
     that has an actuator's name drives it, and several such outputs add; every other output is
-    monitored.
+    monitored. A block may also read what is known in advance: the derivatives of a reference
+    (`die:ref:velocity`, `die:ref:acceleration`, `die:ref:jerk`, `die:ref:snap`), which `simulate`
+    takes from the SetPoint, and forces (`u1:feedforward`), which it is given as a reference.
 
     Parameters
     ----------
@@ -84,10 +87,14 @@ def close_loop(
     for name in resting:
         if name not in plant.u:
             raise unknown_label("actuator to leave idle", name, plant.u)
+    larger = _completed(plant, larger)
+    plant = with_known(plant, systems)
     driven, watched = drives(plant, systems, resting)
     check_inputs(plant, systems)
     controller = joined(plant, systems, driven, watched)
-    loop = ClosedLoop(plant, systems, controller, resting, _completed(plant, larger))
+    loop = ClosedLoop(
+        plant, systems, controller, resting, None if larger is None else with_known(larger, systems)
+    )
     found = loop.left_out
     if not loop.is_stable:
         if loop.obstacle and loop.obstacle.reason.startswith("unstable"):

@@ -8,6 +8,12 @@ from .estimator_comparison import reading_along as reading_along
 from .exposure import ExposureErrors as ExposureErrors
 from .exposure import exposure_errors as exposure_errors
 from .exposure import settling_time as settling_time
+from .feedforward import Feedforward as Feedforward
+from .feedforward import design_feedforward as design_feedforward
+from .feedforward import known_forces as known_forces
+from .inverse import inverse_forces as inverse_forces
+from .learning import LearnedFeedforward as LearnedFeedforward
+from .learning import learn_feedforward as learn_feedforward
 from .motion import Motion as Motion
 from .motion import SetPoint as SetPoint
 from .response import Response as Response

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
+from ..loop.known import DERIVATIVES, references
 from ..loop.noise import WhiteNoise, white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
@@ -64,6 +65,7 @@ def simulate(
     reference : signal or mapping {name: signal}, optional
         For references such as `die:ref`; one signal where the plant has one reference. A signal is
         a SetPoint, an array of one value per sample, a number, or a function of the times [s].
+        Derivatives of a SetPoint that blocks read are taken from it.
     disturbance : mapping {name: signal}, optional
         For other channels of w, held over each sample, in addition to their noise.
     noise : bool
@@ -243,17 +245,17 @@ def _given(
     time: FloatArray,
 ) -> FloatArray:
     """Return the known part of w (n_time, nw)."""
-    references = [name for name in plant.w if name in plant.y]
-    others = [name for name in plant.w if name not in references]
+    both = [name for name in plant.w if name in plant.y]
+    own, others = references(plant), [name for name in plant.w if name not in both]
     if reference is None:
         reference = {}
     elif not isinstance(reference, Mapping):
-        if len(references) != 1:
+        if len(own) != 1:
             raise LabelError(
-                f"the plant has {len(references)} references {references}: say which one is meant, "
+                f"the plant has {len(own)} references {own}: say which one is meant, "
                 "reference={name: signal}; Ports(references=[Reference(poi)]) adds one."
             )
-        reference = {references[0]: reference}
+        reference = {own[0]: reference}
     if disturbance is not None and not isinstance(disturbance, Mapping):
         raise ModelError(
             f"disturbance must be a mapping, got {short(disturbance)}: say which channel of w is "
@@ -261,7 +263,7 @@ def _given(
         )
     given = np.zeros((time.size, len(plant.w)))
     for kind, known, signals in (
-        ("reference", references, reference),
+        ("reference", both, {**reference, **_derivatives(reference, both, own)}),
         ("disturbance", others, disturbance or {}),
     ):
         for name, signal in signals.items():
@@ -269,6 +271,35 @@ def _given(
                 raise unknown_label(kind, name, known, "the plant's w")
             given[:, plant.w.index(name)] = _sampled(signal, f"{kind} {name!r}", time)
     return given
+
+
+def _derivatives(
+    reference: Mapping[str, Signal], both: Sequence[str], own: Sequence[str]
+) -> dict[str, Signal]:
+    """Return the derivatives of set-points that blocks read and that are not given themselves."""
+    found: dict[str, Signal] = {}
+    for name in both:
+        owner, _, kind = name.rpartition(":")
+        if owner not in own or name in reference or owner not in reference:
+            continue
+        move = reference[owner]
+        if not isinstance(move, SetPoint):
+            raise ModelError(
+                f"a block reads {name!r}, which follows from a SetPoint only: pass one for "
+                f"{owner!r} (setpoint, scan), or give {name!r} as a reference too."
+            )
+        if move.order < DERIVATIVES.index(kind) + 1:
+            raise ModelError(
+                f"a block reads {name!r}, but {move!r} is of order {move.order}, so that its "
+                f"{kind} is impulses. Give the set-point a bound on {kind}, or use "
+                "feedforward.up_to of a lower derivative."
+            )
+        found[name] = _of(move, kind)
+    return found
+
+
+def _of(move: SetPoint, kind: str) -> Callable[[FloatArray], FloatArray]:
+    return lambda time: np.asarray(getattr(move.at(time), kind))
 
 
 def _sampled(signal: Any, name: str, time: FloatArray) -> FloatArray:

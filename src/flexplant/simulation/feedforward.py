@@ -1,0 +1,377 @@
+"""Feedforward: forces from the derivatives of a set-point, as the plant's own inverse says."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import AssumptionError, LabelError, ModelError
+from ..loop import ClosedLoop, close_loop
+from ..loop.known import DERIVATIVES, force_name
+from ..lti.statespace import StateSpace
+from ..plant import Poi, StandardPlant, decouple, standard_plant
+from ..values import ComplexArray, FloatArray, Value, name_list, real_array, short, whole
+from .motion import SetPoint
+
+#: points on a circle of Cauchy's integrals; its largest radius [rad/s], and how often it is halved
+_SAMPLES, _LARGEST, _RADII = 16, 6e3, 24
+#: relative: two circles give the same coefficients
+_SAME = 1e-8
+#: condition above which a response counts as singular
+_SINGULAR = 1e9
+#: the response of a POI to forces, and what is to follow, at s
+Inverse: TypeAlias = Callable[[complex], tuple[ComplexArray, ComplexArray]]
+#: what a set-point gives, by the order of the derivative
+TERMS = ("position", *DERIVATIVES)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Feedforward(Value):
+    """Forces proportional to a set-point and its derivatives; a block for `close_loop`.
+
+    ``u = T sum_m gains[m] d^m r / dt^m``, T from forces and moments of the POI's axes at the
+    centre of gravity to the actuators. Made by `design_feedforward`.
+
+    Parameters
+    ----------
+    reference : str
+        The channel of the set-point r.
+    axes : sequence of str
+        The r axes of the forces.
+    T : (nu, r) array
+        Forces to actuators.
+    actuators : sequence of str
+        Their names.
+    gains : (p, r, 5) array
+        On position, velocity, acceleration, jerk and snap; one row, or one for each of p places.
+    dt : float [s]
+        Sampling time of the plant.
+    """
+
+    reference: str
+    axes: tuple[str, ...]
+    T: FloatArray
+    actuators: tuple[str, ...]
+    gains: FloatArray
+    dt: float
+
+    def __post_init__(self) -> None:
+        self._set(
+            axes=tuple(self.axes), actuators=tuple(self.actuators), T=self.T, gains=self.gains
+        )
+
+    def __repr__(self) -> str:
+        places = f", {len(self.gains)} places" if len(self.gains) > 1 else ""
+        lines = [f"<Feedforward {self.reference} to {len(self.actuators)} actuators{places}>"]
+        for axis, row in zip(self.axes, self.gains[0], strict=True):
+            shown = "  ".join(f"{t} {g:.4g}" for t, g in zip(TERMS, row, strict=True) if g)
+            lines.append(f"  {axis}: {shown or 'nothing'}")
+        return "\n".join(lines)
+
+    @property
+    def system(self) -> StateSpace:
+        """The block: static, from the reference and its derivatives to the actuators.
+
+        Raises
+        ------
+        ModelError
+            When the gains depend on the place: then `forces` gives the signals.
+        """
+        if len(self.gains) != 1:
+            raise ModelError(
+                f"gains that depend on the place ({len(self.gains)} of them) are no constant "
+                "block: close the loop with known_forces(plant) and pass forces(move, time) to "
+                "simulate as references."
+            )
+        used = [m for m in range(5) if np.any(self.gains[0, :, m])] or [2]
+        names = [self.reference if m == 0 else f"{self.reference}:{TERMS[m]}" for m in used]
+        D = self.T @ self.gains[0][:, used]
+        return StateSpace(
+            [], [], [], D, self.dt, inputs=names, outputs=self.actuators, name="feedforward"
+        )
+
+    def up_to(self, term: str) -> Feedforward:
+        """Return the feedforward without the derivatives above one.
+
+        Parameters
+        ----------
+        term : str
+            position, velocity, acceleration, jerk or snap.
+
+        Raises
+        ------
+        LabelError
+            When it is none of these.
+        """
+        gains = self.gains.copy()
+        gains[:, :, _term(term) + 1 :] = 0.0
+        return self.replace(gains=gains)
+
+    def forces(self, move: SetPoint, time: npt.ArrayLike) -> dict[str, FloatArray]:
+        """Return the force of each actuator over time, named for `known_forces`.
+
+        Parameters
+        ----------
+        move : SetPoint
+            The set-point.
+        time : (n_time,) array [s]
+            The samples; as many as places where the gains depend on the place.
+
+        Raises
+        ------
+        ModelError
+            When `move` is no SetPoint, or its order is below that of the highest gain.
+        ShapeError
+            When there are places for other times.
+        """
+        _check_order(move, self.gains)
+        t = real_array(time, "time", (None,) if len(self.gains) == 1 else (len(self.gains),))
+        signals = np.array(move.at(t))
+        gains = np.broadcast_to(self.gains, (t.size, *self.gains.shape[1:]))
+        u = np.einsum("tam,mt->ta", gains, signals) @ self.T.T
+        return {force_name(name): u[:, i] for i, name in enumerate(self.actuators)}
+
+
+def design_feedforward(
+    given: StandardPlant | ClosedLoop,
+    *,
+    reference: str | None = None,
+    order: int = 4,
+    along: npt.ArrayLike | None = None,
+) -> Feedforward:
+    """Return the feedforward of a plant or a loop: its inverse at low frequency, term by term.
+
+    With P the response from forces at the centre of gravity to the POI (the hold, all delays,
+    sensors' and actuators' filters in it), ``P(s)^-1 = k_0 + k_1 s + k_2 s^2 + ...``: of a free
+    machine k_2 is the mass, k_3 the mass times the delay, and k_4 holds half the square of the
+    delay and, negative, the compliance of the flexible modes between actuators and POI; on springs
+    k_0 and k_1 are their stiffness and damping. In a loop ``G_u F + G_r = 1`` is solved for F
+    instead, G_u and G_r the responses of the POI to forces and reference in closed loop: where
+    sensors and POI do not move alike, the feedback would work against the inverse of P. The
+    coefficients are Cauchy's integrals on a circle, the largest on which they no longer depend on
+    its radius. All axes of the POI are taken together: the forces that keep the axes without a
+    reference at rest are in it.
+
+    Parameters
+    ----------
+    given : StandardPlant or ClosedLoop
+        Assembled from a structure; sampled, for a sampled loop. Of a loop, that without
+        feedforward, on a model.
+    reference : str, optional
+        The reference's channel; the plant's only one when not given.
+    order : int
+        Highest derivative, 2 to 4: acceleration, jerk, snap.
+    along : (p, 3) array [m], optional
+        Places of the POI: gains for each of them, for a POI that moves; of a plant only.
+
+    Returns
+    -------
+    Feedforward
+        Its `system` is a block for `close_loop`; the loop's reference must then be a SetPoint.
+
+    Raises
+    ------
+    LabelError
+        When it is not clear which reference is meant.
+    AssumptionError
+        When the actuators cannot move the POI's axes apart from each other.
+    ModelError
+        When the plant was not assembled from a structure or is weighted, or the order is none.
+
+    References
+    ----------
+    Boerlage, Tousain, Steinbuch, Jerk derivative feedforward control for motion systems, American
+    Control Conference, 2004.
+    """
+    loop = given if isinstance(given, ClosedLoop) else None
+    plant, poi, name = tracked(given if loop is None else loop.plant, reference)
+    highest = whole(order, "order", minimum=2, maximum=4)
+    T, axes = force_axes(plant, poi)
+    if loop is None:
+        find = _of_plant(plant, poi, T, along)
+    elif along is not None:
+        raise ModelError("places along= are for the feedforward of a plant: pass loop.plant.")
+    else:
+        find = _of_loop(loop, poi, T, name)
+    gains = coefficients(find, plant.dt, axes)
+    gains[:, :, highest + 1 :] = 0.0
+    return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
+
+
+def known_forces(plant: StandardPlant) -> StateSpace:
+    """Return the block that passes forces given to `simulate` on to the actuators.
+
+    Its inputs are `u1:feedforward`, ...: references of the loop, given as arrays.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Whose actuators they are.
+
+    Raises
+    ------
+    ModelError
+        When it is no plant.
+    """
+    plant = standard_plant(plant)
+    names = [force_name(name) for name in plant.u]
+    return StateSpace(
+        [], [], [], np.eye(len(names)), plant.dt, inputs=names, outputs=plant.u, name="forces"
+    )
+
+
+def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str]:
+    """Return the plant, and the POI and channel of its reference.
+
+    Raises
+    ------
+    LabelError
+        When there is not one reference, or no such one.
+    ModelError
+        When the plant was not assembled from a structure, or is weighted.
+    """
+    plant = standard_plant(plant)
+    if plant.is_weighted:
+        raise ModelError("the plant is weighted: design the feedforward on plant.unweighted.")
+    ports = plant.assembled.ports
+    pois = {p.derived(p.axes[0], "ref"): p for p in (ports.poi(r.poi) for r in ports.references)}
+    if reference is None and len(pois) == 1:
+        reference = next(iter(pois))
+    if not isinstance(reference, str) or reference not in pois:
+        raise LabelError(
+            f"need one of the plant's references {list(pois)}, got {short(reference)}. Pass "
+            "reference=name; Ports(references=[Reference(poi)]) adds one."
+        )
+    return plant, pois[reference], reference
+
+
+def force_axes(plant: StandardPlant, poi: Poi) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return T (nu, r), forces along the POI's axes at the centre of gravity to actuators."""
+    decoupled = decouple(plant, axes=poi.axes)
+    return decoupled.T_u, tuple(decoupled.axes)
+
+
+def _of_plant(
+    plant: StandardPlant, poi: Poi, T: FloatArray, along: npt.ArrayLike | None
+) -> Inverse:
+    """Return the function of s that gives F (p, r), the POI at p places."""
+    g, inputs = plant.system, plant.system.input_index(plant.u)
+    rows = g.output_index([poi.channel(axis) for axis in poi.axes])
+    C, D = g.C[rows][None], (g.D[np.ix_(rows, inputs)] @ T)[None]
+    if along is not None:
+        places = plant.along(poi.name, real_array(along, "along", (None, 3)))
+        C, D = places.C[:, : rows.size], places.D[:, : rows.size, inputs] @ T
+    wanted = np.eye(rows.size)[:, :1]
+
+    def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
+        return C @ _states(g, g.B[:, inputs] @ T, s) + D, wanted.astype(np.complex128)
+
+    return found
+
+
+def _of_loop(loop: ClosedLoop, poi: Poi, T: FloatArray, name: str) -> Inverse:
+    """Return the function of s that gives F (1, r) in closed loop."""
+    forced = close_loop(loop.plant, *loop.blocks, known_forces(loop.plant))
+    g = forced.monitored
+    inputs = g.input_index([force_name(u) for u in loop.plant.u])
+    rows = g.output_index([poi.channel(axis) for axis in poi.axes])
+    to_poi = np.hstack([g.B[:, inputs] @ T, g.B[:, g.input_index([name])]])
+    D = np.hstack([g.D[np.ix_(rows, inputs)] @ T, g.D[np.ix_(rows, g.input_index([name]))]])
+    wanted = np.eye(rows.size)[:, :1]
+
+    def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
+        both = g.C[rows] @ _states(g, to_poi, s) + D
+        return both[None, :, :-1], wanted - both[:, -1:]
+
+    return found
+
+
+def _states(g: StateSpace, B: FloatArray, s: complex) -> ComplexArray:
+    z = np.exp(s * g.dt) if g.dt else s
+    return np.asarray(np.linalg.solve(z * np.eye(g.n_states) - g.A, B.astype(np.complex128)))
+
+
+def coefficients(find: Inverse, dt: float, axes: Sequence[str]) -> FloatArray:
+    """Return k_0, ..., k_4 (p, r, 5) of F(s), G F = rhs, on the largest circle that allows it.
+
+    Parameters
+    ----------
+    find : function
+        Gives G (p, q, r) and the right side (q, 1) at s.
+    dt : float [s]
+        Sampling time; 0 when continuous.
+    axes : sequence of str
+        For the message.
+
+    Raises
+    ------
+    AssumptionError
+        When G is singular, or no circle is found.
+    """
+    radius = min(_LARGEST, 0.5 / dt) if dt else _LARGEST
+    powers = np.arange(5)
+    outer = _on_circle(find, radius, axes)
+    for _ in range(_RADII):
+        inner = _on_circle(find, 0.5 * radius, axes)
+        size = np.abs(outer) * radius**powers
+        scale = size.max(axis=(1, 2), keepdims=True)
+        if np.all(np.abs(outer - inner) * (0.5 * radius) ** powers <= _SAME * scale):
+            inner[np.abs(inner) * (0.5 * radius) ** powers <= _SAME * scale] = 0.0
+            return inner
+        outer, radius = inner, 0.5 * radius
+    raise AssumptionError(
+        f"the response from forces along {', '.join(axes)} to the POI has no inverse that is "
+        "regular at low frequency: there is a zero at rest. Check which axes the actuators move."
+    )
+
+
+def _on_circle(find: Inverse, radius: float, axes: Sequence[str]) -> FloatArray:
+    """Return k_m = sum F(s_i) s_i^-m / N over N points of a circle (the lower half conjugate)."""
+    turns = np.exp(2j * np.pi * (np.arange(_SAMPLES // 2) + 0.5) / _SAMPLES)
+    values = []
+    for turn in turns:
+        G, wanted = find(radius * complex(turn))
+        rows = np.max(np.abs(G), axis=2, keepdims=True)
+        columns = np.max(np.abs(G), axis=1, keepdims=True)
+        flat = rows.min(initial=1.0) <= 0 or columns.min(initial=1.0) <= 0
+        if flat or np.max(np.linalg.cond(G / np.sqrt(rows * columns))) > _SINGULAR:
+            raise AssumptionError(
+                f"the forces along {', '.join(axes)} do not move these axes of the POI apart from "
+                "each other, so that there is no inverse. Choose other axes of the POI."
+            )
+        values.append(np.linalg.solve(G, np.broadcast_to(wanted, (len(G), *wanted.shape)))[..., 0])
+    F = np.array(values)[..., None] * (turns[:, None] ** -np.arange(5))[:, None, None, :]
+    return np.asarray(2.0 / _SAMPLES * F.sum(axis=0).real / radius ** np.arange(5))
+
+
+def _term(term: Any) -> int:
+    if term not in TERMS:
+        raise LabelError(f"a term is one of {', '.join(TERMS)}, got {short(term)}. Choose one.")
+    return TERMS.index(term)
+
+
+def term_numbers(terms: Any) -> list[int]:
+    """Return the orders of derivatives that are named.
+
+    Raises
+    ------
+    LabelError
+        When one is none.
+    """
+    return [_term(term) for term in name_list(terms, "terms")]
+
+
+def _check_order(move: Any, gains: FloatArray) -> None:
+    if not isinstance(move, SetPoint):
+        raise ModelError(f"need a SetPoint, got {short(move)}. Use setpoint(...) or scan(...).")
+    highest = max((m for m in range(5) if np.any(gains[:, :, m])), default=0)
+    if move.order < highest:
+        raise ModelError(
+            f"the feedforward uses the {TERMS[highest]}, but {move!r} is of order {move.order}, "
+            f"so that its {TERMS[highest]} is impulses. Give the set-point a bound on "
+            f"{TERMS[highest]}, or use feedforward.up_to({TERMS[move.order]!r})."
+        )

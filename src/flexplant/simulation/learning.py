@@ -1,0 +1,181 @@
+"""Iterative learning: feedforward gains from the errors of repeated moves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError
+from ..loop import ClosedLoop, close_loop
+from ..loop.known import force_name
+from ..values import FloatArray, Value, positive, short, whole
+from .feedforward import Feedforward, known_forces, term_numbers, tracked
+from .motion import SetPoint
+from .response import Response
+from .simulate import simulate
+
+#: condition of the basis (columns scaled to one) beyond which directions are left as they are
+_RESOLVED = 1e-8
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LearnedFeedforward(Value):
+    """A feedforward whose gains were learnt, and how the error went down; prints as a table.
+
+    Parameters
+    ----------
+    feedforward : Feedforward
+        With the gains of the move of the least error.
+    errors : (trials,) array [m]
+        Rms of the error in each move.
+    gains : (trials, r, 5) array
+        The gains of each move.
+    """
+
+    feedforward: Feedforward
+    errors: FloatArray
+    gains: FloatArray
+
+    def __post_init__(self) -> None:
+        self._set(errors=self.errors, gains=self.gains)
+
+    def __repr__(self) -> str:
+        lines = [f"<LearnedFeedforward {self.errors.size} moves>"]
+        lines += [f"  move {i}: rms {e:.4g} m" for i, e in enumerate(self.errors[:5], 1)]
+        return "\n".join(lines)
+
+
+def learn_feedforward(
+    start: Feedforward,
+    trial: Callable[[Feedforward], Response],
+    loop: ClosedLoop,
+    move: SetPoint,
+    *,
+    duration: float,
+    terms: Sequence[str] = ("acceleration", "jerk", "snap"),
+    trials: int = 4,
+    step: float = 1.0,
+) -> LearnedFeedforward:
+    """Return feedforward gains tuned on repeated moves, by least squares on basis functions.
+
+    The basis functions are the set-point's derivatives, one for each axis of the forces. In a
+    linear loop the error depends linearly on their gains, ``e = e_0 + Phi gains``; Phi, what a
+    unit of each does to the error in closed loop, is from a model, and may be rough: each move
+    measures what is left, and the gains that least squares find for it are added. The residue e_0
+    itself is never modelled, so that whatever is left after the feedforward and repeats (a wrong
+    mass, a compliance, a delay) is compensated as far as the basis functions reach.
+
+    Parameters
+    ----------
+    start : Feedforward
+        Of the first move.
+    trial : function
+        Makes the move with a Feedforward on the machine and returns what was recorded.
+    loop : ClosedLoop
+        The same controller (without feedforward) on a model of the machine, for Phi.
+    move : SetPoint
+        The move.
+    duration : float [s]
+        Of each run.
+    terms : sequence of str
+        Derivatives that are tuned.
+    trials : int
+        Moves.
+    step : float
+        Part of each correction that is made: 1 unless noise is large beside what repeats.
+
+    Returns
+    -------
+    LearnedFeedforward
+
+    Raises
+    ------
+    LabelError
+        When a term is unknown.
+    ModelError
+        When `trial` does not return a Response with the error of the POI, the gains depend on the
+        place, or a number is out of range.
+
+    References
+    ----------
+    Van de Wijdeven, Bosgra, Using basis functions in iterative learning control: analysis and
+    design theory, International Journal of Control 83, 2010.
+    """
+    _check(start, loop, move)
+    orders = term_numbers(terms)
+    part = positive(step, "step")
+    if part > 1.0:
+        raise ModelError(f"step is a part of a correction, at most 1, got {part:g}. Pass 1.0.")
+    _, poi, _ = tracked(loop.plant, start.reference)
+    channels = [poi.derived(poi.axes[0], "error"), *(poi.channel(a) for a in poi.axes[1:])]
+    effects = _effects(start, loop, move, duration, orders, channels)
+    unit = np.linalg.norm(effects, axis=1)
+    used = unit > 0
+    pseudo = np.linalg.pinv((effects[used] / unit[used, None]).T, rcond=_RESOLVED)
+    current, errors, gains = start, [], []
+    for _ in range(whole(trials, "trials")):
+        error = _error(trial(current), channels)
+        if error.size != effects.shape[1]:
+            raise ModelError(
+                f"the trial recorded {error.size // len(channels)} samples, the model's run has "
+                f"{effects.shape[1] // len(channels)}: simulate both for duration={duration:g}."
+            )
+        errors.append(float(np.sqrt(np.mean(error[: error.size // len(channels)] ** 2))))
+        gains.append(current.gains[0])
+        change = np.zeros(unit.size)
+        change[used] = -part * (pseudo @ error) / unit[used]
+        new = current.gains.copy()
+        new[0][:, orders] += change.reshape(len(start.axes), len(orders))
+        current = current.replace(gains=new)
+    best = int(np.argmin(errors))
+    chosen = start.replace(gains=gains[best][None])
+    return LearnedFeedforward(chosen, np.array(errors), np.array(gains))
+
+
+def _effects(
+    start: Feedforward,
+    loop: ClosedLoop,
+    move: SetPoint,
+    duration: float,
+    orders: list[int],
+    channels: list[str],
+) -> FloatArray:
+    """Return what a unit of each gain adds to the errors (n_gain, n_channel * n_time)."""
+    forced = close_loop(loop.plant, *loop.blocks, known_forces(loop.plant), idle=loop.idle)
+    time = np.arange(round(positive(duration, "duration") / loop.plant.dt)) * loop.plant.dt
+    signals = move.at(time)
+    rows = []
+    for axis in range(len(start.axes)):
+        for order in orders:
+            # of size one: a unit gain may make forces far larger than any that is meant
+            size = float(np.max(np.abs(signals[order]))) or 1.0
+            force = np.outer(start.T[:, axis], signals[order] / size)
+            given = {force_name(u): force[i] for i, u in enumerate(start.actuators)}
+            run = simulate(forced, reference=given, duration=duration, noise=False)
+            rows.append(size * _error(run, channels))
+    return np.array(rows)
+
+
+def _error(run: object, channels: list[str]) -> FloatArray:
+    """Return the errors one after the other; the mean over runs where there are several."""
+    if not isinstance(run, Response) or any(name not in run for name in channels):
+        raise ModelError(
+            f"a trial must return a Response with {', '.join(channels)}, got {short(run)}. Return "
+            "simulate(loop, reference=move, duration=...)."
+        )
+    signals = [run[name] for name in channels]
+    return np.concatenate([s.mean(axis=0) if s.ndim == 2 else s for s in signals])
+
+
+def _check(start: object, loop: object, move: object) -> None:
+    if not isinstance(start, Feedforward) or len(start.gains) != 1:
+        raise ModelError(
+            f"need a Feedforward with one set of gains, got {short(start)}. Use "
+            "design_feedforward(plant)."
+        )
+    if not isinstance(loop, ClosedLoop):
+        raise ModelError(f"need a ClosedLoop, got {short(loop)}. Use close_loop(plant, ...).")
+    if not isinstance(move, SetPoint):
+        raise ModelError(f"need a SetPoint, got {short(move)}. Use setpoint(...) or scan(...).")

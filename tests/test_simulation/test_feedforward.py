@@ -1,0 +1,217 @@
+"""Feedforward against closed forms and dense least squares, and what each order buys."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+import flexplant as fx
+import oracles_loop as oracle
+from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
+from flexplant.modes import solve_modes
+from flexplant.plant import GroundSpring, decouple, suspend
+from flexplant.simulation import (
+    design_feedforward,
+    exposure_errors,
+    inverse_forces,
+    known_forces,
+    learn_feedforward,
+)
+from stages import CORNERS, INSET, RATE, full, ports, sampled, some_modes
+
+BOUNDS = {"velocity": 5e-3, "acceleration": 0.5, "jerk": 100.0, "snap": 4e4}
+MOVE = fx.setpoint(100e-6, **BOUNDS, rest=0.05, rate=RATE)
+AFTER = MOVE.duration + 5e-3
+
+
+def blocks_of(plant):
+    static = fx.design_static(plant)
+    return static, fx.design_servo(plant, bandwidth=60.0, observer=static)
+
+
+@pytest.fixture(scope="module")
+def model():
+    plant = sampled(some_modes(0.01))
+    return fx.close_loop(plant, *blocks_of(plant))
+
+
+def on(plant, model, *more):
+    return fx.close_loop(plant, *model.blocks, *more)
+
+
+def run_of(loop, reference, noise=False):
+    return fx.simulate(loop, reference=reference, duration=0.2, noise=noise, rng=1)
+
+
+def compliance(plant, modes):
+    """By hand: sum of c b / omega^2 over the flexible modes, from forces at the centre."""
+    T = decouple(plant).T_u
+    model = plant.assembled.realisation.model
+    b = np.array([model.row(p, "z") for p in INSET]) @ modes.phi
+    c = np.array([model.row((0.3, 0.3, 0.0), a) for a in ("z", "rx", "ry")]) @ modes.phi
+    flexible = modes.omega > 1.0
+    gain = (c[:, flexible] / modes.omega[flexible] ** 2) @ b[:, flexible].T @ T
+    return T, gain
+
+
+@pytest.mark.parametrize("delay", [0, 1, 2.5])
+def test_the_gains_are_mass_delay_and_compliance(delay):
+    """Exact polynomials: 2 (z-1)^2 / (h^2 (z+1)) z^d = s^2 (1 + (d + 1/2) x + ...), x = s h."""
+    modes = some_modes(0.01, 24, attached=False)
+    plant = fx.assemble_plant(modes, ports())
+    _, soft = compliance(plant, modes)
+    mass = decouple(plant).mass
+    snap = -(mass @ soft @ mass)[:, 0]
+    free = design_feedforward(plant)
+    np.testing.assert_allclose(free.gains[0, 0], [0, 0, mass[0, 0], 0, snap[0]], rtol=1e-6, atol=0)
+    assert mass[0, 0] == pytest.approx(2702 * 0.36 * 0.0272, rel=1e-6)
+    held = design_feedforward(plant.discretized(RATE, delay=delay)).gains[0, 0]
+    h = 1.0 / RATE
+    rigid = mass[0, 0] * h**2 * (1 / 12 + delay / 2 + delay**2 / 2)
+    wanted = [0, 0, mass[0, 0], mass[0, 0] * h * (delay + 0.5), rigid + snap[0]]
+    np.testing.assert_allclose(held, wanted, rtol=1e-6, atol=0)
+
+
+def test_springs_to_ground_take_a_force_at_rest():
+    """k_0 is the stiffness of the springs, k_2 the mass (but for what the plate bends)."""
+    springs = [GroundSpring(p, 1e3) for p in CORNERS]
+    plant = fx.assemble_plant(solve_modes(suspend(full(0.01), springs), count=24), ports())
+    found = design_feedforward(plant).gains[0, 0]
+    np.testing.assert_allclose(found[[0, 2]], [4e3, 2702 * 0.36 * 0.0272], rtol=5e-3, atol=0)
+    with pytest.raises(ModelError, match="the plant is held"):
+        held = plant.discretized(RATE, delay=1)
+        loop = fx.close_loop(held, known_forces(held))
+        inverse_forces(loop, MOVE, duration=0.2, bandwidth=100.0)
+
+
+@pytest.mark.slow
+def test_what_each_order_buys(model, capsys):
+    """Largest error in the move, and MA after it: each term takes its part away."""
+    plant = model.plant
+    own = design_feedforward(model)
+    rows = {"none": run_of(model, MOVE)}
+    for term in ("acceleration", "jerk", "snap"):
+        rows[term] = run_of(on(plant, model, own.up_to(term)), MOVE)
+    forces = inverse_forces(model, MOVE, duration=0.2, bandwidth=1000.0)
+    rows["inverse"] = run_of(on(plant, model, known_forces(plant)), {"die:ref": MOVE, **forces})
+    peak = {name: 1e9 * run.peak("die:error") for name, run in rows.items()}
+    late = {
+        name: 1e9 * exposure_errors(run, ["die:error"], start=AFTER)["die:error"].ma
+        for name, run in rows.items()
+    }
+    with capsys.disabled():
+        print("\nfeedforward    largest error [nm]    MA after the move [nm]")
+        for name, size in peak.items():
+            print(f"{name:14s}{size:19.2f}{late[name]:26.3f}")
+    assert 8e3 < peak["none"] < 12e3
+    assert peak["acceleration"] < 0.02 * peak["none"]
+    assert peak["jerk"] < 0.1 * peak["acceleration"]
+    assert peak["snap"] < 0.6 * peak["jerk"] and late["snap"] < 0.3 * late["jerk"]
+    assert peak["inverse"] < 0.05 * peak["snap"]
+    # the inverse of the plant alone: the feedback works against it, as its sensors do not bend so
+    alone = run_of(on(plant, model, design_feedforward(plant)), MOVE)
+    assert 1e9 * alone.peak("die:error") > 10.0 * peak["snap"]
+
+
+@pytest.mark.slow
+def test_gains_are_learnt_on_a_machine_that_the_model_does_not_describe(model):
+    """Half a kilogram that the model lacks: repeated moves under noise find it in the gains."""
+    truth = sampled(solve_modes(full(0.01, mass=0.5), count=24))
+    start = design_feedforward(model)
+
+    def trial(feedforward):
+        return run_of(on(truth, model, feedforward), MOVE, noise=True)
+
+    found = learn_feedforward(start, trial, model, MOVE, duration=0.2, trials=3)
+    assert found.errors[1] < 0.35 * found.errors[0]
+    assert np.ptp(found.errors[1:]) < 0.2 * found.errors[1]
+    added = found.feedforward.gains[0, 0, 2] - start.gains[0, 0, 2]
+    assert added == pytest.approx(0.5, abs=0.05)
+    assert found.feedforward.gains[0] in found.gains and "3 moves" in repr(found)
+    # as least squares of what no basis function reaches: a further move cannot do better
+    assert found.errors.argmin() >= 1
+    with pytest.raises(ModelError, match="must return a Response with die:error"):
+        learn_feedforward(start, lambda f: None, model, MOVE, duration=0.2)
+    with pytest.raises(LabelError, match="a term is one of"):
+        learn_feedforward(start, trial, model, MOVE, duration=0.2, terms=["crackle"])
+
+
+@pytest.mark.slow
+def test_the_inverse_is_that_of_dense_least_squares():
+    """A plant with zeros outside the unit circle: the forces come ahead of the set-point."""
+    plant = sampled(some_modes(0.05, 8, attached=False), ports(die=(0.02, 0.3, 0.0)), delay=1.7)
+    loop = fx.close_loop(plant, *blocks_of(plant))
+    move = fx.setpoint(1e-6, velocity=5e-3, acceleration=0.5, jerk=500.0, snap=4e6, rest=0.018,
+                       rate=RATE)  # fmt: skip
+    n, band = 420, 300.0
+    g, T = plant.system, decouple(plant).T_u
+    rows = g.output_index(["die:z", "die:rx", "die:ry"])
+    B = g.B[:, g.input_index(plant.u)] @ T
+    pencil = np.block([[g.A, B], [g.C[rows], np.zeros((3, 3))]])
+    zeros = la.eigvals(pencil, la.block_diag(np.eye(g.n_states), np.zeros((3, 3))))
+    zeros = zeros[np.isfinite(zeros) & (np.abs(zeros) < 1e3)]
+    assert np.abs(zeros).max() > 1.01
+    target = np.zeros((n, 3))
+    target[:, 0] = move.at(np.arange(n) / RATE).position
+    damping = 1.0 / (decouple(plant).mass.diagonal() * (2 * np.pi * band) ** 2) ** 2
+    wanted = oracle.lifted_inverse(g.A, B, g.C[rows], np.zeros((3, 3)), target, damping) @ T.T
+    forces = inverse_forces(loop, move, duration=n / RATE, bandwidth=band)
+    run = fx.simulate(on(plant, loop, known_forces(plant)), reference={"die:ref": move, **forces},
+                      duration=n / RATE, noise=False)  # fmt: skip
+    applied = np.array([run[u] for u in plant.u]).T
+    inner = slice(60, 330)  # the dense horizon ends, where forces cost and errors do not come
+    scale = np.abs(wanted).max()
+    np.testing.assert_allclose(applied[inner], wanted[inner], rtol=0, atol=5e-3 * scale)
+    before = slice(150, 178)
+    assert np.abs(applied[before]).max() > 0.01 * scale
+    with pytest.warns(FlexplantWarning, match="Give the set-point a longer rest"):
+        inverse_forces(loop, fx.setpoint(1e-6, **BOUNDS, rate=RATE), duration=0.04, bandwidth=band)
+
+
+def test_gains_follow_the_place_of_the_poi():
+    plant = sampled(some_modes(0.01))
+    places = [(0.3, 0.3, 0.0), (0.1, 0.15, 0.0), (0.55, 0.4, 0.0)]
+    along = design_feedforward(plant, along=places)
+    for i, place in enumerate(places):
+        alone = design_feedforward(plant.at(place)).gains[0]
+        np.testing.assert_allclose(along.gains[i, 0, 2:], alone[0, 2:], rtol=1e-5, atol=0)
+    assert abs(along.gains[1, 0, 4] / along.gains[0, 0, 4] - 1.0) > 0.1
+    time = np.array([0.051, 0.055, 0.06])
+    forces = along.forces(MOVE, time)
+    signals = np.array(MOVE.at(time))
+    third = along.T @ along.gains[2] @ signals[:, 2]
+    assert [forces[f"u{i}:feedforward"][2] for i in (1, 2, 3, 4)] == pytest.approx(third, rel=1e-12)
+    with pytest.raises(ModelError, match="depend on the place"):
+        _ = along.system
+    assert "3 places" in repr(along)
+
+
+def test_forces_known_in_advance_are_those_of_the_block(model):
+    own = design_feedforward(model)
+    plant = model.plant
+    block = run_of(on(plant, model, own), MOVE)
+    forces = own.forces(MOVE, block.time)
+    given = run_of(on(plant, model, known_forces(plant)), {"die:ref": MOVE, **forces})
+    for name in ("die:error", "u1"):
+        scale = np.abs(block[name]).max()
+        np.testing.assert_allclose(given[name], block[name], rtol=0, atol=1e-9 * scale)
+    assert "die:ref:acceleration" in block and on(plant, model, own).is_stable
+
+
+def test_what_cannot_be_fed_forward(model):
+    own = design_feedforward(model)
+    loop = on(model.plant, model, own)
+    with pytest.raises(ModelError, match="follows from a SetPoint only"):
+        fx.simulate(loop, reference=1e-6, duration=0.01)
+    third = fx.setpoint(1e-6, velocity=5e-3, acceleration=0.5, jerk=100.0)
+    with pytest.raises(ModelError, match="its snap is impulses"):
+        fx.simulate(loop, reference=third, duration=0.1)
+    with pytest.raises(ModelError, match=r"up_to\('jerk'\)"):
+        own.forces(third, [0.0])
+    assert fx.simulate(on(model.plant, model, own.up_to("jerk")), reference=third, duration=0.1)
+    with pytest.raises(LabelError, match="need one of the plant's references"):
+        design_feedforward(model, reference="die")
+    with pytest.raises(ModelError, match="order"):
+        design_feedforward(model, order=5)
+    two = ports(u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(INSET[:2], 1)])
+    with pytest.raises(AssumptionError, match="cannot be decoupled"):
+        design_feedforward(sampled(some_modes(), two))
