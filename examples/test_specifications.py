@@ -7,7 +7,11 @@ fails, the message is the table of all requirements, reached and allowed.
 # %% The stage, its channels and what it must do
 from functools import cache
 
+import pytest
+
 import flexplant as fx
+
+pytestmark = pytest.mark.slow  # a machine of 243 degrees of freedom: some seconds
 
 RATE, DELAY, SIDE = 10e3, 1, 0.6  # Hz, samples, m
 CORNERS = [(x, y, 0.0) for y in (0.0, SIDE) for x in (0.0, SIDE)]
