@@ -1,0 +1,131 @@
+"""The move of the wafer stage with feedforward: what each order of it buys on the machine.
+
+Run it: ``python examples/feedforward.py``. Two loops of `wafer_stage.py`, designed on the updated
+model, move the virtual machine by 100 um. Feedforward is designed on the model of each loop: term
+by term, and as an inverse with preview. Then a loop whose model lacks the half kilogram learns its
+gains from repeated moves.
+"""
+
+# %% Names and numbers
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import flexplant as fx
+import wafer_stage as stage
+from flexplant import simulation as sim
+
+DAMPING, DURATION = 0.001, 0.5  # 1, s
+MOVE = fx.setpoint(
+    100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, snap=4e4, rest=0.05, rate=stage.RATE
+)
+TERMS = ("acceleration", "jerk", "snap")
+
+
+# %% The machine, and its updated and nominal models
+def models() -> dict[str, Any]:
+    """Return machine and models as `wafer_stage` makes them."""
+    machine = fx.testbeds.wafer_stage(damping=DAMPING, rate=stage.RATE, delay=stage.DELAY)
+    drawing, bare = stage.reduced(DAMPING), stage.plate.with_damping(fx.ModalDamping(DAMPING))
+    fit = stage.updated(drawing, machine.poles([6, 7]))
+    full = {"drawing": bare, "updated": fit.applied_to(bare)}
+    return {
+        "machine": machine,
+        "models": {"drawing": drawing, "updated": fit.model},
+        "full": full,
+    }
+
+
+def moved(case: dict[str, Any], *blocks: Any, reference: Any = MOVE, **noise: Any) -> fx.Response:
+    """Return the move on the machine; without noise unless there is a seed."""
+    loop = case["machine"].loop(stage.ports(), *blocks)
+    options = {"noise": False} | noise
+    return fx.simulate(loop, reference=reference, duration=DURATION, **options)
+
+
+# %% Term by term, and the inverse
+def orders(case: dict[str, Any], design: Any) -> dict[str, fx.Response]:
+    """Return the move with more and more feedforward."""
+    plant = stage.plant_of(case, "updated")
+    blocks = design(plant, case["full"]["updated"])
+    model = fx.close_loop(plant, *blocks)
+    own = fx.design_feedforward(model)
+    runs = {"none": moved(case, *blocks)}
+    runs |= {term: moved(case, *blocks, own.up_to(term)) for term in TERMS}
+    forces = sim.inverse_forces(model, MOVE, duration=DURATION, bandwidth=400.0)
+    through = sim.known_forces(plant)
+    runs["inverse"] = moved(case, *blocks, through, reference={"die:ref": MOVE, **forces})
+    return runs
+
+
+# %% Learning: the servo of the drawing, which lacks half a kilogram
+def learnt(case: dict[str, Any]) -> sim.LearnedFeedforward:
+    """Return the gains after three moves of the machine, under its noise."""
+    plant = stage.plant_of(case, "drawing")
+    static = fx.design_static(plant)
+    blocks = static, fx.design_servo(plant, bandwidth=50.0, observer=static)
+    model = fx.close_loop(plant, *blocks)
+    seeds = iter(range(100))
+
+    def trial(feedforward: sim.Feedforward) -> fx.Response:
+        return moved(case, *blocks, feedforward, noise=True, rng=next(seeds))
+
+    start = fx.design_feedforward(model)
+    return sim.learn_feedforward(start, trial, model, MOVE, duration=DURATION, trials=3)
+
+
+# %% What it shows
+def main() -> dict[str, Any]:
+    """Return the runs of both loops, and what was learnt."""
+    case = models()
+    loops = {"best servo": stage.servo, "H-infinity": stage.hinf}
+    return {
+        "runs": {name: orders(case, design) for name, design in loops.items()},
+        "learnt": learnt(case),
+    }
+
+
+def figures(run: fx.Response) -> tuple[float, float, float]:
+    """Return the largest error, and MA and MSD after the move [nm]."""
+    late = sim.exposure_errors(run, ["die:error"], start=MOVE.duration + 5e-3)["die:error"]
+    return 1e9 * float(np.max(run.peak("die:error"))), 1e9 * late.ma, 1e9 * late.msd
+
+
+def table(result: dict[str, Any]) -> str:
+    """Return all numbers as text."""
+    lines = []
+    for name, runs in result["runs"].items():
+        lines.append(f"{name}, feedforward     largest error [nm]    MA after    MSD after")
+        for label, run in runs.items():
+            peak, ma, msd = figures(run)
+            lines.append(f"  {label:24s}{peak:18.2f}{ma:12.2f}{msd:13.2f}")
+    lines.append(f"\nservo of the drawing, gains learnt on the machine:\n{result['learnt']}")
+    return "\n".join(lines)
+
+
+def picture(result: dict[str, Any], folder: Path = stage.OUT) -> Path:
+    """Draw the error of both loops through the move."""
+    import matplotlib.pyplot as plt
+
+    figure, axs = plt.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
+    for ax, (name, runs) in zip(axs, result["runs"].items(), strict=True):
+        for label, color in (("acceleration", "0.6"), ("jerk", "tab:orange"), ("snap", "tab:blue"),
+                             ("inverse", "black")):  # fmt: skip
+            fx.plot.response(
+                runs[label], ["die:error"], span=(0.04, 0.2), label=label, color=color, ax=ax
+            )
+        peak = figures(runs["none"])[0]
+        ax.set_title(f"{name}: error at the die ({1e-3 * peak:.1f} µm without feedforward)")
+    folder.mkdir(exist_ok=True)
+    figure.savefig(folder / "feedforward.png", dpi=90)
+    plt.close("all")
+    return folder / "feedforward.png"
+
+
+if __name__ == "__main__":
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    outcome = main()
+    print(table(outcome), picture(outcome), sep="\n\npicture: ")
