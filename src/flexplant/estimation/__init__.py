@@ -20,6 +20,8 @@ from .lags import FixedLag as FixedLag
 from .lags import Predictor as Predictor
 from .lags import Smoother as Smoother
 from .left_out import LeftOut as LeftOut
+from .machine_table import MachineTable as MachineTable
+from .machine_table import errors_on_machines as errors_on_machines
 from .minimax import design_minimax_filter as design_minimax_filter
 from .multirate import PeriodicCertificate as PeriodicCertificate
 from .multirate import PeriodicEstimator as PeriodicEstimator

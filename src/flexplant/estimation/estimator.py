@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ModelError, ShapeError
+from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, real_array, with_unit
@@ -21,6 +22,7 @@ from .filter_model import FilterModel, filter_model
 from .lag_report import LAGS, LagReport, lag_report
 from .lags import Filter, Lag
 from .left_out import LeftOut
+from .loop_error import loop_variances
 from .mesh import NODES, NOTED
 
 
@@ -120,16 +122,17 @@ class KalmanEstimator(Value):
         """The sensors, in the order of the columns of `gain`."""
         return sensors(self.plant)
 
-    def rms(self, channel: str, *, on: StandardPlant | System | None = None) -> float:
+    def rms(self, channel: str, *, on: StandardPlant | ClosedLoop | System | None = None) -> float:
         """Return the rms of the estimation error at the sample instants.
 
         Parameters
         ----------
         channel : str
             A POI's motion under any of its names: `die`, `die:z`, `die:hat`, `die:error`.
-        on : StandardPlant, optional
-            A plant that the filter runs on, sampled, with other modes or noises; the error there is
-            exact (`error_variances`), u at rest. None: the predicted error.
+        on : StandardPlant or ClosedLoop, optional
+            A plant that the filter runs on, sampled, with other modes or noises, u at rest; or a
+            closed loop around such a plant, where u moves what the filter does not know. In closed
+            form, exact. None: the predicted error.
 
         Returns
         -------
@@ -140,13 +143,17 @@ class KalmanEstimator(Value):
         LabelError
             When it is no motion of a POI, or the other plant lacks a channel.
         ModelError
-            When the other plant is not sampled alike, or its noise is not known.
+            When the other plant is not sampled alike, its noise is not known, or a loop has the
+            estimates of another filter.
         AssumptionError
-            When the error would contain a rigid-body motion of the other plant.
+            When the error would contain a rigid-body motion of the other plant, or the loop is not
+            stable.
         """
         row = row_of(poi_channels(self.plant), channel)
         variances = self.variances
-        if on is not None:
+        if isinstance(on, ClosedLoop):
+            variances = loop_variances(self.plant, self.system, on)
+        elif on is not None:
             variances = error_variances(same_pois(self.plant, on), self.system).values
         return float(np.sqrt(max(variances[row], 0.0)))
 

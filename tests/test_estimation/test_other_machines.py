@@ -1,0 +1,155 @@
+"""The error of a given observer on machines that are not its model, open and in a closed loop."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from test_kalman import modes, plate_plant
+
+import flexplant as fx
+from flexplant.errors import AssumptionError, FlexplantWarning, LabelError, ModelError
+from flexplant.estimation import design_static, errors_on_machines
+from oracles_estimation import error_covariance, mean_square_and_its_error
+
+
+@cache
+def observer():
+    """Designed on 8 modes at 1 %."""
+    plant = plate_plant(1e-2, count=8, sensor_asd=1e-11)
+    return fx.design_kalman(plant, plant)
+
+
+@cache
+def servo():
+    return fx.design_servo(observer().plant, bandwidth=40.0, observer=observer())
+
+
+@cache
+def machine():
+    """Twelve modes, of another damping: another order."""
+    return plate_plant(4e-3, count=12, sensor_asd=1e-11)
+
+
+def joint(machine, kalman, law):
+    """Covariance of z - hat with u = law(hat), dense: states of machine, filter and controller."""
+    g, o = machine.system, kalman.system
+    y, u = kalman.sensors, machine.u
+    z = [name for name in machine.z if name in ("die:z", "die:rx", "die:ry")]
+    A, B = g.A, g.B[:, g.input_index(u)]
+    C1, C2 = g.C[g.output_index(z)], g.C[g.output_index(y)]
+    assert not g.D[np.ix_(g.output_index([*z, *y]), g.input_index(u))].any()
+    By, Bu = o.B[:, o.input_index(y)], o.B[:, o.input_index(u)]
+    Dy = o.D[:, o.input_index(y)]
+    assert not o.D[:, o.input_index(u)].any()
+    As, Cs = law.A, law.C[law.output_index(u)]
+    hats = [name for name in law.inputs if name in o.outputs]
+    assert set(hats) == set(o.outputs)
+    order = [law.inputs.index(name) for name in o.outputs]
+    Bs, Ds = law.B[:, order], law.D[np.ix_(law.output_index(u), order)]
+    n, m, k = A.shape[0], o.A.shape[0], As.shape[0]
+    hat = np.hstack([Dy @ C2, o.C, np.zeros((len(z), k))])
+    drive = np.hstack([np.zeros((len(u), n + m)), Cs]) + Ds @ hat
+    F = np.zeros((n + m + k, n + m + k))
+    F[:n, :n], F[n : n + m, n : n + m], F[n + m :, n + m :] = A, o.A, As
+    F[n : n + m, :n] = By @ C2
+    F[:n] += B @ drive
+    F[n : n + m] += Bu @ drive
+    F[n + m :] += Bs @ hat
+    rows = [machine.y.index(name) for name in y]
+    R = machine.sensor_noise[np.ix_(rows, rows)]
+    into = np.vstack([B @ Ds @ Dy, By + Bu @ Ds @ Dy, Bs @ Dy])
+    Q = into @ R @ into.T
+    Q[:n, :n] += machine.process_noise
+    assert np.abs(np.linalg.eigvals(F)).max() < 1
+    E = np.hstack([C1, np.zeros((len(z), m + k))]) - hat
+    X = error_covariance(F, Q)
+    return np.diag(E @ X @ E.T + Dy @ R @ Dy.T)
+
+
+def test_in_a_closed_loop_on_another_machine_it_is_the_joint_lyapunov_equation():
+    kalman, law = observer(), servo()
+    for truth in (machine(), kalman.plant):
+        loop = fx.close_loop(truth, kalman, law)
+        wanted = np.sqrt(joint(truth, kalman, law.system))
+        found = [kalman.rms(name, on=loop) for name in ("die:z", "die:rx", "die:ry")]
+        np.testing.assert_allclose(found, wanted, rtol=1e-5)
+    # on its own model u is known: the loop changes nothing
+    np.testing.assert_allclose(
+        found, [kalman.rms(n) for n in ("die", "die:rx", "die:ry")], rtol=1e-6
+    )
+
+
+@pytest.mark.slow
+def test_in_a_closed_loop_a_simulation_has_the_same_error():
+    kalman = observer()
+    loop = fx.close_loop(machine(), kalman, servo())
+    run = fx.simulate(loop, duration=1.5, rng=3, runs=6)
+    error = (run["die:z"] - run["die:hat"])[:, 5000:].T
+    square, deviation = mean_square_and_its_error(error)
+    assert deviation < 0.1 * square
+    assert abs(square - kalman.rms("die", on=loop) ** 2) < 3 * deviation
+
+
+def test_an_observer_beside_a_loop_and_what_is_refused():
+    kalman, law = observer(), servo()
+    other = fx.design_kalman(kalman.plant.replace(origin=kalman.plant.origin), kalman.plant)
+    loop = fx.close_loop(machine(), kalman, law)
+    assert other.rms("die", on=loop) == pytest.approx(kalman.rms("die", on=loop), rel=1e-9, abs=0)
+    loud = fx.design_kalman(plate_plant(1e-2, count=8, sensor_asd=1e-10))
+    with pytest.raises(ModelError, match="another estimator"):
+        loud.rms("die", on=loop)
+    with pytest.raises(LabelError, match="no POI channel"):
+        kalman.rms("dye", on=loop)
+    flipped = law.system.replace(C=-law.system.C, D=-law.system.D)
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        wild = fx.close_loop(machine(), kalman, flipped)
+    with pytest.raises(AssumptionError, match="stable closed loop"):
+        kalman.rms("die", on=wild)
+
+
+@cache
+def light():
+    """A light plate whose filter leans on its model: 0.1 % damping, quiet sensors."""
+    return plate_plant(1e-3, count=14, sensor_asd=1e-13)
+
+
+def scattered(part, count=12):
+    """Machines whose frequencies scatter by a standard deviation of this part."""
+    omega = 2 * np.pi * modes(1e-3, 14).freq[3:]
+    spread = np.concatenate([1e-5 * omega, part * omega])
+    measured = fx.MeasuredModes(
+        omega * (-1e-3 + 1j), modes=range(4, 15), covariance=np.diag(spread**2)
+    )
+    return light().uncertain(measured).sample(1, count)
+
+
+def test_half_a_percent_of_frequency_doubles_the_error_and_the_table_shows_it():
+    kalman = fx.design_kalman(light(), light())
+    named = {"Kalman": kalman, "static": design_static(light(), light())}
+    table = errors_on_machines(named, scattered(5e-3), "die:rx")
+    assert np.median(table["Kalman"]) > 2 * table.nominal[0]
+    assert table["static"].max() < 1.1 * table.nominal[1]
+    for k, other in enumerate(scattered(5e-3, 2)):
+        assert table["Kalman"][k] == pytest.approx(kalman.rms("die:rx", on=other), rel=1e-12, abs=0)
+    text = repr(table)
+    assert "on 12 machines" in text
+    assert "worst / own" in text
+    fine = errors_on_machines(kalman, scattered(5e-5), "die:rx")
+    assert fine.values.max() < 1.1 * fine.nominal[0]
+
+
+def test_the_table_in_a_closed_loop():
+    kalman, law = observer(), servo()
+    stiffer = plate_plant(1e-2, count=10, sensor_asd=1e-11)
+    machines = [kalman.plant, stiffer, machine()]
+    table = errors_on_machines({"a": kalman}, machines, "die", blocks=[law])
+    assert table.values[0, 0] == pytest.approx(kalman.rms("die"), rel=1e-6, abs=0)
+    loop = fx.close_loop(machine(), kalman, law)
+    assert table.values[0, 2] == pytest.approx(kalman.rms("die", on=loop), rel=1e-12, abs=0)
+    for wrong in ([], machine(), [1.0]):
+        with pytest.raises(ModelError, match="StandardPlants"):
+            errors_on_machines(kalman, wrong, "die")
+    with pytest.raises(ModelError, match="by name"):
+        errors_on_machines({"a": 1.0}, [machine()], "die")
+    with pytest.raises(LabelError, match="no POI channel"):
+        errors_on_machines(kalman, [machine()], "dye")
