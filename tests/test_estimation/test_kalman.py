@@ -14,7 +14,7 @@ from flexplant.errors import (
     ShapeError,
     SolverError,
 )
-from flexplant.estimation import check_gain, design_kalman
+from flexplant.estimation import Filter, Smoother, check_gain, design_kalman
 from flexplant.lti import StateSpace
 from flexplant.modes import solve_modes
 from flexplant.plant import (
@@ -28,6 +28,7 @@ from flexplant.plant import (
     assemble_plant,
 )
 from flexplant.structure import ModalDamping, kirchhoff_plate
+from flexplant.synthesis import design_servo
 from machines import stage
 from oracles_estimation import mean_square_and_its_error, observer_error, run
 
@@ -193,6 +194,41 @@ def test_filterpy_in_its_stationary_state_gives_the_same_estimates(make, shape):
         twin.predict(u.reshape(shape))
     size = np.abs(ours).max(axis=0)
     np.testing.assert_allclose(np.array(theirs) / size, np.array(ours) / size, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(-1,), (-1, 1)])
+@pytest.mark.parametrize("make", [lambda: stage(delay=0.0), stage, plate_plant])
+def test_the_smoother_of_filterpy_is_ours_where_u_is_zero(make, shape):
+    """Singular covariances of delay lines included; both begin at the stationary covariance."""
+    plant = make()
+    estimator = design_kalman(plant)
+    twin = estimator.to_filterpy()
+    rng = np.random.default_rng(2)
+    names = (*estimator.sensors, *plant.u)
+    y = rng.standard_normal((40, twin.dim_z)) * np.sqrt(np.diag(twin.R))
+    records = dict(zip(names, np.hstack([y, np.zeros((40, twin.dim_u))]).T, strict=True))
+    means, covariances, *_ = twin.batch_filter([one.reshape(shape) for one in y], update_first=True)
+    smooth, spread, *_ = twin.rts_smoother(means, covariances)
+    C1, at_rest = estimator.model.C1, np.zeros(twin.dim_x)
+    for lag, found in ((Filter(), means), (Smoother(), smooth)):
+        ours = estimator.estimate(records, lag, start=at_rest)
+        theirs = C1 @ found[:, :, 0].T
+        size = np.abs(theirs).max(axis=1, keepdims=True)
+        np.testing.assert_allclose(ours.data / size, theirs / size, rtol=0, atol=1e-12)
+    variance = np.einsum("zi,kij,zj->zk", C1, spread, C1)
+    np.testing.assert_allclose(ours.deviations**2, variance, rtol=1e-6)
+
+
+def test_observers_and_controllers_in_python_control():
+    plant = plate_plant(1e-2, count=8)
+    estimator = design_kalman(plant)
+    servo = design_servo(plant, bandwidth=30.0, observer=estimator)
+    for value in (estimator, servo):
+        theirs, g = value.to_control(), value.system
+        assert (theirs.input_labels, theirs.output_labels) == (list(g.inputs), list(g.outputs))
+        assert theirs.dt == g.dt
+        z = np.exp(2j * np.pi * 0.01)
+        np.testing.assert_allclose(theirs(z), g.evaluated(z), rtol=1e-9)
 
 
 def test_filterpy_runs_without_commands_and_refuses_too_many():

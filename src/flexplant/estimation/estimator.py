@@ -305,7 +305,9 @@ class KalmanEstimator(Value):
         """Return a `filterpy.kalman.KalmanFilter` of the same model, in its stationary state.
 
         Call `update(y)` and then `predict(u)`; y without references, u all actuators, as 1-D
-        arrays or as columns.
+        arrays or as columns; `batch_filter(ys, us, update_first=True)` does so for a record. Its
+        `rts_smoother` takes no u: it is right for u = 0;
+        `estimate(records, Smoother())` is right for any.
         """
         from .filterpy_twin import twin
 

@@ -43,7 +43,9 @@ def twin(model: FilterModel, covariance: FloatArray) -> Any:
 def twin_class() -> Any:
     """Return a subclass of `filterpy.kalman.KalmanFilter` whose y and u are 1-D or columns.
 
-    filterpy adds ``B u`` to the column x as it comes: a 1-D u would make x an (n, n) array.
+    filterpy adds ``B u`` to the column x as it comes: a 1-D u would make x an (n, n) array. Its
+    smoother, which takes no u, inverts covariances: here in states of unit variance, and without
+    the states of delay lines, which are known exactly.
     """
     from filterpy.kalman import KalmanFilter
 
@@ -66,10 +68,27 @@ def twin_class() -> Any:
             x, P = super().get_prediction(_command(u, self.dim_u), **others)
             return x, P
 
+        def rts_smoother(
+            self, Xs: Any, Ps: Any, Fs: Any = None, Qs: Any = None, inv: Any = None
+        ) -> tuple[Any, ...]:
+            found: tuple[Any, ...] = super().rts_smoother(
+                Xs, Ps, Fs, Qs, _scaled_inverse if inv is None else inv
+            )
+            return found
+
         def __reduce__(self) -> tuple[Any, ...]:
             return _restored, (self.__dict__,)
 
     return Twin
+
+
+def _scaled_inverse(P: FloatArray) -> FloatArray:
+    """Return the inverse of a covariance in states of unit variance; delay lines have none."""
+    inverse, size = np.zeros_like(P), np.sqrt(P.diagonal())
+    some = np.flatnonzero(size)
+    unit = P[np.ix_(some, some)] / size[some] / size[some][:, None]
+    inverse[np.ix_(some, some)] = np.linalg.inv(unit) / size[some] / size[some][:, None]
+    return inverse
 
 
 def _command(u: Any, count: int) -> FloatArray:

@@ -17,8 +17,8 @@ from .channels import estimates, poi_channels, same_pois
 def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop) -> FloatArray:
     """Return the variances (nz,) of ``z - hat`` in a closed loop, at the sample instants.
 
-    What u does to a machine that is not the estimator's model enters the error, also where the
-    estimator knows u: the Stein equation of the whole loop, ``X = A X A' + G G'``, each noise
+    What u does to a machine that is not the estimator's model enters the error, although the
+    estimator reads u: the Stein equation of the whole loop, ``X = A X A' + G G'``, each noise
     twice (`loop.budget`).
 
     Parameters

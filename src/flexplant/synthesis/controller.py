@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 from ..loop import SpillOver
 from ..lti.statespace import StateSpace
@@ -50,6 +51,10 @@ class Controller(Value):
             reached=dict(self.reached or {}),
             notes=tuple(self.notes),
         )
+
+    def to_control(self) -> Any:
+        """Return the controller as a `control.StateSpace` with the same names."""
+        return self.system.to_control()
 
     def __repr__(self) -> str:
         gamma = "" if self.gamma is None else f", gamma {self.gamma:.4g}"
