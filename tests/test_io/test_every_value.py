@@ -86,6 +86,7 @@ def made():
     along = fx.close_loop(sampled, static, servo, *fx.reading_along({"static": static}))
     runs = fx.simulate(along, duration=0.01, rng=1, runs=2)
     yield fx.compare_estimators({"static": static}, runs, "die:z")
+    yield fx.estimation.errors_on_machines({"static": static}, [sampled], "die")
     candidates = [fx.Sensor(f"c{i}", at=p, asd=1e-12) for i, p in enumerate([*CORNERS, Z8])]
     small = fx.assemble_plant(some_modes(count=8, attached=False), ports()).discretized(RATE)
     sensors = fx.place_sensors(small, candidates=candidates, count=4)
