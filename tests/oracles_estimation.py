@@ -278,3 +278,27 @@ def records_of(A, C2, C1, factor, R, steps, rng):
         x[k + 1] = A @ x[k] + white[k]
     noise = rng.standard_normal((steps, C2.shape[0])) * np.sqrt(np.diag(R))
     return x[:-1] @ C2.T + noise, x[:-1] @ C1.T
+
+
+def scalar_likelihood(y, a, q, r):
+    """Log likelihood of y[k] = x[k] + v, x+ = a x + w, by the stationary scalar filter."""
+    b = r * (1 - a * a) - q
+    P = (-b + np.sqrt(b * b + 4 * q * r)) / 2
+    K, spread, x, total = a * P / (P + r), P + r, 0.0, 0.0
+    for k, value in enumerate(y):
+        e = value - x
+        x = a * x + K * e
+        if k >= 100:
+            total -= 0.5 * (np.log(spread) + e * e / spread)
+    return total
+
+
+def correlated_covariance(plant, steps):
+    """P[k|k] of the Kalman recursion with E w v' = S (Simon, Optimal State Estimation, 7.1)."""
+    A, C, Q, R, S = (plant[name] for name in ("A", "C2", "Q", "R", "S"))
+    P = np.eye(A.shape[0])
+    for _ in range(steps):
+        ahead = A @ P @ C.T + S
+        P = A @ P @ A.T + Q - ahead @ np.linalg.solve(C @ P @ C.T + R, ahead.T)
+        P = 0.5 * (P + P.T)
+    return P - P @ C.T @ np.linalg.solve(C @ P @ C.T + R, C @ P)

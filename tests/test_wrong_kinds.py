@@ -103,6 +103,8 @@ CALLS = [
     ("RigidForce direction", lambda x: fx.plant.RigidForce("a", x), ()),
     ("consistency", lambda x: fx.estimation.consistency(x, x), ()),
     ("consistency estimate", lambda x: fx.estimation.consistency(kalman(), x), ()),
+    ("estimate_noise", lambda x: fx.estimation.estimate_noise(x, {}), ()),
+    ("estimate_noise records", lambda x: fx.estimation.estimate_noise(plant(), x), ()),
     ("invertibility", lambda x: fx.estimation.invertibility(x, ["amp1"]), ()),
     ("invertibility inputs", lambda x: fx.estimation.invertibility(plant(), x), ()),
     ("input_estimator", lambda x: fx.estimation.design_input_estimator(x, ["amp1"]), ()),

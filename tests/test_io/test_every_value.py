@@ -136,6 +136,8 @@ def of_estimators(plant, small):
     yield from (estimation.Smoother(), estimation.Unbiased(), estimation.Augmented(1.0))
     longer = {name: 1e-9 * rng.standard_normal(400) for name in (*small.y, *small.u)}
     observer = fx.design_kalman(small)
+    one = np.ones(1)
+    yield estimation.NoiseLevels(small, ("y1:noise",), one, np.eye(1), one, 0.0, 1.0, 400)
     yield estimation.consistency(observer, observer.estimate(longer))
     yield estimation.design_hinf_filter(small, accuracy=0.5)
     yield estimation.design_minimax_filter(small, [small], iterations=2)

@@ -26,6 +26,8 @@ from .minimax import design_minimax_filter as design_minimax_filter
 from .multirate import PeriodicCertificate as PeriodicCertificate
 from .multirate import PeriodicEstimator as PeriodicEstimator
 from .multirate import design_multirate as design_multirate
+from .noise_from_records import estimate_noise as estimate_noise
+from .noise_levels import NoiseLevels as NoiseLevels
 from .robust import HinfFilterCertificate as HinfFilterCertificate
 from .robust import MinimaxCertificate as MinimaxCertificate
 from .robust import RobustFilter as RobustFilter

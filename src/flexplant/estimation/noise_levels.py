@@ -1,0 +1,97 @@
+"""Levels of the noises of a plant, by channel, from recorded data: what is estimated."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..plant import StandardPlant
+from ..values import FloatArray, Value
+
+#: channel that stands for all disturbances of a plant made elsewhere
+PROCESS = "process"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class NoiseLevels(Value):
+    """Amplitude densities of disturbances and sensors from a record, with their uncertainty.
+
+    Parameters
+    ----------
+    given : StandardPlant
+        The plant with the densities that the search started from.
+    channels : tuple of str
+        Disturbances of w, then sensors (`y1:noise`); `process` stands for all disturbances of a
+        plant made elsewhere.
+    ratios : (p,) array
+        Estimated density of each channel beside the given one.
+    covariance : (p, p) array
+        Of the logarithms of the ratios: the inverse of Fisher's information.
+    start : (p,) array
+        Ratios by autocovariance least squares, where the search began; 0 where it gave none.
+    slope : float
+        Largest derivative of the likelihood at the end, beside its standard deviation: below 1e-3.
+    nis : float
+        Mean normalised innovation squared per sensor of the filter with these levels, from the
+        record itself: 1 when the model explains it.
+    samples : int
+        Used.
+    """
+
+    given: StandardPlant
+    channels: tuple[str, ...]
+    ratios: FloatArray
+    covariance: FloatArray
+    start: FloatArray
+    slope: float
+    nis: float
+    samples: int
+
+    def __post_init__(self) -> None:
+        self._set(ratios=self.ratios, covariance=self.covariance, start=self.start)
+
+    def __repr__(self) -> str:
+        shown = [
+            f"  {name} {ratio:.4g} times the given density, +- {100 * self.relative[name]:.2g} %"
+            for name, ratio in zip(self.channels[:5], self.ratios, strict=False)
+        ]
+        more = [f"  ... and {len(self.channels) - 5} more"] if len(self.channels) > 5 else []
+        first = f"<NoiseLevels from {self.samples} samples, NIS {self.nis:.4g}"
+        return "\n".join([first, *shown, *more]) + ">"
+
+    @property
+    def asd(self) -> Mapping[str, float]:
+        """Estimated densities [unit/sqrt(Hz)] of the channels that have one."""
+        return {
+            name: float(ratio * self.given.asd[name])
+            for name, ratio in zip(self.channels, self.ratios, strict=True)
+            if name in self.given.asd
+        }
+
+    @property
+    def relative(self) -> Mapping[str, float]:
+        """Relative standard deviation of each density."""
+        sizes = np.sqrt(np.maximum(self.covariance.diagonal(), 0.0))
+        return dict(zip(self.channels, sizes.tolist(), strict=True))
+
+    @property
+    def plant(self) -> StandardPlant:
+        """The plant with the estimated densities."""
+        given = self.given
+        if not given.is_assembled:
+            factor = given.noise_factor * self.ratios[self.channels.index(PROCESS)]
+            origin = given.origin.replace(noise_factor=factor)
+            return given.replace(asd={**given.asd, **self.asd}, origin=origin)
+        ports, asd = given.assembled.ports, self.asd
+        return given.with_ports(
+            ports.replace(
+                w=[p.replace(asd=asd.get(p.name, p.asd)) for p in ports.w],
+                y=[s.replace(asd=asd.get(f"{s.name}:noise", s.asd)) for s in ports.y],
+                u=[
+                    p.replace(asd=asd.get(f"{p.name}:disturbance", p.asd)) if p.asd else p
+                    for p in ports.u
+                ],
+            )
+        )
