@@ -297,3 +297,33 @@ def test_the_report_by_lag_is_that_of_the_estimates():
         kalman.report([0.0])
     with pytest.raises(LabelError, match="no row 'smooth'"):
         report["smooth"]
+
+
+@pytest.mark.parametrize("truncated", [False, True])
+@pytest.mark.parametrize("method", [Predictor(), Filter(), FixedLag(4), Smoother()])
+def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):
+    """Start, a gap, blocks, compliance and noise of modes left out: row by row the fixed POI's."""
+    plant = plate_plant(2e-2, count=5, sensor_asd=1e-10)
+    kalman = design_kalman(plant, modes(2e-2, 9) if truncated else plant)
+    model = kalman.model
+    rng = np.random.default_rng(9)
+    y, u = 1e-8 * rng.standard_normal((600, 4)), 10 * rng.standard_normal((600, 4))
+    y[300:303, 1] = np.nan
+    places = np.array([(0.31, 0.26, 0.0), (0.1, 0.5, 0.0), (0.45, 0.2, 0.0)])
+    which = np.arange(600) % 3
+    channels = records(model, y, u)
+    for start in (None, np.zeros(model.A.shape[0])):
+        found = kalman.estimate(channels, method, start=start, path=places[which])
+        for i, point in enumerate(places):
+            there = plant.at(point.tolist())
+            fixed = design_kalman(there, modes(2e-2, 9) if truncated else there)
+            wanted = fixed.estimate(channels, method, start=start)
+            at = np.flatnonzero(which == i)[1:]
+            for name in wanted.names:
+                size = wanted.deviation(name)[at]
+                np.testing.assert_allclose(found.deviation(name)[at], size, rtol=1e-5)
+                assert np.abs((found[name][at] - wanted[name][at]) / size).max() < 1e-5
+    with pytest.raises(ShapeError, match="2 points, the record 600 samples"):
+        kalman.estimate(channels, path=places[:2])
+    with pytest.raises(LabelError, match="no POI 'dye'"):
+        kalman.estimate(channels, path={"dye": places[which]})

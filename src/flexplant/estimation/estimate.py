@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -156,9 +156,13 @@ def estimated(
     records: Any,
     lag: Any,
     start: Any,
+    place: Callable[[int], Sight] | None,
     units: Mapping[str, str],
 ) -> Estimate:
-    """Return the estimate of a record by the filter of a model with stationary covariance P."""
+    """Return the estimate of a record by the filter of a model with stationary covariance P.
+
+    `place` gives the rows of POIs that move, for a number of samples.
+    """
     if not isinstance(lag, Predictor | Filter | FixedLag | Smoother):
         raise ModelError(
             f"lag must say when an estimate is known, got {short(lag)}. Pass Predictor(), "
@@ -166,6 +170,9 @@ def estimated(
         )
     record = recorded(records, model)
     steady, sight, d, s = in_unit_states(model, P)
+    if place is not None:
+        moving = place(record.time.size)
+        sight = moving._replace(c=moving.c * np.concatenate([d, 1.0 / s]))
     first: Start | FloatArray = (
         stationary_start(steady.model)
         if start is None

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from .lags import Filter, Lag
 from .left_out import LeftOut
 from .loop_error import loop_variances
 from .mesh import NODES, NOTED
+from .moving_pois import moving_sight
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -163,6 +165,7 @@ class KalmanEstimator(Value):
         lag: Lag | None = None,
         *,
         start: npt.ArrayLike | None = None,
+        path: npt.ArrayLike | Mapping[str, npt.ArrayLike] | None = None,
     ) -> Estimate:
         """Return the motions at the POIs from recorded measurements and commands.
 
@@ -183,6 +186,8 @@ class KalmanEstimator(Value):
             of the estimate before. None: damped modes are in the stationary motion that the
             disturbances keep up, rigid-body motions and undamped modes are quite unknown (diffuse,
             no prior at all), and u was 0 before the record.
+        path : (N, 3) array [m] or mapping {name: (N, 3) array}, optional
+            Where a POI is at each sample, when it moves; by name when there are several.
 
         Returns
         -------
@@ -192,7 +197,7 @@ class KalmanEstimator(Value):
         Raises
         ------
         LabelError
-            When a sensor or command is not in the records.
+            When a sensor or command is not in the records, or a POI on a path is unknown.
         ShapeError
             When channels differ in length, or `start` is no state.
         ModelError
@@ -204,12 +209,16 @@ class KalmanEstimator(Value):
         Anderson, Moore, Optimal Filtering, 1979, ch. 7; de Jong, The diffuse Kalman filter, Ann.
         Statist. 19, 1991.
         """
+        place = None
+        if path is not None:
+            place = partial(moving_sight, self.plant, self.left_out, self.model, path)
         return estimated(
             self.model,
             self.predicted_covariance,
             records,
             Filter() if lag is None else lag,
             start,
+            place,
             self.plant.units,
         )
 

@@ -42,6 +42,8 @@ class LeftOut(Value):
     plant : StandardPlant
         The plant whose motions also follow u by the static compliance of the modes left out.
         Shapes that stood for them (attachment vectors) are excited by u only.
+    larger : StandardPlant, optional
+        The plant that has the modes: from it the same follows for a POI elsewhere.
     """
 
     modes: IntArray
@@ -49,6 +51,7 @@ class LeftOut(Value):
     pois: FloatArray
     cross: FloatArray
     plant: StandardPlant
+    larger: StandardPlant | None = None
 
     def __post_init__(self) -> None:
         self._set(modes=self.modes, sensors=self.sensors, pois=self.pois, cross=self.cross)
@@ -115,6 +118,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
         covariance[:nz, :nz],
         covariance[:nz, nz:] @ read.T,
         read_alike(plant, quiet),
+        larger,
     )
 
 
