@@ -123,6 +123,19 @@ def test_a_scan_of_second_order_without_a_grid():
     assert (move.duration, move.stop) == (pytest.approx(0.305), pytest.approx(1.041))
 
 
+@given(metres, bounds_of, rates)
+def test_scans_hold_their_bounds(length, bounds, rate):
+    """From nanometres to metres; the exposed stretch is exact, its velocity constant."""
+    move = scan(-length, **dict(zip(NAMES, bounds, strict=False)), rate=rate, settle=1e-3)
+    peaks = [getattr(move.peaks, name) for name in NAMES]
+    assert all(p <= bound * (1 + 1e-11) for p, bound in zip(peaks, bounds, strict=False))
+    begin, end = move.exposures[0]
+    found = move.at([begin, 0.5 * (begin + end), end])
+    slack = 1e-12 * (length + abs(move.stop)) + 4e-16 * move.duration * peaks[0]
+    assert found.position[0] - found.position[2] == pytest.approx(length, abs=slack)
+    assert np.ptp(found.velocity[:2]) == 0.0 and not found.acceleration[1]
+
+
 def test_what_the_run_cuts_off_is_said():
     loop = fx.close_loop(stage(), observer(), servo())
     move = setpoint(1e-3, velocity=0.02, acceleration=1.0, jerk=100.0, rest=0.01)

@@ -92,7 +92,8 @@ class ErrorBudget(Value):
         """
         half = 0.5 * self[source] ** 2
         row = self.cumulative[self.names.index(source)]
-        return float(self.freq[min(int(np.searchsorted(row, half)), self.freq.size - 1)])
+        known = np.isfinite(self.freq)
+        return float(np.interp(half, row[known], self.freq[known]))
 
     def __repr__(self) -> str:
         size, prefix = scale(self.rms) if self.unit else (1.0, "")

@@ -18,6 +18,8 @@ Densities = Callable[[FloatArray], FloatArray]
 #: intervals are halved until the error of each source's integral is below this part of it
 TOLERANCE = 1e-8
 ROUNDS = 40
+#: edges over all frequencies, beside those at resonances: what a picture of the stairs needs
+_STAIRS = 150
 #: frequencies at a time
 STEP = 2048
 
@@ -141,7 +143,7 @@ def _starts(monitored: StateSpace, top: float) -> FloatArray:
     s = continuous_poles(monitored)
     s = s[(s.imag > 0) & (np.abs(s.real) < 0.1 * s.imag)]
     near = (s.imag[:, None] - s.real[:, None] * np.array([-20, -3, 0, 3, 20])) / (2.0 * np.pi)
-    edges = np.concatenate([np.geomspace(base[0], base[-1], 25), near.ravel()])
+    edges = np.concatenate([np.geomspace(base[0], base[-1], _STAIRS), near.ravel()])
     return np.concatenate([[0.0], np.unique(edges[(edges > 0) & (edges < top)]), [top]])
 
 

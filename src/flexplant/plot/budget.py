@@ -41,7 +41,9 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     order = [int(i) for i in np.argsort(-found.variances, kind="stable")]
     shown, rest = order[: max(most, 1)], order[max(most, 1) :]
     factor, prefix = scale(found.rms) if found.unit else (1.0, "")
-    inside = np.isfinite(found.freq) & (found.freq > 0)
+    # from where a thousandth of the variance has come
+    low = found.cumulative.sum(axis=0) < 1e-3 * found.variances.sum()
+    inside = np.isfinite(found.freq) & (found.freq > 0) & ~low
     freq, stairs = found.freq[inside], found.cumulative[:, inside] / factor**2
     layers = [(found.names[i], stairs[i], found[found.names[i]]) for i in shown]
     if rest:

@@ -148,6 +148,7 @@ def scan(
     grid = _Grid(rate)
     wait = [grid.whole(rest, "rest"), grid.whole(settle, "settle")]
     exposed = grid.whole(abs(signed) / bounds[0], "length / velocity")
+    exposed = max(exposed, grid.tick) if grid else exposed  # a sample at least
     speed = abs(signed) / exposed
     if grid:
         t = tuple(grid.tick * n for n in on_grid(speed, bounds[1:], 1.0 / grid.tick))
