@@ -22,3 +22,5 @@ from .setpoint import setpoint as setpoint
 from .simulate import simulate as simulate
 from .specification import Specification as Specification
 from .specification import Verdict as Verdict
+from .study import study as study
+from .study_table import StudyTable as StudyTable

@@ -1,0 +1,133 @@
+"""The table of a study: one row for each machine, a column for each result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError, unknown_label
+from ..values import Value, short
+
+#: reasons that the repr lists
+_SHOWN = 3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
+    """Results by column, ``table["MA"]`` of shape (n_machines,); ``pandas.DataFrame(dict(table))``.
+
+    Where a machine failed, numbers are NaN, texts empty and truths False; the column "failed"
+    holds the reason, empty otherwise.
+
+    Parameters
+    ----------
+    columns : mapping {str: (n,) array}
+        Of numbers, truths or texts.
+    failed : sequence of str
+        Why each machine has no results; "" where it has.
+    """
+
+    columns: Mapping[str, npt.NDArray[Any]]
+    failed: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        self._set(columns=dict(self.columns), failed=tuple(self.failed))
+
+    def __getitem__(self, name: str) -> npt.NDArray[Any]:
+        if name == "failed":
+            return np.array(self.failed, dtype=np.str_)
+        if name not in self.columns:
+            raise unknown_label("column", name, self)
+        return self.columns[name]
+
+    def __iter__(self) -> Iterator[str]:
+        yield from (*self.columns, "failed")
+
+    def __len__(self) -> int:
+        return len(self.columns) + 1
+
+    def __repr__(self) -> str:
+        reasons = [(i, reason) for i, reason in enumerate(self.failed) if reason]
+        lines = [f"<StudyTable: {len(self.failed)} machines, {len(reasons)} failed>"]
+        width = max((len(name) for name in self.columns), default=0) + 2
+        numeric = {n: c for n, c in self.columns.items() if c.dtype.kind == "f"}
+        if numeric:
+            lines.append(f"  {'':{width}s}{'5 %':>10s}{'median':>10s}{'95 %':>10s}")
+        for name, column in numeric.items():
+            known = column[np.isfinite(column)]
+            shown = np.quantile(known, (0.05, 0.5, 0.95)) if known.size else np.full(3, np.nan)
+            lines.append(f"  {name:{width}s}" + "".join(f"{value:10.4g}" for value in shown))
+        done = np.array([not reason for reason in self.failed])
+        for name, column in self.columns.items():
+            if column.dtype.kind == "b":
+                lines.append(f"  {name:{width}s}{np.count_nonzero(column[done])} of {done.sum()}")
+        lines += [f"  machine {i}: {reason}" for i, reason in reasons[:_SHOWN]]
+        if len(reasons) > _SHOWN:
+            lines.append(f"  and {len(reasons) - _SHOWN} more that failed")
+        return "\n".join(lines)
+
+
+def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
+    """Return the table of rows; a text in place of a row is the reason why there is none.
+
+    Raises
+    ------
+    ModelError
+        When the rows have different columns or a column has values of different kinds.
+    """
+    failed = tuple(row if isinstance(row, str) else "" for row in rows)
+    found = [row for row in rows if not isinstance(row, str)]
+    names = list(found[0]) if found else []
+    for row in found:
+        if set(row) != set(names):
+            raise ModelError(
+                f"the pipeline returned the columns {sorted(row)} for one machine and "
+                f"{sorted(names)} for another. Return the same names for all of them."
+            )
+    columns = {name: _column(name, rows, found[0][name]) for name in names}
+    return StudyTable(columns, failed)
+
+
+def checked_row(row: Any) -> dict[str, Any]:
+    """Return what a pipeline returned as plain numbers, truths and texts.
+
+    Raises
+    ------
+    ModelError
+        When it is no mapping of names to these.
+    """
+    if not isinstance(row, Mapping):
+        raise ModelError(
+            f"the pipeline must return a mapping {{column: number, truth or text}}, got "
+            f"{short(row)}. Return a dict."
+        )
+    plain: dict[str, Any] = {}
+    for name, value in row.items():
+        if not isinstance(name, str) or name == "failed":
+            raise ModelError(f"{name!r} cannot be the name of a column. Use another text.")
+        if isinstance(value, bool | np.bool_):
+            plain[name] = bool(value)
+        elif isinstance(value, str):
+            plain[name] = str(value)
+        elif isinstance(value, int | float | np.integer | np.floating):
+            plain[name] = float(value)
+        else:
+            raise ModelError(
+                f"column {name!r} holds {short(value)}: a table has one number, truth or text for "
+                "each machine. Return several columns, or save arrays to files of your own."
+            )
+    return plain
+
+
+def _column(name: str, rows: Sequence[Mapping[str, Any] | str], first: Any) -> npt.NDArray[Any]:
+    missing: Any = "" if isinstance(first, str) else False if isinstance(first, bool) else np.nan
+    values = [missing if isinstance(row, str) else row[name] for row in rows]
+    if any(type(value) is not type(missing) for value in values):
+        raise ModelError(
+            f"column {name!r} has values of different kinds. Return numbers, truths or texts only."
+        )
+    return np.array(values)

@@ -1,0 +1,192 @@
+"""study: the same table whoever computes it, nothing lost or done twice, failures as rows."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flexplant.errors import LabelError, ModelError
+from flexplant.simulation import StudyTable, study
+from flexplant.store import load
+
+
+def drawn(machine, generator):
+    """Linear algebra whose last bits hang on threads, and chance."""
+    if machine == 3:
+        raise ValueError("no pole\nwas found")
+    M = generator.normal(size=(60, 60))
+    return {"largest": np.linalg.norm(M @ M, 2), "stable": machine % 2 == 0, "name": f"m{machine}"}
+
+
+def ends(machine):
+    if machine == 2:
+        os._exit(1)
+    return {"value": 2.0 * machine}
+
+
+def counted(machine):
+    folder, number = machine
+    with (Path(folder) / "calls").open("a") as file:
+        file.write(f"{number}\n")
+    time.sleep(0.05)
+    return {"value": 0.1 * number}
+
+
+def same(a, b):
+    assert list(a) == list(b)
+    for name in a:
+        assert a[name].dtype == b[name].dtype
+        np.testing.assert_array_equal(a[name], b[name])
+
+
+def test_serial_and_process_pool_agree_to_the_bit():
+    plain = study(range(8), drawn, rng=5)
+    with ProcessPoolExecutor(2) as pool:
+        same(study(range(8), drawn, rng=5, executor=pool), plain)
+    with ThreadPoolExecutor(2) as pool:
+        same(study(range(8), drawn, rng=np.random.SeedSequence(5), executor=pool), plain)
+    expected = [
+        np.linalg.norm(M @ M, 2)
+        for seed in np.random.SeedSequence(5).spawn(8)
+        if (M := np.random.default_rng(seed).normal(size=(60, 60))) is not None
+    ]
+    ok = plain["failed"] == ""
+    np.testing.assert_allclose(plain["largest"][ok], np.array(expected)[ok], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_dask_agrees_to_the_bit():
+    distributed = pytest.importorskip("distributed")
+    plain = study(range(8), drawn, rng=5)
+    with (
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as own,
+        distributed.Client(own) as client,
+    ):
+        same(study(range(8), drawn, rng=5, executor=client.get_executor()), plain)
+
+
+def test_a_machine_that_fails_is_a_row_with_its_reason():
+    table = study(range(5), drawn, rng=0)
+    assert table["failed"].tolist() == ["", "", "", "ValueError: no pole was found", ""]
+    assert np.isnan(table["largest"][3])
+    assert (table["name"][3], bool(table["stable"][3])) == ("", False)
+    shown = repr(table)
+    assert "5 machines, 1 failed" in shown
+    assert "machine 3: ValueError: no pole was found" in shown
+    assert "stable" in shown
+    assert "3 of 4" in shown
+
+
+def test_a_process_that_dies_takes_only_its_machine_with_it():
+    with ProcessPoolExecutor(2) as pool:
+        table = study(range(6), ends, executor=pool)
+    np.testing.assert_array_equal(table["value"], [0.0, 2.0, np.nan, 6.0, 8.0, 10.0])
+    assert "worker died, twice" in table["failed"][2]
+    assert (table["failed"] != "").sum() == 1
+
+
+SCRIPT = """
+import sys
+sys.path.insert(0, {tests!r})
+from test_study import counted
+from flexplant.simulation import study
+study([({folder!r}, i) for i in range(40)], counted, checkpoint={path!r})
+"""
+
+
+def test_killed_and_resumed_nothing_is_lost_or_done_twice(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    code = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(tmp_path), path=str(path))
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while not path.exists() or path.read_bytes().count(b"\n") < 6:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    kept = path.read_bytes().count(b"\n") - 1
+    with path.open("ab") as file:  # as a power cut would leave it
+        file.write(b'[39, {"val')
+    machines = [(str(tmp_path), i) for i in range(40)]
+    table = study(machines, counted, checkpoint=path)
+    np.testing.assert_array_equal(table["value"], 0.1 * np.arange(40))
+    calls = [int(line) for line in (tmp_path / "calls").read_text().splitlines()]
+    assert set(calls) == set(range(40))
+    assert len(calls) <= 41  # the one that was under way when it was killed
+    assert kept >= 5
+    same(study(machines, counted, checkpoint=path), table)
+    assert len((tmp_path / "calls").read_text().splitlines()) == len(calls)
+
+
+def test_a_resumed_study_has_the_seeds_that_it_began_with(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    table = study(range(4), drawn, rng=np.random.default_rng(3), checkpoint=path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    path.write_bytes(b"".join(lines[:3]))
+    again = study(range(4), drawn, rng=np.random.default_rng(99), checkpoint=path)
+    same(again, table)
+
+
+def test_the_checkpoint_of_another_study_is_refused(tmp_path):
+    path = tmp_path / "rows.jsonl"
+    study(range(4), drawn, rng=1, checkpoint=path)
+    before = path.read_bytes()
+    for machines, pipeline, options in (
+        (range(5), drawn, {"rng": 1}),
+        ([0, 1, 2, 4], drawn, {"rng": 1}),
+        (range(4), drawn, {"rng": 2}),
+        (range(4), ends, {}),
+    ):
+        with pytest.raises(ModelError, match="of another study"):
+            study(machines, pipeline, checkpoint=path, **options)
+    other = tmp_path / "notes.txt"
+    other.write_text("mine\n")
+    with pytest.raises(ModelError, match="not the checkpoint of a study: nothing is written"):
+        study(range(4), drawn, rng=1, checkpoint=other)
+    assert (path.read_bytes(), other.read_text()) == (before, "mine\n")
+    assert json.loads(before.splitlines()[0])["machines"] == 4
+
+
+@pytest.mark.parametrize(
+    ("result", "message"),
+    [
+        (3.0, "must return a mapping"),
+        ({"a": np.zeros(3)}, "column 'a' holds"),
+        ({"failed": 1.0}, "cannot be the name of a column"),
+    ],
+)
+def test_what_is_no_row_is_refused(result, message):
+    with pytest.raises(ModelError, match=message):
+        study([1], lambda machine: result)
+
+
+def test_rows_have_the_same_columns_and_kinds():
+    with pytest.raises(ModelError, match=r"columns \['b'\] for one machine and \['a'\]"):
+        study([0, 1], lambda machine: {"ab"[machine]: 1.0})
+    with pytest.raises(ModelError, match="values of different kinds"):
+        study([0, 1], lambda machine: {"a": [1.0, "x"][machine]})
+
+
+def test_wrong_calls():
+    with pytest.raises(ModelError, match="needs machines, got none"):
+        study([], drawn)
+    with pytest.raises(ModelError, match="pipeline must be callable"):
+        study([1], "update")
+
+
+def test_the_table_is_a_mapping_that_is_saved_and_that_pandas_takes(tmp_path):
+    table = study(range(5), drawn, rng=0)
+    table.save(tmp_path / "t.npz")
+    same(load(tmp_path / "t.npz"), table)
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(dict(table))
+    assert list(frame.columns) == ["largest", "stable", "name", "failed"]
+    with pytest.raises(LabelError, match="no column 'larges'"):
+        table["larges"]
+    assert isinstance(table, StudyTable)
