@@ -87,6 +87,7 @@ from .simulation import reading_along as reading_along
 from .simulation import scan as scan
 from .simulation import setpoint as setpoint
 from .simulation import simulate as simulate
+from .simulation import study as study
 from .store import load as load
 from .structure import Damper as Damper
 from .structure import Disc as Disc
