@@ -33,8 +33,8 @@ lowpass discretized
 design_kalman design_static KalmanEstimator FixedLag Smoother
 design_servo servo_bandwidth design_hinf Riccati Lmi StructuredLmi Controller
 score_sensors score_actuators place_sensors place_actuators PoiVariance Placement sensor_map
-close_loop ClosedLoop compare_loops modulus_margin
-setpoint scan simulate Response Specification study design_feedforward compare_estimators reading_along
+close_loop ClosedLoop compare_loops modulus_margin reading_along
+setpoint scan simulate Response Specification study design_feedforward compare_estimators
 """
 ROOMS = {
     *("lti", "sparse", "structure", "modes", "reduction", "identification", "updating", "plant"),
