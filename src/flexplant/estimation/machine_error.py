@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError
-from ..lti.lyapunov import accumulated, doubled, scale_of
+from ..errors import AssumptionError, SolverError
+from ..lti.lyapunov import DOUBLINGS, scale_of, solve_stein
 from ..plant import StandardPlant
 from ..values import FloatArray
 from .error import moving_parts
@@ -16,6 +16,8 @@ from .filter_model import FilterModel, filter_model
 
 #: what a filter may miss of a rigid-body motion that it should follow without error
 _MISSED = 1e-7
+#: norm of a power of the filter, states of unit size, that adds nothing any more
+_VANISHED = 1e-17
 
 
 class Gains(NamedTuple):
@@ -25,97 +27,137 @@ class Gains(NamedTuple):
     L_z: FloatArray
 
 
+class FilterPart(NamedTuple):
+    """What the errors on all machines share: the filter with some gains, states of unit size.
+
+    Parameters
+    ----------
+    K, L : arrays
+        Gains, K in scaled states and L_z in units of the value.
+    powers : list of (n, n) arrays
+        ``A_o^(2^k)`` of A_o = A0 - K C0, until it vanishes.
+    C0, E : arrays
+        Filter states to sensors, and to the error, less sign.
+    sight : (n, n) array
+        Y_oo of ``Y_oo = A_o' Y_oo A_o + E' E``.
+    """
+
+    K: FloatArray
+    L: FloatArray
+    powers: list[FloatArray]
+    C0: FloatArray
+    E: FloatArray
+    sight: FloatArray
+
+
+@np.errstate(over="ignore", invalid="ignore")
+def filter_part(m: FilterModel, gains: Gains, scale: FloatArray, unit: FloatArray) -> FilterPart:
+    """Return the part of the errors that does not depend on the machine.
+
+    Parameters
+    ----------
+    m : FilterModel
+        Its matrices.
+    gains : Gains
+        Of the filter.
+    scale : (n,) array
+        Of its states.
+    unit : (nz, 1) array
+        Of the POI motions.
+
+    Raises
+    ------
+    SolverError
+        When the filter is not stable.
+    """
+    K, L, C0 = gains.K / scale[:, None], gains.L_z / unit, m.C2 * scale
+    power = m.A * scale / scale[:, None] - K @ C0
+    powers, E = [power], m.C1 * scale / unit - L @ C0
+    while not (size := np.linalg.norm(power)) < _VANISHED:
+        if len(powers) > DOUBLINGS or not np.isfinite(size):
+            raise SolverError("the filter is not stable: its error has no variance.")
+        power = power @ power
+        powers.append(power)
+    return FilterPart(K, L, powers, C0, E, _summed(powers, powers, E.T @ E, turned=True))
+
+
 class MachineError(NamedTuple):
     """Error of ``x_o+ = A0 x_o + K (y - C0 x_o)``, ``hat = C1 x_o + L_z (y - C0 x_o)``.
 
     On a machine ``x+ = A x + G xi``, ``y = C x + v``, ``z = C1e x``, without the rigid-body motion
-    x_r that both share: x and x_o are what is left beside V_e x_r and V_o x_r.
+    x_r that both share: x and x_o are what is left beside V_e x_r and V_o x_r. All in states of
+    unit size.
 
     Parameters
     ----------
-    A, C, C1e, G : arrays
+    powers : list of (n_e, n_e) arrays
+        ``A^(2^k)``, as many as were needed so far.
+    C, C1e, G : arrays
         Of the machine's states that decay.
-    A0, C0, C1 : arrays
-        Of the filter.
+    X : (n_e, n_e) array
+        Their covariance.
     back, driven : arrays
         ``V_o A_re`` and ``V_o G_r``: what moves the filter's part of the rigid-body motion.
     root : (ny, ny + r) array
         Of the sensor noise: what each sensor has alone, then what disturbances add at once.
-    sizes : (nz,) array
-        Of the POI motions; their variances count relative to ``sizes^2``, their mean is the value.
-    scale : (n + n_o,) array
-        Of the states of machine and filter, powers of two.
     """
 
-    A: FloatArray
+    powers: list[FloatArray]
     C: FloatArray
     C1e: FloatArray
     G: FloatArray
-    A0: FloatArray
-    C0: FloatArray
-    C1: FloatArray
+    X: FloatArray
     back: FloatArray
     driven: FloatArray
     root: FloatArray
-    sizes: FloatArray
-    scale: FloatArray
 
-    def value(self, gains: Gains) -> float:
-        """Return the mean relative variance.
+    def value(self, part: FilterPart) -> float:
+        """Return the mean relative variance."""
+        return self.value_and_slopes(part)[0]
 
-        Raises
-        ------
-        SolverError
-            When the filter is not stable.
-        """
-        F, N, E, direct = self._joint(gains)
-        X = doubled(F, N @ N.T)
-        return float(np.sum((E @ X) * E) + np.sum(direct**2))
-
-    def value_and_gradient(self, gains: Gains) -> tuple[float, Gains]:
-        """Return the mean relative variance and its derivatives to both gains.
+    def value_and_slopes(self, part: FilterPart) -> tuple[float, Gains]:
+        """Return the mean relative variance and its derivatives to K and L of the part.
 
         ``J = tr(E X E')``, X = F X F' + N N', Y = F' Y F + E' E: dJ/dF = 2 Y F X,
-        dJ/dN = 2 Y N, dJ/dE = 2 E X.
-
-        Raises
-        ------
-        SolverError
-            When the filter is not stable.
+        dJ/dN = 2 Y N, dJ/dE = 2 E X with ``F = [A, 0; B, A_o]``, B = K C - back; of Y the rows of
+        the filter are enough.
         """
-        F, N, E, direct = self._joint(gains)
-        X, Y = doubled(F, N @ N.T), doubled(F.T, E.T @ E)
-        n, d = self.A.shape[0], self.scale
-        unit = np.sqrt(self.sizes.size) * self.sizes[:, None]
-        to_F, to_N, to_E = 2 * (Y[n:] @ F) @ X, 2 * Y[n:] @ N, 2 * E @ X
-        own, other = self.C * d[:n], self.C0 * d[n:]
-        K = to_F[:, :n] @ own.T - to_F[:, n:] @ other.T + to_N @ self.root.T
-        L_z = -to_E[:, :n] @ own.T + to_E[:, n:] @ other.T + 2 * direct @ self.root.T
-        value = float(np.sum((E @ X) * E) + np.sum(direct**2))
-        return value, Gains(K / d[n:, None], L_z / unit)
+        A, A_o, Y = self.powers[0], part.powers[0], part.sight
+        powers = self._until(len(part.powers))
+        B, ny = part.K @ self.C - self.back, len(self.root)
+        N = part.K @ self.root
+        N[:, ny:] -= self.driven
+        E = self.C1e - part.L @ self.C
+        entering = B @ self.X
+        X_oe = _summed(part.powers, powers, entering @ A.T + N[:, ny:] @ self.G.T)
+        half = A_o @ X_oe @ B.T
+        X_oo = _summed(part.powers, part.powers, entering @ B.T + half + half.T + N @ N.T)
+        Y_oe = _summed(part.powers, powers, A_o.T @ Y @ B - part.E.T @ E, turned=True)
+        direct = part.L @ self.root
+        to_e, to_o = E @ self.X - part.E @ X_oe, E @ X_oe.T - part.E @ X_oo
+        value = float(np.sum(to_e * E) - np.sum(to_o * part.E) + np.sum(direct**2))
+        left, right = Y_oe @ A + Y @ B, Y @ A_o
+        to_Fe, to_Fo = left @ self.X + right @ X_oe, left @ X_oe.T + right @ X_oo
+        to_N = Y @ N
+        to_N[:, ny:] += Y_oe @ self.G
+        K = to_Fe @ self.C.T - to_Fo @ part.C0.T + to_N @ self.root.T
+        L = -to_e @ self.C.T + to_o @ part.C0.T + direct @ self.root.T
+        return value, Gains(2 * K, 2 * L)
 
-    def sight(self, gains: Gains) -> tuple[FloatArray, FloatArray]:
-        """Return the Gramian Y of the filter's states in the value, and their scale."""
-        F, _, E, _ = self._joint(gains)
-        n = self.A.shape[0]
-        return doubled(F[n:, n:].T, E[:, n:].T @ E[:, n:]), self.scale[n:]
+    def _until(self, count: int) -> list[FloatArray]:
+        while len(self.powers) < count:
+            self.powers.append(self.powers[-1] @ self.powers[-1])
+        return self.powers
 
-    def _joint(self, gains: Gains) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return F, N, E in scaled states, and the part of the noise that enters the estimate."""
-        K, L_z, d, n = gains.K, gains.L_z, self.scale, self.A.shape[0]
-        F = np.block(
-            [
-                [self.A, np.zeros((n, self.A0.shape[0]))],
-                [K @ self.C - self.back, self.A0 - K @ self.C0],
-            ]
-        )
-        ny, r = len(self.root), self.G.shape[1]
-        N = np.zeros((F.shape[0], ny + r))
-        N[:n, ny:], N[n:, ny:] = self.G, -self.driven
-        N[n:] += K @ self.root
-        E = np.hstack([self.C1e - L_z @ self.C, -(self.C1 - L_z @ self.C0)])
-        unit = np.sqrt(self.sizes.size) * self.sizes[:, None]
-        return F * d / d[:, None], N / d[:, None], E * d / unit, L_z @ self.root / unit
+
+def _summed(
+    left: list[FloatArray], right: list[FloatArray], first: FloatArray, *, turned: bool = False
+) -> FloatArray:
+    """Return the sum of ``A^j first B'^j`` (``A'^j first B^j`` when turned) by doubling."""
+    X = first
+    for P, Q in zip(left, right, strict=False):
+        X = X + (P.T @ X @ Q if turned else P @ X @ Q.T)
+    return X
 
 
 def machine_error(
@@ -123,7 +165,8 @@ def machine_error(
     model: FilterModel,
     machine: StandardPlant,
     start: Gains,
-    sizes: FloatArray,
+    scale: FloatArray,
+    unit: FloatArray,
 ) -> MachineError:
     """Return the error of filters on a plant's matrices when they run on a machine.
 
@@ -140,8 +183,10 @@ def machine_error(
         Sampled alike.
     start : Gains
         A stable filter.
-    sizes : (nz,) array
-        Units of the POI motions.
+    scale : (n,) array
+        Of the filter's states.
+    unit : (nz, 1) array
+        Of the POI motions.
 
     Raises
     ------
@@ -171,14 +216,18 @@ def machine_error(
     rows = [machine.y.index(name) for name in own.sensors]
     at_once = machine.noise_direct[rows]
     alone = np.sqrt(machine.sensor_noise[np.ix_(rows, rows)])
-    first = MachineError(
-        A, C, C1e, G, m.A, m.C2, m.C1, back, driven, np.hstack([alone, at_once]), sizes,
-        np.ones(rest.size + m.A.shape[0]),
-    )  # fmt: skip
-    F, N, *_ = first._joint(start)
-    even = scale_of(accumulated(F, N @ N.T))
-    F, N = F * even / even[:, None], N / even[:, None]
-    return first._replace(scale=even * scale_of(doubled(F, N @ N.T).diagonal()))
+    X = solve_stein(A, G @ G.T)
+    d = scale_of(X.diagonal())
+    return MachineError(
+        [A * d / d[:, None]],
+        C * d,
+        C1e * d / unit,
+        G / d[:, None],
+        X / d / d[:, None],
+        back * d / scale[:, None],
+        driven / scale[:, None],
+        np.hstack([alone, at_once]),
+    )
 
 
 def _size(rows: FloatArray) -> FloatArray:

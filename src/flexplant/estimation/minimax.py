@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..lti.lyapunov import scale_of
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, UncertainPlant
@@ -16,7 +17,7 @@ from .channels import same_pois
 from .error import error_variances
 from .filter_system import filter_system, own_variances
 from .kalman import design_kalman
-from .machine_error import Gains, MachineError, machine_error
+from .machine_error import FilterPart, Gains, MachineError, filter_part, machine_error
 from .robust import MinimaxCertificate, RobustFilter
 
 #: width of the smooth maximum relative to the largest value, from coarse to fine
@@ -88,12 +89,17 @@ def design_minimax_filter(
     sizes = np.sqrt(kalman.variances)
     others = _checked(plant, machines)
     start = Gains(kalman.predictor_gain, model.C1 @ kalman.gain)
-    errors = [machine_error(plant, model, other, start, sizes) for other in others]
-    unit = _Units.of(
-        errors[0], model.innovation(kalman.predicted_covariance), start, kalman.covariance
-    )
-    found, slope = _searched(errors, unit, start, steps)
-    values = np.array([error.value(found) for error in errors])
+    P = kalman.predicted_covariance
+    scale, unit = scale_of(P.diagonal()), np.sqrt(sizes.size) * sizes[:, None]
+
+    def part(gains: Gains) -> FilterPart:
+        return filter_part(model, gains, scale, unit)
+
+    errors = [machine_error(plant, model, other, start, scale, unit) for other in others]
+    spread = kalman.covariance.diagonal() / scale**2
+    units = _Units.of(part(start).sight, model.innovation(P), spread, (scale, unit))
+    found, slope = _searched(errors, part, units, start, steps)
+    values = np.array([error.value(part(found)) for error in errors])
     system = filter_system(plant, model, found.K, found.L_z, "minimax_filter")
     truth = _means(others, system, sizes)
     difference = float(np.max(np.abs(values - truth) / truth))
@@ -154,61 +160,70 @@ class _Units(NamedTuple):
     """
 
     states: FloatArray
-    pois: FloatArray
     right: FloatArray
+
+    scale: FloatArray
+    unit: FloatArray
 
     @classmethod
     def of(
-        cls, error: MachineError, innovation: FloatArray, start: Gains, covariance: FloatArray
+        cls, Y: FloatArray, innovation: FloatArray, spread: FloatArray, into: tuple[FloatArray, ...]
     ) -> _Units:
-        """Return the units at a start on the nominal plant."""
-        Y, d = error.sight(start)
+        """Return the units from Y and variances of states; `into` scales states and POIs."""
         # what the POIs hardly see moves by a part of its deviation for an innovation of one
-        spread = np.maximum(covariance.diagonal() / d**2, 1e-12)
-        values, vectors = np.linalg.eigh(Y + np.diag(1.0 / (_PART * spread)))
-        states = d[:, None] * vectors / np.sqrt(values)
+        values, vectors = np.linalg.eigh(Y + np.diag(1.0 / (_PART * np.maximum(spread, 1e-12))))
+        states = vectors / np.sqrt(values)
         size = np.sqrt(innovation.diagonal())
         values, vectors = np.linalg.eigh(innovation / size / size[:, None])
-        right = (vectors / np.sqrt(values)).T / size
-        return cls(states, np.diag(error.sizes * np.sqrt(error.sizes.size)), right)
+        return cls(states, (vectors / np.sqrt(values)).T / size, *into)
+
+    def change(self, x: FloatArray) -> Gains:
+        """Return the change of the gains for a vector (n ny + nz ny,)."""
+        n, ny = len(self.states), len(self.right)
+        K, L = x[: n * ny].reshape(n, ny), x[n * ny :].reshape(-1, ny)
+        return Gains(
+            self.scale[:, None] * (self.states @ K @ self.right), self.unit * (L @ self.right)
+        )
+
+    def slope(self, rate: Gains) -> FloatArray:
+        """Return the derivatives to that vector from those to gains in scaled states."""
+        both = self.states.T @ rate.K @ self.right.T, rate.L_z @ self.right.T
+        return np.concatenate([one.reshape(-1) for one in both])
 
 
 def _searched(
-    errors: Sequence[MachineError], unit: _Units, start: Gains, steps: int
+    errors: Sequence[MachineError],
+    part: Callable[[Gains], FilterPart],
+    units: _Units,
+    start: Gains,
+    steps: int,
 ) -> tuple[Gains, float]:
     """Return the best gains that were found, and the relative slope there."""
     from scipy.optimize import minimize
 
-    split = start.K.size
     best: list[tuple[float, Gains]] = []
 
-    def gains(x: FloatArray) -> Gains:
-        return Gains(
-            start.K + unit.states @ x[:split].reshape(start.K.shape) @ unit.right,
-            start.L_z + unit.pois @ x[split:].reshape(start.L_z.shape) @ unit.right,
-        )
-
     def smooth(x: FloatArray, width: float) -> tuple[float, FloatArray]:
-        at = gains(x)
+        change = units.change(x)
+        at = Gains(start.K + change.K, start.L_z + change.L_z)
         try:
-            found = [error.value_and_gradient(at) for error in errors]
+            shared = part(at)
+            found = [error.value_and_slopes(shared) for error in errors]
         except SolverError:  # the filter is not stable
             return np.inf, np.zeros(x.size)
         values = np.array([value for value, _ in found])
         weight = np.exp((values - values.max()) / width)
         if not best or values.max() < best[0][0]:
             best[:] = [(float(values.max()), at)]
-        slope = np.zeros(x.size)
-        for part, (_, rate) in zip(weight / weight.sum(), found, strict=True):
-            slope[:split] += part * (unit.states.T @ rate.K @ unit.right.T).reshape(-1)
-            slope[split:] += part * (unit.pois @ rate.L_z @ unit.right.T).reshape(-1)
+        shares = zip(weight / weight.sum(), found, strict=True)
+        slope = np.sum([share * units.slope(rate) for share, (_, rate) in shares], axis=0)
         return float(values.max() + width * np.log(weight.sum())), slope
 
     def relative(x: FloatArray, width: float, scale: float) -> tuple[float, FloatArray]:
         value, slope = smooth(x, width * scale)
         return value / scale, slope / scale
 
-    x = np.zeros(split + start.L_z.size)
+    x = np.zeros(start.K.size + start.L_z.size)
     if not np.isfinite(smooth(x, 1.0)[0]):
         raise AssumptionError(
             "the Kalman filter of the nominal plant is not stable to working precision, so the "
