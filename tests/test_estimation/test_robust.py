@@ -5,8 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 from scipy.optimize import minimize
-from test_kalman import plate_plant
+from test_kalman import modes, plate_plant, ports
 
+import flexplant as fx
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import design_hinf_filter, design_kalman, design_minimax_filter
 from flexplant.lti import StateSpace
@@ -137,6 +138,26 @@ def test_worst_machine_of_the_plate():
     assert found.certificate.difference < 1e-6
     # what it costs on the nominal machine
     assert found.rms("die") < 1.2 * found.sizes[0]
+
+
+@pytest.mark.slow
+def test_machines_of_a_fit():
+    """Added masses known to some grams move all modes, rigid-body ones too."""
+    grid = list(fx.select_dofs(modes(1e-3, 9), 9))
+    rom = fx.reduce(modes(1e-3, 9), fx.DesiredDofs(grid))
+    nominal = rom.modes()
+    poles = nominal.omega[3:6] * (-nominal.zeta[3:6] + 1j) * 0.99
+    spread = np.diag(np.concatenate([(2e-4 * np.abs(poles)) ** 2, (2e-3 * np.abs(poles)) ** 2]))
+    measured = fx.MeasuredModes(poles=poles, modes=[4, 5, 6], covariance=spread)
+    fit = fx.update(rom, [fx.AddedMass(grid[7]), fx.AddedMass(grid[4])], [fx.Eigenvalues(measured)])
+    plant = fx.assemble_plant(fit.model, ports()).discretized(1e4, delay=1)
+    drawn = plant.uncertain(fit).sample(3, 4)
+    found = design_minimax_filter(plant, drawn, iterations=40)
+    assert found.certificate.worst < 0.9 * found.certificate.kalman
+    assert found.certificate.difference < 1e-6
+    rms = [[found.rms(n, on=one) for n in ("die:z", "die:rx", "die:ry")] for one in drawn]
+    worst = np.mean((np.array(rms) / found.sizes) ** 2, axis=1).max()
+    assert worst == pytest.approx(found.certificate.worst, rel=1e-9, abs=0)
 
 
 def test_one_machine_alone_is_its_kalman_filter():

@@ -96,13 +96,16 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
             begin = np.ones(len(channels))
         found = _scored(spectrum, begin, np.minimum(_LOW / ratios**2, 1.0))
         ratios = ratios * np.sqrt(found.variances)
-        if np.max(np.abs(np.log(found.variances))) < 2 * _SETTLED:
+        covariance = _covariance(found, channels)
+        # what is known to a few percent only is settled well within that
+        known = np.maximum(2 * _SETTLED, 0.1 * np.sqrt(covariance.diagonal()))
+        if np.all(np.abs(np.log(found.variances)) < known):
             break
-    _check_separate(found.information, found.variances, channels)
-    # variances are squares: the logarithm of a density has a quarter of the variance
-    scaled = found.information * np.outer(found.variances, found.variances)
-    size = np.sqrt(scaled.diagonal())
-    covariance = 0.25 * np.linalg.inv(scaled / np.outer(size, size)) / np.outer(size, size)
+    else:
+        raise SolverError(
+            f"the noise levels still change after {_PASSES} designs of the filter. Pass a plant "
+            "with densities nearer to the true ones, or a longer record."
+        )
     final = _levels(plant, channels, ratios)
     return NoiseLevels(
         plant, channels, ratios, covariance, first, found.slope,
@@ -284,8 +287,12 @@ def _likelihood(spectrum: _LevelSpectrum, t: FloatArray) -> tuple[float, FloatAr
     return float(value), slope * t, information * np.outer(t, t)
 
 
-def _check_separate(information: FloatArray, t: FloatArray, channels: tuple[str, ...]) -> None:
-    scaled = information * np.outer(t, t)
+def _covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
+    """Return the covariance of the logarithms of the densities, when the channels can be separated.
+
+    Densities are roots of variances: a quarter of the inverse of the information in log t.
+    """
+    scaled = found.information * np.outer(found.variances, found.variances)
     size = np.sqrt(scaled.diagonal())
     if np.any(size == 0):
         raise AssumptionError(
@@ -300,6 +307,8 @@ def _check_separate(information: FloatArray, t: FloatArray, channels: tuple[str,
             ": other shares of them give the same record. Give only one of them a density, or add "
             "a sensor."
         )
+    inverse = np.linalg.inv(scaled / np.outer(size, size))
+    return np.asarray(0.25 * inverse / np.outer(size, size))
 
 
 def _nis(observer: KalmanEstimator, records: Any) -> float:
