@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 import flexplant as fx
@@ -26,7 +26,6 @@ def made(distance, bounds, **options):
     return setpoint(distance, **dict(zip(NAMES, bounds, strict=False)), **options)
 
 
-@settings(max_examples=60)
 @given(metres, bounds_of, rates, st.sampled_from([-1.0, 1.0]))
 def test_bounds_hold_and_the_end_is_reached(distance, bounds, rate, sign):
     """Orders 2 to 4 from nanometres to metres, on a grid and off it."""
@@ -52,7 +51,6 @@ def test_bounds_hold_and_the_end_is_reached(distance, bounds, rate, sign):
         assert move.duration <= free.duration + (2 ** len(bounds)) / rate
 
 
-@settings(max_examples=60)
 @given(metres, bounds_of, st.sampled_from([1e3, 7e3, 1e4]))
 def test_samples_of_all_derivatives_are_in_phase(distance, bounds, rate):
     """Held over a sample, the highest derivative moves all others to their next sample."""
@@ -132,7 +130,8 @@ def test_scans_hold_their_bounds(length, bounds, rate):
     begin, end = move.exposures[0]
     found = move.at([begin, 0.5 * (begin + end), end])
     slack = 1e-12 * (length + abs(move.stop)) + 4e-16 * move.duration * peaks[0]
-    assert found.position[0] - found.position[2] == pytest.approx(length, abs=slack)
+    assume(slack < 1e-3 * length)  # or it lies too far away for its digits
+    assert found.position[0] - found.position[2] == pytest.approx(length, rel=0, abs=slack)
     assert np.ptp(found.velocity[:2]) == 0.0 and not found.acceleration[1]
 
 

@@ -151,7 +151,7 @@ def design_feedforward(
     delay and, negative, the compliance of the flexible modes between actuators and POI; on springs
     k_0 and k_1 are their stiffness and damping. In a loop ``G_u F + G_r = 1`` is solved for F
     instead, G_u and G_r the responses of the POI to forces and reference in closed loop: where
-    sensors and POI do not move alike, the feedback would work against the inverse of P. The
+    sensors and POI do not move alike, the feedback would oppose the inverse of P. The
     coefficients are Cauchy's integrals on a circle, the largest on which they no longer depend on
     its radius. All axes of the POI are taken together: the forces that keep the axes without a
     reference at rest are in it.
