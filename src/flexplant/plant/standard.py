@@ -222,9 +222,9 @@ class StandardPlant(Partition):
             given.
         deviations : float
             Standard deviations at which a delta is 1.
-        neglected : StandardPlant, FEModel, Modes or ReducedModel, optional
-            A larger model with the same u and y: the difference from u to y is bounded by an
-            additive weight (not that from w or to z; see `NeglectedModes`).
+        neglected : StandardPlant, FEModel, Modes, ReducedModel or NeglectedModes, optional
+            A larger model with the same channels: the difference from w and u to z and y is
+            bounded by additive weights (see `NeglectedModes`).
 
         Returns
         -------

@@ -1,4 +1,4 @@
-"""Modes that a plant lacks, as an additive dynamic uncertainty with a weight that bounds them."""
+"""Modes that a plant lacks, as an additive dynamic uncertainty with weights that bound them."""
 
 from __future__ import annotations
 
@@ -7,68 +7,90 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...errors import CertificateError, ModelError
-from ...lti.frequency import default_freq, frequency_response
-from ...lti.interconnection import series
+from ...lti.frequency import frequency_response
+from ...lti.interconnection import append
 from ...lti.statespace import StateSpace, System
-from ...values import ComplexArray, FloatArray, Value
+from ...values import ComplexArray, FloatArray, Value, whole
 from ..building import with_modes_of
 from ..partition import Partition, is_plant
 from ..realisation import Structure
+from .covering import covering
 
-#: the weight lies this far above the largest difference found
+#: the weights lie this far above the largest difference found
 _MARGIN = 1.05
+#: part of the rigid-body accelerations by which two models of one body may differ
+_SAME_BODY = 1e-6
+#: offsets from a resonance, in its half widths, at which the bound is looked at besides
+_BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
+#: part of a channel's largest response below which a row or column of the difference is rounding
+_ROUNDING = 1e-12
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NeglectedModes(Value):
-    """``y = (G + diag(sizes) Delta w(s)) u``, Delta any stable system of gain at most 1.
+    """``[z; y] = (G + W(s) Delta diag(1/scales)) [w; u]``, Delta stable and of gain at most 1.
 
-    The bound is of the loop, u -> y: it answers whether a controller stays stable on the larger
-    model. What neglected modes do from w and to z at a point of interest is no part of it (Delta
-    would tie forces in N to motions in m of other places, a bound far too wide to be of use):
-    judge performance on the larger model itself, or on machines that `sample` draws.
+    One Delta for all that neglected modes do: from disturbances and actuators to points of
+    interest and sensors. That they reach a loop is its part from u to y, what they do to its
+    performance the others.
 
     Parameters
     ----------
-    weight : StateSpace
-        The scalar w: stable, with a stable inverse; continuous.
-    sizes : (ny,) array [output unit / input unit]
-        Largest difference of each output.
-    u, y : sequences of str
-        Actuators and the outputs that they move.
+    weights : StateSpace
+        W, diagonal: an own weight for each output, stable with a stable inverse; continuous.
+    scales : (n_in,) array [input unit]
+        Sizes of the inputs at which they move the outputs alike.
+    inputs, outputs : sequences of str
+        What drives neglected modes, and what they move.
+    mirrored : mapping {str: str}
+        Outputs that are others with the opposite sign (errors of a reference): not bounded twice.
     tightest : float
-        Largest ``|difference| / |w|`` over the sweep that verified the bound: at most 1.
+        Largest singular value of Delta over the frequencies that verified the bound: at most 1.
+    looseness : float
+        Median of its inverse, over the logarithm of frequency.
     """
 
-    weight: StateSpace
-    sizes: FloatArray
-    u: tuple[str, ...]
-    y: tuple[str, ...]
+    weights: StateSpace
+    scales: FloatArray
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    mirrored: dict[str, str]
     tightest: float
+    looseness: float
 
     def __post_init__(self) -> None:
-        self._set(sizes=self.sizes)
+        self._set(scales=self.scales)
 
     def __repr__(self) -> str:
-        return f"<NeglectedModes: {len(self.u)} u -> {len(self.y)} y, bounded {self.tightest:.3g}>"
+        return (
+            f"<NeglectedModes: {len(self.inputs)} inputs -> {len(self.outputs)} outputs, "
+            f"{self.weights.n_states} states, bounded {self.tightest:.3g}, median looseness "
+            f"{self.looseness:.3g}>"
+        )
 
 
 def neglected_modes(
-    plant: Partition | System, larger: Partition | System | Structure
+    plant: Partition | System, larger: Partition | System | Structure, *, resonances: int = 24
 ) -> NeglectedModes:
-    """Return a weight that bounds what a larger model has and a plant has not, from u to y.
+    """Return weights that bound what a larger model has and a plant has not, from w, u to z, y.
 
-    ``sigma_max(diag(1/sizes) (G_larger - G)(i omega)) <= |w(i omega)|`` at all frequencies, with
-    ``w = g ((1 + s/a) / (1 + s/b))^2``; corners by least mean log distance, a tenth above
-    twice the frequency of the highest peak, then verified on
-    another grid with points through every resonance.
+    ``sigma_max(W^-1 (G_larger - G) diag(scales)) <= 1`` from 0 Hz up. The square of each weight is
+    ``p_0 + sum_k p_k / |s^2 + 2 zeta_k omega_k s + omega_k^2|^2`` at ``s = i omega``, p by linear
+    programming: least mean looseness over the logarithm of frequency, above the difference at
+    every frequency. The resonances are those of the lowest modes neglected, further terms are well
+    damped. The bound is then verified on other frequencies, with points through every resonance.
+
+    Rigid-body motions are the same in both and cancel, so that the difference is finite at 0 Hz.
 
     Parameters
     ----------
     plant : StandardPlant
         Continuous, or sampled (its continuous plant is compared).
     larger : StandardPlant, FEModel, Modes or ReducedModel
-        With the same u and y; a structure gets the plant's ports.
+        With the same channels; a structure gets the plant's ports.
+    resonances : int
+        How many neglected modes the weights follow; all others lie below a smooth line. Each
+        costs two states for each output.
 
     Returns
     -------
@@ -79,117 +101,199 @@ def neglected_modes(
     ModelError
         When channels differ, the two do not differ, or they differ in their rigid body.
     CertificateError
-        When the sweep finds a larger difference than the weight.
+        When the verification finds a larger difference than the weights.
     """
     small = Partition.of(plant).continuous
     big = Partition.of(larger).continuous if is_plant(larger) else with_modes_of(small, larger)
-    moved = _moved(small)
-    if set(big.u) != set(small.u) or not set(moved) <= set(big.y):
-        raise ModelError(f"the larger plant has other channels: {big.u} -> {big.y}.")
-    pair = small.system.select(moved, small.u), big.system.select(moved, small.u)
-    grid = _grid(*pair)
-    gap = _gap(*pair, grid)
-    sizes = np.linalg.norm(gap, axis=1).max(axis=1)
-    if not np.all(sizes > 0):
+    follow = whole(resonances, "resonances")
+    pair = _elastic(small, big)
+    pair, mirrored = _distinct(*pair)
+    if not pair[0].outputs or not pair[0].inputs:
         raise ModelError("the larger model does not differ from the plant: nothing is neglected.")
-    height = _height(gap, sizes)
-    low = np.searchsorted(grid, 3 * grid[0])
-    if height[0] > 3 * height[low]:
-        raise ModelError(
-            "the difference grows toward low frequencies: the two differ in their rigid body "
-            "(mass or inertia), which is no neglected mode. Update the mass first."
-        )
-    weight = _fitted(grid, height)
-    fine = np.unique(np.concatenate([grid[:-1] + f * np.diff(grid) for f in (0.25, 0.5, 0.75)]))
-    gain = np.abs(frequency_response(weight, fine).data[0, 0])
-    tightest = float(np.max(_height(_gap(*pair, fine), sizes) / gain))
-    if tightest > 1:
+    poles = _swinging(*pair)
+    grid = _grid(poles)
+    gap = _gap(pair, grid)
+    scales, gap = _evened(gap)
+    tall = np.sqrt(gap.shape[0])  # all rows may be at their bound at once, at one resonance
+    rows = [covering(grid, tall * np.linalg.norm(row, axis=0), poles, follow) for row in gap]
+    weights = _diagonal(rows, tuple(pair[0].outputs))
+    height = _height(weights, gap, grid)
+    factor = _MARGIN * float(height.max())
+    weights = weights.replace(C=factor * weights.C, D=factor * weights.D)
+    fine = _verifying(grid, poles)
+    found = _height(weights, _gap(pair, fine) * scales[:, None], fine)
+    tightest = float(found.max())
+    if not tightest <= 1.0:
+        worst = fine[int(np.argmax(found))]
         raise CertificateError(
-            f"the difference is {tightest:.4g} times the weight somewhere: a resonance is "
+            f"the difference is {tightest:.4g} times the weights at {worst:.6g} Hz: a resonance is "
             "sharper than the grid. Report this with the two models."
         )
-    return NeglectedModes(weight, sizes, small.u, tuple(moved), tightest)
+    spacing = np.gradient(np.log(np.maximum(fine, fine[1])))
+    order = np.argsort(1.0 / found)
+    half = np.searchsorted(np.cumsum(spacing[order]), 0.5 * spacing.sum())
+    looseness = float(1.0 / found[order][half])
+    return NeglectedModes(
+        weights,
+        scales,
+        tuple(pair[0].inputs),
+        tuple(pair[0].outputs),
+        mirrored,
+        tightest,
+        looseness,
+    )
 
 
 def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateSpace:
     """Return a system with the channels of neglected modes after its first, those of Deltas.
 
-    Inputs `y1:neglected:w` add to the outputs y, times their size; outputs `u1:neglected:z` are
-    the inputs u through the weight.
+    Inputs `y1:neglected:w` pass the weights and add to the outputs; outputs `u1:neglected:z` are
+    the inputs over their scales.
     """
-    w, nu = neglected.weight, len(neglected.u)
-    columns = system.input_index(neglected.u)
-    B = np.vstack([system.B, np.zeros((nu * w.n_states, len(system.inputs)))])
-    B[system.n_states :, columns] = np.kron(np.eye(nu), w.B)
-    B = np.insert(B, [deltas] * len(neglected.y), 0.0, axis=1)
-    C = np.hstack([system.C, np.zeros((len(system.outputs), nu * w.n_states))])
-    rows = np.hstack([np.zeros((nu, system.n_states)), np.kron(np.eye(nu), w.C)])
-    C = np.insert(C, [deltas] * nu, rows, axis=0)
-    D = np.insert(system.D, [deltas] * nu, 0.0, axis=0)
-    D[deltas : deltas + nu, columns] = w.D * np.eye(nu)
-    D = np.insert(D, [deltas] * len(neglected.y), 0.0, axis=1)
-    inputs, outputs = list(system.inputs), list(system.outputs)
-    inputs[deltas:deltas] = [f"{name}:neglected:w" for name in neglected.y]
-    outputs[deltas:deltas] = [f"{name}:neglected:z" for name in neglected.u]
-    for i, name in enumerate(neglected.y):
-        D[outputs.index(name), deltas + i] = neglected.sizes[i]
-    n, total = system.n_states, system.n_states + nu * w.n_states
+    W, n = neglected.weights, system.n_states
+    total = n + W.n_states
     A = np.zeros((total, total))
-    A[:n, :n], A[n:, n:] = system.A, np.kron(np.eye(nu), w.A)
-    states = [f"{name}:neglected:{state}" for name in neglected.u for state in w.states]
-    blocks = None if system.blocks is None else [*system.blocks, *([w.n_states] * nu)]
+    A[:n, :n], A[n:, n:] = system.A, W.A
+    ends = [f"{name}:neglected:w" for name in neglected.outputs]
+    starts = [f"{name}:neglected:z" for name in neglected.inputs]
+    inputs = [*system.inputs[:deltas], *ends, *system.inputs[deltas:]]
+    outputs = [*system.outputs[:deltas], *starts, *system.outputs[deltas:]]
+    column, row = ({name: i for i, name in enumerate(names)} for names in (inputs, outputs))
+    B, C = np.zeros((total, len(inputs))), np.zeros((len(outputs), total))
+    D = np.zeros((len(outputs), len(inputs)))
+    own_in, own_out = [column[name] for name in system.inputs], [row[n] for n in system.outputs]
+    B[:n, own_in], C[own_out, :n], D[np.ix_(own_out, own_in)] = system.B, system.C, system.D
+    B[n:, [column[name] for name in ends]] = W.B
+    for i, name in enumerate(neglected.outputs):
+        C[row[name], n:] = W.C[i]
+        D[row[name], column[ends[i]]] = W.D[i, i]
+    for name, of in neglected.mirrored.items():
+        C[row[name], n:] = -C[row[of], n:]
+        D[row[name], column[f"{of}:neglected:w"]] = -D[row[of], column[f"{of}:neglected:w"]]
+    for name, start, scale in zip(neglected.inputs, starts, neglected.scales, strict=True):
+        D[row[start], column[name]] = 1.0 / scale
+    blocks = None
+    if system.blocks is not None and W.blocks is not None:
+        blocks = [*system.blocks, *W.blocks]
     return StateSpace(
-        A, B, C, D, inputs=inputs, outputs=outputs, states=[*system.states, *states],
+        A, B, C, D, inputs=inputs, outputs=outputs, states=[*system.states, *W.states],
         name=system.name, blocks=blocks,
     )  # fmt: skip
 
 
-def _moved(plant: Partition) -> list[str]:
-    """Return the outputs y that u moves: not references."""
-    g = plant.Gyu
-    seen = np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1)
-    return [name for name, moves in zip(plant.y, seen, strict=True) if moves]
+def _elastic(small: Partition, big: Partition) -> tuple[StateSpace, StateSpace]:
+    """Return both systems with the channels of the small one, without their rigid-body motions."""
+    names = (*small.z, *small.y), (*small.w, *small.u)
+    if not set(names[0]) <= set(big.system.outputs) or not set(names[1]) <= set(big.system.inputs):
+        raise ModelError(
+            f"the larger plant has other channels: {big.w + big.u} -> {big.z + big.y}. Assemble "
+            "both with the same ports."
+        )
+    systems, bodies = [], []
+    for plant in (small, big):
+        g = plant.system.select(*names)
+        rigid = np.arange(0)
+        if plant.n_rigid:
+            rigid = plant.modal_states[: 2 * plant.n_rigid]
+        kept = np.setdiff1d(np.arange(g.n_states), rigid)
+        body = g.C[:, rigid] @ g.A[np.ix_(rigid, rigid)] @ g.B[rigid] if len(rigid) else 0.0
+        bodies.append(np.asarray(body))
+        systems.append(StateSpace(
+            g.A[np.ix_(kept, kept)], g.B[kept], g.C[:, kept], g.D,
+            inputs=g.inputs, outputs=g.outputs,
+        ))  # fmt: skip
+    _same_body(*bodies)
+    return systems[0], systems[1]
 
 
-def _grid(small: StateSpace, big: StateSpace) -> FloatArray:
-    """Frequencies [Hz] from a tenth of the first resonance up, through those of both."""
-    poles = np.concatenate([small.poles(), big.poles()])
-    swinging = np.abs(poles[poles.imag > 0]) / (2 * np.pi)
-    if not swinging.size:
+def _same_body(one: FloatArray, other: FloatArray) -> None:
+    size = np.abs(one).max(initial=0.0), np.abs(other).max(initial=0.0)
+    if one.shape != other.shape or np.any(
+        np.abs(one - other) > _SAME_BODY * np.abs(one).max(axis=-1, keepdims=True)
+    ):
+        raise ModelError(
+            "the difference grows toward low frequencies: the two differ in their rigid body "
+            f"(mass or inertia; largest accelerations {size[0]:.6g} and {size[1]:.6g}), which is "
+            "no neglected mode. Update the mass first."
+        )
+
+
+def _distinct(
+    small: StateSpace, big: StateSpace
+) -> tuple[tuple[StateSpace, StateSpace], dict[str, str]]:
+    """Return the pair with the channels that differ, each output once, and which are mirrored."""
+    probe = _grid(_swinging(small, big))[1::7]
+    gap = _gap((small, big), probe)
+    size = np.abs(frequency_response(big, probe).data)
+    moved = np.abs(gap).max(axis=2) > _ROUNDING * size.max(axis=2).max(initial=0.0)
+    rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
+    kept: list[int] = []
+    mirrored: dict[str, str] = {}
+    for i in rows.tolist():
+        same = [j for j in kept if np.array_equal(small.C[i], -small.C[j])
+                and np.array_equal(big.C[i], -big.C[j])]  # fmt: skip
+        if same:
+            mirrored[small.outputs[i]] = small.outputs[same[0]]
+        else:
+            kept.append(i)
+    names = [small.outputs[i] for i in kept], [small.inputs[j] for j in columns.tolist()]
+    return (small.select(*names), big.select(*names)), mirrored
+
+
+def _swinging(small: StateSpace, big: StateSpace) -> ComplexArray:
+    """Return the poles of both in the upper half plane, slowest first, each once."""
+    poles = np.concatenate([big.poles(), small.poles()])
+    poles = poles[poles.imag > 0]
+    if not poles.size:
         raise ModelError("neither model has an elastic mode: nothing is neglected.")
-    top = 10 * swinging.max()
-    grids = [default_freq(g) for g in (small, big)]
-    flat = np.geomspace(0.1 * swinging.min(), top, 400)
-    grid = np.unique(np.concatenate([flat, *grids]))
-    return np.asarray(grid[(grid >= flat[0]) & (grid <= top)])
+    found: list[complex] = []
+    for pole in poles[np.argsort(np.abs(poles), kind="stable")].tolist():
+        if not any(abs(pole - other) < 0.3 * abs(other.real) for other in found[-4:]):
+            found.append(pole)
+    return np.array(found)
 
 
-def _gap(small: StateSpace, big: StateSpace, grid: FloatArray) -> ComplexArray:
-    """Return the difference of the responses (ny, nu, n_freq)."""
-    return frequency_response(big, grid).data - frequency_response(small, grid).data
+def _grid(poles: ComplexArray) -> FloatArray:
+    """Return 0 and frequencies [Hz] from a hundredth of the first resonance, through all."""
+    own = np.abs(poles) / (2 * np.pi)
+    flat = np.geomspace(0.01 * own[0], 10 * own[-1], 500)
+    beside = (own[:, None] - _BESIDE * poles.real[:, None] / (2 * np.pi)).ravel()
+    grid = np.unique(np.concatenate([flat, beside]))
+    return np.concatenate([[0.0], grid[(grid >= flat[0]) & (grid <= flat[-1])]])
 
 
-def _height(gap: ComplexArray, sizes: FloatArray) -> FloatArray:
-    """Largest singular value (n_freq,) of the scaled difference."""
-    return np.asarray(np.linalg.norm(np.moveaxis(gap / sizes[:, None, None], -1, 0), 2, (1, 2)))
+def _verifying(grid: FloatArray, poles: ComplexArray) -> FloatArray:
+    """Return frequencies between those of a grid, and others beside the resonances."""
+    inner = [grid[:-1] + part * np.diff(grid) for part in (0.29, 0.5, 0.83)]
+    own, half = np.abs(poles) / (2 * np.pi), -poles.real / (2 * np.pi)
+    beside = own[:, None] + np.array([-0.43, 0.11, 0.57]) * half[:, None]
+    return np.unique(np.concatenate([[0.0], beside.ravel(), *inner]))
 
 
-def _fitted(grid: FloatArray, height: FloatArray) -> StateSpace:
-    """Return the closest w = g ((1 + s/a) / (1 + s/b))^2 above a height."""
-    corners = np.geomspace(grid[0], grid[-1], 61)
-    sections = np.log(1 + (grid / corners[:, None]) ** 2)  # of |1 + i f/c|^2, in logs
-    step = np.log(np.maximum(height, 1e-12 * height.max()))
-    spacing = np.gradient(np.log(grid))
-    spacing[grid > 2 * grid[np.argmax(height)]] *= 0.1  # a tight bound matters below the peak
-    best, chosen = np.inf, (0, 0)
-    for a in range(corners.size):
-        shape = sections[a] - sections
-        above = np.max(step - shape, axis=1)
-        distance = (above[:, None] + shape - step) @ spacing
-        if distance.min() < best:
-            best, chosen = float(distance.min()), (a, int(np.argmin(distance)))
-    a, b = (2 * np.pi * corners[i] for i in chosen)
-    gain = float(np.exp(np.max(step - sections[chosen[0]] + sections[chosen[1]])))
-    half = StateSpace([[-b]], [[b]], [[1 - b / a]], [[b / a]], inputs=["u"], outputs=["z"])
-    both = series(half, half.replace(states=["x2"]))
-    return both.replace(C=_MARGIN * gain * both.C, D=_MARGIN * gain * both.D)
+def _gap(pair: tuple[StateSpace, StateSpace], grid: FloatArray) -> ComplexArray:
+    """Return the difference of the responses (n_out, n_in, n_freq)."""
+    return frequency_response(pair[1], grid).data - frequency_response(pair[0], grid).data
+
+
+def _evened(gap: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+    """Return scales (n_in,) that make all inputs alike, and the difference per scaled input."""
+    most = np.abs(gap).max(axis=2)
+    scales = 1.0 / np.max(most / most.max(axis=1, keepdims=True), axis=0)
+    return scales, gap * scales[:, None]
+
+
+def _diagonal(rows: list[StateSpace], outputs: tuple[str, ...]) -> StateSpace:
+    names = [
+        g.replace(inputs=[name], outputs=[name], states=[f"{name}:neglected:{s}" for s in g.states])
+        for g, name in zip(rows, outputs, strict=True)
+    ]
+    return append(*names)
+
+
+def _height(weights: StateSpace, gap: ComplexArray, freq: FloatArray) -> FloatArray:
+    """Return the largest singular value (n_freq,) of the difference over the weights."""
+    gains = np.array([
+        np.abs(frequency_response(weights.select([name], [name]), freq).data[0, 0])
+        for name in weights.outputs
+    ])  # fmt: skip
+    return np.asarray(np.linalg.norm(np.moveaxis(gap / gains[:, None], -1, 0), 2, (1, 2)))

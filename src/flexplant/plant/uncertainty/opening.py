@@ -16,7 +16,7 @@ from ...values import ComplexArray, FloatArray, positive
 from ..building import P
 from ..partition import Partition
 from ..realisation import ModalRealisation
-from .neglected import neglected_modes, opened
+from .neglected import NeglectedModes, neglected_modes, opened
 from .parametric import by_parameters
 from .uncertain_plant import Delta, UncertainPlant, modal_realisation, with_changes
 
@@ -74,7 +74,8 @@ def uncertain(
     system = _opened(plant.continuous, deltas)
     weight = None
     if neglected is not None:
-        weight = neglected_modes(plant, neglected)
+        known = isinstance(neglected, NeglectedModes)
+        weight = neglected if known else neglected_modes(plant, neglected)
         system = opened(system, weight, len(system.inputs) - len(plant.w) - len(plant.u))
     return UncertainPlant(
         plant,

@@ -112,10 +112,10 @@ class UncertainPlant(Value, Generic[P]):
     plant : StandardPlant
         The nominal plant, continuous or sampled.
     system : StateSpace
-        Continuous: inputs [Delta channels `mode6:freq:w`; neglected modes `y1:neglected:w`; w; u],
-        outputs [`mode6:freq:z`; `u1:neglected:z`; z; y]. A Delta that acts at several places has
-        further channels after the first ones of all: `mode6:freq:rate:w`, where accelerations need
-        it.
+        Continuous: inputs [Delta channels `mode6:freq:w`; neglected modes `die:z:neglected:w`,
+        `y1:neglected:w`; w; u], outputs [`mode6:freq:z`; `amp1:neglected:z`, `u1:neglected:z`; z;
+        y]. A Delta that acts at several places has further channels after the first ones of all:
+        `mode6:freq:rate:w`, where accelerations need it.
     deltas : sequence of Delta
         In the order of their channels.
     covariance : (m, m) array
@@ -123,7 +123,7 @@ class UncertainPlant(Value, Generic[P]):
     deviations : float
         Standard deviations at which a delta is 1.
     neglected : NeglectedModes, optional
-        Weight on the modes that the plant lacks.
+        Weights on the modes that the plant lacks.
     fit : UpdateResult, optional
         Where the uncertainty comes from; `sample` draws its parameters.
     parameters : sequence of Parameter
