@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy.linalg as la
-from scipy.optimize import least_squares
 
 from ...lti.statespace import StateSpace
 from ...values import ComplexArray, FloatArray
@@ -125,6 +124,8 @@ def _least(terms: FloatArray, square: FloatArray, spacing: FloatArray) -> FloatA
     Least squares over q = log p, weighted half by the logarithm of frequency, half by the points
     (most of which stand at resonances).
     """
+    from scipy.optimize import least_squares  # not loaded with the package
+
     goal = np.log(square)
     weight = np.sqrt(0.5 * spacing / spacing.sum() + 0.5 / spacing.size)
 
