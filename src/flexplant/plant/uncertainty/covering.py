@@ -171,7 +171,7 @@ def _factor(constant: float, ends: dict[complex, complex], unit: float) -> State
     at = -(np.concatenate([poles, poles.conj()]) ** 2)
     root = np.sqrt(np.concatenate([share, share.conj()]))
     n, top = at.size, float(np.abs(root).max(initial=1e-300))
-    # bordered, not divided by the constant: that would drown the slow zeros in the fast ones
+    # bordered, not divided by the constant: slow zeros would be lost in the rounding of fast ones
     left, right = np.diag(np.append(at, constant / top**2)), np.diag(np.append(np.ones(n), 0.0))
     left[:n, n] = left[n, :n] = root / top
     values = np.asarray(la.eigvals(left, right, homogeneous_eigvals=True))

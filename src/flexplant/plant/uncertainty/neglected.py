@@ -20,7 +20,7 @@ from .covering import covering
 _MARGIN = 1.05
 #: part of the rigid-body accelerations by which two models of one body may differ
 _SAME_BODY = 1e-6
-#: offsets from a resonance, in its half widths, at which the bound is looked at besides
+#: offsets from a resonance, in its half widths, at which the bound is checked besides
 _BESIDE = np.array([0.0, 0.5, -0.5, 2.0, -2.0, 8.0, -8.0])
 #: part of a channel's largest response below which a row or column of the difference is rounding
 _ROUNDING = 1e-12
