@@ -45,7 +45,7 @@ class RigidBody(Value):
     lost: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._set(motions=self.motions, mass=self.mass, centre=self.centre)
+        self._set(motions=self.motions, mass=self.mass, centre=self.centre, lost=dict(self.lost))
 
 
 def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:

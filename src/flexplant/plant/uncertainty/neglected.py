@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -54,12 +55,12 @@ class NeglectedModes(Value):
     scales: FloatArray
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-    mirrored: dict[str, str]
+    mirrored: Mapping[str, str]
     tightest: float
     looseness: float
 
     def __post_init__(self) -> None:
-        self._set(scales=self.scales)
+        self._set(scales=self.scales, mirrored=dict(self.mirrored))
 
     def __repr__(self) -> str:
         return (
