@@ -8,6 +8,8 @@ from test_kalman import modes, plate_plant
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
+from flexplant.estimation.estimate import estimated
+from flexplant.lti.riccati import solve_dare
 from machines import stage
 from oracles_estimation import batch, error_covariance
 
@@ -90,6 +92,20 @@ def test_start_gaps_and_lags_are_the_normal_equations(lag, gaps):
     agree(result, *batch(dense(model), y, u, P, Z, np.arange(60) + later))
     missing = np.isnan(result["y1:innovation"])
     assert np.all(missing[np.isnan(y[:, 0])])
+
+
+@pytest.mark.parametrize("lag", LAGS)
+def test_noises_of_process_and_sensors_may_be_correlated(lag):
+    model = observer().model
+    S = np.zeros_like(model.C2.T)
+    S[:, 0] = 0.7 * observer().plant.noise_factor[:, 0] * np.sqrt(model.R[0, 0])
+    model = model.replace(S=S)
+    P = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=S).P
+    y, u, _ = run(model, 40, seed=10)
+    y[12:15, 0] = np.nan
+    method, later = LAGS[lag]
+    result = estimated(model, P, records(model, y, u), method, None, None, {})
+    agree(result, *batch(dense(model), y, u, *prior(model), np.arange(40) + later))
 
 
 @pytest.mark.parametrize("lag", LAGS)

@@ -302,7 +302,7 @@ class KalmanEstimator(Value):
             When lags are not positive numbers.
         """
         steady, sight, _, _ = in_unit_states(self.model, self.predicted_covariance)
-        filtered = sight.variances(steady.form(steady.P, steady.gains, predict=False))[0]
+        filtered = steady.variances(sight, steady.P, steady.gains, predict=False)[0]
         whole = self.variances if self.left_out is not None else filtered
         return lag_report(self.plant, steady, sight, np.sqrt(whole), lags, poi_channels(self.plant))
 

@@ -140,10 +140,9 @@ def lag_report(
     counts = {f"{1e3 * s:.4g} ms": round(s / plant.dt) for s in sorted(wanted.tolist())}
     counts = {name: count for name, count in counts.items() if count}
     g, F = steady.gains, steady.F
-    here = sight.at(0)
-    base = sight.variances(steady.form(steady.P, g, predict=False))[0]
-    predicted = sight.variances(steady.form(steady.P, g, predict=True))[0]
-    rows = here.c @ steady.onward(steady.P, g)
+    base = steady.variances(sight, steady.P, g, predict=False)[0]
+    predicted = steady.variances(sight, steady.P, g, predict=True)[0]
+    rows = sight.c[0] @ steady.onward(steady.P, g)
     seen = g.W @ steady.model.C2
     total = solve_stein(F.T, seen.T @ seen)
     smooth = base - np.einsum("zi,ij,zj->z", rows, total, rows)

@@ -157,20 +157,20 @@ class _Walk:
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
         m, there = self.model, self.there[k]
         g = gains(m, P, there)
-        here = self.sight.at(k)
+        here = self.sight.part(slice(k, k + 1))
+        c = here.c[0]
         e = np.where(there, self.y[k] / self.s - m.C2 @ x - m.D2 @ self.u[k], 0.0)
         enter = self.steady.entering(g, predict=self.predict)
         n = x.size
-        form = self.steady.form(P, g, predict=self.predict)
-        hat = here.c[:, :n] @ x + here.c @ (enter @ e) + here.D1 @ self.u[k]
-        variance = np.einsum("zi,ij,zj->z", here.c, form, here.c) + here.V
+        hat = c[:, :n] @ x + c @ (enter @ e) + here.D1[0] @ self.u[k]
+        variance = self.steady.variances(here, P, g, predict=self.predict)[0]
         white = g.W @ e
         C = m.C2 @ Z
         before = self.found if Z.shape[1] else None
         self._innovate(k, e, m.innovation(P), C, before)
         if self.keep:
             self.white[k] = white
-        shown, seen = g.W @ C, here.c[:, :n] @ Z - here.c @ (enter @ (C * there[:, None]))
+        shown, seen = g.W @ C, c[:, :n] @ Z - c @ (enter @ (C * there[:, None]))
         self.hat[k], self.variance[k] = hat, variance
         if Z.shape[1]:
             unknowns.add(shown, white)
@@ -185,7 +185,7 @@ class _Walk:
             self.variance[k] += used.added(seen)
             self.hat[k][np.isinf(self.variance[k])] = np.nan
         if self.keep:
-            T = here.c @ self.steady.onward(P, g)
+            T = c @ self.steady.onward(P, g)
             self.moments[k] = Moment(
                 g, T, shown, seen, hat, variance, self.found if Z.shape[1] else None
             )
@@ -270,6 +270,6 @@ class _Walk:
             self.whitened[now] = white
             if self.keep:
                 self.white[now] = white
-        self.variance[at] = here.variances(self.steady.form(self.steady.P, g, predict=self.predict))
+        self.variance[at] = self.steady.variances(here, self.steady.P, g, predict=self.predict)
         self.deviation[at] = self.s * np.sqrt(m.innovation(self.steady.P).diagonal())
         return x

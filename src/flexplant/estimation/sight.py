@@ -19,11 +19,6 @@ class Sight(NamedTuple):
     D1: FloatArray  # (1 or N, nz, nu)
     V: FloatArray  # (1 or N, nz) variances of n
 
-    def at(self, k: int) -> Sight:
-        """Return the rows at one sample."""
-        i = min(k, self.c.shape[0] - 1)
-        return Sight(*(part[i] for part in self))
-
     def part(self, at: slice | IntArray) -> Sight:
         """Return the rows at some samples."""
         return self if self.c.shape[0] == 1 else Sight(*(part[at] for part in self))
@@ -39,7 +34,3 @@ class Sight(NamedTuple):
         if self.c.shape[0] == 1:
             return np.asarray(u @ self.D1[0].T)
         return np.asarray(np.einsum("kzi,ki->kz", self.D1, u))
-
-    def variances(self, omega: FloatArray) -> FloatArray:
-        """Return the variances (1 or k, nz) of ``c [x; b] + n`` for a form omega of [x; b]."""
-        return np.asarray(np.einsum("kzi,kzi->kz", self.c @ omega, self.c) + self.V)

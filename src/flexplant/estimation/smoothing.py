@@ -81,13 +81,13 @@ def _back(
     C = g.W @ steady.model.C2
     information = C.T @ C
     settled = solve_stein(F.T, information)
-    size = np.sqrt(here.variances(steady.form(steady.P, g, predict=False)))
+    size = np.sqrt(steady.variances(here, steady.P, g, predict=False))
     some = (here.c @ onward / size[:, :, None]).reshape(-1, F.shape[0])
     weight = solve_stein(F, some.T @ some / here.c.shape[0])
     k = span[1]
     while k > span[0] and abs(np.sum(weight * (settled - M))) > SETTLED:
         k -= 1
-        T = here.at(k - span[0]).c @ onward
+        T = here.part(slice(k - span[0], k - span[0] + 1)).c[0] @ onward
         variance[k] -= np.einsum("zi,ij,zj->z", T, M, T)
         M = F.T @ M @ F + information
     if k > span[0]:
@@ -183,7 +183,7 @@ def _followed(
     W = np.array([one.gains.W for one in listed])
     onward = steady.onward(steady.P, g)
     w = np.array([
-        passage.moments[k].T if k in passage.moments else sight.at(k).c @ onward
+        passage.moments[k].T if k in passage.moments else sight.part(slice(k, k + 1)).c[0] @ onward
         for k in ks.tolist()
     ])  # fmt: skip
     founds = [_last_found(passage, min(k + lag, N - 1)) for k in ks.tolist()]

@@ -42,17 +42,19 @@ class Steady:
         self.gains = gains(model, P, np.ones(model.C2.shape[0], dtype=bool))
         self.F = model.A - self.gains.K @ model.C2
 
-    def form(self, P: FloatArray, g: FilterGains, *, predict: bool) -> FloatArray:
-        """Return the form omega of the error [x; b], b the estimate of n in units of N."""
-        n, ny = self.model.C2.T.shape
-        omega = np.zeros((n + ny, n + ny))
-        if predict:
-            omega[:n, :n] = P
-            return omega
-        omega[:n, :n] = self.model.updated(P, g.L)
-        omega[:n, n:], omega[n:, :n] = -g.L, -g.L.T
-        omega[n:, n:] = -g.W.T @ g.W
-        return omega
+    def variances(
+        self, sight: Sight, P: FloatArray, g: FilterGains, *, predict: bool
+    ) -> FloatArray:
+        """Return the variances (1 or k, nz) of the estimates of a covariance P and its gains.
+
+        ``(C1 - L_z C2) P (C1 - L_z C2)' + V - L_z N' - N L_z' + L_z R L_z'``: Joseph's form.
+        """
+        m, n = self.model, P.shape[0]
+        C1, N = sight.c[:, :, :n], sight.c[:, :, n:]
+        L_z = sight.c @ self.entering(g, predict=predict)
+        left = C1 - L_z @ m.C2
+        own = np.sum((left @ P) * left, axis=2)
+        return np.asarray(own + sight.V + np.sum((L_z @ m.R - 2.0 * N) * L_z, axis=2))
 
     def entering(self, g: FilterGains, *, predict: bool) -> FloatArray:
         """Return how an innovation enters [x; b] (n + ny, ny)."""
@@ -69,7 +71,7 @@ class Steady:
         n = self.model.A.shape[0]
         some = np.unique(np.linspace(0, sight.c.shape[0] - 1, 50).astype(np.int64))
         chosen = Sight(*(part[some] for part in sight))
-        size = np.sqrt(chosen.variances(self.form(self.P, self.gains, predict=False)))
+        size = np.sqrt(self.variances(chosen, self.P, self.gains, predict=False))
         rows = (chosen.c[:, :, :n] / size[:, :, None] / np.sqrt(some.size)).reshape(-1, n)
         H = np.vstack([self.gains.W @ self.model.C2, rows])
         return solve_stein(self.F.T, H.T @ H)
