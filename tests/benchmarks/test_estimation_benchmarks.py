@@ -25,7 +25,7 @@ def observer():
     return fx.design_kalman(plant, plant)
 
 
-def best(call, repeats=7):
+def best(call, repeats=30):
     """Return what a call gave, and its shortest time [s]."""
     times = []
     for _ in range(repeats):

@@ -102,12 +102,14 @@ class _Walk:
         self.s = s
         self.steady, self.model, self.sight = steady, steady.model, sight
         self.predict, self.keep = predict, keep
-        self.there = np.asarray(np.isfinite(record.y))
-        self.whole = np.all(self.there, axis=1, keepdims=True)[:, 0]
         both = record.both
-        if not self.whole.all():
-            both = both.copy()
+        self.there = np.broadcast_to(True, record.y.shape)
+        if not record.complete:
+            self.there, both = np.asarray(np.isfinite(record.y)), both.copy()
             both[:, : record.ny][~self.there] = 0.0
+        self.whole = (
+            self.there[:, 0] if record.complete else np.sum(self.there, axis=1) == record.ny
+        )
         self.both, self.y, self.u = both, both[:, : record.ny], record.u
         (N, ny), nz = record.y.shape, sight.c.shape[1]
         # channel by channel in memory: so the estimate takes them

@@ -10,16 +10,20 @@ from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray, real_array, short
 from .filter_model import FilterModel
 
+#: samples that are copied together
+_PIECE = 2048
+
 
 class Recorded(NamedTuple):
     """A record: time (N,), and measurements y with NaN where missing beside commands u.
 
-    `both` is [y u] (N, ny + nu).
+    `both` is [y u] (N, ny + nu), `complete` says that no sample is missing.
     """
 
     time: FloatArray
     both: FloatArray
     ny: int
+    complete: bool
 
     @property
     def y(self) -> FloatArray:
@@ -81,9 +85,12 @@ def recorded(records: Any, model: FilterModel) -> Recorded:
     if not count:
         raise ShapeError("the record holds no samples: there is nothing to estimate from.")
     both = np.empty((count, len(sizes)))
-    for i, part in enumerate((*y, *u)):
-        both[:, i] = part
-    return Recorded(_time(records, known, count, model.dt), both, len(y))
+    for first in range(0, count, _PIECE):  # a piece of all columns stays in the cache
+        piece = slice(first, first + _PIECE)
+        for i, part in enumerate((*y, *u)):
+            both[piece, i] = part[piece]
+    complete = all(bool(np.all(np.isfinite(part))) for part in y)
+    return Recorded(_time(records, known, count, model.dt), both, len(y), complete)
 
 
 def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
@@ -98,7 +105,7 @@ def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
             f"channel {name!r} must be (N,), one run over time, got {array.shape}. Of several runs "
             "take one: response.replace(data=response.data[0])."
         )
-    if np.all(np.isfinite(array)) or (missing and not np.any(np.isinf(array))):
+    if missing and not np.any(np.isinf(array)):
         return array
     return real_array(array, f"channel {name!r}")
 
