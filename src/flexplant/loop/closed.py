@@ -377,6 +377,11 @@ class ClosedLoop(Value):
             self.monitored, row, noises, residue=residue, start=start, left_out=left_out
         )
 
+    @cached_property
+    def _white(self) -> list[Source]:
+        """The white noises, each by itself."""
+        return sources(self.plant, self.monitored)
+
     def _noises(self, channel: str) -> tuple[int, list[Source]]:
         """Return the row of a signal and the white noises of a loop that has a stationary state."""
         if self.plant.is_weighted:
@@ -386,7 +391,7 @@ class ClosedLoop(Value):
             )
         row = row_of(self.monitored, channel)
         check_stationary(self.obstacle, f"the rms of {channel!r}")
-        noises = sources(self.plant, self.monitored)
+        noises = self._white
         if not self.plant.dt:
             for one in noises:
                 check_direct(one.D[row], one.name, channel)

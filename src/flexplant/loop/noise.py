@@ -133,11 +133,11 @@ def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
     if len(white) == 1:
         return {white[0]: total}
     if plant.is_assembled:
-        ports = plant.assembled.ports
         found = {}
-        for name in white:
-            alone = [d if d.name == name else d.replace(asd=0.0) for d in ports.w]
-            found[name] = continuous_factor(plant.unweighted.with_ports(ports.replace(w=alone)))
+        for name in white:  # the plant sampled with one of them
+            asd = {n: level for n, level in plant.asd.items() if n == name or n in plant.held}
+            alone = plant.unweighted.continuous.replace(asd=asd)
+            found[name] = continuous_factor(alone.discretized(1.0 / plant.dt, delay=plant.delay))
         # a plant whose noise was changed since it was assembled keeps its own
         if all(factor.shape[0] == total.shape[0] for factor in found.values()):
             own = np.sum(total**2, axis=1)

@@ -68,7 +68,7 @@ class AssumptionReport(Value):
         if self.plant.form.startswith("dense"):
             lines.append(f"  note the plant is {self.plant.form}")
         if self.plant.unstable_modes:
-            listed = ", ".join(self.plant.unstable_modes.values())
+            listed = self.plant.unstable_text
             lines.append(
                 f"  note negative stiffness makes rigid-body motion unstable: {listed}; only a "
                 "controller holds it"

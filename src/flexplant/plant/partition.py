@@ -66,8 +66,7 @@ class Partition(Value):
         if self.form.startswith("dense"):
             lines.append(f"  {self.form}")
         if self.unstable_modes:
-            listed = ", ".join(self.unstable_modes.values())
-            lines.append(f"  unstable rigid-body pairs: {listed}")
+            lines.append(f"  unstable rigid-body pairs: {self.unstable_text}")
         return "\n".join(lines)
 
     @classmethod
@@ -263,6 +262,13 @@ class Partition(Value):
             low, high = np.sort(np.linalg.eigvals(self.modal_blocks[i]).real)
             found[i + 1] = f"mode {i + 1} ({high:+.4g} and {low:+.4g} 1/s)"
         return found
+
+    @property
+    def unstable_text(self) -> str:
+        """The first three of these modes in words, and how many more there are."""
+        listed = list(self.unstable_modes.values())
+        more = f" and {len(listed) - 3} more" if len(listed) > 3 else ""
+        return ", ".join(listed[:3]) + more
 
     @property
     def modal_states(self) -> IntArray:
