@@ -3,16 +3,34 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
 from ..values import FloatArray
 
-#: samples in a block; a block costs 2 _BLOCK^2 p m operations, a state 4 n^2 for each block
-_BLOCK = 8
-#: samples in a piece, whose arrays stay in the cache
-_PIECE = 4096
+#: samples in a piece, whose arrays stay in the cache; a whole number of blocks of any size
+PIECE = 4096
+#: sizes of a block [samples]
+_SIZES = (1, 2, 4, 8, 16, 32, 64, 128)
+#: in operations of a product of two matrices: one of a product with a single vector, and a call
+ONE_VECTOR, CALL = 3.0, 3e4
+
+
+def cheapest(n: int, p: int, m: int, samples: int) -> tuple[int, float]:
+    """Return the size of a block that costs least, and the operations that a sample then takes.
+
+    For n states, p outputs and m inputs; the preparation is shared by so many samples.
+    """
+
+    def cost(size: int) -> float:
+        prepare = 2 * size * n * n * (m + p) + 4 * np.log2(size) * n**3
+        step = (2 * ONE_VECTOR * n * n + CALL) / size
+        return float(step + 2 * n * (m + p) + 2 * size * p * m + prepare / max(samples, 1))
+
+    size = min(_SIZES, key=cost)
+    return size, cost(size)
 
 
 class Recursion(NamedTuple):
@@ -33,83 +51,85 @@ class Recursion(NamedTuple):
     def pieces(
         self, v: FloatArray, start: FloatArray
     ) -> Iterator[tuple[slice, FloatArray, FloatArray]]:
-        """Yield samples, their outputs (k, p) and the state after them, piece by piece.
-
-        With ``F^i`` and the Markov parameters over a block of b samples,
-        ``out = O x + T v`` and ``x[k+b] = F^b x[k] + R v`` are products of large matrices. The
-        states at the starts of blocks are found in chains of blocks side by side from zero, then
-        the starts of the chains one after the other. A piece fits into the cache.
-        """
-        p, m = self.J.shape
-        n, x = self.F.shape[0], start
-        enter, see, step = self._block()
-        see, toeplitz = see.reshape(_BLOCK * p, n).T, self._toeplitz().T
-        whole = v.shape[0] // _BLOCK * _BLOCK
-        for first in range(0, whole, _PIECE):
-            piece = slice(first, min(first + _PIECE, whole))
-            inputs = np.ascontiguousarray(v[piece]).reshape(-1, _BLOCK * m)
-            states = _states(step, inputs @ enter.T, x)
-            out = inputs @ toeplitz
-            out += states[:-1] @ see
-            x = states[-1]
-            yield piece, out.reshape(-1, p), x
+        """Yield samples, their outputs (k, p) and the state after them, piece by piece."""
+        x, blocks = start, self.in_blocks(self.best_size(v.shape[0]))
+        whole = v.shape[0] // blocks.size * blocks.size
+        for first in range(0, whole, PIECE):
+            piece = slice(first, min(first + PIECE, whole))
+            out, x = blocks.run(v[piece], x)
+            yield piece, out, x
         if whole < v.shape[0]:
-            rest, x = self._plain(v[whole:], x, np.empty((v.shape[0] - whole, p)))
+            rest, x = self.sample_by_sample(v[whole:], x)
             yield slice(whole, v.shape[0]), rest, x
 
-    def _plain(
-        self, v: FloatArray, x: FloatArray, out: FloatArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def sample_by_sample(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (N, p) and the last state, as the equations are written."""
+        out = np.empty((v.shape[0], self.J.shape[0]))
         for k in range(v.shape[0]):
             out[k] = self.H @ x + self.J @ v[k]
             x = self.F @ x + self.G @ v[k]
         return out, x
 
-    def _block(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return R (n, b m), O (b, p, n) and F^b of a block."""
-        see, enter = [self.H], [self.G]
-        for _ in range(_BLOCK - 1):
-            see.append(see[-1] @ self.F)
-            enter.append(self.F @ enter[-1])
-        return np.hstack(enter[::-1]), np.array(see), np.linalg.matrix_power(self.F, _BLOCK)
+    def best_size(self, samples: int) -> int:
+        """Return the size of a block that costs least for a record of so many samples."""
+        return cheapest(self.F.shape[0], *self.J.shape, samples)[0]
 
-    def _toeplitz(self) -> FloatArray:
-        """Return T (b p, b m), the answers of a block's outputs to its inputs."""
-        p, m = self.J.shape
-        T = np.zeros((_BLOCK, p, _BLOCK, m))
-        part, moved = self.J, self.G
-        for age in range(_BLOCK):
-            for i in range(age, _BLOCK):
-                T[i, :, i - age] = part
-            part, moved = self.H @ moved, self.F @ moved
-        return T.reshape(_BLOCK * p, _BLOCK * m)
+    def in_blocks(self, size: int) -> Blocks:
+        """Return the matrices of a block of so many samples.
+
+        Over b samples ``out = O x + T v`` and ``x[k+b] = F^b x[k] + R v``, with the observability
+        matrix O, the reachability matrix R and the Toeplitz matrix T of Markov parameters.
+        """
+        b, n, (p, m) = size, self.F.shape[0], self.J.shape
+        see, enter = np.empty((b, p, n)), np.empty((b, n, m))
+        see[0], enter[b - 1] = self.H, self.G
+        power, done = self.F, 1
+        while done < b:  # twice as many each time, by one product each
+            more = min(done, b - done)
+            see[done : done + more] = see[:more] @ power
+            enter[b - done - more : b - done] = power @ enter[b - more :]
+            done += more
+            power = power @ power if done < b else power
+        T = np.zeros((b, p, b, m))
+        late = self.H @ enter  # the Markov parameters, the oldest first
+        for i in range(b):
+            T[i, :, i] = self.J
+            T[i, :, :i] = np.moveaxis(late[b - i :], 0, 1)
+        return Blocks(
+            np.linalg.matrix_power(self.F, b),
+            np.ascontiguousarray(np.moveaxis(enter, 1, 2).reshape(b * m, n)),
+            np.ascontiguousarray(see.reshape(b * p, n).T),
+            np.ascontiguousarray(T.reshape(b * p, b * m).T),
+            b,
+        )
 
 
-def _states(step: FloatArray, entering: FloatArray, start: FloatArray) -> FloatArray:
-    """Return x (J + 1, n) of ``x[j+1] = step x[j] + entering[j]``."""
-    count, n = entering.shape
-    length = max(int(np.sqrt(count)), 1)
-    chains = count // length
-    whole = chains * length
-    x = np.empty((count + 1, n))
-    x[0] = start
-    if chains > 1:
-        parts = entering[:whole].reshape(chains, length, n)
-        own = np.zeros((chains, n))
-        for i in range(length):  # the end of each chain when it starts from zero
-            own = own @ step.T + parts[:, i]
-        jump = np.linalg.matrix_power(step, length)
-        first = np.empty((chains, n))
-        first[0] = start
-        for j in range(chains - 1):
-            first[j + 1] = jump @ first[j] + own[j]
-        inside = x[:whole].reshape(chains, length, n)
-        inside[:, 0] = first
-        for i in range(1, length):
-            inside[:, i] = inside[:, i - 1] @ step.T + parts[:, i - 1]
-        x[whole] = step @ x[whole - 1] + entering[whole - 1]
-    else:
-        whole = 0
-    for j in range(whole, count):
-        x[j + 1] = step @ x[j] + entering[j]
-    return x
+class Blocks(NamedTuple):
+    """``x[k+b] = step x[k] + v enter``, ``out = x see + v direct`` with rows v and out of a block.
+
+    A block has `size` samples b.
+    """
+
+    step: FloatArray
+    enter: FloatArray
+    see: FloatArray
+    direct: FloatArray
+    size: int
+
+    def run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs (N, p) for inputs (N, m) from a state (n,), and the last state.
+
+        N is a whole number of blocks. All is a product of two matrices but ``step x``.
+        """
+        count = v.shape[0] // self.size
+        inputs = np.ascontiguousarray(v).reshape(count, -1)
+        states = np.empty((count + 1, x.size))
+        states[0] = x
+        np.matmul(inputs, self.enter, out=states[1:])
+        moved = np.empty(x.size)
+        for now, following in pairwise(states):
+            np.dot(self.step, now, out=moved)
+            following += moved
+        out = inputs @ self.direct
+        out += states[:-1] @ self.see
+        return out.reshape(count * self.size, -1), states[-1]

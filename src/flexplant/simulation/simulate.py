@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
 from ..loop.known import DERIVATIVES, references
-from ..loop.noise import WhiteNoise, white_noise
+from ..loop.noise import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..values import (
@@ -27,13 +27,10 @@ from ..values import (
 )
 from .motion import SetPoint
 from .response import Response
-from .stepping import Buffers, Machine, machine, step_through
+from .runs import make_runner
 
 #: a signal over time: a set-point, one value per sample, a constant, or a function of time
 Signal: TypeAlias = "SetPoint | npt.ArrayLike | Callable[[FloatArray], npt.ArrayLike]"
-
-#: samples per stretch and runs side by side: what fits the cache of one core
-STRETCH, ABREAST = 128, 16
 
 
 def simulate(
@@ -123,77 +120,28 @@ def simulate(
     numbers = _run_numbers(runs)
     state = _start(loop, start)
     generators = _generators(rng, numbers)
-    _warn_unstable(loop, steps)
+    grows = _warn_unstable(loop, steps)
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
     data = np.zeros((len(numbers), len(shown), steps))
-    parts = machine(loop)
-    groups = [slice(i, i + ABREAST) for i in range(0, len(numbers), ABREAST)]
-    total = len(groups) * -(-steps // STRETCH)
     # products this small run slower on two threads than on one (5 times, on a busy machine)
     overflow = np.errstate(over="ignore", invalid="ignore")
-    with one_thread(), overflow, Progress(total, "simulate", progress=progress) as bar:
-        for group in groups:
-            run = _Group(loop, parts, white, generators[group], state)
-            for first in range(0, steps, STRETCH):
-                stretch = slice(first, min(first + STRETCH, steps))
-                run.fill(given[stretch], data[group, :, stretch])
-                if not np.all(np.isfinite(run.x)):
-                    raise ModelError(
-                        f"the loop diverged beyond all numbers before {time[stretch][-1]:g} s: "
-                        f"it is unstable (spectral radius {loop.spectral_radius:.6g}). Look at "
-                        "loop.is_stable first, or simulate a shorter time."
-                    )
-                bar.advance()
+    with one_thread(), overflow:
+        runner = make_runner(loop, white, given, grows=grows)
+        groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]
+        total = len(groups) * -(-steps // runner.stretch)
+        with Progress(total, "simulate", progress=progress) as bar:
+            for group in groups:
+                runner.begin(state, generators[group])
+                for first in range(0, steps, runner.stretch):
+                    stretch = slice(first, min(first + runner.stretch, steps))
+                    if not runner.fill(given[stretch], data[group, :, stretch]):
+                        raise ModelError(
+                            f"the loop diverged beyond all numbers before {time[stretch][-1]:g} s: "
+                            f"it is unstable (spectral radius {loop.spectral_radius:.6g}). Look at "
+                            "loop.is_stable first, or simulate a shorter time."
+                        )
+                    bar.advance()
     return Response(time, data[0] if runs is None else data, shown, loop.units)
-
-
-class _Group:
-    """Some runs side by side, stretch after stretch."""
-
-    def __init__(
-        self,
-        loop: ClosedLoop,
-        parts: Machine,
-        noise: WhiteNoise,
-        generators: list[np.random.Generator],
-        start: FloatArray,
-    ) -> None:
-        plant = loop.plant
-        n, count = plant.system.n_states, len(generators)
-        self.parts, self.noise, self.generators, self.n_z = parts, noise, generators, len(plant.z)
-        self.x = np.tile(start[:n], (count, 1))
-        self.controller = np.tile(start[n:], (count, 1))
-        u = [plant.u.index(name) for name in loop.driven]
-        self.B1, self.D21 = plant.B1, plant.D21
-        self.C1, self.D11, self.D12 = plant.C1, plant.D11, plant.D12[:, u]
-        self.buffers = Buffers(
-            np.zeros((STRETCH + 1, count, n)),
-            np.zeros((STRETCH, count, len(plant.y))),
-            np.zeros((STRETCH, count, parts.law.shape[0])),
-        )
-        self.w = np.zeros((count, STRETCH, len(plant.w)))
-
-    def fill(self, given: FloatArray, data: FloatArray) -> None:
-        """Run one stretch: w as `given` (k, nw) plus noise, the channels into `data`."""
-        states, y, out = self.buffers
-        k, rank = given.shape[0], self.noise.factor.shape[1]
-        states[0] = self.x
-        self.w[:, :k], self.w[:, k:] = given, 0.0
-        for r, generator in enumerate(self.generators):
-            # always a whole stretch: a longer run begins with the shorter one, bit by bit
-            white = generator.standard_normal((STRETCH, rank + self.noise.columns.size))
-            w = self.w[r]
-            w[:, self.noise.columns] += white[:, rank:] * self.noise.deviation
-            states[1:, r] = white[:, :rank] @ self.noise.factor.T + w @ self.B1.T
-            y[:, r] = w @ self.D21.T
-        part = Buffers(states[: k + 1], y[:k], out[:k])
-        self.controller = step_through(self.parts, self.controller, part)
-        self.x = states[k].copy()
-        nc, nu = self.parts.n_controller, self.parts.n_driven
-        for r in range(len(self.generators)):
-            x, u = np.ascontiguousarray(states[:-1, r]), out[:, r, nc : nc + nu]
-            z = x @ self.C1.T + u @ self.D12.T + self.w[r] @ self.D11.T
-            data[r] = np.hstack([z[:k], y[:k, r], out[:k, r, nc:]]).T
 
 
 def _check_sampled(loop: ClosedLoop) -> None:
@@ -218,14 +166,14 @@ def _check_sampled(loop: ClosedLoop) -> None:
         )
 
 
-def _warn_unstable(loop: ClosedLoop, steps: int) -> None:
-    """Warn of an unstable loop; an integrator without feedback is none."""
+def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
+    """Warn of an unstable loop and return whether it is one; a free integrator is none."""
     radius = loop.spectral_radius
     if radius <= 1:
-        return
+        return False
     found = loop.obstacle
     if found is None or not found.reason.startswith("unstable"):
-        return
+        return False
     with np.errstate(over="ignore"):
         growth = float(np.float64(radius) ** steps)
     by = f"{growth:.3g} times" if np.isfinite(growth) else "beyond all numbers"
@@ -236,6 +184,7 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> None:
         FlexplantWarning,
         stacklevel=3,
     )
+    return True
 
 
 def _given(

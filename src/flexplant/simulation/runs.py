@@ -1,0 +1,204 @@
+"""Runs of a sampled closed loop: sample by sample, or in blocks of samples where these agree."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+
+from ..loop import ClosedLoop
+from ..loop.noise import WhiteNoise
+from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Recursion, cheapest
+from ..values import FloatArray
+from .stepping import Buffers, Machine, machine, step_through
+
+#: samples per stretch and runs side by side: what fits the cache of one core
+STRETCH, ABREAST = 128, 16
+#: a run for which the preparation of blocks must pay [samples]; a fixed one, because the first
+#: samples of a long run are those of a short one to the last bit
+_TYPICAL = 10_000
+#: part of a channel's peak by which blocks may differ from single samples, beside this many times
+#: the rounding of single samples: a channel that symmetry keeps at zero is nothing but rounding
+_AGREE, _ROUNDING = 1e-10, 100.0
+#: part of a state's largest noise that is rounding
+_NO_NOISE = 1e-13
+
+
+class Runner(Protocol):
+    """Runs side by side, stretch after stretch."""
+
+    stretch: int
+    abreast: int
+
+    def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
+        """Put all runs at a state of plant and controller; each draws from its generator."""
+
+    def fill(self, given: FloatArray, data: FloatArray) -> bool:
+        """Run one stretch: w as `given` (k, nw) plus noise; return whether the state is finite.
+
+        The channels z, y, driven u and monitored go into `data` (runs, channels, k).
+        """
+
+
+def make_runner(
+    loop: ClosedLoop, noise: WhiteNoise, given: FloatArray, *, grows: bool = False
+) -> Runner:
+    """Return the faster way through a linear loop.
+
+    Blocks of samples cost less unless a plant in modal blocks is so large that its O(n) operations
+    for a sample are fewer. They are taken when a block agrees with the same samples one by one to
+    1e-10 of each channel's peak, for white inputs as large as those of the run; the rounding of
+    single samples is seen by running them with inputs three times as large. An unstable loop goes
+    sample by sample.
+    """
+    single = SampleBySample(loop, machine(loop), noise)
+    n = loop.plant.system.n_states + loop.controller.n_states
+    shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
+    m = given.shape[1] + noise.factor.shape[1]
+    if not grows and n and cheapest(n, shown, m, _TYPICAL)[1] < single.cost:
+        blocks = InBlocks(loop, noise, given)
+        if blocks.agrees(single, given):
+            return blocks
+    return single
+
+
+class SampleBySample:
+    """All runs at once, each sample by itself."""
+
+    stretch, abreast = STRETCH, ABREAST
+
+    def __init__(self, loop: ClosedLoop, parts: Machine, noise: WhiteNoise) -> None:
+        plant = loop.plant
+        self.parts, self.noise, self.n, self.ny = parts, noise, plant.system.n_states, len(plant.y)
+        u = [plant.u.index(name) for name in loop.driven]
+        self.B1, self.D21 = plant.B1, plant.D21
+        self.C1, self.D11, self.D12 = plant.C1, plant.D11, plant.D12[:, u]
+
+    @property
+    def cost(self) -> float:
+        """Operations for a sample: about twelve calls, and products with single vectors."""
+        m, noise = self.parts, 2 * self.noise.factor.size
+        return 12 * CALL + 2 * ONE_VECTOR * (m.sense.size + m.law.size + m.inflow.size) + noise
+
+    def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
+        """Put all runs at a state of plant and controller; each draws from its generator."""
+        n, count, self.generators = self.n, len(generators), generators
+        self.x = np.tile(start[:n], (count, 1))
+        self.controller = np.tile(start[n:], (count, 1))
+        self.buffers = Buffers(
+            np.zeros((STRETCH + 1, count, n)),
+            np.zeros((STRETCH, count, self.ny)),
+            np.zeros((STRETCH, count, self.parts.law.shape[0])),
+        )
+        self.w = np.zeros((count, STRETCH, self.B1.shape[1]))
+
+    def fill(self, given: FloatArray, data: FloatArray) -> bool:
+        """Run one stretch."""
+        states, y, _ = self.buffers
+        k = given.shape[0]
+        self.w[:, :k], self.w[:, k:] = given, 0.0
+        for r, generator in enumerate(self.generators):
+            white, single = _drawn(generator, STRETCH, self.noise)
+            w = self.w[r]
+            w[:, self.noise.columns] += single
+            states[1:, r] = white @ self.noise.factor.T + w @ self.B1.T
+            y[:, r] = w @ self.D21.T
+        return self.advance(k, data)
+
+    def advance(self, k: int, data: FloatArray) -> bool:
+        """Run k samples, for which w and what it adds to states and y are in the buffers."""
+        states, y, out = self.buffers
+        states[0] = self.x
+        part = Buffers(states[: k + 1], y[:k], out[:k])
+        self.controller = step_through(self.parts, self.controller, part)
+        self.x = states[k].copy()
+        nc, nu = self.parts.n_controller, self.parts.n_driven
+        for r in range(self.x.shape[0]):
+            x, u = np.ascontiguousarray(states[:-1, r]), out[:, r, nc : nc + nu]
+            z = x @ self.C1.T + u @ self.D12.T + self.w[r] @ self.D11.T
+            data[r] = np.hstack([z[:k], y[:k, r], out[:k, r, nc:]]).T
+        return bool(np.all(np.isfinite(self.x)))
+
+
+class InBlocks:
+    """One run after the other, in blocks of samples of the closed loop as one system."""
+
+    stretch, abreast = PIECE, 1
+
+    def __init__(self, loop: ClosedLoop, noise: WhiteNoise, given: FloatArray) -> None:
+        g, self.noise, self.n = loop.monitored, noise, loop.plant.system.n_states
+        named = np.any(given != 0.0, axis=0)
+        named[noise.columns] = True
+        self.columns = np.flatnonzero(named)
+        factor, self.mixed = _thin(noise.factor)
+        rest = np.zeros((g.n_states - self.n, factor.shape[1]))
+        none = np.zeros((g.D.shape[0], factor.shape[1]))
+        self.system = Recursion(
+            g.A,
+            np.hstack([g.B[:, self.columns], np.vstack([factor, rest])]),
+            g.C,
+            np.hstack([g.D[:, self.columns], none]),
+        )
+        self.blocks = self.system.in_blocks(self.system.best_size(_TYPICAL))
+
+    def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
+        """Put the run at a state of plant and controller; it draws from its generator."""
+        self.x, (self.generator,) = start, generators
+
+    def fill(self, given: FloatArray, data: FloatArray) -> bool:
+        """Run one stretch."""
+        k = given.shape[0]
+        white, single = _drawn(self.generator, PIECE, self.noise)
+        w = np.zeros((PIECE, given.shape[1]))
+        w[:k] = given
+        w[:, self.noise.columns] += single
+        v = np.hstack([w[:, self.columns], white @ self.mixed])
+        out, self.x = self.blocks.run(v, self.x)
+        data[0] = out[:k].T
+        return bool(np.all(np.isfinite(self.x)))
+
+    def agrees(self, single: SampleBySample, given: FloatArray) -> bool:
+        """Return whether two blocks (or 128 samples) are the same samples one by one."""
+        k, rng = min(2 * self.blocks.size, STRETCH), np.random.default_rng(0)
+        size = np.abs(given).max(axis=0, initial=0.0)
+        w = size * rng.standard_normal((k, size.size))
+        white, extra = _drawn(rng, k, self.noise)
+        w[:, self.noise.columns] += extra
+        v = np.hstack([w[:, self.columns], white @ self.mixed])
+        start = np.zeros(self.system.F.shape[0])
+        expected = np.zeros((2, self.system.H.shape[0], k))
+        single.begin(start, [rng, rng])
+        states, y, _ = single.buffers
+        for r, times in enumerate((1.0, 3.0)):
+            single.w[r, :k] = times * w
+            states[1 : k + 1, r] = times * (white @ single.noise.factor.T + w @ single.B1.T)
+            y[:k, r] = times * (w @ single.D21.T)
+        single.advance(k, expected)
+        rounding = np.abs(expected[1] / 3.0 - expected[0]).max(axis=1)
+        wrong = np.abs(self.blocks.run(v, start)[0].T - expected[0]).max(axis=1)
+        allowed = _AGREE * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
+        return bool(np.all(wrong <= allowed))
+
+
+def _drawn(
+    generator: np.random.Generator, samples: int, noise: WhiteNoise
+) -> tuple[FloatArray, FloatArray]:
+    """Return white samples for the factor of the states, and noise for the columns of w.
+
+    Always for a whole stretch: a longer run begins with the shorter one, bit by bit.
+    """
+    rank = noise.factor.shape[1]
+    white = generator.standard_normal((samples, rank + noise.columns.size))
+    return white[:, :rank], white[:, rank:] * noise.deviation
+
+
+def _thin(factor: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return L (n, r) and V (m, r) with ``factor = L V'`` to rounding, r as small as that allows.
+
+    Few forces through many modes make a factor whose singular values fall fast.
+    """
+    size = np.linalg.norm(factor, axis=1)
+    unit = factor / np.where(size > 0, size, 1.0)[:, None]
+    U, s, V = np.linalg.svd(unit, full_matrices=False)
+    kept = int(np.count_nonzero(s > _NO_NOISE * s.max(initial=0.0)))
+    return size[:, None] * U[:, :kept] * s[:kept], np.ascontiguousarray(V[:kept].T)

@@ -1,0 +1,99 @@
+"""Blocks of samples against the same samples one by one."""
+
+import numpy as np
+import pytest
+
+from flexplant.loop import ClosedLoop, close_loop
+from flexplant.loop.noise import white_noise
+from flexplant.lti import StateSpace
+from flexplant.lti.recursion import Recursion
+from flexplant.plant import StandardPlant
+from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
+from machines import observer, servo, stage
+
+
+def shown(runner, loop, given, start=None, seed=3):
+    """Return the channels (n, steps) of a run by one of the ways."""
+    total = loop.plant.system.n_states + loop.controller.n_states
+    shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
+    runner.begin(np.zeros(total) if start is None else start, [np.random.default_rng(seed)])
+    data = np.zeros((1, shown, given.shape[0]))
+    for first in range(0, given.shape[0], runner.stretch):
+        part = slice(first, first + runner.stretch)
+        assert runner.fill(given[part], data[:, :, part])
+    return data[0]
+
+
+def free_mass():
+    """A mass that nothing holds, two poles at 1, beside a mode; the law only reads."""
+    c, s = 0.999 * np.cos(0.3), 0.999 * np.sin(0.3)
+    A = np.array([[1.0, 0.1, 0, 0], [0, 1.0, 0, 0], [0, 0, c, s], [0, 0, -s, c]])
+    B = np.array([[0.005, 0.1, 0, 1.0]] * 2).T
+    C = np.array([[1.0, 0, 1e-3, 0]] * 2)
+    names = {"inputs": ["w", "u"], "outputs": ["z", "y"], "blocks": [2, 2]}
+    plant = StandardPlant.from_statespace(
+        StateSpace(A, B, C, np.zeros((2, 2)), 0.1, **names), u=["u"], y=["y"]
+    )
+    return close_loop(plant, StateSpace([], [], [], [[0.0]], inputs=["y"], outputs=["u"]))
+
+
+@pytest.mark.parametrize("kind", ["stage", "free mass"])
+def test_blocks_are_the_samples_one_by_one(kind):
+    """With noise, a start that is not rest and more than one piece of blocks."""
+    loop = close_loop(stage(), observer(), servo()) if kind == "stage" else free_mass()
+    rng = np.random.default_rng(0)
+    given = rng.standard_normal((10_003, len(loop.plant.w))) * 1e-6
+    start = 1e-6 * rng.standard_normal(loop.monitored.n_states)
+    noise = white_noise(loop.plant)
+    fast, plain = (make_runner(loop, noise, given, grows=grows) for grows in (False, True))
+    assert (type(fast), type(plain)) == (InBlocks, SampleBySample)
+    expected = shown(plain, loop, given, start)
+    wrong = np.abs(shown(fast, loop, given, start) - expected).max(axis=1)
+    assert np.all(wrong <= 1e-10 * np.abs(expected).max(axis=1))
+
+
+def test_blocks_that_lose_digits_are_not_taken(monkeypatch):
+    """One entry of the matrices of a block is 1e-8 of itself off."""
+    loop = close_loop(stage(), observer(), servo())
+    given, exact = np.ones((500, len(loop.plant.w))), Recursion.in_blocks
+    wanted = shown(make_runner(loop, white_noise(loop.plant), given), loop, given)
+
+    def off(self, size):
+        blocks = exact(self, size)
+        blocks.see[np.unravel_index(np.argmax(np.abs(blocks.see)), blocks.see.shape)] *= 1 + 1e-8
+        return blocks
+
+    monkeypatch.setattr(Recursion, "in_blocks", off)
+    runner = make_runner(loop, white_noise(loop.plant), given)
+    assert isinstance(runner, SampleBySample)
+    scale = np.abs(wanted).max(axis=1, keepdims=True)
+    np.testing.assert_allclose(shown(runner, loop, given) / scale, wanted / scale, atol=1e-10)
+
+
+def test_thousands_of_modes_go_mode_by_mode():
+    """2000 states of which two are driven: the ring-down is that of the modes in closed form."""
+    modes, dt = 1000, 1e-4
+    angle, decay = np.linspace(0.01, 3.0, modes), 0.999
+    A = np.zeros((2 * modes, 2 * modes))
+    k = 2 * np.arange(modes)
+    A[k, k] = A[k + 1, k + 1] = decay * np.cos(angle)
+    A[k, k + 1], A[k + 1, k] = decay * np.sin(angle), -decay * np.sin(angle)
+    C = np.zeros((2, 2 * modes))
+    C[:, k] = 1.0
+    B = np.zeros((2 * modes, 2))
+    B[1] = 1.0
+    g = StateSpace(
+        A, B, C, np.zeros((2, 2)), dt, inputs=["w", "u"], outputs=["z", "y"], blocks=[2] * modes
+    )
+    plant = StandardPlant.from_statespace(g, u=["u"], y=["y"])
+    law = StateSpace([], [], [], [[0.0]], dt, inputs=["y"], outputs=["u"])
+    loop = ClosedLoop(plant, (law,), law)
+    given = np.zeros((300, 1))
+    runner = make_runner(loop, white_noise(plant), given)
+    assert isinstance(runner, SampleBySample)
+    start = np.zeros(2 * modes)
+    start[k] = 1.0
+    steps = np.arange(300)
+    expected = (decay**steps)[:, None] * np.cos(np.outer(steps, angle))
+    z = shown(runner, loop, given, start)[0]
+    np.testing.assert_allclose(z, expected.sum(axis=1), rtol=0, atol=1e-10 * modes)
