@@ -72,7 +72,8 @@ class Recursion(NamedTuple):
 
     def best_size(self, samples: int) -> int:
         """Return the size of a block that costs least for a record of so many samples."""
-        return cheapest(self.F.shape[0], *self.J.shape, samples)[0]
+        p, m = self.J.shape
+        return cheapest(self.F.shape[0], p, m, samples)[0]
 
     def in_blocks(self, size: int) -> Blocks:
         """Return the matrices of a block of so many samples.
