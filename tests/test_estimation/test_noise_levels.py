@@ -33,6 +33,8 @@ def test_known_levels_from_50000_samples():
     assert np.all(np.abs(off) < 0.1)
     assert np.all(np.abs(off) < 4 * stated)
     assert np.all(stated < 0.02)
+    # already the least-squares fit of the autocovariances comes close
+    np.testing.assert_allclose(found.start, [1 / 0.3] * 4 + [0.5] * 4, rtol=0.1)
     assert found.nis == pytest.approx(1.0, abs=0.01)
     assert found.slope < 1e-3
     assert found.plant.asd == pytest.approx(dict(found.asd), rel=1e-12)

@@ -53,8 +53,8 @@ def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
         i, j = np.argwhere(direct)[0]
         raise AssumptionError(
             f"white noise {white[j]!r} reaches {plant.system.outputs[i]!r} directly: a sample of "
-            "it would have infinite variance. Give the disturbance a coloured spectrum, or sense "
-            "a displacement or velocity."
+            "it would have infinite variance. Give the disturbance a coloured spectrum, let it "
+            "be held over each sample (held=True), or sense a displacement or velocity."
         )
     return white, sensors
 
