@@ -70,7 +70,8 @@ def design_kalman(
     ------
     AssumptionError
         When the plant is continuous, a sensor has no noise, a disturbance that is not held over
-        each sample reaches a sensor directly, w does not excite a rigid-body mode or y does not see it.
+        each sample reaches a sensor directly, w does not excite a rigid-body mode or y does not
+        see it.
     ModelError
         When the plant is weighted or its noise is not known, or the larger model is not larger.
     LabelError

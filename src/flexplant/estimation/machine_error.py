@@ -98,8 +98,8 @@ class MachineError(NamedTuple):
         Their covariance.
     back, driven : arrays
         ``V_o A_re`` and ``V_o G_r``: what moves the filter's part of the rigid-body motion.
-    root : (ny, ny + r) array
-        Of the sensor noise: what each sensor has alone, then what disturbances add at once.
+    root : (ny, s + r) array
+        Of the sensor noise: what the s sensors have alone, then what disturbances add at once.
     """
 
     powers: list[FloatArray]
@@ -124,12 +124,12 @@ class MachineError(NamedTuple):
         """
         A, A_o, Y = self.powers[0], part.powers[0], part.sight
         powers = self._until(len(part.powers))
-        B, ny = part.K @ self.C - self.back, len(self.root)
+        B, own = part.K @ self.C - self.back, self.root.shape[1] - self.G.shape[1]
         N = part.K @ self.root
-        N[:, ny:] -= self.driven
+        N[:, own:] -= self.driven
         E = self.C1e - part.L @ self.C
         entering = B @ self.X
-        X_oe = _summed(part.powers, powers, entering @ A.T + N[:, ny:] @ self.G.T)
+        X_oe = _summed(part.powers, powers, entering @ A.T + N[:, own:] @ self.G.T)
         half = A_o @ X_oe @ B.T
         X_oo = _summed(part.powers, part.powers, entering @ B.T + half + half.T + N @ N.T)
         Y_oe = _summed(part.powers, powers, A_o.T @ Y @ B - part.E.T @ E, turned=True)
@@ -139,7 +139,7 @@ class MachineError(NamedTuple):
         left, right = Y_oe @ A + Y @ B, Y @ A_o
         to_Fe, to_Fo = left @ self.X + right @ X_oe, left @ X_oe.T + right @ X_oo
         to_N = Y @ N
-        to_N[:, ny:] += Y_oe @ self.G
+        to_N[:, own:] += Y_oe @ self.G
         K = to_Fe @ self.C.T - to_Fo @ part.C0.T + to_N @ self.root.T
         L = -to_e @ self.C.T + to_o @ part.C0.T + direct @ self.root.T
         return value, Gains(2 * K, 2 * L)
@@ -215,7 +215,7 @@ def machine_error(
         back, driven = V @ re, V @ G_all[rigid]
     rows = [machine.y.index(name) for name in own.sensors]
     at_once = machine.noise_direct[rows]
-    alone = np.sqrt(machine.sensor_noise[np.ix_(rows, rows)])
+    alone = machine.sensor_noise_factor[rows]
     X = solve_stein(A, G @ G.T)
     d = scale_of(X.diagonal())
     return MachineError(

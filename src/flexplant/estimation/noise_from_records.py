@@ -115,6 +115,12 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
 
 def _channels(plant: StandardPlant) -> tuple[str, ...]:
     noises = tuple(f"{name}:noise" for name in sensors(plant))
+    silent = [name for name in noises if not plant.asd.get(name, 0.0) > 0]
+    if silent:
+        raise AssumptionError(
+            f"{', '.join(silent)} has no density to start from: levels are found for sensors with "
+            "noise of their own. Give Sensor(asd=) a guess, and a plant that reads sensors."
+        )
     if not plant.is_assembled:
         return PROCESS, *noises
     forces = [name for name in plant.w if plant.asd.get(name, 0.0) > 0 and name not in noises]

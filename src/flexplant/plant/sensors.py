@@ -31,8 +31,8 @@ class Sensor(SensorPort):
     quantity : {"displacement", "velocity", "acceleration"}
         What is measured. An acceleration answers forces at once (D21, D22); a white disturbance
         that reaches it would give its samples infinite variance, which Kalman filters and
-        simulation refuse: shape the disturbance, let it be held over each sample (`Disturbance(held=True)`),
-        or give the sensor `dynamics` that roll off.
+        simulation refuse: shape the disturbance, let it be held over each sample
+        (`Disturbance(held=True)`), or give the sensor `dynamics` that roll off.
     asd : float [m/sqrt(Hz), rad/sqrt(Hz), ... per s or s^2]
         One-sided amplitude spectral density of its white noise; a sample has variance
         asd^2 rate / 2. It is added to the samples, after dynamics and latency; what passes through
