@@ -96,6 +96,25 @@ def test_inertial_sensors_and_pois_of_a_suspended_structure():
     np.testing.assert_allclose(pushed, own, rtol=1e-8)
 
 
+def test_modes_of_a_suspended_structure_let_a_white_floor_pass():
+    """Springs that bend the shapes a little leave nothing of the floor at once."""
+    size = {"size": (0.4, 0.3, 0.05), "elements": (4, 3, 1)}
+    block = fx.solid_block(**size, density=2700, youngs_modulus=70e9, poisson_ratio=0.33)
+    places = [(x, y, 0.0) for x in (0.0, 0.4) for y in (0.0, 0.3)]
+    springs = [GroundSpring(at, 2e4, direction=d) for at in places for d in "xyz"]
+    modes = fx.solve_modes(suspend(block, springs), count=14, damping=fx.ModalDamping(0.005))
+    ports = Ports(
+        w=[BaseAcceleration("floor", "z", asd=1e-5)],
+        z=[Poi("die", at=(0.2, 0.2, 0.05))],
+        y=[Sensor("a", at=(0.3, 0.1, 0.05), quantity="acceleration")],
+    )
+    found = fx.assemble_plant(modes, ports)
+    assert found.Gyw.D[0, 0] == 0.0
+    # far below the suspension it moves with the floor
+    low = fx.frequency_response(found.Gyw, np.array([0.01]))["a", "floor"]
+    np.testing.assert_allclose(low, 1.0, rtol=1e-4)
+
+
 def test_what_would_grow_without_bound_is_refused():
     geo = Sensor("geo", at="3:x", quantity="velocity", absolute=True)
     with pytest.raises(ModelError, match=r"'geo' is an absolute velocity.*'floor' has none"):

@@ -9,13 +9,12 @@ import numpy as np
 
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
+from ..structure.placed import SPANNED
 from ..values import FloatArray
 from .port import QUANTITIES, Seen
 
 #: relative: a gain at 0 Hz smaller than this is a zero there
 _ZERO = 1e-9
-#: relative: an absolute acceleration is free of the ground's up to what shapes miss of its motion
-_MISSED = 1e-6
 
 
 class Carried(NamedTuple):
@@ -45,14 +44,14 @@ def followed(one: Seen, order: int, push: FloatArray, ground: FloatArray) -> Flo
     """Return what a channel shows at once (m,) of loads `push` (m, n) and of `ground` (m, 6).
 
     An accelerometer on a free body shows none of the ground's acceleration: the load -M r takes
-    back what the ground adds.
+    back what the ground adds. So it does on springs, up to what the shapes miss of its motion.
     """
     direct = push @ one.direct
     if order < 2:
         return direct
     along = ground @ one.carried
     total: FloatArray = direct + along
-    total[np.abs(total) <= _MISSED * np.abs(along)] = 0.0
+    total[np.abs(total) <= SPANNED * np.abs(along)] = 0.0
     return total
 
 
