@@ -93,7 +93,10 @@ def _stiffness_line(found: Facts) -> Line:
             "fail",
             "definiteness of K",
             f"K has {found.n_negative} negative eigenvalues{lowest}: unstable",
-            "buckled or prestressed state, a sign, or lost digits? Export the unloaded stiffness",
+            (
+                "buckled or prestressed state, a sign, or lost digits? Export the unloaded "
+                "stiffness. FEModel takes it where only rigid-body motions are unstable (magnets)"
+            ),
         )
     kind = "positive semi-definite" if found.n_zero else "positive definite"
     freq = found.first_freq
