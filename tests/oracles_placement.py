@@ -3,6 +3,7 @@
 from itertools import combinations
 
 import numpy as np
+import scipy.linalg as la
 
 
 def kalman_variance(A, C, Q, R, rows, *, steps=6000):
@@ -45,6 +46,23 @@ def lqr_cost(A, B, W, rows, effort, *, steps=6000):
         size = np.sqrt(np.diag(X))
         d = d / np.where(size > 0, size, 1.0)
     return found
+
+
+def riccati_by_scipy(A, B, Q, R, scale=None):
+    """X of ``X = A'XA + Q - A'XB (R + B'XB)^-1 B'XA`` by SciPy, in states of about unit X."""
+    if scale is None:
+        scale, X = np.ones(len(A)), Q
+        for _ in range(300):
+            G = np.linalg.solve(B.T @ X @ B + R, B.T @ X @ A)
+            X = A.T @ X @ (A - B @ G) + Q
+            X = 0.5 * (X + X.T)
+        scale = np.sqrt(np.diag(X))
+    size = np.sqrt(np.diag(R))
+    As, Bs, Qs = A * scale[:, None] / scale, B * scale[:, None] / size, Q / scale / scale[:, None]
+    X = la.solve_discrete_are(As, Bs, Qs, np.eye(size.size))
+    G = np.linalg.solve(Bs.T @ X @ Bs + np.eye(size.size), Bs.T @ X @ As)
+    assert np.linalg.norm(As.T @ X @ (As - Bs @ G) + Qs - X) < 1e-7 * np.linalg.norm(X)
+    return X * scale * scale[:, None]
 
 
 def best_subset(count, total, value, required=()):

@@ -8,7 +8,7 @@ import pytest
 import flexplant as fx
 from flexplant.errors import FlexplantError
 from flexplant.loop import close_loop
-from flexplant.placement import Exchange, Exhaustive
+from flexplant.placement import BranchAndBound, Exchange, Exhaustive
 from flexplant.simulation import (
     error_map,
     exposure_errors,
@@ -200,6 +200,9 @@ CALLS = [
     ("place_sensors rng", lambda x: placed(rng=x, method=Exchange(starts=2)), ("none",)),
     ("place_sensors criterion", lambda x: placed(criterion=x), ("none",)),
     ("Exchange", lambda x: Exchange(starts=x), ()),
+    ("BranchAndBound gap", lambda x: BranchAndBound(gap=x), ("fraction",)),
+    ("BranchAndBound time_limit", lambda x: BranchAndBound(time_limit=x), ("fraction",)),
+    ("BranchAndBound starts", lambda x: BranchAndBound(starts=x), ()),
     ("Exhaustive", lambda x: Exhaustive(limit=x), ()),
     ("score_sensors", lambda x: fx.score_sensors(plant(), x), ()),
     ("score_sensors layout", lambda x: fx.score_sensors(plant(), [x]), ()),

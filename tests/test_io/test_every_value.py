@@ -112,6 +112,7 @@ def made():
         synthesis.Lmi(),
         synthesis.StructuredLmi(),
         placement.Exchange(),
+        placement.BranchAndBound(gap=0.1),
     )
     yield from (placement.Exhaustive(), placement.PoiLqr("die"), placement.PoiVariance("die"))
     yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)

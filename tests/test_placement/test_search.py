@@ -9,6 +9,7 @@ import pytest
 
 from flexplant.errors import AssumptionError, InfeasibleError, LabelError, ModelError
 from flexplant.placement import (
+    BranchAndBound,
     Exchange,
     Exhaustive,
     PoiLqr,
@@ -156,7 +157,7 @@ def test_executors_give_the_same_to_the_bit(make, kind, send_everything):
         "threads": lambda: ThreadPoolExecutor(2),
         "processes": lambda: ProcessPoolExecutor(2, mp_context=get_context("spawn")),
     }
-    for method in (Exchange(starts=4), Exhaustive()):
+    for method in (Exchange(starts=4), Exhaustive(), BranchAndBound(starts=2)):
         serial = place_sensors(plant, sensors, 4, method=method, rng=5)
         with pools[kind]() as pool:
             other = place_sensors(plant, sensors, 4, method=method, rng=5, executor=pool)

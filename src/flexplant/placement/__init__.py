@@ -1,5 +1,6 @@
 """Where sensors and actuators go: criteria, scores, search and bounds."""
 
+from .branch_and_bound import BranchAndBound as BranchAndBound
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
 from .exchange import Exchange as Exchange

@@ -43,18 +43,26 @@ class Exchange(Search):
         self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
     ) -> Found:
         """Return the best of all starts, bounded by relaxation; see `Search.search`."""
-        runs = mapped(
-            partial(_run, problem),
-            range(self.starts),
-            executor=executor,
-            progress=progress,
-            rng=seed_sequence(rng),
-            description="starts",
-        )
-        chosen, history, _ = min(runs, key=lambda run: run[1][-1])
-        value = history[-1]
+        chosen, history, evaluations = best_start(problem, self.starts, rng, executor, progress)
+        value = min(steps[-1] for steps in history)
         bound = min(problem.bound(), value) if np.isfinite(value) else -np.inf
-        return Found(chosen, value, bound, sum(run[2] for run in runs), tuple(r[1] for r in runs))
+        return Found(chosen, value, bound, evaluations, history)
+
+
+def best_start(
+    problem: Problem, starts: int, rng: Rng, executor: Executor | None, progress: bool | None
+) -> tuple[tuple[int, ...], tuple[tuple[float, ...], ...], int]:
+    """Return the best choice of several starts, the values on the way of each, evaluations."""
+    runs = mapped(
+        partial(_run, problem),
+        range(starts),
+        executor=executor,
+        progress=progress,
+        rng=seed_sequence(rng),
+        description="starts",
+    )
+    chosen, _, _ = min(runs, key=lambda run: run[1][-1])
+    return chosen, tuple(run[1] for run in runs), sum(run[2] for run in runs)
 
 
 def _run(

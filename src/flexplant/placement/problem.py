@@ -79,6 +79,8 @@ class Found:
         How many sets were scored.
     history : tuple of tuple of float
         The best score after each step, for each start.
+    stopped : str
+        Why the search ended before it had proven what it should; empty when it did not.
     """
 
     chosen: tuple[int, ...]
@@ -86,6 +88,7 @@ class Found:
     bound: float
     evaluations: int
     history: tuple[tuple[float, ...], ...]
+    stopped: str = ""
 
 
 class Search(Value):

@@ -12,7 +12,7 @@ from ..errors import SolverError
 from ..lti.lyapunov import doubled
 from ..lti.riccati import control_dare
 from ..values import FloatArray, IntArray, Value
-from .criterion import Scorer
+from .tangent import Convex, Tangent
 
 #: a doubling has converged when every diagonal entry grows by less than this: the next one would
 #: add the square of it
@@ -20,12 +20,12 @@ CONVERGED = 1e-8
 DOUBLINGS = 50
 #: largest residual of the Riccati equation, relative, that is taken without another solver
 RESIDUAL = 1e-10
-#: steps of the relaxation, and the relative gap at which it stops
-STEPS, GAP = 60, 1e-3
+#: variance beside the largest that counts as none, and the part of a gradient that must agree
+_NOTHING, _CONFIRMED = 1e-13, 1e-10
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Quadratic(Value, Scorer):
+class Quadratic(Value, Convex):
     """``J(w) = tr(S X+ S') + constant`` with weights w of the candidates.
 
     ::
@@ -78,52 +78,70 @@ class Quadratic(Value, Scorer):
         S, A, H = self.S[:, keep], self.A[inner], self.H[inner]
         return _cost(S, solved(A, H, g), g) + self.constant
 
+    @property
+    def total(self) -> int:
+        """How many candidates there are."""
+        return int(self.items.shape[0])
+
     def relaxed(self, weights: FloatArray) -> tuple[float, FloatArray]:
         """Return J and its gradient (N,) at weights of the candidates.
 
         ``dX+ = M dX+ M' - X+ dG X+`` with ``M = (I - K g) A'``, so with the adjoint Stein
         equation ``Y = M' Y M + S' S`` the gradient is ``-g_i' X+ Y X+ g_i``.
         """
-        g = np.sqrt(weights)[:, None] * self.items
-        used = weights > 0
-        X = solved(self.A, self.H, g[used])
-        gain = _gain(X, g[used])
-        left = np.eye(X.shape[0]) - gain @ g[used]
-        after = left @ X @ left.T + gain @ gain.T
-        adjoint = doubled(self.A @ left.T, self.S.T @ self.S)
-        seen = self.items @ after
-        gradient = -np.einsum("ij,jk,ik->i", seen, adjoint, seen)
-        return _cost(self.S, X, g[used]) + self.constant, gradient
+        cost, _, _, adjoint, seen = self._stationary(weights)
+        return cost, -np.einsum("ij,jk,ik->i", seen, adjoint, seen)
 
-    def bound(self, count: int, required: Sequence[int]) -> float:
-        """Return a lower bound of J over all choices of `count` candidates.
+    def tangent(self, weights: FloatArray) -> Tangent:
+        """Return the tangent of the information ``(X+)^-1`` at weights (N,).
 
-        J is convex in the weights: the information ``(X+)^-1`` is the limit of iterates that are
-        concave in w (a parallel sum is), and the trace of an inverse is convex and decreasing. So
-        J at any weights plus its slope towards the best choice bounds J at every choice
-        (Frank-Wolfe, whose steps only sharpen the bound).
+        The information is the limit of iterates that are concave in w (a parallel sum is). Its
+        derivative by w_i is ``(X+)^-1 D_i (X+)^-1`` with the Stein equation ``D_i = M D_i M' + X+
+        g_i g_i' X+``, solved for all i by the eigenvectors of M; the adjoint equation confirms the
+        slopes. Directions of no variance are left out: a compression of an inverse has an inverse
+        that is concave as well.
+
+        Raises
+        ------
+        SolverError
+            When J is infinite, or the eigenvectors do not confirm the gradient.
         """
-        free = np.setdiff1d(np.arange(self.items.shape[0]), required)
-        chosen = count - len(required)
-        everything = self.value(range(self.items.shape[0]))
-        weights = np.ones(self.items.shape[0])
-        if free.size:
-            weights[free] = chosen / free.size
-        best = everything
-        for step in range(STEPS):
-            try:
-                value, gradient = self.relaxed(weights)
-            except SolverError:
-                break
-            vertex = np.ones_like(weights)
-            vertex[free] = 0.0
-            vertex[free[np.argsort(gradient[free], kind="stable")[:chosen]]] = 1.0
-            best = max(best, value + float(gradient @ (vertex - weights)))
-            if value - best <= GAP * abs(value):
-                break
-            weights = weights + 2.0 / (step + 4.0) * (vertex - weights)
-        # rounding must not turn the bound into a claim
-        return best - 1e-9 * abs(best)
+        cost, after, closed, adjoint, seen = self._stationary(weights)
+        sizes, axes = np.linalg.eigh(0.5 * (after + after.T))
+        kept = sizes > _NOTHING * sizes[-1]
+        lost = (self.S @ axes[:, ~kept]) ** 2 @ np.abs(sizes[~kept])
+        root = axes[:, kept] * np.sqrt(sizes[kept])
+        poles, modes = np.linalg.eig(closed)
+        part = np.linalg.solve(modes, seen.T.astype(complex)).T
+        into = (root / sizes[kept]).T @ modes
+        sums = part[:, :, None] * (part[:, None, :].conj() / (1.0 - poles[:, None] * poles.conj()))
+        slopes = (into @ sums @ into.conj().T).real
+        face = root.T @ self.S.T
+        gradient = np.einsum("ij,jk,ik->i", seen, adjoint, seen)
+        found = np.einsum("ik,nij,jk->n", face, slopes, face, optimize=True)
+        most = float(np.max(gradient))
+        if not (
+            np.max(np.abs(found - gradient)) <= _CONFIRMED * most
+            and float(np.sum(lost)) <= _CONFIRMED * (cost - self.constant)
+        ):
+            raise SolverError("the derivatives of the Riccati equation are not certain.")
+        value, vectors = np.linalg.eigh(adjoint)
+        rows = seen @ (vectors * np.sqrt(np.maximum(value, 0.0)))
+        return Tangent(face, slopes, np.array(weights), self.constant, rows)
+
+    def _stationary(
+        self, weights: FloatArray
+    ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return J, X+, M, the adjoint Y and the rows ``g_i' X+`` at weights."""
+        used = weights > 0
+        g = np.sqrt(weights[used])[:, None] * self.items[used]
+        X = solved(self.A, self.H, g)
+        gain = _gain(X, g)
+        left = np.eye(X.shape[0]) - gain @ g
+        after = left @ X @ left.T + gain @ gain.T
+        closed = left @ self.A.T
+        adjoint = doubled(closed.T, self.S.T @ self.S)
+        return _cost(self.S, X, g) + self.constant, after, closed, adjoint, self.items @ after
 
 
 def quadratic(

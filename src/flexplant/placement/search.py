@@ -34,10 +34,10 @@ class Placement(Value):
     value : float
         Of the criterion.
     bound : float
-        No choice of as many candidates is better than this: the value itself when the search was
-        exhaustive; by convex relaxation, and never below what all candidates together reach, for
-        PoiVariance of the plant's own modes and PoiLqr (where no port has a filter or delay of its
-        own); minus infinity for any other criterion.
+        No choice of as many candidates is better than this: the value itself when the optimum is
+        proven (by every subset, or by branch and bound); by convex relaxation, and never below what
+        all candidates together reach, for PoiVariance of the plant's own modes and PoiLqr (where no
+        port has a filter or delay of its own); minus infinity for any other criterion.
     evaluations : int
         Choices that were scored.
     history : tuple of tuples of float
@@ -48,6 +48,8 @@ class Placement(Value):
         The chosen ones.
     side : {"y", "u"}
         Whether they are sensors or actuators.
+    stopped : str
+        Why the search ended before it had proven what it should; empty when it did not.
     """
 
     chosen: tuple[str, ...]
@@ -58,20 +60,34 @@ class Placement(Value):
     criterion: str
     ports: tuple[Port, ...]
     side: Side
+    stopped: str = ""
 
     def __repr__(self) -> str:
         ends = [steps[-1] for steps in self.history]
-        agree = sum(end <= self.value * (1 + 1e-9) for end in ends)
-        if self.value - self.bound <= 1e-8 * abs(self.value):
-            proof = "the optimum"
+        agree = sum(end <= self.value + 1e-9 * abs(self.value) for end in ends)
+        if self.proven:
+            proof = "the optimum, proven"
         elif np.isfinite(self.bound):
-            proof = f"none is more than {100 * (1 - self.bound / self.value):.2g} % better"
+            proof = f"none is more than {100 * self.gap:.2g} % better"
         else:
             proof = "no bound"
         return (
             f"<Placement {' '.join(self.chosen):.120}: {self.value:.4g} by {self.criterion}, "
-            f"{proof}; {agree} of {len(ends)} starts agree, {self.evaluations} evaluations>"
+            f"{proof}; {agree} of {len(ends)} starts agree, {self.evaluations} evaluations"
+            f"{', ' if self.stopped else ''}{self.stopped}>"
         )
+
+    @property
+    def gap(self) -> float:
+        """The part of the value by which any choice could be better; infinite without a bound."""
+        if not np.isfinite(self.bound):
+            return np.inf
+        return (self.value - self.bound) / abs(self.value) if self.value else 0.0
+
+    @property
+    def proven(self) -> bool:
+        """Whether no choice is better, apart from rounding."""
+        return self.gap <= 1e-8
 
     def on(self, plant: StandardPlant) -> StandardPlant:
         """Return the plant with the chosen sensors (actuators) instead of its own.
@@ -113,7 +129,7 @@ def place_sensors(
         From a plant to a float, smaller is better; `PoiVariance()` when not given.
     required : sequence of str
         Candidates that any choice includes.
-    method : Exchange or Exhaustive, optional
+    method : Exchange, BranchAndBound or Exhaustive, optional
         Every subset where there are at most 1500, else `Exchange()`, when not given.
     executor : concurrent.futures.Executor, optional
         Works on starts (or chunks of subsets); the result is the same to the bit.
@@ -172,7 +188,7 @@ def place_actuators(
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
     required : sequence of str
         Candidates that any choice includes.
-    method : Exchange or Exhaustive, optional
+    method : Exchange, BranchAndBound or Exhaustive, optional
         Every subset where there are at most 1500, else `Exchange()`, when not given.
     executor : concurrent.futures.Executor, optional
         Works on starts (or chunks of subsets); the result is the same to the bit.
@@ -236,7 +252,7 @@ def _placed(
         )
     if method is None:
         method = Exhaustive() if problem.subsets <= _FEW else Exchange()
-    instance(method, Search, "method", "Pass Exchange(...) or Exhaustive().")
+    instance(method, Search, "method", "Pass Exchange(...), BranchAndBound(...) or Exhaustive().")
     found = method.search(problem, rng, executor, progress)
     if not np.isfinite(found.value):
         raise InfeasibleError(
@@ -253,6 +269,7 @@ def _placed(
         repr(layouts.criterion),
         tuple(ports[i] for i in found.chosen),
         side,
+        found.stopped,
     )
 
 

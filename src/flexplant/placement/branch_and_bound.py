@@ -1,0 +1,239 @@
+"""Branch and bound: the optimum, proven, or how far from it the answer can be."""
+
+from __future__ import annotations
+
+import heapq
+import warnings
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from functools import partial
+from time import monotonic
+
+import numpy as np
+
+from ..errors import FlexplantWarning, ModelError
+from ..parallel import Progress, mapped
+from ..values import FloatArray, Rng, positive, whole
+from .branch import Branch
+from .exchange import best_start
+from .problem import Found, Problem, Search
+from .tangent import Convex, root
+
+#: branches that are opened in one round, on an executor or not: results do not depend on it
+_ROUND = 8
+#: a branch of at most so many choices is screened, and ended when so few are left to be scored
+_SCREENED, _SCORED = 600, 40
+
+
+@dataclass(frozen=True, eq=False)
+class BranchAndBound(Search):
+    """Branches of similar candidates, each bounded by convex relaxation: a proof, or a gap.
+
+    The candidates are cut in groups of similar ones, and a branch holds the choices with so many
+    of each group. It is left where no choice in it can be better than the best one found; small
+    branches are screened by a lower bound of each choice. The start is that of `Exchange`.
+
+    Parameters
+    ----------
+    gap : float
+        It ends when no choice can be better by more than this part of the value; 0 for the
+        optimum.
+    time_limit : float [s]
+        It ends after this time, with the gap that was reached and a warning. The exchanges at the
+        start are not cut short.
+    starts : int
+        Starts of the exchanges, as in `Exchange`.
+
+    Raises
+    ------
+    ModelError
+        When the gap is not in [0, 1), the time limit not positive or starts not at least 1.
+
+    Notes
+    -----
+    It needs a criterion whose relaxation is convex: `PoiVariance` of the plant's own modes or
+    `PoiLqr`, of ports without a filter or delay of their own.
+    """
+
+    gap: float = 0.0
+    time_limit: float = 60.0
+    starts: int = 4
+
+    def __post_init__(self) -> None:
+        self._set(
+            gap=positive(self.gap, "gap", zero=True),
+            time_limit=positive(self.time_limit, "time_limit"),
+            starts=whole(self.starts, "starts"),
+        )
+        if self.gap >= 1:
+            raise ModelError(f"gap is a part of the value, below 1, got {self.gap:g}. Try 0.05.")
+
+    def search(
+        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
+    ) -> Found:
+        """Return the best choice and the bound that was proven; see `Search.search`.
+
+        Raises
+        ------
+        ModelError
+            When the criterion has no convex relaxation.
+        """
+        scorer = problem.layouts.scorer
+        if not isinstance(scorer, Convex):
+            raise ModelError(
+                f"{problem.layouts.criterion!r} has no convex relaxation here, so nothing can be "
+                "bounded: branch and bound needs PoiVariance(own_modes=True) or PoiLqr, of ports "
+                "without a filter or delay of their own. Use Exhaustive() or Exchange()."
+            )
+        end = monotonic() + self.time_limit
+        chosen, history, evaluations = best_start(problem, self.starts, rng, executor, progress)
+        value = min(steps[-1] for steps in history)
+        tree = _Tree(problem, scorer, self.gap, chosen, value)
+        with Progress(problem.subsets, "choices settled", progress=progress) as bar:
+            while (batch := tree.next_batch()) and monotonic() < end:
+                tree.pop(len(batch))
+                opened = mapped(
+                    partial(_open, problem, scorer, tree.cutoff),
+                    batch,
+                    executor=executor,
+                    progress=False,
+                )
+                bar.advance(sum(map(tree.take, opened)))
+        bound = tree.bound
+        stopped = ""
+        if batch:
+            stopped = f"the time limit of {self.time_limit:.3g} s was reached"
+            warnings.warn(
+                f"{stopped}: no choice is more than {100 * (1 - bound / tree.value):.2g} % better "
+                f"than the one found, but {100 * self.gap:.2g} % was wanted. Raise time_limit, or "
+                "accept a larger gap.",
+                FlexplantWarning,
+                stacklevel=4,
+            )
+        return Found(
+            tree.chosen,
+            tree.value,
+            bound,
+            evaluations + tree.evaluations,
+            history,
+            stopped,
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class _Node:
+    """A branch that is not settled: a lower bound of its choices, and weights near the least."""
+
+    bound: float
+    branch: Branch
+    weights: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class _Opened:
+    """What opening a branch showed."""
+
+    nodes: list[_Node]
+    value: float
+    chosen: tuple[int, ...]
+    settled: int
+    left: float
+    evaluations: int
+
+
+class _Tree:
+    """Branches not settled, the smallest bound first, and the best choice."""
+
+    def __init__(
+        self, problem: Problem, scorer: Convex, gap: float, chosen: tuple[int, ...], value: float
+    ) -> None:
+        self.chosen, self.value, self.gap = chosen, value, gap
+        self.left, self.evaluations, self.count = np.inf, 0, 0
+        branch = root(len(problem.layouts.candidates), problem.count, problem.required)
+        bound, weights = scorer.relaxation(branch)
+        self.heap: list[tuple[float, int, _Node]] = []
+        self._push(_Node(bound, branch, weights))
+
+    @property
+    def cutoff(self) -> float:
+        """A branch whose bound is above this is left."""
+        return self.value - self.gap * abs(self.value) if np.isfinite(self.value) else np.inf
+
+    @property
+    def bound(self) -> float:
+        """No choice is better than this."""
+        return min(self.value, self.left, *(bound for bound, _, _ in self.heap[:1]))
+
+    def next_batch(self) -> list[_Node]:
+        """Return the branches to open next, smallest bounds first."""
+        while self.heap and self.heap[0][0] >= self.cutoff:
+            self.left = min(self.left, heapq.heappop(self.heap)[0])
+        first = heapq.nsmallest(_ROUND, self.heap, key=lambda entry: entry[:2])
+        return [node for _, _, node in first]
+
+    def pop(self, count: int) -> None:
+        """Take the next branches off."""
+        for _ in range(count):
+            heapq.heappop(self.heap)
+
+    def take(self, opened: _Opened) -> int:
+        """Note what opening a branch showed; return how many choices it settled."""
+        if opened.value < self.value:
+            self.value, self.chosen = opened.value, opened.chosen
+        self.left = min(self.left, opened.left)
+        self.evaluations += opened.evaluations
+        for node in opened.nodes:
+            self._push(node)
+        return opened.settled
+
+    def _push(self, node: _Node) -> None:
+        self.count += 1
+        heapq.heappush(self.heap, (node.bound, self.count, node))
+
+
+def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Opened:
+    """Settle a small branch choice by choice, or cut it in parts with bounds of their own."""
+    branch = node.branch
+    if problem.layouts.missing(branch.members.tolist()):  # no choice in it has a score
+        return _Opened([], np.inf, (), branch.size, np.inf, 0)
+    tangent = scorer.inner_tangent(branch, node.weights)
+    bound, weights = node.bound, node.weights
+    if tangent is not None:
+        found, weights = tangent.least(branch, weights)
+        bound = max(bound, found)
+    if bound >= cutoff:
+        return _Opened([], np.inf, (), branch.size, bound, 0)
+    if branch.size <= _SCREENED:
+        sets = branch.choices()
+        bounds = np.full(len(sets), bound)
+        if tangent is not None:
+            bounds = np.maximum(bounds, tangent.values(sets))
+        if np.count_nonzero(bounds < cutoff) <= _SCORED:
+            return _scored(problem, cutoff, sets, bounds)
+    rows = np.eye(weights.size) if tangent is None else tangent.rows
+    nodes, left, settled = [], np.inf, 0
+    for part in branch.halves(rows, weights):
+        low, near = bound, part.nearest(weights)
+        if tangent is not None:
+            found, near = tangent.least(part, near)
+            low = max(bound, found)
+        if low < cutoff:
+            nodes.append(_Node(low, part, near))
+        else:
+            left, settled = min(left, low), settled + part.size
+    return _Opened(nodes, np.inf, (), settled, left, 0)
+
+
+def _scored(
+    problem: Problem, cutoff: float, sets: list[tuple[int, ...]], bounds: FloatArray
+) -> _Opened:
+    """Score the choices of a branch that could be better, the smallest bound first."""
+    best, chosen, evaluations = np.inf, (), 0
+    for i in np.argsort(bounds, kind="stable").tolist():
+        if bounds[i] >= min(cutoff, best):
+            return _Opened([], best, chosen, len(sets), float(bounds[i]), evaluations)
+        value = float(problem.layouts.score([sets[i]])[0])
+        evaluations += 1
+        if value < best:
+            best, chosen = value, sets[i]
+    return _Opened([], best, chosen, len(sets), np.inf, evaluations)

@@ -1,0 +1,165 @@
+"""Lower bounds of a convex cost of weighted candidates: its information, linear in the weights."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import SolverError
+from ..values import FloatArray
+from .branch import Branch
+from .criterion import Scorer
+
+#: steps in the weights on one tangent, and the relative gap at which they stop
+_STEPS, _GAP = 40, 1e-3
+#: tangents of a bound at the root
+_TANGENTS = 12
+#: what rounding may have added to a bound, relative
+_ROUNDING = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Tangent:
+    """``tr(F' (I + sum_i (w_i - v_i) Z_i)^-1 F) + constant``: below a cost, equal to it at v.
+
+    The cost is ``tr(S Y(w)^-1 S') + constant``. Its information Y is concave in w, as a matrix, so
+    Y is below its tangent at v, and the cost is above the cost of this tangent.
+
+    Parameters
+    ----------
+    face : (n, k) array
+        F.
+    slopes : (N, n, n) array
+        Z_i, positive semidefinite.
+    at : (N,) array
+        v.
+    constant : float
+        What no candidate can change.
+    rows : (N, r) array
+        Effect of each candidate on the cost; of like candidates alike.
+    """
+
+    face: FloatArray
+    slopes: FloatArray
+    at: FloatArray
+    constant: float
+    rows: FloatArray
+
+    def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return numbers (m,) below the cost of each choice."""
+        weights = np.zeros((len(sets), self.at.size))
+        for row, chosen in zip(weights, sets, strict=True):
+            row[list(chosen)] = 1.0
+        try:
+            solved = np.linalg.solve(self._information(weights), self.face)
+        except np.linalg.LinAlgError:
+            return np.full(len(sets), -np.inf)
+        return _safe(np.einsum("ij,mij->m", self.face, solved) + self.constant)
+
+    def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
+        """Return a number below the cost of every choice of a branch, and weights near the least.
+
+        Projected gradient steps of Barzilai and Borwein (IMA J. Numer. Anal. 8, 1988) on
+        ``h = 1 / (cost - constant)``, which is concave in w (a harmonic sum of concave
+        information). So ``h(w) + h'(w) (x - w)`` is above h at every choice x, whatever w.
+        """
+        weights, best, step = branch.nearest(start), -np.inf, 0.0
+        kept, highest = weights, -np.inf
+        before: tuple[FloatArray, FloatArray] | None = None
+        for _ in range(_STEPS):
+            try:
+                solved = np.linalg.solve(self._information(weights[None])[0], self.face)
+            except np.linalg.LinAlgError:
+                break
+            cost = float(np.sum(self.face * solved))
+            if not cost > 0.0:
+                break
+            rise = np.einsum("ik,nij,jk->n", solved, self.slopes, solved, optimize=True) / cost**2
+            most = 1.0 / cost - branch.least(-rise) - float(rise @ weights)
+            best = max(best, 1.0 / most)
+            if 1.0 / cost > highest:
+                kept, highest = weights, 1.0 / cost
+            if cost - best <= _GAP * (cost + abs(self.constant)):
+                break
+            if before is None:
+                step = 0.3 / max(float(np.max(rise)), 1e-300)
+            else:
+                moved, turned = weights - before[0], before[1] - rise
+                bend = float(moved @ turned)
+                step = float(moved @ moved) / bend if bend > 0 else 2.0 * step
+            before = weights, rise
+            weights = branch.nearest(weights + step * rise)
+            if np.max(np.abs(weights - before[0])) < 1e-9:
+                break
+        return float(_safe(np.array(best + self.constant))), kept
+
+    def _information(self, weights: FloatArray) -> FloatArray:
+        """Return ``I + sum_i (w_i - v_i) Z_i`` for rows of weights (m, N)."""
+        total, n = self.slopes.shape[:2]
+        added = (weights - self.at) @ self.slopes.reshape(total, n * n)
+        return np.asarray(added.reshape(-1, n, n) + np.eye(n))
+
+
+class Convex(Scorer):
+    """Scores that are a convex cost of weights of the candidates, in [0, 1]: they have bounds."""
+
+    def tangent(self, weights: FloatArray) -> Tangent:
+        """Return the tangent of the cost's information at weights (N,).
+
+        Raises
+        ------
+        SolverError
+            When the cost at these weights is infinite, or its derivatives are not certain.
+        """
+        raise NotImplementedError
+
+    def inner_tangent(self, branch: Branch, weights: FloatArray) -> Tangent | None:
+        """Return the tangent at weights of a branch moved slightly inwards; None if there is none.
+
+        A weight of zero has no part in the cost: a rigid-body mode might be missed.
+        """
+        try:
+            return self.tangent(0.98 * weights + 0.02 * branch.centre(weights.size))
+        except SolverError:
+            return None
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return a lower bound over all choices of `count` candidates: tangent after tangent."""
+        return self.relaxation(root(self.total, count, required))[0]
+
+    def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
+        """Return a lower bound over a branch, and weights near the least relaxed cost."""
+        weights = branch.centre(self.total)
+        best = self.everything()
+        for _ in range(_TANGENTS):
+            tangent = self.inner_tangent(branch, weights)
+            if tangent is None:
+                break
+            found, weights = tangent.least(branch, weights)
+            if found <= best * (1.0 + _GAP):
+                best = max(best, found)
+                break
+            best = found
+        return best, weights
+
+    def everything(self) -> float:
+        """Return a number below the cost of all candidates together."""
+        return float(_safe(np.array(self.value(range(self.total)))))
+
+    @property
+    def total(self) -> int:
+        """How many candidates there are."""
+        raise NotImplementedError
+
+
+def root(total: int, count: int, required: Sequence[int]) -> Branch:
+    """Return the branch of all choices of `count` among `total` candidates."""
+    free = np.setdiff1d(np.arange(total), required)
+    groups = ((np.array(sorted(required), dtype=np.int64), len(required)),)
+    return Branch(tuple((g, c) for g, c in (*groups, (free, count - len(required))) if c))
+
+
+def _safe(bound: FloatArray) -> FloatArray:
+    return np.asarray(bound - _ROUNDING * np.abs(bound))
