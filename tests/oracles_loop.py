@@ -8,11 +8,12 @@ import scipy.linalg as la
 from scipy.optimize import linprog
 
 
-def run_sample_by_sample(plant, blocks, w, push=None):
+def run_sample_by_sample(plant, blocks, w, push=None, sensed=None, drive=None):
     """Return {name: signal} of measure, update, control, hold, one sample after the other.
 
     `plant` is a dict with A, B, C, D, w, u, z, y; `blocks` dicts with A, B, C, D, inputs, outputs,
-    in an order in which what a block passes on directly is known; `w` {name: samples}.
+    in an order in which what a block passes on directly is known; `w` {name: samples}. `sensed` is
+    a function of y, `drive` one of the commands and what was applied before.
     """
     n_time = len(next(iter(w.values())))
     nw, nz = len(plant["w"]), len(plant["z"])
@@ -22,10 +23,11 @@ def run_sample_by_sample(plant, blocks, w, push=None):
     D21 = plant["D"][nz:, :nw]
     x = np.zeros(plant["A"].shape[0])
     states = [np.zeros(block["A"].shape[0]) for block in blocks]
-    record = {}
+    record, before = {}, np.zeros(B2.shape[1])
     for k in range(n_time):
         now = np.array([w[name][k] if name in w else 0.0 for name in plant["w"]])
-        known = dict(zip(plant["y"], C2 @ x + D21 @ now, strict=True))
+        y = C2 @ x + D21 @ now
+        known = dict(zip(plant["y"], y if sensed is None else sensed(y), strict=True))
         applied = dict.fromkeys(plant["u"], 0.0)
         for block, state in zip(blocks, states, strict=True):
             value = block["C"] @ state
@@ -38,6 +40,9 @@ def run_sample_by_sample(plant, blocks, w, push=None):
                 else:
                     known[name] = number
         u = np.array([applied[name] for name in plant["u"]])
+        if drive is not None:
+            before = u = drive(u, before)
+            applied = dict(zip(plant["u"], u, strict=True))
         z = C1 @ x + D11 @ now + D12 @ u
         for i, block in enumerate(blocks):
             e = np.array([{**known, **applied}[name] for name in block["inputs"]])

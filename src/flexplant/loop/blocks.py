@@ -14,12 +14,26 @@ from ..plant import StandardPlant
 
 
 def joined(
-    plant: StandardPlant, systems: Sequence[StateSpace], driven: list[str], watched: list[str]
+    plant: StandardPlant,
+    systems: Sequence[StateSpace],
+    driven: list[str],
+    watched: list[str],
+    *,
+    applied: bool = False,
 ) -> StateSpace:
-    """Return the blocks as one system from y to the driven actuators and what is watched."""
-    applied = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
+    """Return the blocks as one system from y to the driven actuators and what is watched.
+
+    With `applied`, what the driven actuators apply are inputs too, after y: blocks that read an
+    actuator's name read these, not the commands.
+    """
+    read = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
     none = np.zeros((0, 0))
-    silent = [name for name in applied if name not in driven]
+    silent = [name for name in read if name not in driven]
+    outer = {name: f"{name}|applied" for name in driven} if applied else {}
+    systems = [
+        sys.renamed(inputs={name: outer[name] for name in sys.inputs if name in outer})
+        for sys in systems
+    ]
     zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
     # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: signals are
     # joined in units in which direct gains are at most one, powers of two so that no digit changes
@@ -27,7 +41,7 @@ def joined(
     scaled = [_in_units(sys, units) for sys in systems]
     joined = connect(
         [*scaled, zero] if silent else scaled,
-        inputs=plant.y,
+        inputs=[*plant.y, *outer.values()],
         outputs=[*driven, *watched],
         adding=driven,
     )

@@ -1,5 +1,7 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error."""
 
+from .elements import Quantiser as Quantiser
+from .elements import Saturation as Saturation
 from .error_map import ErrorMap as ErrorMap
 from .error_map import error_map as error_map
 from .estimator_comparison import EstimatorComparison as EstimatorComparison

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -10,6 +11,8 @@ from ..loop import ClosedLoop
 from ..loop.noise import WhiteNoise
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Recursion, cheapest
 from ..values import FloatArray
+from .anti_windup import split_law
+from .elements import Acting, Element, split_elements
 from .stepping import Buffers, Machine, machine, step_through
 
 #: samples per stretch and runs side by side: what fits the cache of one core
@@ -41,7 +44,13 @@ class Runner(Protocol):
 
 
 def make_runner(
-    loop: ClosedLoop, noise: WhiteNoise, given: FloatArray, *, grows: bool = False
+    loop: ClosedLoop,
+    noise: WhiteNoise,
+    given: FloatArray,
+    *,
+    grows: bool = False,
+    elements: Mapping[str, Element] | None = None,
+    anti_windup: float | None = None,
 ) -> Runner:
     """Return the faster way through a linear loop.
 
@@ -49,8 +58,10 @@ def make_runner(
     for a sample are fewer. They are taken when a block agrees with the same samples one by one to
     1e-10 of each channel's peak, for white inputs as large as those of the run; the rounding of
     single samples is seen by running them with inputs three times as large. An unstable loop goes
-    sample by sample.
+    sample by sample, and so does one with elements that are not linear.
     """
+    if elements:
+        return _nonlinear(loop, noise, elements, anti_windup)
     single = SampleBySample(loop, machine(loop), noise)
     n = loop.plant.system.n_states + loop.controller.n_states
     shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
@@ -62,13 +73,37 @@ def make_runner(
     return single
 
 
+def _nonlinear(
+    loop: ClosedLoop,
+    noise: WhiteNoise,
+    elements: Mapping[str, Element],
+    anti_windup: float | None,
+) -> SampleBySample:
+    """Return the way through a loop with elements on sensors or actuators."""
+    on_y, on_u = split_elements(elements, loop.plant.y, loop.driven)
+    dt, parts, applied = loop.plant.dt, machine(loop), None
+    if on_u:
+        command, law = split_law(loop, anti_windup)
+        parts = parts._replace(command=command, law=law)
+        applied = Acting(loop.driven, on_u, dt)
+    sensed = Acting(loop.plant.y, on_y, dt) if on_y else None
+    return SampleBySample(loop, parts, noise, sensed, applied)
+
+
 class SampleBySample:
     """All runs at once, each sample by itself."""
 
     stretch, abreast = STRETCH, ABREAST
 
-    def __init__(self, loop: ClosedLoop, parts: Machine, noise: WhiteNoise) -> None:
-        plant = loop.plant
+    def __init__(
+        self,
+        loop: ClosedLoop,
+        parts: Machine,
+        noise: WhiteNoise,
+        sensed: Acting | None = None,
+        applied: Acting | None = None,
+    ) -> None:
+        plant, self.sensed, self.applied = loop.plant, sensed, applied
         self.parts, self.noise, self.n, self.ny = parts, noise, plant.system.n_states, len(plant.y)
         u = [plant.u.index(name) for name in loop.driven]
         self.B1, self.D21 = plant.B1, plant.D21
@@ -91,6 +126,9 @@ class SampleBySample:
             np.zeros((STRETCH, count, self.parts.law.shape[0])),
         )
         self.w = np.zeros((count, STRETCH, self.B1.shape[1]))
+        for acting in (self.sensed, self.applied):
+            if acting is not None:
+                acting.begin(count)
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
@@ -110,7 +148,7 @@ class SampleBySample:
         states, y, out = self.buffers
         states[0] = self.x
         part = Buffers(states[: k + 1], y[:k], out[:k])
-        self.controller = step_through(self.parts, self.controller, part)
+        self.controller = step_through(self.parts, self.controller, part, self.sensed, self.applied)
         self.x = states[k].copy()
         nc, nu = self.parts.n_controller, self.parts.n_driven
         for r in range(self.x.shape[0]):

@@ -25,6 +25,7 @@ from ..values import (
     short,
     whole,
 )
+from .elements import Element, split_elements
 from .motion import SetPoint
 from .response import Response
 from .runs import make_runner
@@ -39,6 +40,8 @@ def simulate(
     duration: float,
     reference: Signal | Mapping[str, Signal] | None = None,
     disturbance: Mapping[str, Signal] | None = None,
+    elements: Mapping[str, Element] | None = None,
+    anti_windup: float | None = None,
     noise: bool = True,
     rng: Any = None,
     runs: int | Sequence[int] | None = None,
@@ -65,6 +68,12 @@ def simulate(
         Derivatives of a SetPoint that blocks read are taken from it.
     disturbance : mapping {name: signal}, optional
         For other channels of w, held over each sample, in addition to their noise.
+    elements : mapping {name: Saturation or Quantiser, or a list of both}, optional
+        What acts on channels of y before they are read, and on driven actuators: u is then what
+        they apply, and blocks that read an actuator's name (observers) are fed this.
+    anti_windup : float [s], optional
+        Time constant in which integrators (all poles slower than it) of blocks that drive
+        actuators return to what is applied while that is not what they command.
     noise : bool
         Whether the white noises of the plant act.
     rng : int, SeedSequence, Generator or None
@@ -87,11 +96,14 @@ def simulate(
     ------
     AssumptionError
         When the plant is continuous or weighted, when u reaches y within a sample, or when white
-        noise would reach an output directly (its variance would be infinite).
+        noise would reach an output directly (its variance would be infinite); when a saturated
+        command depends on what is applied in the same sample.
     LabelError
-        When a reference or disturbance is unknown, or it is not clear which is meant.
+        When a reference, a disturbance or the channel of an element is unknown, or it is not clear
+        which is meant.
     ModelError, ShapeError
-        When a signal or the state has the wrong length, or the loop diverges beyond all numbers.
+        When a signal or the state has the wrong length, an element is none, integrators cannot be
+        found from the commands, or the loop diverges beyond all numbers.
 
     Examples
     --------
@@ -108,6 +120,8 @@ def simulate(
     instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
     plant = loop.plant
     _check_sampled(loop)
+    split_elements(elements, plant.y, loop.driven)
+    recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
     steps = round(positive(duration, "duration") / plant.dt)
     if not steps:
         raise ModelError(
@@ -126,7 +140,9 @@ def simulate(
     # products this small run slower on two threads than on one (5 times, on a busy machine)
     overflow = np.errstate(over="ignore", invalid="ignore")
     with one_thread(), overflow:
-        runner = make_runner(loop, white, given, grows=grows)
+        runner = make_runner(
+            loop, white, given, grows=grows, elements=elements, anti_windup=recovery
+        )
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]
         total = len(groups) * -(-steps // runner.stretch)
         with Progress(total, "simulate", progress=progress) as bar:

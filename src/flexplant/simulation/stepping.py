@@ -9,13 +9,15 @@ import numpy as np
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, IntArray
+from .elements import Acting
 
 
 class Machine(NamedTuple):
     """The matrices of one sample, arranged for speed.
 
     ``x+ = diagonal x + coupling x[partner] + inflow [x[columns]; u] + noise`` is the plant,
-    ``[c+; u; watched] = law [c; y]`` the controller.
+    ``[c+; u; watched] = law [c; y]`` the controller. Where actuators do not apply what they are
+    commanded, ``command [c; y]`` is commanded and ``[c+; u; watched] = law [c; y; u]``.
     """
 
     diagonal: FloatArray
@@ -27,6 +29,7 @@ class Machine(NamedTuple):
     law: FloatArray
     n_controller: int
     n_driven: int
+    command: FloatArray | None = None
 
 
 class Buffers(NamedTuple):
@@ -59,8 +62,17 @@ def machine(loop: ClosedLoop) -> Machine:
     )
 
 
-def step_through(m: Machine, controller: FloatArray, buffers: Buffers) -> FloatArray:
+def step_through(
+    m: Machine,
+    controller: FloatArray,
+    buffers: Buffers,
+    sensed: Acting | None = None,
+    applied: Acting | None = None,
+) -> FloatArray:
     """Fill `buffers` sample by sample and return the controller's states (runs, n) after them.
+
+    Elements `sensed` act on y before it is read, `applied` on the commands of a machine that has
+    them. All is done in place.
 
     Every product is one matrix-vector product per run, never a matrix-matrix product over runs:
     its rounding, and so a run, does not depend on how many runs go side by side.
@@ -68,7 +80,7 @@ def step_through(m: Machine, controller: FloatArray, buffers: Buffers) -> FloatA
     states, y, out = buffers
     runs, n = states.shape[1:]
     nc, split = m.n_controller, m.n_controller + m.n_driven
-    nj = m.columns.size
+    nj, both = m.columns.size, nc + y.shape[2]
     law_in = np.zeros((runs, m.law.shape[1], 1))
     law_in[:, :nc, 0] = controller
     flow_in = np.zeros((runs, nj + m.n_driven, 1))
@@ -80,7 +92,12 @@ def step_through(m: Machine, controller: FloatArray, buffers: Buffers) -> FloatA
         x, following = states[k], states[k + 1]
         np.matmul(m.sense, x[:, :, None], out=measured)
         y[k] += measured[:, :, 0]
-        law_in[:, nc:, 0] = y[k]
+        if sensed is not None:
+            sensed.apply(y[k])
+        law_in[:, nc:both, 0] = y[k]
+        if m.command is not None and applied is not None:
+            np.matmul(m.command, law_in[:, :both], out=law_in[:, both:])
+            applied.apply(law_in[:, both:, 0])
         answer = out[k]
         np.matmul(m.law, law_in, out=answer[:, :, None])
         law_in[:, :nc, 0] = answer[:, :nc]

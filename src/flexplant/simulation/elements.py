@@ -1,0 +1,157 @@
+"""What is not linear in a loop: limits and rates of actuators, steps of sensors."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from ..errors import ModelError, unknown_label
+from ..values import FloatArray, Value, positive, short
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Saturation(Value):
+    """Limits of a signal: ``|v| <= limit``, and ``|dv/dt| <= rate`` from sample to sample.
+
+    Parameters
+    ----------
+    limit : float [unit of the channel]
+        Largest magnitude; infinite when only the rate is limited.
+    rate : float [unit/s], optional
+        Largest change per time; the signal starts at 0. Not limited when not given.
+
+    Raises
+    ------
+    ModelError
+        When a limit is not positive.
+    """
+
+    limit: float = np.inf
+    rate: float | None = None
+
+    def __post_init__(self) -> None:
+        limit = self.limit if _is_infinite(self.limit) else positive(self.limit, "limit")
+        rate = None if self.rate is None else positive(self.rate, "rate")
+        if limit == np.inf and rate is None:
+            raise ModelError("a Saturation without limits does nothing: give limit, rate or both.")
+        self._set(limit=limit, rate=rate)
+
+    def __repr__(self) -> str:
+        rate = "" if self.rate is None else f", rate {self.rate:g}/s"
+        return f"<Saturation: limit {self.limit:g}{rate}>"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Quantiser(Value):
+    """A signal in whole steps: ``step round(v / step)``, of a converter or an encoder.
+
+    Parameters
+    ----------
+    step : float [unit of the channel]
+        The least significant bit.
+
+    Raises
+    ------
+    ModelError
+        When it is not positive.
+    """
+
+    step: float
+
+    def __post_init__(self) -> None:
+        self._set(step=positive(self.step, "step"))
+
+    def __repr__(self) -> str:
+        return f"<Quantiser: step {self.step:g}>"
+
+
+#: what may act on a channel: one, or a quantiser and a saturation together
+Element: TypeAlias = "Saturation | Quantiser | Sequence[Saturation | Quantiser]"
+
+
+class Acting:
+    """The elements on some channels, sample after sample and in place.
+
+    Values are quantised first, then limited in rate and magnitude: a converter before its
+    amplifier.
+    """
+
+    def __init__(self, names: Sequence[str], elements: Mapping[str, Element], dt: float) -> None:
+        self.limit, self.change = np.full(len(names), np.inf), np.full(len(names), np.inf)
+        step = np.zeros(len(names))
+        for name, element in elements.items():
+            i = names.index(name)
+            for one in _listed(name, element):
+                if isinstance(one, Quantiser):
+                    step[i] = one.step
+                else:
+                    self.limit[i] = one.limit
+                    self.change[i] = np.inf if one.rate is None else one.rate * dt
+        self.step, self.coarse = np.where(step > 0, step, 1.0), step > 0
+        self.begin(1)
+
+    def begin(self, runs: int) -> None:
+        """Start at 0, so many runs side by side."""
+        self.last, self.low, self.high = np.zeros((3, runs, self.step.size))
+
+    def apply(self, values: FloatArray) -> None:
+        """Let the elements act on the values (runs, n) of a sample, in place."""
+        low, high = self.low, self.high
+        np.divide(values, self.step, out=low)
+        np.rint(low, out=low)
+        np.multiply(low, self.step, out=low)
+        np.copyto(values, low, where=self.coarse)
+        np.subtract(self.last, self.change, out=low)
+        np.maximum(low, -self.limit, out=low)
+        np.add(self.last, self.change, out=high)
+        np.minimum(high, self.limit, out=high)
+        np.maximum(values, low, out=values)
+        np.minimum(values, high, out=values)
+        np.copyto(self.last, values)
+
+
+def split_elements(
+    elements: Any, sensors: Sequence[str], driven: Sequence[str]
+) -> tuple[dict[str, Element], dict[str, Element]]:
+    """Return the elements on sensors and on actuators, by channel.
+
+    Raises
+    ------
+    LabelError
+        When a channel is neither.
+    ModelError
+        When there is no element.
+    """
+    if elements is None:
+        return {}, {}
+    if not isinstance(elements, Mapping):
+        raise ModelError(
+            f"elements must be a mapping, got {short(elements)}: name the channel that each acts "
+            "on, elements={'u1': Saturation(10.0), 'y1': Quantiser(1e-9)}."
+        )
+    for name, element in elements.items():
+        if name not in sensors and name not in driven:
+            raise unknown_label("channel for an element", name, [*sensors, *driven])
+        _listed(name, element)
+    on_y = {name: element for name, element in elements.items() if name in sensors}
+    return on_y, {name: element for name, element in elements.items() if name not in on_y}
+
+
+def _listed(name: str, element: Any) -> list[Saturation | Quantiser]:
+    listed = list(element) if isinstance(element, list | tuple) else [element]
+    kinds = [type(one) for one in listed]
+    if not listed or not all(isinstance(one, Saturation | Quantiser) for one in listed):
+        raise ModelError(
+            f"the element on {name!r} must be a Saturation or a Quantiser, got {short(element)}. "
+            "Pass one, or a list of both."
+        )
+    if len(set(kinds)) < len(kinds):
+        raise ModelError(f"{name!r} has two elements of one kind: give the tighter one.")
+    return listed
+
+
+def _is_infinite(limit: object) -> bool:
+    return isinstance(limit, float) and limit == np.inf
