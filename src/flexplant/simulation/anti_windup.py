@@ -21,7 +21,7 @@ def split_law(loop: ClosedLoop, recovery: float | None) -> tuple[FloatArray, Flo
     ----------
     loop : ClosedLoop
         Its blocks that read an actuator's name are fed what the actuator applies.
-    recovery : float or None [s]
+    recovery : float or None [samples]
         Time constant in which integrators of blocks that drive actuators return to what was
         applied: ``c+ = A c + B y + L (u - command)``. None leaves them alone.
 
@@ -52,7 +52,7 @@ def split_law(loop: ClosedLoop, recovery: float | None) -> tuple[FloatArray, Flo
     C, D = law.C[:nu], law.D[:nu, :ny]
     L = np.zeros((nc, nu))
     if recovery is not None:
-        L = _back(loop, law.A, C, float(np.exp(-plant.dt / recovery)))
+        L = _back(loop, law.A, C, float(np.exp(-1.0 / recovery)))
     rows = [
         [law.A - L @ C, law.B[:, :ny] - L @ D, law.B[:, ny:] + L],
         [np.zeros((nu, nc + ny)), np.eye(nu)],

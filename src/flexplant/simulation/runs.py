@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Protocol
 
 import numpy as np
@@ -12,7 +11,8 @@ from ..loop.noise import WhiteNoise
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Recursion, cheapest
 from ..values import FloatArray
 from .anti_windup import split_law
-from .elements import Acting, Element, split_elements
+from .conditions import Conditions, Moving
+from .elements import Acting
 from .stepping import Buffers, Machine, machine, step_through
 
 #: samples per stretch and runs side by side: what fits the cache of one core
@@ -49,8 +49,7 @@ def make_runner(
     given: FloatArray,
     *,
     grows: bool = False,
-    elements: Mapping[str, Element] | None = None,
-    anti_windup: float | None = None,
+    met: Conditions | None = None,
 ) -> Runner:
     """Return the faster way through a linear loop.
 
@@ -60,8 +59,8 @@ def make_runner(
     single samples is seen by running them with inputs three times as large. An unstable loop goes
     sample by sample, and so does one with elements that are not linear.
     """
-    if elements:
-        return _nonlinear(loop, noise, elements, anti_windup)
+    if met is not None and met.any:
+        return _under(loop, noise, met)
     single = SampleBySample(loop, machine(loop), noise)
     n = loop.plant.system.n_states + loop.controller.n_states
     shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
@@ -73,27 +72,23 @@ def make_runner(
     return single
 
 
-def _nonlinear(
-    loop: ClosedLoop,
-    noise: WhiteNoise,
-    elements: Mapping[str, Element],
-    anti_windup: float | None,
-) -> SampleBySample:
-    """Return the way through a loop with elements on sensors or actuators."""
-    on_y, on_u = split_elements(elements, loop.plant.y, loop.driven)
-    dt, parts, applied = loop.plant.dt, machine(loop), None
-    if on_u:
-        command, law = split_law(loop, anti_windup)
+def _under(loop: ClosedLoop, noise: WhiteNoise, met: Conditions) -> SampleBySample:
+    """Return the way through a loop under conditions that are not linear, or change with time."""
+    plant, parts, applied = loop.plant, machine(loop), None
+    dt = met.finer * plant.dt
+    if met.on_u:
+        command, law = split_law(loop, None if met.recovery is None else met.recovery / dt)
         parts = parts._replace(command=command, law=law)
-        applied = Acting(loop.driven, on_u, dt)
-    sensed = Acting(loop.plant.y, on_y, dt) if on_y else None
-    return SampleBySample(loop, parts, noise, sensed, applied)
+        applied = Acting(loop.driven, met.on_u, dt)
+    sensed = Acting(plant.y, met.on_y, dt) if met.on_y else None
+    moving = Moving(plant, met.paths) if met.paths else None
+    return SampleBySample(loop, parts, noise, sensed, applied, moving, met.finer)
 
 
 class SampleBySample:
     """All runs at once, each sample by itself."""
 
-    stretch, abreast = STRETCH, ABREAST
+    abreast = ABREAST
 
     def __init__(
         self,
@@ -102,10 +97,19 @@ class SampleBySample:
         noise: WhiteNoise,
         sensed: Acting | None = None,
         applied: Acting | None = None,
+        moving: Moving | None = None,
+        hold: int = 1,
     ) -> None:
         plant, self.sensed, self.applied = loop.plant, sensed, applied
+        self.moving, self.hold = moving, hold
+        self.stretch = hold * -(-STRETCH // hold)
+        names = np.array(plant.w, dtype=object)[noise.columns]
+        self.read = np.array([n.removesuffix(":noise") in plant.y for n in names], dtype=bool)
+        # a sample that is read has the noise of the controller's rate
+        self.level = np.where(self.read, 1.0 / np.sqrt(hold), 1.0)
         self.parts, self.noise, self.n, self.ny = parts, noise, plant.system.n_states, len(plant.y)
-        u = [plant.u.index(name) for name in loop.driven]
+        u = np.array([plant.u.index(name) for name in loop.driven], dtype=np.int64)
+        self.u, self.n_u = u, len(plant.u)
         self.B1, self.D21 = plant.B1, plant.D21
         self.C1, self.D11, self.D12 = plant.C1, plant.D11, plant.D12[:, u]
 
@@ -121,11 +125,12 @@ class SampleBySample:
         self.x = np.tile(start[:n], (count, 1))
         self.controller = np.tile(start[n:], (count, 1))
         self.buffers = Buffers(
-            np.zeros((STRETCH + 1, count, n)),
-            np.zeros((STRETCH, count, self.ny)),
-            np.zeros((STRETCH, count, self.parts.law.shape[0])),
+            np.zeros((self.stretch + 1, count, n)),
+            np.zeros((self.stretch, count, self.ny)),
+            np.zeros((self.stretch, count, self.parts.law.shape[0])),
         )
-        self.w = np.zeros((count, STRETCH, self.B1.shape[1]))
+        self.w = np.zeros((count, self.stretch, self.B1.shape[1]))
+        self.first = 0
         for acting in (self.sensed, self.applied):
             if acting is not None:
                 acting.begin(count)
@@ -136,7 +141,11 @@ class SampleBySample:
         k = given.shape[0]
         self.w[:, :k], self.w[:, k:] = given, 0.0
         for r, generator in enumerate(self.generators):
-            white, single = _drawn(generator, STRETCH, self.noise)
+            white, single = _drawn(generator, self.stretch, self.noise)
+            if self.hold > 1:
+                single = single * self.level
+                between = np.arange(self.stretch) % self.hold > 0
+                single[np.ix_(between, self.read)] = 0.0
             w = self.w[r]
             w[:, self.noise.columns] += single
             states[1:, r] = white @ self.noise.factor.T + w @ self.B1.T
@@ -148,13 +157,21 @@ class SampleBySample:
         states, y, out = self.buffers
         states[0] = self.x
         part = Buffers(states[: k + 1], y[:k], out[:k])
-        self.controller = step_through(self.parts, self.controller, part, self.sensed, self.applied)
+        self.controller = step_through(
+            self.parts, self.controller, part, self.sensed, self.applied, self.hold
+        )
         self.x = states[k].copy()
         nc, nu = self.parts.n_controller, self.parts.n_driven
         for r in range(self.x.shape[0]):
             x, u = np.ascontiguousarray(states[:-1, r]), out[:, r, nc : nc + nu]
             z = x @ self.C1.T + u @ self.D12.T + self.w[r] @ self.D11.T
+            if self.moving is not None:
+                inputs = np.zeros((k, self.B1.shape[1] + self.n_u))
+                inputs[:, : self.B1.shape[1]] = self.w[r, :k]
+                inputs[:, self.B1.shape[1] + self.u] = u[:k]
+                self.moving.show(z[:k], x[:k], inputs, self.first)
             data[r] = np.hstack([z[:k], y[:k, r], out[:k, r, nc:]]).T
+        self.first += k
         return bool(np.all(np.isfinite(self.x)))
 
 

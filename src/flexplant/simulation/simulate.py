@@ -25,7 +25,8 @@ from ..values import (
     short,
     whole,
 )
-from .elements import Element, split_elements
+from .conditions import conditions, finer_loop
+from .elements import Element
 from .motion import SetPoint
 from .response import Response
 from .runs import make_runner
@@ -42,6 +43,8 @@ def simulate(
     disturbance: Mapping[str, Signal] | None = None,
     elements: Mapping[str, Element] | None = None,
     anti_windup: float | None = None,
+    moving: Mapping[str, Any] | None = None,
+    finer: int = 1,
     noise: bool = True,
     rng: Any = None,
     runs: int | Sequence[int] | None = None,
@@ -74,6 +77,13 @@ def simulate(
     anti_windup : float [s], optional
         Time constant in which integrators (all poles slower than it) of blocks that drive
         actuators return to what is applied while that is not what they command.
+    moving : mapping {POI: path}, optional
+        Places (n_time, 3) [m] of POIs over time, or functions of the times: the channels of such a
+        POI in z are those of its place at each sample.
+    finer : int
+        Samples of the plant in each sample of the controller, whose commands are held: what z does
+        between samples. Sensors are read (noise, elements) in the controller's samples; between
+        them y is the motion alone. Signals are then of the finer samples.
     noise : bool
         Whether the white noises of the plant act.
     rng : int, SeedSequence, Generator or None
@@ -118,31 +128,29 @@ def simulate(
     array([1.    , 0.5   , 0.25  , 0.125 , 0.0625])
     """
     instance(loop, ClosedLoop, "loop", "Pass close_loop(plant, *blocks).")
-    plant = loop.plant
     _check_sampled(loop)
-    split_elements(elements, plant.y, loop.driven)
-    recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
+    closed, loop = loop, finer_loop(loop, finer)
+    plant = loop.plant
     steps = round(positive(duration, "duration") / plant.dt)
     if not steps:
         raise ModelError(
             f"duration {float(duration):g} s is less than half a sample ({plant.dt:g} s)."
         )
     time: FloatArray = np.arange(steps, dtype=np.float64) * plant.dt
+    met = conditions(loop, elements, anti_windup, finer, moving, time)
     given = _given(plant, reference, disturbance, time)
     silent = plant if flag(noise, "noise") else plant.replace(asd={})
     white = white_noise(silent)
     numbers = _run_numbers(runs)
     state = _start(loop, start)
     generators = _generators(rng, numbers)
-    grows = _warn_unstable(loop, steps)
+    grows = _warn_unstable(closed, -(-steps // finer))
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
     data = np.zeros((len(numbers), len(shown), steps))
     # products this small run slower on two threads than on one (5 times, on a busy machine)
     overflow = np.errstate(over="ignore", invalid="ignore")
     with one_thread(), overflow:
-        runner = make_runner(
-            loop, white, given, grows=grows, elements=elements, anti_windup=recovery
-        )
+        runner = make_runner(loop, white, given, grows=grows, met=met)
         groups = [slice(i, i + runner.abreast) for i in range(0, len(numbers), runner.abreast)]
         total = len(groups) * -(-steps // runner.stretch)
         with Progress(total, "simulate", progress=progress) as bar:
@@ -153,8 +161,8 @@ def simulate(
                     if not runner.fill(given[stretch], data[group, :, stretch]):
                         raise ModelError(
                             f"the loop diverged beyond all numbers before {time[stretch][-1]:g} s: "
-                            f"it is unstable (spectral radius {loop.spectral_radius:.6g}). Look at "
-                            "loop.is_stable first, or simulate a shorter time."
+                            f"it is unstable (spectral radius {closed.spectral_radius:.6g}). Look "
+                            "at loop.is_stable first, or simulate a shorter time."
                         )
                     bar.advance()
     return Response(time, data[0] if runs is None else data, shown, loop.units)

@@ -68,11 +68,13 @@ def step_through(
     buffers: Buffers,
     sensed: Acting | None = None,
     applied: Acting | None = None,
+    hold: int = 1,
 ) -> FloatArray:
     """Fill `buffers` sample by sample and return the controller's states (runs, n) after them.
 
     Elements `sensed` act on y before it is read, `applied` on the commands of a machine that has
-    them. All is done in place.
+    them. All is done in place. The controller acts in the first of every `hold` samples, and what
+    it commands is held.
 
     Every product is one matrix-vector product per run, never a matrix-matrix product over runs:
     its rounding, and so a run, does not depend on how many runs go side by side.
@@ -92,15 +94,18 @@ def step_through(
         x, following = states[k], states[k + 1]
         np.matmul(m.sense, x[:, :, None], out=measured)
         y[k] += measured[:, :, 0]
-        if sensed is not None:
-            sensed.apply(y[k])
-        law_in[:, nc:both, 0] = y[k]
-        if m.command is not None and applied is not None:
-            np.matmul(m.command, law_in[:, :both], out=law_in[:, both:])
-            applied.apply(law_in[:, both:, 0])
         answer = out[k]
-        np.matmul(m.law, law_in, out=answer[:, :, None])
-        law_in[:, :nc, 0] = answer[:, :nc]
+        if k % hold:
+            answer[:] = out[k - 1]
+        else:
+            if sensed is not None:
+                sensed.apply(y[k])
+            law_in[:, nc:both, 0] = y[k]
+            if m.command is not None and applied is not None:
+                np.matmul(m.command, law_in[:, :both], out=law_in[:, both:])
+                applied.apply(law_in[:, both:, 0])
+            np.matmul(m.law, law_in, out=answer[:, :, None])
+            law_in[:, :nc, 0] = answer[:, :nc]
         if nj:
             flow_in[:, :nj, 0] = x[:, m.columns]
         flow_in[:, nj:, 0] = answer[:, nc:split]

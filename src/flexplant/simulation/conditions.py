@@ -1,0 +1,110 @@
+"""What a run meets beside the linear loop: elements, samples between samples, POIs that move."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..errors import ModelError, unknown_label
+from ..loop import ClosedLoop
+from ..loop.known import with_known
+from ..plant import StandardPlant
+from ..values import FloatArray, positive, real_array, short, whole
+from .elements import Element, split_elements
+
+
+class Conditions(NamedTuple):
+    """What makes a run differ from that of the linear loop at its own samples.
+
+    `paths` are the places (n_time, 3) of POIs; the controller acts in every `finer`-th sample.
+    """
+
+    on_y: Mapping[str, Element] = {}
+    on_u: Mapping[str, Element] = {}
+    recovery: float | None = None
+    finer: int = 1
+    paths: Mapping[str, FloatArray] = {}
+
+    @property
+    def any(self) -> bool:
+        """Whether there are any."""
+        return bool(self.on_y or self.on_u or self.paths or self.finer > 1)
+
+
+def conditions(
+    loop: ClosedLoop, elements: Any, anti_windup: Any, finer: Any, moving: Any, time: FloatArray
+) -> Conditions:
+    """Return what was given to `simulate`, checked."""
+    on_y, on_u = split_elements(elements, loop.plant.y, loop.driven)
+    recovery = None if anti_windup is None else positive(anti_windup, "anti_windup")
+    return Conditions(on_y, on_u, recovery, finer, _paths(loop.plant, moving, time))
+
+
+def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
+    """Return a loop whose plant is sampled so many times in a sample of its controller.
+
+    The same plant before sampling, with the same delay in seconds.
+
+    Raises
+    ------
+    ModelError
+        When the plant before sampling is not known.
+    """
+    if whole(finer, "finer") == 1:
+        return loop
+    plant = loop.plant
+    if plant.continuous.dt:
+        raise ModelError(
+            "finer= needs the plant before it was sampled, which is not known of a plant made "
+            "elsewhere. Make it by assemble_plant(model, ports).discretized(rate), or simulate at "
+            "its own samples."
+        )
+    fine = plant.continuous.discretized(finer / plant.dt, delay=finer * plant.delay)
+    fine = with_known(fine, loop.blocks)
+    if (fine.w, fine.u, fine.z, fine.y) != (plant.w, plant.u, plant.z, plant.y):
+        raise ModelError(
+            "the channels of the plant were changed after it was sampled, so that its motion "
+            "between samples is not known. Change the ports before plant.discretized(rate)."
+        )
+    fine = fine.replace(asd={name: level for name, level in plant.asd.items() if name in fine.w})
+    return ClosedLoop(fine, loop.blocks, loop.controller, loop.idle)
+
+
+def _paths(plant: StandardPlant, moving: Any, time: FloatArray) -> dict[str, FloatArray]:
+    if moving is None:
+        return {}
+    if not isinstance(moving, Mapping):
+        raise ModelError(
+            f"moving must be a mapping, got {short(moving)}: name the POI, "
+            "moving={'die': (n_time, 3) points or a function of the times}."
+        )
+    pois = [poi.name for poi in plant.assembled.ports.z]
+    found = {}
+    for name, path in moving.items():
+        if name not in pois:
+            raise unknown_label("POI to move", name, pois)
+        points: Callable[[FloatArray], Any] | Any = path(time) if callable(path) else path
+        found[name] = real_array(points, f"the path of {name!r}", (time.size, 3))
+        ends = [*found[name].argmin(axis=0), *found[name].argmax(axis=0)]
+        plant.along(name, found[name][ends])  # refuses places off the structure
+    return found
+
+
+class Moving:
+    """The rows of z that change with the places of POIs."""
+
+    def __init__(self, plant: StandardPlant, paths: Mapping[str, FloatArray]) -> None:
+        self.plant, self.paths = plant, paths
+
+    def show(self, z: FloatArray, x: FloatArray, inputs: FloatArray, first: int) -> None:
+        """Put the motion of POIs at their places, samples from `first`, into z (k, nz).
+
+        x are the states (k, n) of the plant, `inputs` its [w; u] (k, m).
+        """
+        for name, points in self.paths.items():
+            rows = self.plant.along(name, points[first : first + z.shape[0]])
+            shown = [self.plant.z.index(channel) for channel in rows.channels]
+            z[:, shown] = np.einsum("kcn,kn->kc", rows.C, x)
+            z[:, shown] += np.einsum("kcm,km->kc", rows.D, inputs)
