@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pytest
 import scipy.linalg as la
+from scipy import stats
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError
 from flexplant.estimation import design_kalman, design_static
@@ -65,8 +66,9 @@ def renamed(system, key):
 
 
 @cache
-def errors_on_the_machine(zeta, thickness=0.0272):
-    """rms of die:z less the estimates (a), (b), (c), by a Stein equation of the whole loop."""
+def statistics_on_the_machine(zeta, thickness=0.0272):
+    """rms of die:z less the estimates (a), (b), (c), by a Stein equation of the whole loop; and
+    independent samples of their squares per sample of time."""
     found = designs(zeta)
     holding = design_servo(found["plants"][0], bandwidth=10.0)
     blocks = [found["static"].system, holding.system]
@@ -80,13 +82,29 @@ def errors_on_the_machine(zeta, thickness=0.0272):
     noise[:n, :n] += T["Q"]
     X = la.solve_discrete_lyapunov(A, noise, method="bilinear")
     assert np.allclose(X, stationary_by_doubling(A, noise), rtol=1e-5, atol=1e-9 * X.max())
-    rms = []
+    found = []
     for key in ("die", "nominal", "updated"):
         row = -signals[f"{key}:hat"][0]
         row[:n] += T["C"][4]
-        white = deviation * signals[f"{key}:hat"][1]
-        rms.append(np.sqrt(row @ X @ row + white @ white))
-    return np.array(rms)
+        white = -deviation * signals[f"{key}:hat"][1]
+        power = row @ X @ row + white @ white
+        later = correlation(A, row, A @ X @ row + deviation * R @ white)
+        # a Gaussian e: cov(e_0^2, e_k^2) = 2 r_k^2, so N samples are worth N r_0^2 / sum r_k^2
+        found.append((np.sqrt(power), power**2 / (power**2 + 2 * later @ later)))
+    return np.transpose(found)
+
+
+def correlation(A, row, start, m=128):
+    """row A^k start for k = 0 .. m^2 - 1, from m powers on either side."""
+    right, left, leap = [start], [row], np.linalg.matrix_power(A, m)
+    for _ in range(m - 1):
+        right.append(A @ right[-1])
+        left.append(left[-1] @ leap)
+    return (np.array(left) @ np.transpose(right)).ravel()
+
+
+def errors_on_the_machine(zeta, thickness=0.0272):
+    return statistics_on_the_machine(zeta, thickness)[0]
 
 
 def test_poles(zeta):
@@ -227,12 +245,17 @@ def test_a_run_of_the_machine_is_its_closed_form(zeta):
         runs=6,
     )
     late = run.time > 1.0
-    wanted = errors_on_the_machine(zeta)
-    for key, rms in zip(("die", "nominal", "updated"), wanted, strict=True):
-        power = ((run["die:z"] - run[f"{key}:hat"])[:, late] ** 2).mean(axis=1)
-        spread = power.std(ddof=1) / np.sqrt(power.size)
-        assert abs(power.mean() - rms**2) < 4 * spread  # t of five degrees of freedom
-        assert spread < 0.25 * rms**2
+    for key, rms, share in zip(
+        ("die", "nominal", "updated"), *statistics_on_the_machine(zeta), strict=True
+    ):
+        error = (run["die:z"] - run[f"{key}:hat"])[:, late]
+        # the mean square of a stationary Gaussian signal is nearly chi-square, of as many degrees
+        # of freedom as it has independent samples
+        count = share * error.size
+        low, high = stats.chi2.ppf([5e-5, 1 - 5e-5], count) / count
+        print(f"{key}: {np.mean(error**2) / rms**2:.3f} in [{low:.3f}, {high:.3f}], {count:.0f}")
+        assert low < np.mean(error**2) / rms**2 < high
+        assert high < 2.0  # the interval shows something
 
 
 def sensitivity_peak(T, observer, servo, freq):
