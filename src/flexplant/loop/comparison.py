@@ -75,7 +75,7 @@ class LoopComparison(Value):
         return self.rows[name]
 
     def __repr__(self) -> str:
-        width = max(map(len, self.rows)) + 2
+        width = max(map(len, self.rows))  # each column after it starts with two spaces
         first = next(iter(self.rows.values()))
         measure = f"stable ({'spectral radius' if self.sampled else 'largest real part [rad/s]'})"
         low = f"|S| at {first.low_freq:.3g} Hz" if self.channel else "|S| low"
