@@ -92,19 +92,31 @@ def _paths(plant: StandardPlant, moving: Any, time: FloatArray) -> dict[str, Flo
     return found
 
 
+class Rows(NamedTuple):
+    """Channels of z whose rows C (k, c, n) and D (k, c, m) over x and [w; u] differ by sample."""
+
+    shown: list[int]
+    C: FloatArray
+    D: FloatArray
+
+    def show(self, z: FloatArray, x: FloatArray, inputs: FloatArray) -> None:
+        """Put these channels into z (k, nz), for states x (k, n) and [w; u] (k, m)."""
+        z[:, self.shown] = np.einsum("kcn,kn->kc", self.C, x)
+        z[:, self.shown] += np.einsum("kcm,km->kc", self.D, inputs)
+
+
 class Moving:
     """The rows of z that change with the places of POIs."""
 
     def __init__(self, plant: StandardPlant, paths: Mapping[str, FloatArray]) -> None:
         self.plant, self.paths = plant, paths
 
-    def show(self, z: FloatArray, x: FloatArray, inputs: FloatArray, first: int) -> None:
-        """Put the motion of POIs at their places, samples from `first`, into z (k, nz).
-
-        x are the states (k, n) of the plant, `inputs` its [w; u] (k, m).
-        """
+    def rows(self, first: int, count: int) -> list[Rows]:
+        """Return the rows of the samples from `first`; a place that comes again is found once."""
+        found = []
         for name, points in self.paths.items():
-            rows = self.plant.along(name, points[first : first + z.shape[0]])
-            shown = [self.plant.z.index(channel) for channel in rows.channels]
-            z[:, shown] = np.einsum("kcn,kn->kc", rows.C, x)
-            z[:, shown] += np.einsum("kcm,km->kc", rows.D, inputs)
+            places, at = np.unique(points[first : first + count], axis=0, return_inverse=True)
+            along, again = self.plant.along(name, places), at.ravel()
+            shown = [self.plant.z.index(channel) for channel in along.channels]
+            found.append(Rows(shown, along.C[again], along.D[again]))
+        return found

@@ -91,6 +91,9 @@ class Acting:
                     self.limit[i] = one.limit
                     self.change[i] = np.inf if one.rate is None else one.rate * dt
         self.step, self.coarse = np.where(step > 0, step, 1.0), step > 0
+        self.below = -self.limit
+        self.counts, self.limits = bool(np.any(self.coarse)), bool(np.any(np.isfinite(self.limit)))
+        self.is_slow = bool(np.any(np.isfinite(self.change)))
         self.begin(1)
 
     def begin(self, runs: int) -> None:
@@ -100,17 +103,21 @@ class Acting:
     def apply(self, values: FloatArray) -> None:
         """Let the elements act on the values (runs, n) of a sample, in place."""
         low, high = self.low, self.high
-        np.divide(values, self.step, out=low)
-        np.rint(low, out=low)
-        np.multiply(low, self.step, out=low)
-        np.copyto(values, low, where=self.coarse)
-        np.subtract(self.last, self.change, out=low)
-        np.maximum(low, -self.limit, out=low)
-        np.add(self.last, self.change, out=high)
-        np.minimum(high, self.limit, out=high)
-        np.maximum(values, low, out=values)
-        np.minimum(values, high, out=values)
-        np.copyto(self.last, values)
+        if self.counts:
+            np.divide(values, self.step, out=low)
+            np.rint(low, out=low)
+            np.multiply(low, self.step, out=low)
+            np.copyto(values, low, where=self.coarse)
+        if self.is_slow:
+            np.subtract(self.last, self.change, out=low)
+            np.maximum(values, low, out=values)
+            np.add(self.last, self.change, out=high)
+            np.minimum(values, high, out=values)
+        if self.limits:
+            np.maximum(values, self.below, out=values)
+            np.minimum(values, self.limit, out=values)
+        if self.is_slow:
+            np.copyto(self.last, values)
 
 
 def split_elements(

@@ -162,14 +162,15 @@ class SampleBySample:
         )
         self.x = states[k].copy()
         nc, nu = self.parts.n_controller, self.parts.n_driven
+        places = [] if self.moving is None else self.moving.rows(self.first, k)
         for r in range(self.x.shape[0]):
             x, u = np.ascontiguousarray(states[:-1, r]), out[:, r, nc : nc + nu]
             z = x @ self.C1.T + u @ self.D12.T + self.w[r] @ self.D11.T
-            if self.moving is not None:
+            for rows in places:
                 inputs = np.zeros((k, self.B1.shape[1] + self.n_u))
                 inputs[:, : self.B1.shape[1]] = self.w[r, :k]
                 inputs[:, self.B1.shape[1] + self.u] = u[:k]
-                self.moving.show(z[:k], x[:k], inputs, self.first)
+                rows.show(z[:k], x[:k], inputs)
             data[r] = np.hstack([z[:k], y[:k, r], out[:k, r, nc:]]).T
         self.first += k
         return bool(np.all(np.isfinite(self.x)))
@@ -207,7 +208,10 @@ class InBlocks:
         w = np.zeros((PIECE, given.shape[1]))
         w[:k] = given
         w[:, self.noise.columns] += single
-        v = np.hstack([w[:, self.columns], white @ self.mixed])
+        known = self.columns.size
+        v = np.empty((PIECE, known + self.mixed.shape[1]))
+        v[:, :known] = w[:, self.columns]
+        np.matmul(white, self.mixed, out=v[:, known:])
         out, self.x = self.blocks.run(v, self.x)
         data[0] = out[:k].T
         return bool(np.all(np.isfinite(self.x)))
