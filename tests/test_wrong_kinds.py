@@ -132,6 +132,8 @@ CALLS = [
     ("servo_bandwidth peak", lambda x: fx.servo_bandwidth(plant(), peak=x), ("fraction",)),
     ("design_servo a notch", lambda x: servo(notches=[x]), ("fraction", "bool")),
     ("design_servo poi", lambda x: servo(poi=x), ("none",)),
+    ("design_h2", lambda x: fx.design_h2(x), ()),
+    ("design_h2 u", lambda x: fx.design_h2(plant().system, u=x, y=plant().y), ()),
     ("design_hinf", lambda x: fx.design_hinf(x), ()),
     ("design_hinf method", lambda x: fx.design_hinf(plant(), x), ("none",)),
     ("design_hinf u", lambda x: fx.design_hinf(plant().system, u=x, y=plant().y), ()),

@@ -110,6 +110,7 @@ from .synthesis import Controller as Controller
 from .synthesis import Lmi as Lmi
 from .synthesis import Riccati as Riccati
 from .synthesis import StructuredLmi as StructuredLmi
+from .synthesis import design_h2 as design_h2
 from .synthesis import design_hinf as design_hinf
 from .synthesis import design_servo as design_servo
 from .synthesis import servo_bandwidth as servo_bandwidth

@@ -276,7 +276,7 @@ def _defect(
     """Return why no strictly stabilising solution exists, or "" (Popov-Belevitch-Hautus)."""
     lam = la.eigvals(p.A).astype(np.complex128)
     size = max(1.0 if marginal else 0.0, float(np.max(np.abs(lam), initial=0.0)))
-    critical = lam[growth(lam) > -1e-9 * size]
+    critical = lam[growth(lam) >= -1e-9 * size]
     # a Jordan block of a rigid-body mode comes out of eigvals at the root of the rounding
     near = np.abs(critical - marginal) < 1e-6 * size
     distinct = [complex(marginal)] if near.any() else []

@@ -29,7 +29,7 @@ _MIXED, _CONDITION = 5.0, 1e3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prepared(Value):
-    """A continuous, scaled problem ``[w; u] -> [z; y]`` with D22 = 0.
+    """A scaled problem ``[w; u] -> [z; y]`` with D22 = 0, continuous unless `direct`.
 
     Parameters
     ----------
@@ -50,6 +50,8 @@ class Prepared(Value):
     departure : float
         Size of the given A, its states balanced, beside that of its poles: 1 in modal coordinates,
         large where the coordinates of the states mix modes, and rounding with them.
+    direct : bool
+        A sampled problem in its own recursion, not mapped to continuous time.
     """
 
     A: FloatArray
@@ -68,13 +70,14 @@ class Prepared(Value):
     u: Sequence[str]
     y: Sequence[str]
     departure: float = 1.0
+    direct: bool = False
 
     def __repr__(self) -> str:
         return f"<Prepared: {self.A.shape[0]} states, unit of frequency {self.speed:.3g} rad/s>"
 
     @property
     def system(self) -> StateSpace:
-        """The scaled problem as one continuous system, inputs w1.., u and outputs z1.., y."""
+        """The scaled problem as one system, inputs w1.., u and outputs z1.., y."""
         return StateSpace(
             self.A,
             np.hstack([self.B1, self.B2]),
@@ -82,6 +85,7 @@ class Prepared(Value):
             np.block([[self.D11, self.D12], [self.D21, np.zeros_like(self.D22)]]),
             inputs=[f"w{i}" for i in range(1, self.B1.shape[1] + 1)] + list(self.u),
             outputs=[f"z{i}" for i in range(1, self.C1.shape[0] + 1)] + list(self.y),
+            dt=self.dt if self.direct else 0.0,
         )
 
     def measured_in(self, unit: float) -> Prepared:
@@ -99,7 +103,7 @@ class Prepared(Value):
 
     def frequency(self, omega: float) -> float:
         """Return the frequency [Hz] of the original plant that a scaled one [1] stands for."""
-        if self.dt:
+        if self.dt and not self.direct:
             return float(np.arctan(0.5 * self.dt * self.speed * omega) / (np.pi * self.dt))
         return self.speed * omega / (2.0 * np.pi)
 
@@ -142,11 +146,14 @@ class Prepared(Value):
             self.u_scale @ D @ self.y_scale,
             inputs=self.y,
             outputs=self.u,
+            dt=self.dt if self.direct else 0.0,
         )
-        return tustin(controller, 1.0 / self.dt) if self.dt else controller
+        return tustin(controller, 1.0 / self.dt) if self.dt and not self.direct else controller
 
 
-def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
+def prepared(
+    P: StateSpace, u: Sequence[str], y: Sequence[str], *, direct: bool = False
+) -> Prepared:
     """Return a standard plant ``[w; u] -> [z; y]``, made ready for synthesis.
 
     Parameters
@@ -155,11 +162,13 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         The plant; u are its last inputs, y its last outputs.
     u, y : sequences of str
         Channels of the controller.
+    direct : bool
+        Keep a sampled plant's recursion, for H2 norms: the bilinear map keeps gains only.
 
     Raises
     ------
     ModelError
-        When a sampled plant has a pole at z = -1.
+        When a sampled plant that is mapped has a pole at z = -1.
     """
     # balanced first: whether I + A can be inverted must not depend on the units of the states
     s = np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles()))
@@ -169,8 +178,9 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         form = modal_form(P, largest_condition=_CONDITION * departure)
         A, B, C = (A, B, C) if form.reason else _balanced(*_matrices(form.system), s)
     g = P.replace(A=A, B=B, C=C, blocks=None)
-    g = bilinear(g, 1.0 / P.dt) if P.dt else g
-    speed = mean_speed(g.poles())
+    direct = direct and bool(P.dt)
+    g = bilinear(g, 1.0 / P.dt) if P.dt and not direct else g
+    speed = 1.0 if direct else mean_speed(g.poles())
     m1, p1 = len(g.inputs) - len(u), len(g.outputs) - len(y)
     root = np.sqrt(speed)
     A, B, C = g.A / speed, g.B / root, g.C / root
@@ -182,7 +192,7 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         A,
         np.hstack([B[:, :m1] @ w_turn, B[:, m1:] @ u_scale]),
         np.vstack([z_turn.T @ C[:p1], y_scale @ C[p1:]]),
-        np.exp(1j),
+        s if direct else np.exp(1j),
     )
     return Prepared(
         A,
@@ -201,6 +211,7 @@ def prepared(P: StateSpace, u: Sequence[str], y: Sequence[str]) -> Prepared:
         tuple(u),
         tuple(y),
         departure,
+        direct,
     )
 
 

@@ -1,6 +1,7 @@
-"""Controllers: the servo on the estimated point of interest, and H-infinity."""
+"""Controllers: the servo on the estimated point of interest, H2 and H-infinity."""
 
 from .controller import Controller as Controller
+from .h2 import design_h2 as design_h2
 from .hinf import design_hinf as design_hinf
 from .lmi import Lmi as Lmi
 from .riccati import Riccati as Riccati

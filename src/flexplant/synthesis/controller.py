@@ -22,11 +22,11 @@ class Controller(Value):
     method : str
         How it was designed.
     gamma : float, optional
-        The norm that its closed loop was verified to stay below.
+        The norm that its closed loop was verified to stay below: H-infinity, of `design_h2` the H2.
     lower : float, optional
         A bound from below on what controllers reach; see the method for its conditions.
     certificate : mapping {str: float}
-        Numbers computed after the design by another route.
+        Numbers computed after the design by another computation.
     reached : mapping {str: float}
         Of a weighted design: the norm from each group of w to each group of z, beside 1, which
         is what the weights require. The largest is close to gamma.
