@@ -238,7 +238,7 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
     Raises
     ------
     CertificateError
-        When the loop is unstable or its norm is not the claim (of a regular problem: the least cost).
+        When the loop is unstable or its norm is not the claim (the least cost).
     """
     loop = lft(P, K)
     poles = loop.poles()
