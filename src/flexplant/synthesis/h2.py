@@ -176,7 +176,7 @@ def _solved(p: Prepared) -> SolvedController:
     R = p.D12.T @ p.D12 + p.B2.T @ X @ p.B2
     S = p.D21 @ p.D21.T + p.C2 @ Y @ p.C2.T
     F0 = -np.linalg.solve(R, p.B2.T @ X @ p.B1 + p.D12.T @ p.D11)
-    L0 = np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T
+    L0 = np.asarray(np.linalg.solve(S, (F @ Y @ p.C2.T + F0 @ p.D21.T).T).T, dtype=np.float64)
     square = np.sum(p.B1 * (X @ p.B1)) + np.sum(p.D11**2)
     square += np.sum(R * (F @ Y @ F.T - L0 @ S @ L0.T))
     cost = float(np.sqrt(max(square, 0.0)))
