@@ -187,7 +187,7 @@ def _solved(p: Prepared) -> SolvedController:
 def _made_regular(problem: Prepared, lacking: Sequence[str]) -> SolvedController:
     """Return the controller of a singular problem: a little noise and effort are added.
 
-    The norm of its own loop, without what was added, falls with the level to its infimum.
+    The norm of the loop without what was added falls with the level to its infimum.
     """
     found: list[tuple[float, SolvedController]] = []
     errors: list[FlexplantError] = []
