@@ -143,7 +143,7 @@ def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
     points = [(x, y, 0.0) for y in np.linspace(0, L, 9) for x in np.linspace(0, L, 9)]
     many = fx.solve_modes(case["full"]["updated"], count=80)
     plant, goal = plant_of(case, "updated"), fx.PoiVariance("die", larger=many)
-    return fx.sensor_map(plant, points, goal, asd=NOISE, exclude=[fx.Disc((L / 2, L / 2), 0.12)])
+    return fx.sensor_map(plant, points, goal, asd=NOISE, constraints=[fx.placement.OffPoi(0.12)])
 
 
 # %% What it shows: each claim is printed with its figures, and stops the example when untrue

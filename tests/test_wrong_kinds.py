@@ -8,7 +8,15 @@ import pytest
 import flexplant as fx
 from flexplant.errors import FlexplantError
 from flexplant.loop import close_loop
-from flexplant.placement import BranchAndBound, Exchange, Exhaustive
+from flexplant.placement import (
+    BranchAndBound,
+    Budget,
+    Exchange,
+    Excluded,
+    Exhaustive,
+    MinimumDistance,
+    Together,
+)
 from flexplant.simulation import (
     error_map,
     exposure_errors,
@@ -208,6 +216,11 @@ CALLS = [
     ("place_sensors candidates", lambda x: placed(candidates=x), ()),
     ("place_sensors count", lambda x: placed(count=x), ()),
     ("place_sensors required", lambda x: placed(required=x), ()),
+    ("place_sensors constraints", lambda x: placed(constraints=x), ()),
+    ("MinimumDistance", lambda x: MinimumDistance(x), ("fraction",)),
+    ("Budget", lambda x: Budget(x), ("fraction",)),
+    ("Excluded", lambda x: Excluded(x), ()),
+    ("Together", lambda x: Together(x), ()),
     ("place_sensors method", lambda x: placed(method=x), ("none",)),
     ("place_sensors rng", lambda x: placed(rng=x, method=Exchange(starts=2)), ("none",)),
     ("place_sensors criterion", lambda x: placed(criterion=x), ("none",)),

@@ -115,6 +115,10 @@ def made():
         placement.Exchange(),
         placement.BranchAndBound(gap=0.1),
     )
+    disc = structure.Disc((0.1, 0.1), 0.05)
+    yield from (placement.Excluded(disc), placement.Within(disc, at_most=1), placement.OffPoi(0.1))
+    yield from (placement.MinimumDistance(0.1), placement.Mirrored("x", 0.3))
+    yield from (placement.Together([("a", "b")]), placement.Budget(3.0, {"a": 2.0}))
     yield from (placement.Exhaustive(), placement.PoiLqr("die"), placement.PoiVariance("die"))
     yield placement.score_sensors(small, [[c.name for c in candidates[:4]]], candidates=candidates)
     yield placement.sensor_map(small, [CORNERS[0], (0.2, 0.3, 0.0)], asd=1e-12)

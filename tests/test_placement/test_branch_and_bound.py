@@ -17,8 +17,8 @@ from flexplant.placement import (
     place_actuators,
     place_sensors,
 )
+from flexplant.placement.branch import Branch
 from flexplant.placement.layouts import layouts_of
-from flexplant.placement.tangent import root
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
 from flexplant.structure import FEModel, ModalDamping
 from oracles_placement import best_subset, riccati_by_scipy
@@ -105,7 +105,7 @@ def test_optima_are_proven_and_no_bound_is_above_any_truth(case, side):
         values[tuple(int(n[1:]) for n in found.chosen)], rel=1e-6, abs=0.0
     )
     scorer = layouts_of(plant, side, candidates, criterion).scorer
-    whole = root(len(candidates), count, ())
+    whole = Branch(((np.arange(len(candidates)), count),))
     low, weights = scorer.relaxation(whole)
     assert low <= values[best] * (1 + 1e-7)
     # every tangent, wherever it touches, is below every truth; every branch below those it holds

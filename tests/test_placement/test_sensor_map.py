@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from flexplant.errors import AssumptionError, LabelError, ModelError, ShapeError
-from flexplant.placement import PoiVariance, sensor_map
+from flexplant.placement import Excluded, PoiVariance, sensor_map
 from flexplant.plant import Sensor
 from flexplant.store import load
 from flexplant.structure import Disc, Rectangle
@@ -43,7 +43,7 @@ def test_no_sensor_is_tried_where_none_can_be(make, tmp_path):
     plant, _, _ = make(21)
     every = sensor_map(plant, GRID, asd=1e-11)
     zones = [Disc(every.best[:2], 0.01), Rectangle((0.4, 0.1), (0.6, 0.3))]
-    found = sensor_map(plant, GRID, asd=1e-11, exclude=zones)
+    found = sensor_map(plant, GRID, asd=1e-11, constraints=[Excluded(zones)])
     left = [
         i
         for i, (x, y, _) in enumerate(GRID)
@@ -55,10 +55,10 @@ def test_no_sensor_is_tried_where_none_can_be(make, tmp_path):
     assert found.values.min() > every.values.min()
     found.save(tmp_path / "map.npz")
     assert repr(load(tmp_path / "map.npz").excluded) == repr(tuple(zones))
-    with pytest.raises(ModelError, match="outside the excluded zones"):
-        sensor_map(plant, GRID[:1], asd=1e-11, exclude=Disc(GRID[0, :2], 0.01))
+    with pytest.raises(ModelError, match="that satisfies the constraints"):
+        sensor_map(plant, GRID[:1], asd=1e-11, constraints=[Excluded(Disc(GRID[0, :2], 0.01))])
     with pytest.raises(ModelError, match="a Rectangle or a Disc, got"):
-        sensor_map(plant, GRID, asd=1e-11, exclude=[(0.3, 0.3)])
+        sensor_map(plant, GRID, asd=1e-11, constraints=[Excluded([(0.3, 0.3)])])
 
 
 def test_names_do_not_collide(make):

@@ -1,6 +1,14 @@
 """Where sensors and actuators go: criteria, scores, search and bounds."""
 
 from .branch_and_bound import BranchAndBound as BranchAndBound
+from .constraints import Budget as Budget
+from .constraints import Constraint as Constraint
+from .constraints import Excluded as Excluded
+from .constraints import MinimumDistance as MinimumDistance
+from .constraints import Mirrored as Mirrored
+from .constraints import OffPoi as OffPoi
+from .constraints import Together as Together
+from .constraints import Within as Within
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
 from .exchange import Exchange as Exchange

@@ -17,7 +17,7 @@ from ..values import FloatArray, Rng, positive, whole
 from .branch import Branch
 from .exchange import best_start
 from .problem import Found, Problem, Search
-from .tangent import Convex, root
+from .tangent import Convex
 
 #: branches that are opened in one round, on an executor or not: results do not depend on it
 _ROUND = 8
@@ -89,7 +89,7 @@ class BranchAndBound(Search):
         chosen, history, evaluations = best_start(problem, self.starts, rng, executor, progress)
         value = min(steps[-1] for steps in history)
         tree = _Tree(problem, scorer, self.gap, chosen, value)
-        with Progress(problem.subsets, "choices settled", progress=progress) as bar:
+        with Progress(problem.root.size, "choices settled", progress=progress) as bar:
             while (batch := tree.next_batch()) and monotonic() < end:
                 tree.pop(len(batch))
                 opened = mapped(
@@ -149,7 +149,7 @@ class _Tree:
     ) -> None:
         self.chosen, self.value, self.gap = chosen, value, gap
         self.left, self.evaluations, self.count = np.inf, 0, 0
-        branch = root(len(problem.layouts.candidates), problem.count, problem.required)
+        branch = problem.root
         bound, weights = scorer.relaxation(branch)
         self.heap: list[tuple[float, int, _Node]] = []
         self._push(_Node(bound, branch, weights))
@@ -194,7 +194,8 @@ class _Tree:
 def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Opened:
     """Settle a small branch choice by choice, or cut it in parts with bounds of their own."""
     branch = node.branch
-    if problem.layouts.missing(branch.members.tolist()):  # no choice in it has a score
+    # no choice in it satisfies the constraints or has a score
+    if not problem.rows.possible(branch) or problem.layouts.missing(branch.members.tolist()):
         return _Opened([], np.inf, (), branch.size, np.inf, 0)
     tangent = scorer.inner_tangent(branch, node.weights)
     bound, weights = node.bound, node.weights
@@ -205,11 +206,12 @@ def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Open
         return _Opened([], np.inf, (), branch.size, bound, 0)
     if branch.size <= _SCREENED:
         sets = branch.choices()
+        sets = [s for s, holds in zip(sets, problem.rows.hold(sets), strict=True) if holds]
         bounds = np.full(len(sets), bound)
         if tangent is not None:
             bounds = np.maximum(bounds, tangent.values(sets))
         if np.count_nonzero(bounds < cutoff) <= _SCORED:
-            return _scored(problem, cutoff, sets, bounds)
+            return _scored(problem, cutoff, sets, bounds, branch.size)
     rows = np.eye(weights.size) if tangent is None else tangent.rows
     nodes, left, settled = [], np.inf, 0
     for part in branch.halves(rows, weights):
@@ -225,15 +227,15 @@ def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Open
 
 
 def _scored(
-    problem: Problem, cutoff: float, sets: list[tuple[int, ...]], bounds: FloatArray
+    problem: Problem, cutoff: float, sets: list[tuple[int, ...]], bounds: FloatArray, settled: int
 ) -> _Opened:
     """Score the choices of a branch that could be better, the smallest bound first."""
     best, chosen, evaluations = np.inf, (), 0
     for i in np.argsort(bounds, kind="stable").tolist():
         if bounds[i] >= min(cutoff, best):
-            return _Opened([], best, chosen, len(sets), float(bounds[i]), evaluations)
+            return _Opened([], best, chosen, settled, float(bounds[i]), evaluations)
         value = float(problem.layouts.score([sets[i]])[0])
         evaluations += 1
         if value < best:
             best, chosen = value, sets[i]
-    return _Opened([], best, chosen, len(sets), np.inf, evaluations)
+    return _Opened([], best, chosen, settled, np.inf, evaluations)

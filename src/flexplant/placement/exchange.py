@@ -83,15 +83,16 @@ class _Run:
     ) -> tuple[tuple[int, ...], tuple[float, ...], int]:
         """Return the choice, the values on the way to it and the number of evaluations."""
         chosen = self._start(start, rng)
-        values = [float(self._values([chosen])[0])]
-        movable = [i for i, item in enumerate(chosen) if item not in self.problem.required]
+        values = [float(self._values([_flat(chosen)])[0])]
+        movable = [i for i, unit in enumerate(chosen) if not set(unit) & set(self.problem.required)]
         idle = 0
         while movable and idle < len(movable):
             slot = movable.pop(0)
             movable.append(slot)
-            rest = [i for i in range(len(self.problem.layouts.candidates)) if i not in chosen]
-            trials = [[*chosen[:slot], i, *chosen[slot + 1 :]] for i in rest] or [chosen]
-            found = self._values(trials)
+            size = len(chosen[slot])
+            rest = [u for u in self.problem.units if u not in chosen and len(u) == size]
+            trials = [[*chosen[:slot], u, *chosen[slot + 1 :]] for u in rest] or [chosen]
+            found = self._values([_flat(units) for units in trials])
             best, value = trials[int(np.argmin(found))], float(found.min())
             if value < values[-1] - _GAIN * abs(values[-1]) or (
                 np.isinf(values[-1]) and np.isfinite(value)
@@ -100,22 +101,28 @@ class _Run:
                 values.append(value)
             else:
                 idle += 1
-        return tuple(sorted(chosen)), tuple(values), len(self.seen)
+        return tuple(sorted(_flat(chosen))), tuple(values), len(self.seen)
 
     def _values(self, trials: Sequence[Sequence[int]]) -> FloatArray:
         """Return the scores of choices, those not seen before at once."""
         keys = [tuple(sorted(chosen)) for chosen in trials]
         new = list(dict.fromkeys(key for key in keys if key not in self.seen))
-        self.seen.update(zip(new, self.problem.layouts.score(new).tolist(), strict=True))
+        self.seen.update(zip(new, self.problem.score(new).tolist(), strict=True))
         return np.array([self.seen[key] for key in keys])
 
-    def _start(self, start: int, rng: np.random.Generator) -> list[int]:
-        total = len(self.problem.layouts.candidates)
-        chosen = self.problem.spanning(rng.uniform(0.1, 1.0, total) if start else None)
-        rest = [i for i in range(total) if i not in chosen]
+    def _start(self, start: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
+        """Return the first choice, as units."""
+        problem = self.problem
+        chosen = list(problem.start(rng if start else None))
+        rest = [i for i in problem.free if i not in chosen]
         if start:
-            return chosen + list(rng.permutation(rest)[: self.problem.count - len(chosen)])
-        while len(chosen) < self.problem.count:
+            chosen += list(rng.permutation(rest)[: problem.count - len(chosen)])
+        while len(chosen) < problem.count:
             best = int(np.argmin(self._values([[*chosen, i] for i in rest])))
             chosen.append(rest.pop(best))
-        return chosen
+        units = {i: unit for unit in problem.units for i in unit}
+        return list(dict.fromkeys(units.get(int(i), (int(i),)) for i in chosen))
+
+
+def _flat(units: Sequence[tuple[int, ...]]) -> list[int]:
+    return [i for unit in units for i in unit]

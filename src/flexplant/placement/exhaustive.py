@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from itertools import combinations
 
 import numpy as np
 
@@ -49,8 +48,7 @@ class Exhaustive(Search):
                 "allows. Use Exchange(), whose bound shows how far from the optimum it can be, or "
                 "a higher limit."
             )
-        kept, more = problem.required, problem.count - len(problem.required)
-        sets = [tuple(sorted((*kept, *rest))) for rest in combinations(problem.free, more)]
+        sets = list(problem.choices())
         values = problem.layouts.scores(
             sets, executor=executor, progress=progress, description="every subset"
         )

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from concurrent.futures import Executor
 from dataclasses import dataclass
-from math import comb
+from functools import cached_property
+from itertools import combinations, product
+from math import comb, prod
 
 import numpy as np
 
 from ..values import FloatArray, Rng, Value
+from .branch import Branch
 from .layouts import WEAK, Layouts
+from .rows import LinearRows
+from .tangent import Convex
+
+#: draws of an admissible choice until one sees every rigid-body mode
+_DRAWS = 20
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,25 +33,119 @@ class Problem:
         How many to choose.
     required : tuple of int
         Indices of candidates that every choice holds.
+    rows : LinearRows
+        What every choice satisfies.
     """
 
     layouts: Layouts
     count: int
     required: tuple[int, ...]
+    rows: LinearRows
+
+    @property
+    def total(self) -> int:
+        """How many candidates there are."""
+        return len(self.layouts.candidates)
+
+    @cached_property
+    def units(self) -> list[tuple[int, ...]]:
+        """Candidates that may be left out, those that are chosen together as one."""
+        shut = self.rows.shut(self.required)
+        units = [u for u in self.rows.units() if not set(u) & set(self.required)]
+        return [u for u in units if not np.any(shut[list(u)])]
 
     @property
     def free(self) -> list[int]:
         """Candidates that may be left out."""
-        return [i for i in range(len(self.layouts.candidates)) if i not in self.required]
+        return sorted(i for unit in self.units for i in unit)
+
+    @cached_property
+    def subsets(self) -> int:
+        """How many choices of units there are; some may be against other constraints."""
+        sizes = self._by_size
+        return sum(
+            prod(comb(len(sizes[size]), n) for size, n in mix.items()) for mix in self._mixes()
+        )
+
+    def choices(self) -> Iterator[tuple[int, ...]]:
+        """Yield every choice that satisfies the constraints, indices ascending."""
+        for mix in self._mixes():
+            parts = [combinations(self._by_size[size], n) for size, n in mix.items()]
+            for units in product(*parts):
+                chosen = tuple(sorted((*self.required, *(i for p in units for u in p for i in u))))
+                if not self.rows.A.size or self.rows.hold([chosen])[0]:
+                    yield chosen
 
     @property
-    def subsets(self) -> int:
-        """How many choices there are."""
-        return comb(len(self.free), self.count - len(self.required))
+    def root(self) -> Branch:
+        """All choices, apart from those constraints that exclude no single candidate."""
+        groups = (
+            (np.array(self.required, dtype=np.int64), len(self.required)),
+            (np.array(self.free, dtype=np.int64), self.count - len(self.required)),
+        )
+        return Branch(tuple((group, count) for group, count in groups if count))
 
     def bound(self) -> float:
         """Return a number below the score of every choice; minus infinity when none is known."""
-        return self.layouts.scorer.bound(self.count, self.required)
+        relaxed = self.relaxed()
+        if relaxed is None:
+            return self.layouts.scorer.bound(self.count, self.required)
+        return relaxed[0]
+
+    def relaxed(self) -> tuple[float, FloatArray] | None:
+        """Return a lower bound and weights (N,) near the least relaxed cost, where it is convex."""
+        scorer, root = self.layouts.scorer, self.root
+        if not isinstance(scorer, Convex) or self.layouts.missing(root.members.tolist()):
+            return None
+        return scorer.relaxation(root) if self.rows.possible(root) else None
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return the scores (n,) of choices, infinite where a constraint is not satisfied."""
+        values = np.full(len(sets), np.inf)
+        kept = np.flatnonzero(self.rows.hold(sets)).tolist() if len(sets) else []
+        values[kept] = self.layouts.score([sets[i] for i in kept])
+        return values
+
+    def start(self, random: np.random.Generator | None) -> tuple[int, ...]:
+        """Return a choice that satisfies the constraints and sees every rigid-body mode.
+
+        By chance where there is a generator, else by relaxed weights; the nearest one when none
+        was found, and no index at all when no choice satisfies the constraints.
+        """
+        if not self.rows.A.size:
+            weights = None if random is None else random.uniform(0.1, 1.0, self.total)
+            return tuple(self.spanning(weights))
+        draws = np.random.default_rng(0) if random is None else random
+        nearest: tuple[int, ...] = ()
+        for draw in range(_DRAWS):
+            worth = draws.uniform(0.0, 1.0, self.total)
+            worth[self.spanning(worth)] += 2.0
+            if random is None and not draw and (relaxed := self.relaxed()) is not None:
+                worth = relaxed[1]
+            found = self.rows.best(worth, self.count, self.required)
+            if found is None:
+                break
+            missed = self.layouts.missing(found)
+            if not nearest or missed < self.layouts.missing(nearest):
+                nearest = found
+            if not missed:
+                break
+        return nearest
+
+    @cached_property
+    def _by_size(self) -> dict[int, list[tuple[int, ...]]]:
+        found: dict[int, list[tuple[int, ...]]] = {}
+        for unit in self.units:
+            found.setdefault(len(unit), []).append(unit)
+        return dict(sorted(found.items()))
+
+    def _mixes(self) -> Iterator[dict[int, int]]:
+        """Yield how many units of each size make up the count."""
+        more, sizes = self.count - len(self.required), list(self._by_size)
+        limits = [range(min(len(self._by_size[s]), more // s) + 1) for s in sizes]
+        for numbers in product(*limits):
+            if sum(s * n for s, n in zip(sizes, numbers, strict=True)) == more:
+                yield dict(zip(sizes, numbers, strict=True))
 
     def spanning(self, weights: FloatArray | None = None) -> list[int]:
         """Return the required and those that add most to the rigid-body modes seen, one by one.
@@ -50,13 +153,14 @@ class Problem:
         Orthogonalisation with pivoting: it reaches the highest rank that any choice of the size
         has. Weights (N,) favour some candidates.
         """
-        chosen = list(self.required)
+        chosen, shut = list(self.required), self.rows.shut(self.required)
         left = self.layouts.rigid.copy()
         for i in self.required:
             left = _without(left, left[i])
         while len(chosen) < self.count:
             sizes = np.linalg.norm(left, axis=1) * (1.0 if weights is None else weights)
             sizes[chosen] = 0.0
+            sizes[shut] = 0.0
             pick = int(np.argmax(sizes))
             if np.linalg.norm(left[pick]) < WEAK:
                 break
@@ -102,7 +206,7 @@ class Search(Value):
         Parameters
         ----------
         problem : Problem
-            With `layouts.score(sets)`, `bound()`, and choices that see every rigid-body mode.
+            With `score(sets)`, `bound()`, `choices()` and a `start`.
         rng : int, SeedSequence or Generator, optional
             For what is random.
         executor : concurrent.futures.Executor, optional

@@ -13,10 +13,12 @@ from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
 from ..plant import StandardPlant
 from ..values import Rng, Value, instance, name_list, whole
 from .candidates import Port, Side, checked_plant, known_candidates, with_side
+from .constraints import Constraint, rows_of
 from .criterion import Criterion
 from .exchange import Exchange
 from .exhaustive import Exhaustive
 from .layouts import layouts_of
+from .places import places_of
 from .problem import Problem, Search
 
 #: up to here every subset is scored when no method is given: it takes seconds, and proves it
@@ -107,6 +109,7 @@ def place_sensors(
     criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     required: Sequence[str] = (),
+    constraints: Sequence[Constraint] = (),
     method: Search | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
@@ -129,6 +132,9 @@ def place_sensors(
         From a plant to a float, smaller is better; `PoiVariance()` when not given.
     required : sequence of str
         Candidates that any choice includes.
+    constraints : sequence of Constraint, optional
+        What every choice satisfies: Excluded, OffPoi, Within, MinimumDistance, Together, Mirrored,
+        Budget. No sensor is placed on a POI unless OffPoi(-1) is among them.
     method : Exchange, BranchAndBound or Exhaustive, optional
         Every subset where there are at most 1500, else `Exchange()`, when not given.
     executor : concurrent.futures.Executor, optional
@@ -158,7 +164,17 @@ def place_sensors(
         When the score is not confirmed by the other route.
     """
     return _placed(
-        plant, "y", candidates, count, criterion, required, method, executor, progress, rng
+        plant,
+        "y",
+        candidates,
+        count,
+        criterion,
+        required,
+        constraints,
+        method,
+        executor,
+        progress,
+        rng,
     )
 
 
@@ -169,6 +185,7 @@ def place_actuators(
     criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     required: Sequence[str] = (),
+    constraints: Sequence[Constraint] = (),
     method: Search | None = None,
     executor: Executor | None = None,
     progress: bool | None = None,
@@ -188,6 +205,9 @@ def place_actuators(
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
     required : sequence of str
         Candidates that any choice includes.
+    constraints : sequence of Constraint, optional
+        What every choice satisfies: Excluded, OffPoi, Within, MinimumDistance, Together, Mirrored,
+        Budget.
     method : Exchange, BranchAndBound or Exhaustive, optional
         Every subset where there are at most 1500, else `Exchange()`, when not given.
     executor : concurrent.futures.Executor, optional
@@ -217,7 +237,17 @@ def place_actuators(
         When the score is not confirmed by the other route.
     """
     return _placed(
-        plant, "u", candidates, count, criterion, required, method, executor, progress, rng
+        plant,
+        "u",
+        candidates,
+        count,
+        criterion,
+        required,
+        constraints,
+        method,
+        executor,
+        progress,
+        rng,
     )
 
 
@@ -228,6 +258,7 @@ def _placed(
     count: int,
     criterion: Criterion | Callable[[StandardPlant], float] | None,
     required: Sequence[str],
+    constraints: Sequence[Constraint],
     method: Search | None,
     executor: Executor | None,
     progress: bool | None,
@@ -243,13 +274,11 @@ def _placed(
         raise ModelError(f"{len(kept)} candidates are required, but only {count} are chosen.")
     layouts = layouts_of(plant, side, ports, criterion)
     layouts.require_any()
-    problem = Problem(layouts, count, kept)
-    spanning = problem.spanning()
-    if layouts.missing(spanning):
-        raise InfeasibleError(
-            f"no choice of {count} of the {len(ports)} candidates will do; of the nearest one: "
-            f"{layouts.reason(spanning)} Choose more, or require others."
-        )
+    places = places_of(plant, ports)
+    rows = rows_of(constraints, places, side)
+    kept = rows.with_partners(kept)
+    problem = Problem(layouts, count, kept, rows)
+    _require_start(problem, constraints)
     if method is None:
         method = Exhaustive() if problem.subsets <= _FEW else Exchange()
     instance(method, Search, "method", "Pass Exchange(...), BranchAndBound(...) or Exhaustive().")
@@ -271,6 +300,25 @@ def _placed(
         side,
         found.stopped,
     )
+
+
+def _require_start(problem: Problem, constraints: Sequence[Constraint]) -> None:
+    """Raise InfeasibleError when there is no choice to begin with."""
+    layouts = problem.layouts
+    first = problem.start(None) if len(problem.required) <= problem.count else ()
+    what = f"no choice of {problem.count} of the {problem.total} candidates"
+    if not first and problem.rows.A.size:
+        given = ", ".join(map(repr, constraints)) or "OffPoi()"
+        raise InfeasibleError(
+            f"{what} satisfies the constraints {given:.300}: {len(problem.free)} candidates are "
+            f"free and {len(problem.required)} required. Relax a constraint, or give more "
+            "candidates."
+        )
+    if layouts.missing(first):
+        raise InfeasibleError(
+            f"{what} will do; of the nearest one: {layouts.reason(first)} Choose more, or require "
+            "others."
+        )
 
 
 def _required(names: Sequence[str], required: Sequence[str]) -> tuple[int, ...]:

@@ -13,10 +13,12 @@ from ..errors import ModelError
 from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
-from ..values import FloatArray, Value, positive, real_array, short
+from ..values import FloatArray, Value, positive, real_array
 from .candidates import checked_plant
+from .constraints import Constraint, all_of, rows_of
 from .criterion import Criterion
 from .layouts import layouts_of
+from .places import places_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -74,7 +76,7 @@ def sensor_map(
     asd: float,
     direction: str = "z",
     quantity: Quantity = "displacement",
-    exclude: Sequence[Rectangle | Disc] = (),
+    constraints: Sequence[Constraint] = (),
     executor: Executor | None = None,
     progress: bool | None = None,
 ) -> SensorMap:
@@ -94,9 +96,9 @@ def sensor_map(
         What it measures at the point.
     quantity : {"displacement", "velocity", "acceleration"}
         What it measures.
-    exclude : sequence of Rectangle or Disc
-        Zones, seen from above, where no sensor can be: the die itself, say. Points inside are left
-        out.
+    constraints : sequence of Constraint, optional
+        As for `place_sensors`: points at which one more sensor breaks one are left out. A point on
+        a POI is, unless OffPoi(-1) is among them.
     executor : concurrent.futures.Executor, optional
         Computes in chunks; the result is the same to the bit.
     progress : bool, optional
@@ -105,13 +107,13 @@ def sensor_map(
     Returns
     -------
     SensorMap
-        In the order of the points that are not excluded.
+        In the order of the points that are not left out.
 
     Raises
     ------
     ModelError
-        When the plant is not sampled or has no structure, a zone is neither a Rectangle nor a Disc,
-        or there is no point outside all zones.
+        When the plant is not sampled or has no structure, something is no constraint, or no point
+        satisfies them.
     ShapeError
         When the points are not (n, 3).
     LabelError
@@ -123,14 +125,6 @@ def sensor_map(
     """
     checked_plant(plant)
     places = real_array(points, "points", (None, 3))
-    zones = _zones(exclude)
-    inside = [zone.holds(places[:, :2]) for zone in zones]
-    places = places[~np.any(inside, axis=0)] if inside else places
-    if not places.size:
-        raise ModelError(
-            "there is no point to try: give at least one"
-            + (" outside the excluded zones." if zones else ".")
-        )
     noise = positive(asd, "asd", zero=True)
     own = plant.assembled.ports.y
     taken = {sensor.name for sensor in own}
@@ -139,6 +133,15 @@ def sensor_map(
         Sensor(f"{prefix}{i}", at=place, direction=direction, quantity=quantity, asd=noise)
         for i, place in enumerate(places, 1)
     ]
+    where = places_of(plant, (*own, *tried))
+    free = rows_of(constraints, where, "y").added(range(len(own)))[len(own) :]
+    if not np.any(free):
+        raise ModelError(
+            "there is no point to try: give at least one"
+            + (" that satisfies the constraints." if len(tried) else ".")
+        )
+    places, tried = places[free], [sensor for sensor, kept in zip(tried, free, strict=True) if kept]
+    zones = tuple(zone for item in all_of(constraints, "y") for zone in item.drawn(where))
     layouts = layouts_of(plant, "y", (*own, *tried), criterion)
     layouts.require_any()
     base = tuple(range(len(own)))
@@ -147,14 +150,3 @@ def sensor_map(
     best = 1 + int(np.argmin(values[1:]))
     layouts.confirm(sets[best], float(values[best]))
     return SensorMap(places, values[1:], float(values[0]), repr(layouts.criterion), zones)
-
-
-def _zones(exclude: Sequence[Rectangle | Disc]) -> tuple[Rectangle | Disc, ...]:
-    listed = (exclude,) if isinstance(exclude, Rectangle | Disc) else tuple(exclude)
-    for zone in listed:
-        if not isinstance(zone, Rectangle | Disc):
-            raise ModelError(
-                f"an excluded zone is a Rectangle or a Disc, got {short(zone)}. Type "
-                "Disc((0.3, 0.3), radius=0.05)."
-            )
-    return listed

@@ -127,7 +127,10 @@ class Convex(Scorer):
 
     def bound(self, count: int, required: Sequence[int]) -> float:
         """Return a lower bound over all choices of `count` candidates: tangent after tangent."""
-        return self.relaxation(root(self.total, count, required))[0]
+        free = np.setdiff1d(np.arange(self.total), required)
+        kept = np.array(sorted(required), dtype=np.int64)
+        groups = ((kept, kept.size), (free, count - kept.size))
+        return self.relaxation(Branch(tuple((g, n) for g, n in groups if n)))[0]
 
     def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
         """Return a lower bound over a branch, and weights near the least relaxed cost."""
@@ -152,13 +155,6 @@ class Convex(Scorer):
     def total(self) -> int:
         """How many candidates there are."""
         raise NotImplementedError
-
-
-def root(total: int, count: int, required: Sequence[int]) -> Branch:
-    """Return the branch of all choices of `count` among `total` candidates."""
-    free = np.setdiff1d(np.arange(total), required)
-    groups = ((np.array(sorted(required), dtype=np.int64), len(required)),)
-    return Branch(tuple((g, c) for g, c in (*groups, (free, count - len(required))) if c))
 
 
 def _safe(bound: FloatArray) -> FloatArray:

@@ -1,0 +1,183 @@
+"""Constraints are satisfied by every search, which finds the best choice that satisfies them."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+from flexplant.errors import InfeasibleError, LabelError, ModelError
+from flexplant.placement import (
+    BranchAndBound,
+    Budget,
+    Exchange,
+    Excluded,
+    Exhaustive,
+    MinimumDistance,
+    Mirrored,
+    OffPoi,
+    PoiLqr,
+    PoiVariance,
+    Together,
+    Within,
+    place_actuators,
+    place_sensors,
+    sensor_map,
+)
+from flexplant.placement.layouts import layouts_of
+from flexplant.plant import Poi, Sensor
+from flexplant.store import load
+from flexplant.structure import Disc, Rectangle
+
+GRID = [(x, y, 0.0) for x in (0.0, 0.2, 0.3, 0.5) for y in (0.0, 0.175, 0.35)]
+COSTS = {0: 5.0, 2: 4.0, 9: 3.0, 11: 3.0}
+
+XY = np.array(GRID)[:, :2]
+
+
+def image(i):
+    """The candidate opposite in x."""
+    return (3 - i // 3) * 3 + i % 3
+
+
+#: a constraint and the same in words of Python, over sets of indices
+CASES = {
+    "excluded": (
+        Excluded([Disc((0.5, 0.35), 0.1), Rectangle((-0.1, -0.1), (0.1, 0.1))]),
+        lambda s: not s & {0, 11},
+    ),
+    "off the die": (
+        OffPoi(0.16),
+        lambda s: all(np.hypot(*(XY[i] - (0.2, 0.0))) > 0.16 for i in s),
+    ),
+    "within": (Within(Rectangle((-1, -1), (0.45, 1))), lambda s: not s & {9, 10, 11}),
+    "few in a zone": (
+        Within([Disc((0, 0), 0.01), Disc((0.5, 0), 0.01)], at_most=1, at_least=1),
+        lambda s: len(s & {0, 9}) == 1,
+    ),
+    "apart": (
+        MinimumDistance(0.25),
+        lambda s: all(np.hypot(*(XY[i] - XY[j])) >= 0.25 for i, j in combinations(s, 2)),
+    ),
+    "together": (
+        Together([("c0", "c11"), ("c2", "c9", "c5")]),
+        lambda s: len(s & {0, 11}) != 1 and len(s & {2, 9, 5}) in (0, 3),
+    ),
+    "mirrored": (Mirrored("x", 0.25), lambda s: {image(i) for i in s} == s),
+    "budget": (
+        Budget(7.0, {f"c{i}": cost for i, cost in COSTS.items()}),
+        lambda s: sum(COSTS.get(i, 1.0) for i in s) <= 7.0,
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def machine(make):
+    """A plant whose die is on a place of the grid, in the middle of nothing else."""
+    plant, sensors, actuators = make(41, count=12)
+    die = Poi("die", at=GRID[3], axes=("z", "rx", "ry"))
+    plant = plant.with_ports(plant.assembled.ports.replace(z=[die]))
+    on_grid = [
+        [p.replace(name=f"c{i}", at=GRID[i]) for i, p in enumerate(ports)]
+        for ports in (sensors, actuators)
+    ]
+    return plant, *on_grid
+
+
+@pytest.mark.parametrize("kind", CASES)
+@pytest.mark.parametrize("side", ["y", "u"])
+def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, side):
+    for name, few in (("_SCREENED", 30), ("_SCORED", 5)):
+        monkeypatch.setattr(f"flexplant.placement.branch_and_bound.{name}", few)
+    plant, sensors, actuators = machine
+    candidates = sensors if side == "y" else actuators
+    place = place_sensors if side == "y" else place_actuators
+    criterion = PoiVariance("die") if side == "y" else PoiLqr("die", effort=1e-8)
+    constraint, satisfied = CASES[kind]
+    sets = [s for s in combinations(range(12), 4) if satisfied(set(s))]
+    if side == "y":  # a sensor on the die is excluded without a word
+        sets = [s for s in sets if 3 not in s]
+    values = layouts_of(plant, side, candidates, criterion).score(sets)
+    best = tuple(f"c{i}" for i in sets[int(np.argmin(values))])
+    for method in (Exhaustive(), Exchange(starts=4), BranchAndBound(starts=1)):
+        found = place(
+            plant, candidates, 4, criterion, constraints=[constraint], method=method, rng=2
+        )
+        assert found.chosen == best, method
+        assert found.value == pytest.approx(values.min(), rel=1e-9, abs=0.0)
+        assert found.bound <= values.min()
+        assert found.proven or isinstance(method, Exchange)
+        if isinstance(method, Exhaustive):
+            assert found.evaluations == len(sets)
+
+
+def test_several_at_once_and_required(machine):
+    plant, sensors, _ = machine
+    given = [CASES["mirrored"][0], CASES["excluded"][0], OffPoi(-1)]
+    found = place_sensors(plant, sensors, 4, required=["c3"], constraints=given)
+    every = [
+        s
+        for s in combinations(range(12), 4)
+        if {3, 6} <= set(s) and CASES["mirrored"][1](set(s)) and not set(s) & {0, 11, 2, 9}
+    ]
+    assert {"c3", "c6"} <= set(found.chosen)
+    assert found.evaluations == len(every)
+    with pytest.raises(InfeasibleError, match=r"satisfies the constraints OffPoi\(\)"):
+        place_sensors(plant, sensors, 4, required=["c3"])
+    with pytest.raises(InfeasibleError, match=r"MinimumDistance.*Relax a constraint"):
+        place_sensors(plant, sensors, 4, constraints=[MinimumDistance(0.5)])
+    # three in a row are apart and cheap, but miss a rotation
+    row = [Within(Rectangle((-1, -0.1), (1, 0.1)))]
+    with pytest.raises(InfeasibleError, match="rigid-body"):
+        place_sensors(plant, sensors, 3, constraints=[*row, OffPoi(-1)])
+
+
+def test_places_of_ports_with_several_points(machine):
+    """A differential sensor is where each of its points is."""
+    plant, sensors, _ = machine
+    across = Sensor("across", at={GRID[0]: 1.0, GRID[11]: -1.0}, asd=1e-14)
+    given = [*sensors[:6], across]
+    free = place_sensors(plant, given, 4)
+    assert "across" in free.chosen
+    shut = place_sensors(plant, given, 4, constraints=[Excluded(Disc((0.5, 0.35), 0.01))])
+    assert "across" not in shut.chosen
+    near = place_sensors(plant, given, 4, constraints=[MinimumDistance(1e-3)])
+    assert not {"across", "c0"} <= set(near.chosen)
+
+
+def test_no_sensor_of_a_map_is_on_the_die(machine):
+    plant, sensors, _ = machine
+    plant = plant.with_ports(plant.assembled.ports.replace(y=[sensors[i] for i in (0, 2, 9)]))
+    found = sensor_map(plant, GRID, asd=1e-11)
+    assert len(found.points) == 11
+    assert not np.any(np.all(found.points == GRID[3], axis=1))
+    assert len(sensor_map(plant, GRID, asd=1e-11, constraints=[OffPoi(-1)]).points) == 12
+    wide = sensor_map(plant, GRID, asd=1e-11, constraints=[OffPoi(0.16)])
+    assert len(wide.points) == 10
+    assert wide.excluded[0].radius == 0.16
+    # one more, 0.25 m from those that are there, and not where they are
+    apart = sensor_map(plant, GRID, asd=1e-11, constraints=[MinimumDistance(0.25)])
+    own = np.array([GRID[i] for i in (0, 2, 9)])
+    assert all(np.min(np.linalg.norm(own - p, axis=1)) >= 0.25 for p in apart.points)
+    assert len(apart.points) > 2
+
+
+def test_constraints_are_values_and_refuse_what_they_are_not(machine, tmp_path):
+    plant, sensors, _ = machine
+    for i, (constraint, _) in enumerate(CASES.values()):
+        constraint.save(tmp_path / f"{i}.npz")
+        assert repr(load(tmp_path / f"{i}.npz")) == repr(constraint)
+    with pytest.raises(ModelError, match="a Rectangle or a Disc, got"):
+        Excluded([(0.3, 0.3)])
+    with pytest.raises(ModelError, match="at_least 3 is above at_most 2"):
+        Within(Disc((0, 0), 1), at_least=3, at_most=2)
+    with pytest.raises(ModelError, match="distance must be positive"):
+        MinimumDistance(0.0)
+    with pytest.raises(LabelError, match="fewer than two"):
+        Together([("a",)])
+    with pytest.raises(LabelError, match="candidate of a group 'a'"):
+        place_sensors(plant, sensors, 4, constraints=[Together([("a", "c1")])])
+    with pytest.raises(LabelError, match="candidate with a cost 'a'"):
+        place_sensors(plant, sensors, 4, constraints=[Budget(1.0, {"a": 2.0})])
+    for bad in ("none", [3], Disc((0, 0), 1), 3.0):
+        with pytest.raises(ModelError, match="constraint"):
+            place_sensors(plant, sensors, 4, constraints=bad)
