@@ -1,0 +1,95 @@
+"""examples/fleet.py on a few machines, and the pipeline that it runs."""
+
+import importlib.util
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import ModelError
+
+EXAMPLE = Path(__file__).parents[1] / "examples" / "fleet.py"
+
+
+@pytest.fixture(scope="module")
+def fleet():
+    spec = importlib.util.spec_from_file_location("fleet", EXAMPLE)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def hidden(count, seed=20261):
+    """Masses, stiffness and damping that the example draws, drawn again."""
+    found = []
+    for one in np.random.SeedSequence(seed).spawn(count):
+        rng = np.random.default_rng(one)
+        found.append([*rng.uniform(0.0, 1.0, 3), rng.uniform(0.97, 1.03) - 1.0])
+    return np.array(found)
+
+
+@pytest.mark.slow
+def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_path):
+    """Two machines: the parameters found are theirs; both ways hold; reports are written."""
+    machines = fleet.fleet(2)
+    assert fleet.table is not None
+    errors = fx.reference_errors
+    mean = fx.assemble_plant(fleet.reduced((0.5, 0.5, 0.5)), fleet.PORTS)
+    plant = mean.discretized(fleet.RATE, delay=fleet.DELAY)
+    weights = fx.stage_weights(plant, 20.0)
+    weighted = plant.through(errors(plant)).weighted(z=weights.z, w=weights.w)
+    blocks = errors(plant), fx.design_hinf(weighted)
+    pipelines = {
+        "one for all": fleet.pipeline(blocks),
+        "one for each": fleet.pipeline().replace(folder=tmp_path / "reports"),
+    }
+    tables = {name: fx.study(machines, one, rng=1) for name, one in pipelines.items()}
+    own, every = tables["one for each"], tables["one for all"]
+    names = list(own)[:4]
+    np.testing.assert_allclose(np.transpose([own[n] for n in names]), hidden(2), atol=2e-3)
+    for table in (own, every):
+        assert table["failed"].tolist() == ["", ""]
+        assert table["stable"].all()
+    np.testing.assert_allclose(own["bandwidth"], [81.8, 81.8], rtol=5e-3)
+    np.testing.assert_allclose(every["bandwidth"], 24.0, atol=1.0)
+    assert np.all(own["MA"] < 0.3 * every["MA"])
+    assert own["passed"].all()
+    assert not every["passed"].any()
+    for name, value in zip(own["report"], own["stiffness"], strict=True):
+        text = (tmp_path / "reports" / name).read_text()
+        assert f"stiffness = {value:.4g}"[:16] in text
+        assert "specification: passed" in text
+    shown = fleet.table({"asked": 20.0, "tables": tables})
+    assert "one for each       2 of 2" in shown
+    assert max(map(len, shown.splitlines())) <= 120
+    assert fleet.picture({"asked": 20.0, "tables": tables}, tmp_path).stat().st_size > 10_000
+
+
+@pytest.mark.slow
+def test_measured_frfs_and_a_mass_that_is_searched_for(fleet):
+    """FRFs are identified, the place is found among candidates, nothing is known beforehand."""
+    truth = fleet.loaded((0.6, 0.0, 0.0)).with_damping(fx.ModalDamping(0.01))
+    machine = fx.testbeds.WaferStage(truth, fleet.RATE, fleet.DELAY)
+    chain = fleet.pipeline().replace(
+        modes=None,
+        starts=None,
+        parameters=(),
+        candidates=[fx.AddedMass(label) for label in fleet.LABELS],
+        bandwidth=30.0,
+    )
+    row = chain(machine, np.random.default_rng(0))
+    masses = [row[f"mass at {label}"] for label in fleet.LABELS]
+    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=0.02)
+    assert row["stable"]
+
+
+def test_the_chain_refuses_what_it_cannot_use(fleet):
+    chain = fleet.pipeline()
+    assert repr(chain) == "<MachinePipeline: 5 parameters updated, H-infinity, 80, 60, 40 Hz>"
+    with pytest.raises(ModelError, match="full must be of type FEModel"):
+        chain.replace(full=chain.model)
+    with pytest.raises(ModelError, match="the ports need a reference"):
+        chain.replace(ports=chain.ports.replace(references=()))
+    with pytest.raises(ModelError, match="bandwidth"):
+        chain.replace(bandwidth=(80.0, -1.0))
