@@ -95,7 +95,7 @@ def pipeline(blocks: Any = None) -> fx.simulation.MachinePipeline:
         PORTS,
         RATE,
         DELAY,
-        modes=MEASURED,
+        MEASURED,
         starts=8,
         bandwidth=OWN,
         blocks=blocks,

@@ -33,7 +33,6 @@ def hidden(count, seed=20261):
 def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_path):
     """Two machines: the parameters found are theirs; both ways hold; reports are written."""
     machines = fleet.fleet(2)
-    assert fleet.table is not None
     errors = fx.reference_errors
     mean = fx.assemble_plant(fleet.reduced((0.5, 0.5, 0.5)), fleet.PORTS)
     plant = mean.discretized(fleet.RATE, delay=fleet.DELAY)
@@ -67,20 +66,17 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
 
 
 @pytest.mark.slow
-def test_measured_frfs_and_a_mass_that_is_searched_for(fleet):
-    """FRFs are identified, the place is found among candidates, nothing is known beforehand."""
-    truth = fleet.loaded((0.6, 0.0, 0.0)).with_damping(fx.ModalDamping(0.01))
+def test_a_mass_that_is_searched_for_among_candidates(fleet):
+    """Places that are not chosen have no mass; nothing else is updated."""
+    truth = fleet.loaded((0.6, 0.0, 0.0)).with_damping(fx.ModalDamping(fleet.DAMPING))
     machine = fx.testbeds.WaferStage(truth, fleet.RATE, fleet.DELAY)
+    candidates = [fx.AddedMass(label) for label in fleet.LABELS]
     chain = fleet.pipeline().replace(
-        modes=None,
-        starts=None,
-        parameters=(),
-        candidates=[fx.AddedMass(label) for label in fleet.LABELS],
-        bandwidth=30.0,
+        starts=None, parameters=(), candidates=candidates, bandwidth=20.0, duration=0.4
     )
     row = chain(machine, np.random.default_rng(0))
     masses = [row[f"mass at {label}"] for label in fleet.LABELS]
-    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=0.02)
+    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=1e-3)
     assert row["stable"]
 
 

@@ -1,4 +1,4 @@
-"""The usual chain for one machine of many: measure, update, design, verify, report."""
+"""The usual chain for one machine of many: measured poles, update, designs, a run, a report."""
 
 from __future__ import annotations
 
@@ -14,14 +14,13 @@ import numpy as np
 
 from ..errors import AssumptionError, ModelError
 from ..estimation import KalmanEstimator, design_kalman
-from ..identification import MeasuredModes, identify_modes
 from ..loop import ClosedLoop, bandwidth
 from ..modes import solve_modes
 from ..plant import Ports, StandardPlant, assemble_plant, reference_errors, stage_weights
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..synthesis import Controller, design_hinf
-from ..updating import Eigenvalues, ModeShapes, UpdateResult, localise, update
+from ..updating import Eigenvalues, UpdateResult, localise, update
 from ..values import Value, positive, whole
 from .response import Response
 from .specification import Specification, Verdict
@@ -29,12 +28,13 @@ from .specification import Specification, Verdict
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachinePipeline(Value):
-    """The chain identify, localise, update, plant, observer, controller, verify, for `study`.
+    """The chain measure, localise, update, plant, observer, controller, verify, for `study`.
 
     Called with a machine it returns a row: the parameters found, what the observer predicts, and
     what the controller reaches *on the machine*, beside the specification. A machine answers to
-    ``poles(modes)`` or ``measure_frf(ports, rng=)``, ``loop(ports, *blocks)`` and ``run(ports,
-    *blocks, duration=, reference=, rng=)``, as `fx.testbeds.WaferStage` does.
+    ``poles(modes)`` with MeasuredModes (ideal ones, or those that `identify_modes` and `numbered`
+    find in its FRFs), to ``loop(ports, *blocks)`` and to ``run(ports, *blocks, duration=,
+    reference=, rng=)``, as `fx.testbeds.WaferStage` does.
 
     Parameters
     ----------
@@ -50,8 +50,8 @@ class MachinePipeline(Value):
         Of the controller.
     delay : int [samples]
         From measurement to actuation.
-    modes : sequence of int, optional
-        Modes whose poles are measured; unless given FRFs are, and their modes are identified.
+    modes : sequence of int
+        Numbers of the modes whose poles are measured.
     starts : int, optional
         From how many places each update searches, for parameters with bounds: poles alone may be
         explained nearly as well by masses elsewhere.
@@ -87,7 +87,7 @@ class MachinePipeline(Value):
     ports: Ports
     rate: float
     delay: int
-    modes: Sequence[int] | None = None
+    modes: Sequence[int]
     starts: int | None = None
     candidates: Sequence[Any] = ()
     bandwidth: float | Sequence[float] = 50.0
@@ -109,7 +109,7 @@ class MachinePipeline(Value):
             parameters=tuple(self.parameters),
             rate=positive(self.rate, "rate"),
             delay=whole(self.delay, "delay", minimum=0),
-            modes=None if self.modes is None else tuple(self.modes),
+            modes=tuple(self.modes),
             candidates=tuple(self.candidates),
             bandwidth=tuple(sorted(map(_hertz, np.atleast_1d(self.bandwidth)), reverse=True)),
             margin=positive(self.margin, "margin"),
@@ -137,11 +137,11 @@ class MachinePipeline(Value):
         machine : object
             Answers to what is named above.
         rng : numpy.random.Generator, optional
-            Of its measurement and its run.
+            Of the noise of its run.
         """
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            fit = self._updated(machine, rng)
+            fit = self._updated(machine)
             many = solve_modes(fit.applied_to(self.full), count=self.larger)
             plant = assemble_plant(fit.model, self.ports).discretized(self.rate, delay=self.delay)
             observer = design_kalman(plant, larger=many)
@@ -163,12 +163,8 @@ class MachinePipeline(Value):
             row["report"] = _written(Path(self.folder), "\n\n".join(lines) + "\n")
         return row
 
-    def _updated(self, machine: Any, rng: Any) -> UpdateResult:
-        if self.modes is not None:
-            residuals: list[Any] = [Eigenvalues(machine.poles(self.modes))]
-        else:
-            found: MeasuredModes = identify_modes(machine.measure_frf(self.ports, rng=rng))
-            residuals = [Eigenvalues(found), ModeShapes(found)]
+    def _updated(self, machine: Any) -> UpdateResult:
+        residuals = [Eigenvalues(machine.poles(self.modes))]
         chosen = []
         if self.candidates:
             places = localise(
