@@ -188,7 +188,9 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
         ax.set(xlabel=label, ylabel="machines below [%]", ylim=(0.0, 102.0))
         ax.grid(alpha=0.3)
     axs[1].set_xscale("log")
-    axs[0].legend()
+    axs[1].set_xticks([5, 10, 20, 50], ["5", "10", "20", "50"])
+    axs[1].minorticks_off()
+    axs[0].legend(loc="center")
     figure.savefig(folder / "fleet.png", dpi=90)
     plt.close(figure)
     return folder / "fleet.png"
