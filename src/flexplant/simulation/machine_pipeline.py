@@ -176,8 +176,8 @@ class MachinePipeline(Value):
     def _designed(self, plant: StandardPlant, many: Any) -> tuple[Any, Controller]:
         """Return the errors that the H-infinity controller reads, and the controller."""
         errors = reference_errors(plant)
-        for asked in np.atleast_1d(self.bandwidth):
-            weights = stage_weights(plant, float(asked))
+        for wanted in np.atleast_1d(self.bandwidth):
+            weights = stage_weights(plant, float(wanted))
             weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
             found = design_hinf(weighted, larger=many)
             if found.left_out is not None and found.left_out.modulus_margin >= self.margin:
