@@ -103,6 +103,27 @@ def test_a_slow_sampler_of_a_fast_mode(rate, blocks):
     assert scaled_gap(covariance(g, [1.0], h), X - E @ X @ E.T) < 1e-9
 
 
+@pytest.mark.parametrize("size", [0.1, 3.0, 40.0, 300.0])
+@pytest.mark.parametrize("zeta", [0.001, 0.3, 0.99])
+def test_many_modes_and_few_forces_take_few_columns(size, zeta):
+    """In closed form: v = x1 - i x2 follows v' = p v + f, with p and its conjugate."""
+    n, h = 300, 1e-4
+    p = np.geomspace(0.01, 1.0, n) * size / h * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    A, k = np.zeros((2 * n, 2 * n)), 2 * np.arange(n)
+    A[k, k], A[k + 1, k + 1], A[k, k + 1], A[k + 1, k] = p.real, p.real, p.imag, -p.imag
+    B = np.random.default_rng(3).standard_normal((2 * n, 2))
+    g = StateSpace(A, B, np.ones((1, 2 * n)), np.zeros((1, 2)), blocks=[2] * n)
+    G = noise_factor(g, np.ones(2), h)
+    assert G.shape[1] <= 2 * (0.5 * size + 4 * np.cbrt(size) + 11)
+    found, force = G[::2] - 1j * G[1::2], (B[::2] - 1j * B[1::2]) / np.sqrt(2)
+    for other, right, q in ((found.conj(), force.conj(), p.conj()), (found, force, p)):
+        s = p[:, None] + q
+        wanted = force @ right.T * np.expm1(s * h) / s
+        deviation = np.linalg.norm(found, axis=1)
+        gap = np.abs(found @ other.T - wanted) / np.outer(deviation, deviation)
+        assert gap.max() < 1e-12
+
+
 def test_no_noise():
     g = pairs(*MODEL)
     assert noise_factor(g, np.zeros(2), 1e-3).shape == (8, 0)

@@ -20,10 +20,11 @@ def accumulated_noise(
 ) -> FloatArray:
     """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``.
 
-    Gauss-Legendre quadrature over a piece so short that ten nodes are exact to rounding, then
-    ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate) steps, however fast the modes are. Sums of
-    squares, so that G G' is positive semidefinite in any units; the block exponential of Van Loan
-    was seen to lose that on large models.
+    Gauss-Legendre quadrature. Over the whole interval where as many nodes as make it exact to
+    rounding give less than n columns, as for a large structure with few forces. Else over a piece
+    so short that ten nodes are exact, then ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate)
+    steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
+    any units; the block exponential of Van Loan was seen to lose that on large models.
 
     Parameters
     ----------
@@ -36,9 +37,14 @@ def accumulated_noise(
     rate : float [rad/s]
         Size of A.
     """
-    doublings = max(0, int(np.ceil(np.log2(max(rate * time, 1e-300)))))
+    n, m = force.shape
+    # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
+    size = min(rate * time, 2.0 * n)
+    count, doublings = _NODES + int(np.ceil(0.5 * size + 4.0 * np.cbrt(size))), 0
+    if count * m >= n:
+        count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, 1e-300)))))
     piece = time / 2**doublings
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
+    nodes, weights = np.polynomial.legendre.leggauss(count)
     G = _compressed(
         [
             np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
