@@ -137,9 +137,9 @@ class StabilisationDiagram(Value):
                 kept.append(int(track))
         if not kept:
             raise SolverError(
-                f"no pole stays over the orders {known.tolist()!r:.60}: raise the orders, narrow "
-                "the band to where resonances stand out of the noise, or pick poles by hand with "
-                "diagram.select(freq=[...])."
+                f"no pole stays over the orders {known.min()} to {known.max()}: raise the orders, "
+                "narrow the band to where resonances stand out of the noise, or pick poles by hand "
+                "with diagram.select(freq=[...])."
             )
         return self._chosen(kept)
 

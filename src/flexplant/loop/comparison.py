@@ -76,9 +76,9 @@ class LoopComparison(Value):
 
     def __repr__(self) -> str:
         width = max(map(len, self.rows))  # each column after it starts with two spaces
-        first = next(iter(self.rows.values()))
+        low_freq = next(iter(self.rows.values())).low_freq  # nan where none is stable
         measure = f"stable ({'spectral radius' if self.sampled else 'largest real part [rad/s]'})"
-        low = f"|S| at {first.low_freq:.3g} Hz" if self.channel else "|S| low"
+        low = f"|S| at {low_freq:.3g} Hz" if self.channel and low_freq > 0 else "|S| low"
         head = (measure, "|S| < 1 up to", "max |S|", "at", low, "max |S| at u")
         cells = [_cells(row) for row in self.rows.values()]
         wide = [max(len(h), *(len(c[i]) for c in cells)) + 2 for i, h in enumerate(head)]

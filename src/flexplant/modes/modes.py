@@ -14,6 +14,8 @@ from ..structure.negative_stiffness import signed_square
 from ..structure.placed import Placed, missed
 from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
 
+#: relative: a frequency that rounding of K may change by more is one to know of
+_SOFT = 1e-4
 #: relative: what complex shapes span less than this is rounding
 _TRUNCATED = 1e-9
 
@@ -145,11 +147,21 @@ class Modes(Placed, Value):
         more = ", ..." if self.n_vectors > 4 else ""
         extra = f", vectors at {', '.join(self.vector_dofs[:4])}{more}" if self.n_vectors else ""
         checked = ""
+        soft = self.rounding > _SOFT
         if "counted" in self.certificate:
+            # relative to the elastic forces, which are rounding themselves in soft modes
+            residual = self.residual[~soft] if soft.size == self.residual.size else self.residual
             checked = (
                 f",\n  {self.certificate['counted']:.0f} counted below "
                 f"{self.certificate['shift']:.4g} Hz, none missing; "
-                f"residual {np.max(self.residual, initial=0.0):.1g}"
+                f"residual {np.max(residual, initial=0.0):.1g}"
+            )
+        if np.any(soft):
+            found = np.flatnonzero(soft) + 1
+            which = f"mode {found[0]}" if found.size == 1 else f"{found.size} modes from {found[0]}"
+            checked += (
+                f",\n  rounding of K may change {which} by up to {self.rounding.max():.1g} of the "
+                "frequency"
             )
         return f"<Modes: {self.n_modes}{kind} of {len(self.dofs)} DOFs{held}{extra}{checked}>"
 

@@ -116,7 +116,8 @@ class ReducedModel(Value):
             shown = f"{shown} and {extra}" if held else f"{extra} for {len(self.full_dofs)} DOFs"
         left = ""
         if self.truncated is not None:
-            left = f", {self.truncated.n_modes} modes left out are known"
+            count = self.truncated.n_modes
+            left = f", {count} mode{'s' * (count > 1)} left out {'are' if count > 1 else 'is'} known"
         grows = f", {self.n_unstable} unstable" if self.n_unstable else ""
         return (
             f"<ReducedModel: {shown} by {self.method}, {self.rigid_body.shape[1]} rigid-body "

@@ -184,7 +184,7 @@ class UpdateResult(Value):
         std = self.std
         deviations = [""] * len(self.parameters) if std is None else [f" +- {s:.2g}" for s in std]
         lines = [
-            f"  {name} = {value:.7g}{deviation} {unit}"
+            f"  {name} = {value:.7g}{deviation} {unit}".rstrip()
             for name, value, deviation, unit in zip(
                 self.parameters[:5], self.values.tolist(), deviations, self.units, strict=False
             )
