@@ -142,7 +142,7 @@ class Localisation(Value):
             f"<Localisation: {found or 'no change'} (BIC {self.chosen_bic:.4g}, no change "
             f"{self.nothing_bic:.4g})\n  explained alone: {best}"
         )
-        if len(self.alike) > 1:
+        if len(self.alike) > 1 and self.chosen:
             text += f"\n  AMBIGUOUS, {len(self.alike)} alike: {_shown(self.alike)}"
         rivals = [name for name in self.rivals if len(self.alike) < 2 or name not in self.alike]
         if rivals and self.chosen:
