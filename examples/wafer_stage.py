@@ -72,12 +72,13 @@ def study(damping: float) -> dict[str, Any]:
     fit = updated(nominal, machine.poles([6, 7]))
     case: dict[str, Any] = {"machine": machine, "fit": fit}
     case["models"] = {"drawing": nominal, "updated": fit.model}  # what designs run on
-    case["full"] = {"drawing": bare, "updated": fit.applied_to(bare)}  # with the modes left out
+    whole = {"drawing": bare, "updated": fit.applied_to(bare)}  # with the modes left out
+    case["full"] = {name: fx.solve_modes(model) for name, model in whole.items()}
     seeds = np.random.SeedSequence([20260, round(1e6 * damping)]).spawn(len(FORCES))
     case["errors"] = {f: estimation(case, f, s) for f, s in zip(FORCES, seeds, strict=True)}
     case["loops"] = control(case)
-    machines = {name: loop["machine"] for name, loop in case["loops"].items()}
-    return case | {"table": fx.compare_loops(machines)}
+    table = fx.compare_loops({name: loop["machine"] for name, loop in case["loops"].items()})
+    return case | {"table": table}
 
 
 def plant_of(case: dict[str, Any], kind: str, force: float = 1e-3) -> fx.StandardPlant:
@@ -104,14 +105,14 @@ def estimation(case: dict[str, Any], force: float, seed: Any) -> Any:
 
 
 # %% Control: H-infinity on the drawing and on the updated model, and the best servo that holds
-def hinf(plant: fx.StandardPlant, full: fx.FEModel) -> tuple[Any, ...]:
+def hinf(plant: fx.StandardPlant, full: fx.Modes) -> tuple[Any, ...]:
     """Return the errors that the H-infinity controller reads, and the controller."""
     errors, weights = fx.reference_errors(plant), fx.stage_weights(plant, BANDWIDTH)
     weighted = plant.through(errors).weighted(z=weights.z, w=weights.w)
     return errors, fx.design_hinf(weighted, larger=full)
 
 
-def servo(plant: fx.StandardPlant, full: fx.FEModel) -> tuple[Any, ...]:
+def servo(plant: fx.StandardPlant, full: fx.Modes) -> tuple[Any, ...]:
     """Return the servo of the largest bandwidth that keeps |S| at u below 6 dB, by geometry."""
     static = fx.design_static(plant, larger=full)  # a Kalman filter in the loop allows less
     reach = fx.servo_bandwidth(plant, observer=static, larger=full)
@@ -141,7 +142,7 @@ def control(case: dict[str, Any]) -> dict[str, dict[str, Any]]:
 def placement(case: dict[str, Any]) -> fx.placement.SensorMap:
     """Return the predicted error of the die over places of a sensor beside those at the corners."""
     points = [(x, y, 0.0) for y in np.linspace(0, L, 9) for x in np.linspace(0, L, 9)]
-    many = fx.solve_modes(case["full"]["updated"], count=80)
+    many = case["full"]["updated"].select(range(80))
     plant, goal = plant_of(case, "updated"), fx.PoiVariance("die", larger=many)
     return fx.sensor_map(plant, points, goal, asd=NOISE, constraints=[fx.placement.OffPoi(0.12)])
 
@@ -202,9 +203,8 @@ def table(result: dict[str, Any]) -> str:
                 parts.append(f"{name}: MA {ma:.1f} nm, MSD {msd:.1f} nm")
     parts.append("MA, MSD: largest mean and deviation of die:error over 5 ms, after the move.\n")
     (x, y, _), (old, new) = fifth.best, 1e9 * np.sqrt([fifth.without, fifth.values.min()])
-    parts.append(
-        f"A fifth sensor helps most at ({x:g}, {y:g}) m: {old:.3f} -> {new:.3f} nm predicted"
-    )
+    found = f"({x:g}, {y:g}) m: {old:.3f} -> {new:.3f} nm predicted"
+    parts.append(f"A fifth sensor helps most at {found}")
     return "\n".join(parts)
 
 

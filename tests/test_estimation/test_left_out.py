@@ -130,6 +130,32 @@ def test_the_best_filter_of_all_modes_bounds_them():
     assert best.rms("die") == pytest.approx(0.68e-9, rel=0.02, abs=0)
 
 
+@pytest.mark.slow
+def test_modes_left_out_as_noise_forgive_what_is_not_known_of_them():
+    """Above mode 24 frequencies off by 1 % and damping by 40 %: against a filter on 160 modes."""
+    true = machine("paper", 0.001, ELEMENTS)
+    bare = FEModel(true.M, true.K, dofs=true.dofs)
+    modes, channel = solve_modes(bare, damping=ModalDamping(0.001)), ports(1e-3)
+    few, many = (
+        design_kalman(sampled(modes.select(range(count)), channel), larger=modes)
+        for count in (40, 160)
+    )
+    assert 1e9 * few.rms("die") == pytest.approx(0.774, rel=0.01)
+    assert 1e9 * many.rms("die") == pytest.approx(0.683, rel=0.01)  # what more modes promise
+    found = []
+    for seed in range(4):
+        off = np.random.default_rng(seed).standard_normal((2, modes.n_modes - 24))
+        omega, zeta = modes.omega.copy(), modes.zeta.copy()
+        omega[24:] *= 1 + 0.01 * off[0]
+        zeta[24:] *= np.exp(0.4 * off[1] - 0.08)
+        other = sampled(modes.replace(omega=omega, zeta=zeta), channel)
+        found.append([1e9 * filter_.rms("die", on=other) for filter_ in (few, many)])
+    robust, fragile = np.sqrt(np.mean(np.square(found), axis=0))
+    assert robust == pytest.approx(0.87, rel=0.03)
+    assert fragile > 1.08 * robust
+    assert fragile > 1.3 * 1e9 * many.rms("die")
+
+
 def test_modes_that_the_reduced_model_knows_are_the_default():
     real = solve_modes(make_plate(elements=(4, 4)), count=40, damping=ModalDamping(0.01))
     grid = [real.dofs.nearest((x, y, 0), "z") for x in (0, 0.3, 0.6) for y in (0, 0.3, 0.6)]
