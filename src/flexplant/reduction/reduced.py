@@ -117,7 +117,8 @@ class ReducedModel(Value):
         left = ""
         if self.truncated is not None:
             count = self.truncated.n_modes
-            left = f", {count} mode{'s' * (count > 1)} left out {'are' if count > 1 else 'is'} known"
+            known = "modes left out are" if count > 1 else "mode left out is"
+            left = f", {count} {known} known"
         grows = f", {self.n_unstable} unstable" if self.n_unstable else ""
         return (
             f"<ReducedModel: {shown} by {self.method}, {self.rigid_body.shape[1]} rigid-body "
