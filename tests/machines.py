@@ -18,14 +18,14 @@ SHAPES = {
 }
 
 
-def stage(*, delay=1.0, rate=RATE, asd=1e-2, sensor_asd=1e-9, stiffer=1.0, blocks=True):
+def stage(*, delay=1.0, rate=RATE, asd=1e-2, sensor_asd=1e-9, stiffer=1.0, blocks=True, zeta=0.01):
     """Return a sampled stage: rigid body and three elastic modes, two actuators, two sensors."""
     omega, k = OMEGA * np.sqrt(stiffer), np.arange(OMEGA.size)
     scale = np.where(omega > 0, omega, omega[1])
     n = 2 * omega.size
     A, B, C = np.zeros((n, n)), np.zeros((n, 3)), np.zeros((3, n))
     A[2 * k, 2 * k + 1], A[2 * k + 1, 2 * k] = scale, -(omega**2) / scale
-    A[2 * k + 1, 2 * k + 1] = -2 * 0.01 * omega
+    A[2 * k + 1, 2 * k + 1] = -2 * zeta * omega
     for column, place in enumerate(("amp", "1", "2")):
         B[2 * k + 1, column] = SHAPES[place]
     for row, place in enumerate(("die", "1", "2")):

@@ -9,6 +9,7 @@ from test_kalman import modes, plate_plant
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
 from flexplant.estimation.estimate import estimated
+from flexplant.estimation.passage import _Walk
 from flexplant.lti.riccati import solve_dare
 from machines import stage
 from oracles_estimation import batch, error_covariance
@@ -191,6 +192,7 @@ def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatc
     mixed = kalman.estimate(records(model, y, u), method)
     for module in ("passage", "smoothing"):
         monkeypatch.setattr(f"flexplant.estimation.{module}.SETTLED", -1.0)
+    monkeypatch.setattr("flexplant.estimation.fading.excess", lambda *_: None)
     slow = kalman.estimate(records(model, y, u), method)
     for channel in ("die:hat", "y1:innovation", "y2:innovation"):
         deviation, known = slow.deviation(channel), np.isfinite(slow[channel])
@@ -199,6 +201,32 @@ def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatc
         assert np.abs(off).max() < 1e-5
     usual, gap = slow.deviation("die:hat")[600], slow.deviation("die:hat")[695:715].max()
     assert gap > 1.2 * usual
+
+
+@pytest.mark.parametrize("method", [Predictor(), Filter()])
+def test_a_start_that_lasts_for_long_goes_in_blocks_and_is_that_of_single_samples(
+    method, monkeypatch
+):
+    # light and little disturbed: the gain becomes stationary in some ten thousand samples only
+    kalman = observer(zeta=2e-5, asd=1e-6)
+    model = kalman.model
+    y, u, _ = run(model, 2500, seed=5)
+    y[900:905] = y[1700:1702, 0] = np.nan
+    singly, count = _Walk._step, []
+    monkeypatch.setattr(_Walk, "_step", lambda *given: count.append(1) or singly(*given))
+    fast = kalman.estimate(records(model, y, u), method)
+    assert len(count) < 100
+    monkeypatch.setattr("flexplant.estimation.fading.excess", lambda *_: None)
+    slow = kalman.estimate(records(model, y, u), method)
+    assert len(count) > 2500
+    for channel in ("die:hat", "y1:innovation", "y2:innovation"):
+        deviation, known = slow.deviation(channel), np.isfinite(slow[channel])
+        np.testing.assert_array_equal(np.isfinite(fast[channel]), known)
+        np.testing.assert_allclose(fast.deviation(channel), deviation, rtol=1e-9, atol=0)
+        off = (fast[channel] - slow[channel])[known] / deviation[known]
+        assert np.abs(off).max() < 1e-6
+    np.testing.assert_allclose(fast.whitened, slow.whitened, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(fast.state, slow.state, rtol=1e-6, atol=1e-12)
 
 
 class Frame:

@@ -172,7 +172,9 @@ class KalmanEstimator(Value):
         Until its gain is stationary the filter is the time-varying one, and so it is in and after
         gaps, where the sensors that are there go on to count; then it runs in blocks of samples.
         It counts as stationary when what is left changes all later estimates and innovations
-        together by less than 1e-6 of their variance.
+        together by less than 1e-6 of their variance. Filter and Predictor run in blocks already
+        while it is not, exactly; FixedLag and Smoother go sample by sample until then, about a
+        millisecond each.
 
         Parameters
         ----------

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..lti.recursion import Recursion
 from ..values import FloatArray
+from . import fading
 from .records import Recorded
 from .sight import Sight
 from .start import Start
@@ -146,6 +147,13 @@ class _Walk:
                 k += 1
                 if k < N and whole[k] and (k - first) % _LOOK == 0:
                     settled, x, Z = self._settled(x, P, Z)
+                    Y = None if settled or self.keep else self._excess(P, Z)
+                    if Y is not None:
+                        x = x + Z @ self.found.value if Z.shape[1] and self.found else x
+                        Z = Z[:, :0]
+                        later = np.searchsorted(gaps, k)
+                        until = int(gaps[later]) if later < gaps.size else N
+                        k, x, P, settled = self._fading(k, until, x, Y)
             stretches.append((first, k, False))
         if Z.shape[1] and self.found is not None:
             x = x + Z @ self.found.value
@@ -239,6 +247,44 @@ class _Walk:
             weight = self.steady.weight(self.sight)
             self._kept_weight = weight, float(np.sum(np.abs(weight) * np.abs(self.steady.P)))
         return self._kept_weight
+
+    def _excess(self, P: FloatArray, Z: FloatArray) -> FloatArray | None:
+        found = self.found if Z.shape[1] else None
+        return fading.excess(self.steady, self._weight[0], P, Z, found)
+
+    def _fading(
+        self, k: int, until: int, x: FloatArray, Y: FloatArray
+    ) -> tuple[int, FloatArray, FloatArray, bool]:
+        """Go on in blocks from ``x + Y eta`` until eta no longer matters, or to a gap.
+
+        Returns the sample after it, state and covariance there, and whether it is stationary.
+        """
+        m, g = self.model, self.steady.gains
+        length = fading.FIRST
+        while k < until and Y.shape[1]:
+            at = slice(k, min(k + length, until))
+            count = at.stop - k
+            x = self._steadily(at.start, at.stop, x)
+            moved = fading.faded(self.steady.F, Y, count)
+            C = m.C2 @ moved[:-1]
+            found = fading.shown(g.W @ C, self.whitened[at])
+            before, after = found.value[:-1], found.value[1:]
+            enter = fading.seen(self.steady, self.sight.part(at), moved[:-1], predict=self.predict)
+            value, covariance = (before, found.covariance[:-1])
+            if not self.predict:
+                value, covariance = after, found.covariance[1:]
+            self.hat[at] += np.einsum("kzr,kr->kz", enter, value)
+            self.variance[at] += np.sum((enter @ covariance) * enter, axis=2)
+            e = self.innovations[at] / self.s - np.einsum("kyr,kr->ky", C, before)
+            S = m.innovation(self.steady.P) + C @ found.covariance[:-1] @ C.transpose(0, 2, 1)
+            self.innovations[at] = e * self.s
+            self.deviation[at] = self.s * np.sqrt(np.diagonal(S, axis1=1, axis2=2))
+            self.whitened[at] = np.linalg.solve(np.linalg.cholesky(S), e[:, :, None])[:, :, 0]
+            x = x + moved[-1] @ found.value[-1]
+            Y = moved[-1] @ np.linalg.cholesky(found.covariance[-1])
+            Y = fading.kept(self._weight[0], Y)
+            k, length = at.stop, min(2 * length, fading.LONGEST)
+        return k, x, self.steady.P + Y @ Y.T, not Y.shape[1]
 
     def _steadily(self, first: int, last: int, x: FloatArray) -> FloatArray:
         """Fill a stretch of the stationary filter and return the state after it."""
