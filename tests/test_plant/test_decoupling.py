@@ -97,6 +97,18 @@ def test_some_axes():
         decouple(assemble_plant(some_modes(), ports(y=off, references=[])), axes=["z", "rx"])
 
 
+def test_what_held_dofs_prevent_is_no_axis():
+    hinged = full().fixed(full().dofs.where(directions="z", box=((0, 0, 0), (L, 0, 0))))
+    with pytest.raises(AssumptionError, match=r"part in z, ry, against which DOFs .* are held"):
+        decouple(assemble_plant(hinged, ports()))
+    turning = decouple(assemble_plant(hinged, ports()), axes=["rx"])
+    # about the hinge, of what is free to move
+    assert turning.mass[0, 0] == pytest.approx(INERTIA + MASS * L**2 / 4, rel=0.02)
+    held = full().fixed(full().dofs.where(directions="z", box=((0, 0, 0), (0.1, 0.1, 0))))
+    with pytest.raises(ModelError, match="DOFs are held against z, rx, ry"):
+        decouple(assemble_plant(held, ports()))
+
+
 def test_refusals():
     plant = assemble_plant(some_modes(), ports())
     with pytest.raises(LabelError, match="no rigid-body axis 'x'"):

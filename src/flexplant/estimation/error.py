@@ -7,11 +7,12 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, ModelError
+from ..errors import AssumptionError, CertificateError, ModelError
 from ..lti.lyapunov import accumulated, doubled, scale_of, solve_stein
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, IntArray
+from .certificate import AGREEMENT
 from .channels import poi_channels
 
 #: a rigid-body motion may enter the error by this part of the motion itself
@@ -20,6 +21,8 @@ _SEEN = 1e-7
 _DEFECTIVE = 1e6
 #: modulus of a sampled pole from which a mode counts as undamped
 _ON_CIRCLE = 1.0 - 1e-12
+#: and as hardly damped: its time constant is a hundred million samples
+_HARDLY = 1.0 - 1e-8
 
 
 class Variances(NamedTuple):
@@ -60,6 +63,8 @@ def error_variances(
         When sampling times differ, or the noise of the plant is not known.
     AssumptionError
         When the error contains a rigid-body motion or an undamped mode of the plant.
+    CertificateError
+        When the dual equation gives other variances: next to undamped modes, which it names.
     SolverError
         When the error is not stable.
     """
@@ -76,7 +81,32 @@ def error_variances(
     else:
         primal, dual = _primal(joint), np.array([_dual(joint, row) for row in joint.E])
     size = np.where(primal > 0, primal, 1.0)
-    return Variances(primal + joint.direct, float(np.max(np.abs(dual - primal) / size)))
+    difference = float(np.max(np.abs(dual - primal) / size, initial=0.0))
+    if not difference <= AGREEMENT:
+        raise CertificateError(
+            "the variance of the estimation error on a plant and its dual differ by "
+            f"{difference:.1e} (allowed {AGREEMENT:.0e}): the number cannot be trusted."
+            + _hardly_damped(plant)
+        )
+    return Variances(primal + joint.direct, difference)
+
+
+def _hardly_damped(plant: StandardPlant) -> str:
+    """Return which modes move so far under white noise that the error is lost in rounding."""
+    if not plant.is_assembled:
+        return " Look for poles within rounding of the unit circle, and damp them."
+    states = plant.modal_states.reshape(-1, 2)[plant.n_rigid :]
+    poles = np.linalg.eigvals(plant.system.A[states[:, :, None], states[:, None, :]])
+    slow = np.abs(poles).max(axis=1, initial=0.0) > _HARDLY
+    if not np.any(slow):
+        return ""
+    freq = np.sort(np.abs(np.angle(poles[slow, 0]))) / (2 * np.pi * plant.dt)
+    listed = ", ".join(f"{value:.3g}" for value in freq[:6]) + (", ..." if freq.size > 6 else "")
+    return (
+        f" Modes at {listed} Hz have next to no damping: under white disturbances they move "
+        "further than rounding lets the estimate follow. Damp them, as they are in the machine: "
+        "GroundSpring(..., damping=) for a suspension, ModalDamping for the structure."
+    )
 
 
 class _Joint(NamedTuple):

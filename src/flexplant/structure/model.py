@@ -23,7 +23,7 @@ from .eigen import elastic_modes
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
-from .rigid import body_motions, rigid_body_basis
+from .rigid import body_motions, force_parts, rigid_body_basis
 from .units import units
 
 
@@ -186,8 +186,15 @@ class FEModel(Placed, Value):
         return load if self.held_inertia is None else load + self.held_inertia @ ground
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return zeros (6,): the DOFs can make every rigid-body motion, at some cost."""
-        return np.zeros(6)
+        """Return how much of each of the six rigid-body motions DOFs held by `fixed` prevent (6,).
+
+        Springs to ground prevent none: the DOFs can make every motion, at some cost. Next to held
+        DOFs the largest force of a motion is as large as those of its parts, which cancel
+        elsewhere: ``max |K r|_i / max (|K| |r|)_i``, forces over the root of K_ii.
+        """
+        if self.held_inertia is None:
+            return np.zeros(6)
+        return force_parts(self.K, self.rigid_motions(about))
 
     @property
     def mass(self) -> float:

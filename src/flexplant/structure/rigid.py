@@ -171,11 +171,21 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
 
 def _everywhere_small(K: Matrix, size_of_K: Any, motions: FloatArray) -> FloatArray:
     """Return those of some motions without a large force at any DOF: nothing grounds them."""
+    return motions[:, _largest_parts(K, size_of_K, motions) < _EVERYWHERE]
+
+
+def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:
+    """Return the largest force of each motion (r,), of the largest that its parts make anywhere."""
+    rows = by_rows(K)
+    return _largest_parts(rows, absolute(rows), motions)
+
+
+def _largest_parts(K: Matrix, size_of_K: Any, motions: FloatArray) -> FloatArray:
     entries: Any = K.diagonal()
     weight = 1 / np.sqrt(np.where(entries > 0, entries, 1.0))[:, None]
     force = np.abs(weight * np.asarray(K @ motions)).max(axis=0)
     most = (weight * np.asarray(size_of_K @ np.abs(motions))).max(axis=0)
-    return motions[:, force < _EVERYWHERE * most]
+    return np.asarray(force / np.where(most > 0, most, 1.0))
 
 
 def _null_vectors(

@@ -34,8 +34,8 @@ class RigidBody(Value):
     centre : (3,) array [m]
         The centre of gravity; what the motions do not determine of it is 0.
     lost : mapping {axis: float}
-        Axes along which the model has DOFs, but which its shapes do not make: by how much of the
-        motion they miss it.
+        Axes along which the model has DOFs, but which its shapes do not make, by how much of the
+        motion they miss it; or which held DOFs prevent.
     """
 
     axes: tuple[str, ...]
@@ -95,9 +95,14 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
     exists = _independent(everywhere, [i for i in moving if missed[i] < SPANNED])
     lost = {DIRECTIONS[i]: float(missed[i]) for i in moving if missed[i] >= SPANNED}
     if not exists:
+        why = (
+            f"DOFs are held against {', '.join(lost)}"
+            if isinstance(model, FEModel)
+            else f"its shapes miss {_listed(lost)} of these motions"
+        )
         raise ModelError(
-            "this structure is held: it cannot move as a rigid body. Its shapes miss "
-            f"{_listed(lost)} of these motions."
+            f"this structure is held: it cannot move as a rigid body, {why}. Take the structure "
+            "without its supports."
         )
     axes = tuple(DIRECTIONS[i] for i in exists)
     centre = _centre(_mass(model, everywhere[:, exists]), axes)
@@ -137,11 +142,17 @@ def refuse_lost(
     seen = np.any(np.abs(stacked @ motions) > _SEEN * most.max(axis=0, initial=0.0), axis=0)
     if np.any(seen):
         named = {axis: part for (axis, part), one in zip(lost.items(), seen, strict=True) if one}
+        others = f"the other axes ({', '.join(body.axes)}) would be mixed with these"
+        if isinstance(realisation.model, FEModel):
+            raise AssumptionError(
+                f"the channels have part in {', '.join(named)}, against which DOFs of this model "
+                f"are held, and {others}{do}."
+            )
         raise AssumptionError(
             f"the channels have part in rigid-body axes that this model has no shapes for: they "
-            f"miss {_listed(named)}, and the other axes ({', '.join(body.axes)}) would be mixed "
-            "with these. Stiff springs that were there before the modes were solved bend them: "
-            f"keep more modes, or solve the free structure and suspend(modes, springs){do}."
+            f"miss {_listed(named)}, and {others}. Stiff springs that were there before the modes "
+            "were solved bend them: keep more modes, or solve the free structure and "
+            f"suspend(modes, springs){do}."
         )
 
 

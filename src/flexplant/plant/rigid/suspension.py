@@ -81,7 +81,8 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
     ----------
     model : FEModel, ReducedModel or Modes
         Modes and reduced models are suspended within their own shapes, which for springs much
-        softer than the structure is exact to the ratio of the two.
+        softer than the structure is exact to the ratio of the two. Modes that a reduced model left
+        out are stiffened and damped each by itself.
     springs : GroundSpring or sequence
         The springs.
 
@@ -112,12 +113,26 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
             K=given.K + stiffness,
             D=given.D + damping,
             rigid_body=given.rigid_body @ _untouched(rows, given.rigid_body),
+            truncated=None if given.truncated is None else _each(given.truncated, listed),
             method=f"{given.method}, {len(listed)} ground springs",
         )
     if isinstance(given, Modes):
         return _modes(given, listed)  # type: ignore[return-value]
     raise ModelError(
         f"suspend needs an FEModel, ReducedModel or Modes, got {type(model).__name__}."
+    )
+
+
+def _each(modes: Modes, springs: list[GroundSpring]) -> Modes:
+    """Return modes that springs change each by itself: ``omega^2 + r k r'``, dampers likewise."""
+    rows = np.array([modes.row(s.at, s.direction) for s in springs]) @ modes.phi
+    size = np.abs(rows) ** 2
+    square = modes.omega**2 + np.array([s.stiffness for s in springs]) @ size
+    rate = 2.0 * modes.zeta * modes.omega + np.array([s.damping for s in springs]) @ size
+    order = np.argsort(square)
+    omega = np.sqrt(square)
+    return modes.replace(
+        omega=omega[order], zeta=(0.5 * rate / omega)[order], phi=modes.phi[:, order]
     )
 
 
