@@ -9,6 +9,7 @@ import scipy.linalg as la
 from flexplant.errors import AssumptionError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.identification import MeasuredModes
+from flexplant.labels import DofSet
 from flexplant.loop import close_loop
 from flexplant.lti import frequency_response
 from flexplant.modes import solve_modes
@@ -216,6 +217,12 @@ def test_raw_matrices_are_judged_by_the_motion_that_is_unstable():
 
 
 @pytest.mark.slow
+def test_a_single_mass_on_a_magnet():
+    model = FEModel([[2.0]], [[-10.0]], dofs=DofSet([1], ["x"], np.zeros((1, 3))))
+    assert model.n_unstable == 1
+    assert solve_modes(model, count=1).omega == pytest.approx([-np.sqrt(5.0)], rel=1e-12, abs=0)
+
+
 def test_a_large_sparse_model_on_magnets():
     plate = make_plate(elements=(24, 24))
     held = suspend(plate, magnets())

@@ -20,7 +20,7 @@ _LARGEST = 1e4
 FIRST, LONGEST = 64, 1024
 
 
-class Found(NamedTuple):
+class ShownSoFar(NamedTuple):
     """What the measurements of a stretch say of eta, before the first and after each of them."""
 
     value: FloatArray  # (k + 1, r)
@@ -83,7 +83,7 @@ def faded(F: FloatArray, Y: FloatArray, samples: int) -> FloatArray:
     return moved
 
 
-def shown(rows: FloatArray, white: FloatArray) -> Found:
+def shown(rows: FloatArray, white: FloatArray) -> ShownSoFar:
     """Return what whitened innovations ``white = rows eta + noise`` (k, ny) show of eta."""
     count, _, r = rows.shape
     information, values = np.zeros((count + 1, r, r)), np.zeros((count + 1, r))
@@ -92,7 +92,7 @@ def shown(rows: FloatArray, white: FloatArray) -> Found:
     values[1:] = np.einsum("kyr,ky->kr", rows, white)
     covariance = np.linalg.inv(np.cumsum(information, axis=0))
     covariance = 0.5 * (covariance + covariance.transpose(0, 2, 1))
-    return Found(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
+    return ShownSoFar(np.einsum("krs,ks->kr", covariance, np.cumsum(values, axis=0)), covariance)
 
 
 def seen(steady: Steady, here: Sight, moved: FloatArray, *, predict: bool) -> FloatArray:

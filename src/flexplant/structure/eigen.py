@@ -79,7 +79,7 @@ def elastic_modes(
         subset_by_index=(0, kept - 1) if few else None,
         driver="evr" if few else "evd",
     )
-    if squares[0] < _DIRECT * largest:
+    if squares.size > 1 and squares[0] < _DIRECT * largest:
         if few:  # all of them, for the space of the soft ones to be right
             squares, vectors = la.eigh(stiffness, driver="evd")
         squares, phi = _improved(M, K, rigid, squares, reach.T @ (elastic @ vectors))
