@@ -135,12 +135,13 @@ def test_without_its_mass_it_is_the_drawing():
 
 @pytest.mark.slow
 def test_a_finer_mesh():
-    # notes.md: refining moves the frequencies by 0.2 % at most; 867 DOFs
-    fine = wafer_stage(elements=(16, 16))
-    assert fine.truth.n_dof == 867
+    # notes.md: refining moves the frequencies by 0.2 % at most; 507 DOFs
+    fine = wafer_stage(elements=(12, 12))
+    assert fine.truth.n_dof == 507
     poles = fine.poles([4, 6, 7]).poles
     np.testing.assert_allclose(poles[1:], POLES[0.01], rtol=3e-3)
-    assert poles[0].imag / (2 * np.pi) == pytest.approx(245.50, rel=1e-4)
+    wanted = dense_poles(*machine(0.01, mass=0.5, n=12))[[0, 2, 3]]
+    np.testing.assert_allclose(poles, wanted, rtol=1e-6)
     found = designs(0.01)
     servo = design_servo(found["plants"][1], bandwidth=50.0, notches=[458.9])
     assert fine.loop(ports(), found["updated"], servo).spectral_radius < 1
