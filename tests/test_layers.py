@@ -287,7 +287,7 @@ def test_importing_it_is_light_and_changes_nothing():
 def test_class_names_are_unique():
     where = {}
     for path in MODULES:
-        for node in ast.parse(path.read_text()).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef):
                 where.setdefault(node.name, []).append(name_of(path))
     twice = {name: found for name, found in where.items() if len(found) > 1}
