@@ -254,6 +254,7 @@ def seen_and_pushed():
     return np.array(see), np.array([*push, *push])
 
 
+@pytest.mark.slow
 def test_neglected_modes_are_bounded_by_their_weights():
     """The difference between all DOFs and the reduced model, by dense solves, from 0 Hz up."""
     fit, unknowns = fitted()
@@ -300,6 +301,7 @@ def test_neglected_modes_are_bounded_by_their_weights():
                          uncertain.lft({"mode6:freq": 0.3}).system)  # fmt: skip
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [6, 12])
 def test_the_bound_on_neglected_modes_is_tight(count):
     """At 0.1 % damping, from 0 Hz: median of bound over difference, by modes written apart."""
