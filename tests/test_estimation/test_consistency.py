@@ -50,6 +50,7 @@ def judged(design, truth, **options):
     return consistency(observer, observer.estimate(records), truth=motions)
 
 
+@pytest.mark.slow
 def test_a_right_model_passes_as_often_as_stated():
     """One state, 200 records of 1000 samples at 95 %: the share is binomial."""
     design = one_state(0.9)

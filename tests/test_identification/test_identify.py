@@ -50,6 +50,7 @@ def z_scores(found, truth):
     return np.concatenate([error.real / found.std.real, error.imag / found.std.imag])
 
 
+@pytest.mark.slow
 def test_close_and_repeated_modes_with_rigid_body_motion():
     freq = np.arange(30.0, 180.0, 0.2)
     frf = measured(freq=freq)
@@ -266,6 +267,7 @@ def test_without_variance_doubt_comes_from_what_is_left():
     assert np.abs(z_scores(found, known.poles)).max() < 4.0
 
 
+@pytest.mark.slow
 def test_fewer_outputs_than_inputs():
     frf = measured(n_in=3).select(outputs=["y1", "y2"])
     found = identify_modes(frf, orders=ORDERS)

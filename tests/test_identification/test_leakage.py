@@ -125,6 +125,7 @@ def test_fits_over_hann_lines_claim_what_they_are_off_by():
     assert np.mean(misfits) == pytest.approx(1.0, abs=0.03)
 
 
+@pytest.mark.slow
 def test_segments_too_short_for_the_damping_are_warned_of():
     """0.05 % in segments of 2 s gave twice as many modes, of several times the damping."""
     rate, freqs = 1000.0, np.array([40.0, 85.0, 130.0, 190.0, 240.0])

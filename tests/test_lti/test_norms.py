@@ -88,6 +88,7 @@ def test_machine_with_many_channels_equals_a_search(blocks, zeta, sampled):
     assert found == pytest.approx(truth, rel=1e-8, abs=0)
 
 
+@pytest.mark.slow
 @given(st.integers(0, 10_000))
 def test_random_systems(seed):
     rng = np.random.default_rng(seed)

@@ -458,6 +458,7 @@ def test_hinf_and_neglected_modes_of_a_dragged_plate():
     assert found.gamma < 3
 
 
+@pytest.mark.slow
 def test_a_free_plate_of_all_dofs_on_a_strong_damper():
     # 486 states in metres and newtons; oracle: dense solves
     bare = full(0.001)

@@ -101,6 +101,7 @@ study([({folder!r}, i) for i in range(40)], counted, checkpoint={path!r})
 """
 
 
+@pytest.mark.slow
 def test_killed_and_resumed_nothing_is_lost_or_done_twice(tmp_path):
     path = tmp_path / "rows.jsonl"
     code = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(tmp_path), path=str(path))

@@ -60,6 +60,7 @@ def dense_loop(P, K):
     return closed_loop(split(P.A, P.B, P.C, P.D, len(K.outputs), len(K.inputs)), K.A, K.B, K.C, K.D)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [1, None], ids=["sampled", "continuous"])
 def test_the_stage_keeps_its_claim(delay):
     """Dense interconnection, eigenvalues, a brute sweep: gamma is the norm, 5 % above `lower`."""
@@ -82,6 +83,7 @@ def test_doing_nothing_is_twice_as_bad():
     assert stability(problem.system.A, problem.dt) > -1e-9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("on", ["model", "machine"])
 def test_the_asked_bandwidth_is_reached_on_model_and_machine(on):
     """|S| < 1 from die:ref to die:error up to 30 Hz, and stable, with the true dynamics too."""
@@ -117,6 +119,7 @@ def test_one_flipped_sign_is_refused(side, channel):
         certified_norm(problem.system, K, found.gamma)
 
 
+@pytest.mark.slow
 def test_delay_costs():
     """The same weights with five samples of delay cannot be met as well."""
     slow = stage(5)[3]
@@ -159,6 +162,7 @@ def test_nanometres_and_milliseconds_make_no_difference():
         assert np.linalg.norm(first - second) < 1e-5 * np.linalg.norm(first)
 
 
+@pytest.mark.slow
 def test_accelerometers_feed_through():
     """D22 is not zero: the loop of the restored controller is the one that was designed."""
     y = [Sensor(f"y{i}", at=p, asd=NOISE) for i, p in enumerate(CORNERS, 1)]

@@ -86,6 +86,7 @@ def test_sensitivity_against_a_zero_and_a_pole(zero, pole, over):
     assert found.gamma <= 1.002 * found.lower
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("zero", "pole"), [(2.0, -1.0), (3.0, 1.0)])
 def test_without_cost_of_the_effort_at_high_frequency(zero, pole):
     """The infimum is that of the plant without lag, and no controller attains it."""

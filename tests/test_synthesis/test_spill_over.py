@@ -117,6 +117,7 @@ def test_the_named_modes_are_the_cause():
         assert freq == pytest.approx(many().freq[number - 1], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_default_weights_are_stable_with_the_modes_left_out():
     errors, _, found, messages = design(80.0, ())
     assert not messages and found.left_out.is_stable and not found.left_out.modes
@@ -151,6 +152,7 @@ def test_one_flipped_sign_fails_the_check():
         assert not checked.is_stable and checked.modulus_margin == 0.0
 
 
+@pytest.mark.slow
 def test_the_reduced_model_knows_its_modes_by_itself():
     """`solve_modes` found 60 modes, the reduction kept 21: nothing need be given."""
     spots = [(x, y, 0.0) for y in np.linspace(0, L, 5) for x in np.linspace(0, L, 5)]

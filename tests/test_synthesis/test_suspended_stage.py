@@ -67,6 +67,7 @@ def newton(die):
     return np.array(columns).T
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("model", MODELS)
 def test_the_rigid_gain_is_newtons_law_free_partly_and_wholly_suspended(model):
     line = springs(points=[(L / 2, y, 0.0) for y in (0.1, 0.5)])
