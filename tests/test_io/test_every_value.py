@@ -118,6 +118,7 @@ def made():
     )
     disc = structure.Disc((0.1, 0.1), 0.05)
     yield from (placement.Excluded(disc), placement.Within(disc, at_most=1), placement.OffPoi(0.1))
+    yield from (placement.ModalObservability("trace"), placement.ModalControllability())
     yield from (placement.MinimumDistance(0.1), placement.Mirrored("x", 0.3))
     yield from (placement.Together([("a", "b")]), placement.Budget(3.0, {"a": 2.0}))
     yield from (placement.Exhaustive(), placement.PoiLqr("die"), placement.PoiVariance("die"))

@@ -13,6 +13,8 @@ from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
 from .exchange import Exchange as Exchange
 from .exhaustive import Exhaustive as Exhaustive
+from .gramian import ModalControllability as ModalControllability
+from .gramian import ModalObservability as ModalObservability
 from .poi_lqr import PoiLqr as PoiLqr
 from .poi_variance import PoiVariance as PoiVariance
 from .problem import Found as Found
