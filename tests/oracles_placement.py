@@ -3,7 +3,6 @@
 from itertools import combinations
 
 import numpy as np
-import scipy.linalg as la
 
 
 def kalman_variance(A, C, Q, R, rows, *, steps=6000):
@@ -48,8 +47,8 @@ def lqr_cost(A, B, W, rows, effort, *, steps=6000):
     return found
 
 
-def riccati_by_scipy(A, B, Q, R, scale=None):
-    """X of ``X = A'XA + Q - A'XB (R + B'XB)^-1 B'XA`` by SciPy, in states of about unit X."""
+def stationary_riccati(A, B, Q, R, scale=None):
+    """X of ``X = A'XA + Q - A'XB (R + B'XB)^-1 B'XA`` by doubling, in states of about unit X."""
     if scale is None:
         scale, X = np.ones(len(A)), Q
         for _ in range(300):
@@ -59,9 +58,15 @@ def riccati_by_scipy(A, B, Q, R, scale=None):
         scale = np.sqrt(np.diag(X))
     size = np.sqrt(np.diag(R))
     As, Bs, Qs = A * scale[:, None] / scale, B * scale[:, None] / size, Q / scale / scale[:, None]
-    X = la.solve_discrete_are(As, Bs, Qs, np.eye(size.size))
+    # 2^k steps of the recursion at once: what SciPy's solver returns need not be stabilising here
+    F, S, X = As, Bs @ Bs.T, Qs
+    for _ in range(40):
+        W = np.linalg.inv(np.eye(len(A)) + S @ X)
+        F, S, X = F @ W @ F, S + F @ W @ S @ F.T, X + F.T @ X @ W @ F
+        S, X = 0.5 * (S + S.T), 0.5 * (X + X.T)
     G = np.linalg.solve(Bs.T @ X @ Bs + np.eye(size.size), Bs.T @ X @ As)
     assert np.linalg.norm(As.T @ X @ (As - Bs @ G) + Qs - X) < 1e-7 * np.linalg.norm(X)
+    assert np.max(np.abs(np.linalg.eigvals(As - Bs @ G))) < 1
     return X * scale * scale[:, None]
 
 
