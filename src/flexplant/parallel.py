@@ -7,6 +7,7 @@ and linear algebra runs on one thread while items are computed (its rounding dep
 from __future__ import annotations
 
 import sys
+import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future
 from contextlib import contextmanager
@@ -37,15 +38,36 @@ def _controller() -> Any:
     return ThreadpoolController()
 
 
+#: how deep a thread is in `one_thread`; how many threads are in it, and what they found before
+_depth = threading.local()
+_lock, _inside = threading.Lock(), 0
+_original: Any = None
+
+
 @contextmanager
 def one_thread() -> Iterator[None]:
     """Return a context, also a decorator, in which BLAS runs on one thread.
 
     For loops over small matrices: more threads wait for each other, 3 to 30 times as long on a busy
-    machine.
+    machine. Inside another one it costs nothing; the last of several threads restores what was.
     """
-    with _controller().limit(limits=1, user_api="blas"):
+    global _inside, _original
+    if getattr(_depth, "value", 0):
         yield
+        return
+    with _lock:  # the number of threads may belong to each thread, or to all
+        limited = _controller().limit(limits=1, user_api="blas")
+        _original = limited if _inside == 0 else _original
+        _inside += 1
+    _depth.value = 1
+    try:
+        yield
+    finally:
+        _depth.value = 0
+        with _lock:
+            _inside -= 1
+            if _inside == 0:
+                _original.restore_original_limits()
 
 
 class Progress:

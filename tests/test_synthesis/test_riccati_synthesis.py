@@ -468,3 +468,19 @@ def test_delays_of_a_sampled_plant():
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ModelError):
         Riccati(**wrong)
+
+
+@pytest.mark.parametrize("missing", ["w", "z"])
+def test_a_missing_channel_is_named(missing):
+    P, u, y = scalar(1.0)
+    P = P.select(inputs=["u1"]) if missing == "w" else P.select(outputs=["y1"])
+    with pytest.raises(AssumptionError, match=rf"a plant without {missing} \(.*\)\. Add a channel"):
+        design_hinf(P, u=u, y=y)
+
+
+def test_progress_shows_the_steps_of_the_bisection(capsys):
+    P, u, y = scalar(1.0)
+    design_hinf(P, u=u, y=y, progress=True)
+    assert "steps of the bisection" in capsys.readouterr().err
+    design_hinf(P, Riccati(), u=u, y=y, progress=False)
+    assert not capsys.readouterr().err

@@ -36,6 +36,7 @@ def design_hinf(
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
     larger: Any = None,
+    progress: bool | None = None,
 ) -> Controller:
     """Return a controller ``u = K y`` that keeps the H-infinity norm of w -> z small.
 
@@ -48,7 +49,7 @@ def design_hinf(
     plant : StandardPlant
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
         serves too: by the names of its channels, or with u and y named.
-    method : Riccati or Lmi, optional
+    method : Riccati, StructuredLmi or Lmi, optional
         Unless given `Riccati()`, which adds a little noise and effort where D12 or D21 is
         singular, and `StructuredLmi()` for small problems on which it fails. `StructuredLmi()`
         needs none of it, up to some 60 states; `Lmi()` is its readable form for less than 30.
@@ -58,6 +59,9 @@ def design_hinf(
         A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
         there too, sampled and delayed alike. Unless given, with those that the plant's reduced
         model still has.
+    progress : bool, optional
+        True shows a bar of the method's steps at once, False never; None after two seconds on a
+        terminal. `Lmi()` shows none.
 
     Returns
     -------
@@ -100,13 +104,12 @@ def design_hinf(
             f"method must be Riccati(...), StructuredLmi(...) or Lmi(...), got {short(method)}. "
             "Pass one, or none."
         )
-    if not plant.w or not plant.z or not plant.u or not plant.y:
-        raise AssumptionError(f"H-infinity synthesis needs channels w, z, u and y, got {plant!r}.")
+    _require_channels(plant)
     if plant.is_assembled:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
     try:
-        method, found, controller, certificate = _certified(plant, problem, method)
+        method, found, controller, certificate = _certified(plant, problem, method, progress)
     except (AssumptionError, SolverError, CertificateError) as error:
         raise _blamed(problem, error) from error
     reached = reached_norms(plant, controller)
@@ -125,14 +128,39 @@ def design_hinf(
     )
 
 
+def _require_channels(plant: StandardPlant) -> None:
+    """Raise AssumptionError when there is no w, z, u or y."""
+    roles = {
+        "w": "disturbance or noise",
+        "z": "output to be kept small",
+        "u": "actuator",
+        "y": "sensor",
+    }
+    for name, role in roles.items():
+        if not getattr(plant, name):
+            others = ", ".join(f"{len(getattr(plant, one))} {one}" for one in roles if one != name)
+            raise AssumptionError(
+                f"H-infinity synthesis needs channels w, z, u and y, got a plant without {name} "
+                f"({others}). Add a channel {name} ({role})."
+            )
+
+
 def _certified(
-    plant: StandardPlant, problem: Prepared, method: SynthesisMethod | None
+    plant: StandardPlant,
+    problem: Prepared,
+    method: SynthesisMethod | None,
+    progress: bool | None,
 ) -> tuple[SynthesisMethod, SolvedController, StateSpace, dict[str, float]]:
     """Return the method, its answer, the controller and what was verified of its loop."""
     _require_reach(problem)
     if plant.is_assembled:  # whatever a method makes of it: this motion would drift
         require_shown(problem)
-    method, found = _solved(problem) if method is None else (method, method.solve(problem))
+    if method is None:
+        method, found = _solved(problem, progress)
+    else:
+        if progress is not None and isinstance(method, (Riccati, StructuredLmi)):
+            method = method.replace(progress=progress)
+        found = method.solve(problem)
     controller = problem.restored(found.A, found.B, found.C, found.D).replace(
         name="hinf", units=plant.units
     )
@@ -151,18 +179,18 @@ def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
     )
 
 
-def _solved(problem: Prepared) -> tuple[SynthesisMethod, SolvedController]:
+def _solved(problem: Prepared, progress: bool | None) -> tuple[SynthesisMethod, SolvedController]:
     """Return the answer by Riccati equations, of a small problem that they fail on by LMIs."""
-    first: SynthesisMethod = Riccati()
+    first: SynthesisMethod = Riccati(progress=progress)
     try:
         return first, first.solve(problem)
     except SolverError as error:
         if problem.A.shape[0] > _SMALL:
             raise
-        second = StructuredLmi()
+        second = StructuredLmi(progress=progress)
         try:
             return second, second.solve(problem)
-        except SolverError:
+        except FlexplantError:
             raise error from None
 
 

@@ -61,22 +61,29 @@ def pointwise_bound(problem: Prepared) -> float:
     grid = grid[np.all(apart > _UNDAMPED * (1.0 + np.abs(undamped.imag)), axis=1)]
 
     def bounds(freq: FloatArray) -> FloatArray:
-        P = np.moveaxis(responses(system, freq), 2, 0)
-        return np.array([_parrott(one, m1, p1) for one in P])
+        return _parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
 
     _, values = climbed(bounds, grid, _REFINEMENTS)
-    return max(float(np.max(values)), _parrott(np.asarray(system.D, complex), m1, p1))
+    return max(float(np.max(values)), float(_parrott(system.D[None], m1, p1)[0]))
 
 
-def _parrott(P: ComplexArray, m1: int, p1: int) -> float:
-    Pzw = P[:p1, :m1]
-    parts = (_left_null(P[:p1, m1:]).conj().T @ Pzw, Pzw @ _left_null(P[p1:, :m1].conj().T))
-    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
+def _parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:
+    """Return the bound of each of a stack of responses (n_freq, p, m)."""
+    Pzw = P[:, :p1, :m1]
+    parts = (_beyond(P[:, :p1, m1:], Pzw), _beyond(_adjoint(P[:, p1:, :m1]), _adjoint(Pzw)))
+    return np.maximum(*parts)
 
 
-def _left_null(M: ComplexArray) -> ComplexArray:
-    """Return an orthonormal basis of what is perpendicular to the columns of M.
+def _beyond(M: ComplexArray | FloatArray, Pzw: ComplexArray | FloatArray) -> FloatArray:
+    """Return the norms of Pzw on what is perpendicular to the columns of M.
 
     Its dimension is that of M of full rank: more would hang on rounding.
     """
-    return np.linalg.svd(M)[0][:, M.shape[1] :]
+    if M.shape[1] <= M.shape[2]:
+        return np.zeros(M.shape[0])
+    part = _adjoint(np.linalg.svd(M)[0][:, :, M.shape[2] :]) @ Pzw
+    return np.asarray(np.linalg.norm(part, 2, axis=(1, 2)))
+
+
+def _adjoint(M: ComplexArray | FloatArray) -> ComplexArray:
+    return np.asarray(M.conj().swapaxes(1, 2), dtype=np.complex128)

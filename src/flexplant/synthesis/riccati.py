@@ -14,6 +14,7 @@ from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
+from ..parallel import Progress
 from ..values import FloatArray, Value, positive
 from .central import OnAxisError, central, quadratic, riccati_solutions
 from .method import SolvedController
@@ -50,6 +51,9 @@ class Riccati(Value):
         Relative distance from the smallest gamma found.
     tolerance : float
         Relative width at which the bisection stops.
+    progress : bool, optional
+        True shows a bar of the bisection at once, False never; None after two seconds on a
+        terminal.
 
     Raises
     ------
@@ -59,6 +63,7 @@ class Riccati(Value):
 
     back_off: float = 0.05
     tolerance: float = 1e-3
+    progress: bool | None = None
 
     def __post_init__(self) -> None:
         self._set(
@@ -103,7 +108,8 @@ class Riccati(Value):
         if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
             return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)
         scaled = problem.measured_in(unit)
-        high, low = self._searched(scaled)
+        with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
+            high, low = self._searched(scaled, bar)
         controller, norm = self._accepted(scaled, high)
         if controller is None:  # nothing below it holds
             controller = least.replace(C=least.C / unit)
@@ -118,7 +124,7 @@ class Riccati(Value):
             unit * min(low, norm),
         )
 
-    def _searched(self, problem: Prepared) -> tuple[float, float]:
+    def _searched(self, problem: Prepared, bar: Progress) -> tuple[float, float]:
         """Return the smallest gamma that bisection reached from 1, and the largest refuted one."""
         high = 1.0
         low = tried = min(_direct_bound(problem), high)
@@ -127,6 +133,7 @@ class Riccati(Value):
                 break
             middle = float(np.sqrt(max(tried, 1e-2 * high) * high))
             attempt = _attempt(problem, middle)
+            bar.advance()
             K = attempt.controller
             if K is not None and _seen(problem, K) <= middle * (1.0 + _SLACK):
                 high = middle

@@ -25,6 +25,8 @@ _LEVELS = (1e-4, 1e-5, 1e-6, 1e-7)
 _LAST = 1e-3
 #: relative: what a level may cost in gamma, compared with a tenth of it
 _COST = 2e-3
+#: relative: a smaller gamma that is the same
+_SAME = 1e-6
 #: gamma falls by so much from level to level where its infimum is zero
 _FALL = 0.5
 #: a fastest pole that grows so much when the level is a tenth has no limit
@@ -196,9 +198,13 @@ def _with_notes(
         "effort of each actuator, relative to the plant's own channels, and verified without them"
     )
     if finer is not one:
-        note += f"; a tenth of it gives a gamma {100 * cost:.2g} % smaller"
+        note += (
+            f"; a tenth of it gives a gamma {100 * cost:.2g} % smaller"
+            if cost > _SAME
+            else "; a tenth of it gives no smaller gamma"
+        )
     notes = [note + "."]
-    if finer is not one and finer.speed > _GROWTH * one.speed:
+    if cost > _SAME and finer.speed > _GROWTH * one.speed:
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "

@@ -131,7 +131,9 @@ class StructuredLmi(Value):
             As for `solve`.
         """
         n = problem.A.shape[0]
-        if not 0 < n <= self.max_states:
+        if not n:
+            raise ModelError("StructuredLmi needs states, got a static plant. Use Riccati().")
+        if n > self.max_states:
             raise ModelError(
                 f"StructuredLmi takes plants of 1 to {self.max_states} states, got {n}: time "
                 "grows as n^6. Reduce the order first, use Riccati(), or raise max_states."
@@ -159,9 +161,9 @@ class StructuredLmi(Value):
             raise failures[0]
         if found.value < _NOTHING * guess:
             raise InfeasibleError(
-                f"there is no smallest gamma: {found.value:.3g} is reached, where the plant's own "
-                f"size is {guess:.3g}. u cancels w in z, at no cost. Weight the efforts in z, or "
-                "give the sensors noise in w."
+                f"there is no smallest gamma: the infimum is 0. {found.value:.3g} is reached, "
+                f"where the plant's own size is {guess:.3g}. u cancels w in z, at no cost. Weight "
+                "the efforts in z, or give the sensors noise in w."
             )
         return found
 
