@@ -112,7 +112,9 @@ from .synthesis import Riccati as Riccati
 from .synthesis import StructuredLmi as StructuredLmi
 from .synthesis import design_h2 as design_h2
 from .synthesis import design_hinf as design_hinf
+from .synthesis import design_ncf as design_ncf
 from .synthesis import design_servo as design_servo
+from .synthesis import ncf_margin as ncf_margin
 from .synthesis import servo_bandwidth as servo_bandwidth
 from .updating import AddedDamping as AddedDamping
 from .updating import AddedMass as AddedMass

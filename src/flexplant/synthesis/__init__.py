@@ -4,6 +4,8 @@ from .controller import Controller as Controller
 from .h2 import design_h2 as design_h2
 from .hinf import design_hinf as design_hinf
 from .lmi import Lmi as Lmi
+from .ncf import design_ncf as design_ncf
+from .ncf import ncf_margin as ncf_margin
 from .riccati import Riccati as Riccati
 from .servo import design_servo as design_servo
 from .servo import servo_bandwidth as servo_bandwidth

@@ -1,0 +1,284 @@
+"""design_ncf: loop shaping, then robust against errors of the normalised coprime factors."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..loop import modulus_margin
+from ..lti.discretisation import bilinear, tustin
+from ..lti.frequency import frequency_response
+from ..lti.hankel import hankel_norm
+from ..lti.interconnection import lft, series
+from ..lti.minimal import minimal
+from ..lti.norms import peak_gain
+from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
+from ..lti.statespace import StateSpace, System, as_statespace
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..values import FloatArray, positive
+from .controller import Controller
+from .spill_over import spill_over, unchecked
+
+#: corner of the integral action of the recipe, beside the bandwidth
+_INTEGRAL = 0.1
+#: claim and margin, and the smallest gamma by two computations, agree to this
+AGREEMENT = 1e-4
+
+
+@one_thread()
+def design_ncf(
+    plant: StandardPlant | System,
+    *,
+    before: System | FloatArray | None = None,
+    after: System | FloatArray | None = None,
+    bandwidth: float | None = None,
+    back_off: float = 0.1,
+    larger: Any = None,
+) -> Controller:
+    """Return the loop-shaping controller of Glover and McFarlane, ``u = K y``.
+
+    The shaped plant ``G_s = after G before`` = N / M (normalised left coprime factors) is
+    stabilised together with all ``(N + dN) / (M + dM)``, ``|[dN, dM]| < 1 / gamma``::
+
+        gamma_min = (1 + lambda_max(X Z))^(1/2),   gamma = (1 + back_off) gamma_min
+
+    with X and Z of the two Riccati equations of G_s: no search. ``K = before K_s after``. A
+    sampled plant is mapped to continuous time and the controller back, which keeps gains and
+    factors. Rigid-body modes and integrators are allowed in the plant and in `before` and `after`.
+
+    Parameters
+    ----------
+    plant : StandardPlant or StateSpace
+        Its u -> y; a StateSpace is taken as it is.
+    before, after : StateSpace or array, optional
+        Shaping at u and at y, of the plant's sampling time: what gives the loop its slope, and
+        transformations to decoupled axes (`decouple`: accelerations and to_motions).
+    bandwidth : float [Hz], optional
+        Recipe: each channel of the square ``after G before`` is multiplied further by
+        ``k (1 + w / (10 s))``, w = 2 pi bandwidth, with gain 1 at the bandwidth.
+    back_off : float
+        Relative distance from gamma_min, at which K_s is singular.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+
+    Returns
+    -------
+    Controller
+        `gamma` is the verified norm, `lower` gamma_min; the certificate holds the margin 1 / gamma
+        of the shaped plant, gamma_min from the Hankel norm of the factors, and the modulus margin
+        of the loop at u. A gamma below 4 is called robust.
+
+    Raises
+    ------
+    AssumptionError
+        When an undamped or unstable mode is not reached or seen, or hidden by the shaping.
+    CertificateError
+        When the closed loop does not keep the promise.
+    ModelError, ShapeError
+        When plant, shaping and bandwidth do not go together.
+
+    References
+    ----------
+    McFarlane, Glover, A loop-shaping design procedure using H-infinity synthesis, IEEE Trans.
+    Automatic Control 37, 1992.
+    """
+    G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
+    back_off = positive(back_off, "back_off")
+    first = as_statespace(np.eye(len(G.inputs)) if before is None else before)
+    last = as_statespace(np.eye(len(G.outputs)) if after is None else after)
+    first, last = (s if s.n_states else s.replace(dt=G.dt) for s in (first, last))
+    if (len(first.outputs), len(last.inputs)) != (len(G.inputs), len(G.outputs)):
+        raise ModelError(
+            f"before has {len(first.outputs)} outputs for {len(G.inputs)} u, after "
+            f"{len(last.inputs)} inputs for {len(G.outputs)} y: pass systems or matrices that fit."
+        )
+    shaped = series(series(first, G), last)
+    if bandwidth is not None:
+        weight = _integral_action(shaped, positive(bandwidth, "bandwidth"))
+        first, shaped = series(weight, first), series(weight, shaped)
+    part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
+    K, gamma, least = _robust(part, back_off)
+    margin, stability = _margin(shaped, K)
+    other = _least_by_factors(part)
+    whole = series(series(last, K), first).replace(
+        inputs=G.outputs, outputs=G.inputs, name="ncf", units=G.units
+    )
+    if not margin or not _margin(G, whole)[0]:
+        raise AssumptionError(
+            "a mode that is undamped, integrating or unstable is not reached by u, not seen in y, "
+            "or hidden by the shaping (a zero of `before` or `after` on its pole, or an integrator "
+            "on a zero of the plant): the loop is not stable. Move that zero, or add an actuator "
+            "or a sensor."
+        )
+    if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
+        raise CertificateError(
+            f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
+            f"claimed, the smallest gamma is {least:.6g} by the Riccati equations and {other:.6g} "
+            "by the Hankel norm of the factors: the shaped plant is too badly conditioned to "
+            "trust. Bring its gains at u and y to size 1, and leave out states that are hardly "
+            "reached or seen."
+        )
+    left_out = spill_over(plant, [whole], larger) if isinstance(plant, StandardPlant) else None
+    lacking = unchecked(plant) if isinstance(plant, StandardPlant) and left_out is None else ()
+    return Controller(
+        whole,
+        "loop shaping by normalised coprime factors",
+        gamma=1.0 / margin,
+        lower=least,
+        certificate={
+            "margin": margin,
+            "smallest gamma by the Hankel norm": other,
+            "stability": stability,
+            "modulus margin": modulus_margin((G, whole)),
+        }
+        | (left_out.certificate if left_out is not None else {}),
+        left_out=left_out,
+        notes=lacking,
+    )
+
+
+def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -> float:
+    """Return the margin of a loop u = K y against errors of normalised coprime factors.
+
+    ``b = 1 / | [K; I] (I - G K)^-1 [I, G] |``, between 0 (unstable) and
+    ``(1 + lambda_max(X Z))^(-1/2)`` of the plant. It depends on the units of u and y: scale both
+    sides so that signals are of size 1, or give the shaped plant and its controller.
+
+    Parameters
+    ----------
+    plant : StandardPlant or StateSpace
+        Its u -> y.
+    controller : Controller or StateSpace
+        From y to u, channels in the plant's order.
+
+    Returns
+    -------
+    float
+        0.2 to 0.3 and more is called robust.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When the two do not go together.
+    """
+    G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
+    return _margin(G, as_statespace(controller))[0]
+
+
+def _margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
+    """Return 1 / the norm of the loop, 0 when unstable, and its stability."""
+    p, m = len(G.outputs), len(G.inputs)
+    if (len(K.inputs), len(K.outputs)) != (p, m):
+        raise ModelError(
+            f"the controller has {len(K.inputs)} inputs and {len(K.outputs)} outputs, the plant "
+            f"{p} y and {m} u: pass the K of u = K y for this plant."
+        )
+    n = G.n_states
+    I_p, I_m = np.eye(p), np.eye(m)
+    # [noise at y, force at u, u] -> [u, y, y], y = G (u + force) + noise
+    P = StateSpace(
+        G.A,
+        np.hstack([np.zeros((n, p)), G.B, G.B]),
+        np.vstack([np.zeros((m, n)), G.C, G.C]),
+        np.block(
+            [
+                [np.zeros((m, p)), np.zeros((m, m)), I_m],
+                [I_p, G.D, G.D],
+                [I_p, G.D, G.D],
+            ]
+        ),
+        inputs=[*(f"n{i}" for i in range(p)), *(f"d{i}" for i in range(m)), *_names("u", m)],
+        outputs=[*(f"zu{i}" for i in range(m)), *(f"zy{i}" for i in range(p)), *_names("y", p)],
+        dt=G.dt,
+    )
+    loop = lft(P, K.replace(inputs=_names("y", p), outputs=_names("u", m), units={}))
+    poles = loop.poles()
+    growth = np.abs(poles) if loop.dt else poles.real
+    stability = float(np.max(growth, initial=0.0 if loop.dt else -np.inf))
+    if not stability < (1.0 if loop.dt else 0.0):
+        return 0.0, stability
+    return 1.0 / peak_gain(loop)[0], stability
+
+
+def _names(letter: str, count: int) -> list[str]:
+    return [f"{letter}{i}" for i in range(count)]
+
+
+def _continuous(shaped: StateSpace) -> StateSpace:
+    return bilinear(shaped, 1.0 / shaped.dt) if shaped.dt else shaped
+
+
+def _solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
+    """Return X and Z of the Riccati equations of control and filtering (the bilinear map's too)."""
+    control, estimate = (control_dare, solve_dare) if g.dt else (control_care, solve_care)
+    R, S = np.eye(len(g.outputs)) + g.D @ g.D.T, np.eye(len(g.inputs)) + g.D.T @ g.D
+    try:
+        X = control(g.A, g.B, Q=g.C.T @ g.C, R=S, S=g.C.T @ g.D).P
+        Z = estimate(g.A, g.C, Q=g.B @ g.B.T, R=R, S=g.B @ g.D.T).P
+    except SolverError as error:
+        raise AssumptionError(
+            f"no normalised coprime factors of the shaped plant were found: {error}"
+        ) from error
+    return X, Z
+
+
+def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, float]:
+    """Return the controller of the shaped plant, its gamma, and the smallest gamma."""
+    X, Z = _solutions(shaped)
+    g = _continuous(shaped)
+    least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
+    gamma = (1.0 + back_off) * least
+    S = np.eye(len(g.inputs)) + g.D.T @ g.D
+    F = -np.linalg.solve(S, g.D.T @ g.C + g.B.T @ X)
+    L = (1.0 - gamma**2) * np.eye(g.n_states) + X @ Z
+    gain = gamma**2 * np.linalg.solve(L.T, Z @ g.C.T)
+    K = StateSpace(g.A + g.B @ F + gain @ (g.C + g.D @ F), gain, g.B.T @ X, -g.D.T)
+    return (tustin(K, 1.0 / shaped.dt) if shaped.dt else K), gamma, least
+
+
+def _integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
+    """Return ``k_i (1 + w / (10 s))`` for each channel, of gain 1 with the plant's at bandwidth.
+
+    Raises
+    ------
+    ModelError
+        When the shaped plant is not square, or has no gain there.
+    """
+    count = len(shaped.inputs)
+    if len(shaped.outputs) != count or (shaped.dt and bandwidth >= 0.5 / shaped.dt):
+        raise ModelError(
+            f"bandwidth needs as many y as u (got {len(shaped.outputs)} and {count}) and to lie "
+            f"below half the rate, got {bandwidth:g} Hz: pass before= and after= that decouple."
+        )
+    gains = np.abs(frequency_response(shaped, np.array([bandwidth])).data[:, :, 0].diagonal())
+    if not np.all(gains > 0):
+        raise ModelError(
+            f"channel {int(np.argmin(gains)) + 1} of the shaped plant has no gain at "
+            f"{bandwidth:g} Hz, so that no gain gives it that bandwidth. Pair u and y that act on "
+            "each other by before= and after=."
+        )
+    omega = 2.0 * np.pi * bandwidth
+    k = np.diag(1.0 / gains / np.hypot(1.0, _INTEGRAL))
+    action = StateSpace(np.zeros((count, count)), np.eye(count), _INTEGRAL * omega * k, k)
+    return tustin(action, 1.0 / shaped.dt) if shaped.dt else action
+
+
+def _least_by_factors(shaped: StateSpace) -> float:
+    """Return ``(1 - |[N, M]|_H^2)^(-1/2)``, the smallest gamma by a Hankel norm."""
+    _, Z = _solutions(shaped)
+    g = _continuous(shaped)
+    R = np.eye(len(g.outputs)) + g.D @ g.D.T
+    H = -np.linalg.solve(R, (g.B @ g.D.T + Z @ g.C.T).T).T
+    values, vectors = np.linalg.eigh(R)
+    root = (vectors / np.sqrt(values)) @ vectors.T
+    factors = StateSpace(
+        g.A + H @ g.C,
+        np.hstack([g.B + H @ g.D, H]),
+        root @ g.C,
+        root @ np.hstack([g.D, np.eye(R.shape[0])]),
+    )
+    size = hankel_norm(factors)
+    return float(1.0 / np.sqrt(max(1.0 - size**2, 1e-300)))
