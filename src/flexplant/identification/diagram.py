@@ -136,8 +136,9 @@ class StabilisationDiagram(Value):
             if stable >= max(4, presence * span):
                 kept.append(int(track))
         if not kept:
+            where = f"over the orders {known[0]} to {known[-1]}" if known.size else "in the band"
             raise SolverError(
-                f"no pole stays over the orders {known.min()} to {known.max()}: raise the orders, "
+                f"no pole stays {where}: raise the orders, "
                 "narrow the band to where resonances stand out of the noise, or pick poles by hand "
                 "with diagram.select(freq=[...])."
             )
