@@ -75,11 +75,9 @@ def poles(frf: fx.Frf) -> tuple[fx.identification.IdentifiedModes, fx.MeasuredMo
 # %% Where is the mass? Stiffness and damping are wrong everywhere: found anew with every place
 def response(frf: fx.Frf, lines: Any, outputs: list[str]) -> fx.FrfResidual:
     """Return what compares lines of the sampled machine with a model behind the same hold."""
-    where = {**{name: SENSORS[name] for name in outputs}, **ACTUATORS}
-    used = frf.select(outputs=outputs)
-    # the spread of few runs is itself uncertain: the mean of sigma^2 / s^2 is (R - 1) / (R - 2)
-    sure = used.variance * (RUNS - 1) / (RUNS - 2)
-    return fx.FrfResidual(used, lines=lines, places=where, hold=RATE, variance=sure)
+    used, where = frf.select(outputs=outputs), {name: SENSORS[name] for name in outputs}
+    noise = used.variance * (RUNS - 1) / (RUNS - 2)  # the mean of sigma^2 / s^2 of few runs
+    return fx.FrfResidual(used, lines=lines, places=where | ACTUATORS, hold=RATE, variance=noise)
 
 
 def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[Localisation, Localisation]:
