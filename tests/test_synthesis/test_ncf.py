@@ -55,8 +55,8 @@ def test_several_channels_with_feedthrough(dt):
     B, C, D = rng.normal(size=(4, 2)), rng.normal(size=(3, 4)), 0.5 * rng.normal(size=(3, 2))
     G = StateSpace(A, B, C, D, dt=dt)
     solve = la.solve_discrete_are if dt else la.solve_continuous_are
-    X = solve(A, B, C.T @ C, np.eye(2) + D.T @ D, s=C.T @ D)
-    Z = solve(A.T, C.T, B @ B.T, np.eye(3) + D @ D.T, s=B @ D.T)
+    X = solve(A, B, C.T @ C, np.eye(2) + D.T @ D, e=np.eye(4), s=C.T @ D)
+    Z = solve(A.T, C.T, B @ B.T, np.eye(3) + D @ D.T, e=np.eye(4), s=B @ D.T)
     least = np.sqrt(1.0 + np.max(la.eigvals(X @ Z).real))
     found = design_ncf(G)
     assert found.lower == pytest.approx(least, rel=1e-7)
