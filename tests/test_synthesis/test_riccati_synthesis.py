@@ -281,6 +281,7 @@ def turned(P, condition, seed=3, speed=1.0):
 
 
 @needs_data
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["AC4", "HE1", "TMD", "WEC1", "BDT1", "CM1", "JE3"])
 def test_coordinates_and_units_of_time_change_nothing(name):
     """0.1 % of gamma, or a message that blames the coordinates."""

@@ -111,7 +111,13 @@ def test_what_is_eliminated_solves_its_inequality(seed):
         _eliminated(np.eye(7), P, C)
 
 
-@pytest.mark.parametrize("name", known())
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[] if name in ("HE1", "TMD", "EB1") else [pytest.mark.slow])
+        for name in known()
+    ],
+)
 def test_compleib(name):
     """Of full rank or not: within 5 % of the best known, gap and bound as they are claimed."""
     P, u, y = compleib(name)
