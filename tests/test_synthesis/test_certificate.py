@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import CertificateError
-from flexplant.lti import StateSpace
+from flexplant.lti import StateSpace, lft
 from flexplant.synthesis import certificate
 from flexplant.synthesis.certificate import certified_norm, swept_norm
 from oracles_synthesis import brute_norm
@@ -31,7 +31,7 @@ def loop_parts(dt=0.0):
 @pytest.mark.parametrize(("dt", "norm", "edge"), [(0.0, 2.0, -0.5), (0.1, 1.25, 0.2)])
 def test_scalar_loops_are_certified_with_their_exact_norm(dt, norm, edge):
     """1 / (s + 1/2) peaks at 2; 1 / (z - 0.2) at 1 / 0.8."""
-    found = certified_norm(*loop_parts(dt), norm)
+    found = certified_norm(lft(*loop_parts(dt)), norm)
     assert found["norm"] == pytest.approx(norm, rel=1e-8)
     assert found["swept norm"] == pytest.approx(norm, rel=1e-6)
     assert found["stability"] == pytest.approx(edge)
@@ -41,34 +41,34 @@ def test_scalar_loops_are_certified_with_their_exact_norm(dt, norm, edge):
 def test_the_other_sign_is_refused(dt):
     P, K = loop_parts(dt)
     with pytest.raises(CertificateError, match=r"not stable.*sign"):
-        certified_norm(P, K.replace(D=-K.D), 10.0)
+        certified_norm(lft(P, K.replace(D=-K.D)), 10.0)
 
 
 def test_a_claim_below_the_norm_is_refused_and_one_within_a_thousandth_is_not():
     P, K = loop_parts()
     with pytest.raises(CertificateError, match=r"norm 2, but 1\.99 was claimed"):
-        certified_norm(P, K, 1.99)
-    assert certified_norm(P, K, 1.9985)["claim"] == 1.9985
+        certified_norm(lft(P, K), 1.99)
+    assert certified_norm(lft(P, K), 1.9985)["claim"] == 1.9985
 
 
 @pytest.mark.parametrize("wrong", [0.99, 1.01, float("nan")])
 def test_two_norms_that_disagree_are_refused(monkeypatch, wrong):
-    monkeypatch.setattr(certificate, "swept_norm", lambda loop: 2.0 * wrong)
+    monkeypatch.setattr(certificate, "swept_norm", lambda *_: 2.0 * wrong)
     with pytest.raises(CertificateError, match="two routes"):
-        certified_norm(*loop_parts(), 2.0)
+        certified_norm(lft(*loop_parts()), 2.0)
 
 
 def test_a_marginally_stable_loop_is_refused():
     P, K = loop_parts()
     with pytest.raises(CertificateError, match="not stable"):
-        certified_norm(P, K.replace(D=[[-0.5]]), 10.0)
+        certified_norm(lft(P, K.replace(D=[[-0.5]])), 10.0)
 
 
 def test_static_loops_have_the_norm_of_their_gain():
     P = StateSpace([], [], [], [[3.0, 1.0], [1.0, 0.0]], inputs=["w", "u"], outputs=["z", "y"])
     K = StateSpace([], [], [], [[-1.0]], inputs=["y"], outputs=["u"])
-    assert certified_norm(P, K, 2.0)["norm"] == pytest.approx(2.0)
-    sampled = certified_norm(P.replace(dt=0.1), K.replace(dt=0.1), 2.0)
+    assert certified_norm(lft(P, K), 2.0)["norm"] == pytest.approx(2.0)
+    sampled = certified_norm(lft(P.replace(dt=0.1), K.replace(dt=0.1)), 2.0)
     assert sampled["swept norm"] == pytest.approx(2.0)
 
 

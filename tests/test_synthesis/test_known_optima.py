@@ -10,7 +10,7 @@ import scipy.signal
 
 import oracles_synthesis as oracle
 from flexplant.errors import CertificateError
-from flexplant.lti import StateSpace
+from flexplant.lti import StateSpace, lft
 from flexplant.synthesis import Lmi, Riccati, StructuredLmi, design_hinf
 from flexplant.synthesis.certificate import certified_norm
 
@@ -56,7 +56,7 @@ def test_coprime_factors(name, method):
     for i in range(len(u)):
         sign = np.where(np.arange(len(u)) == i, -1.0, 1.0)[:, None]
         with pytest.raises(CertificateError):
-            certified_norm(P, K.replace(C=sign * K.C, D=sign * K.D), found.gamma)
+            certified_norm(lft(P, K.replace(C=sign * K.C, D=sign * K.D)), found.gamma)
 
 
 def test_the_double_integrator_by_hand():

@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flexplant.errors import CertificateError, InfeasibleError, ModelError, SolverError
-from flexplant.lti import StateSpace
+from flexplant.lti import StateSpace, lft
 from flexplant.lti.preparation import prepared
 from flexplant.store import load
 from flexplant.synthesis import lmi_programs
@@ -232,11 +232,11 @@ def test_flipped_sign_is_refused_by_the_certificate():
     P, u, y = system(scalar(1.0, 1.0))
     found = design_hinf(P, Lmi(), u=u, y=y)
     K = found.system
-    assert certified_norm(P, K, found.gamma)["norm"] == found.gamma
+    assert certified_norm(lft(P, K), found.gamma)["norm"] == found.gamma
     with pytest.raises(CertificateError, match="not stable"):
-        certified_norm(P, K.replace(C=-K.C, D=-K.D), found.gamma)
+        certified_norm(lft(P, K.replace(C=-K.C, D=-K.D)), found.gamma)
     with pytest.raises(CertificateError, match="was claimed"):
-        certified_norm(P, K, 0.9 * found.gamma)
+        certified_norm(lft(P, K), 0.9 * found.gamma)
 
 
 # --- the trap: `M >> 0` constrains only the symmetric part of M

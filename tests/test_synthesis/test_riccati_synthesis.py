@@ -17,7 +17,7 @@ from flexplant.errors import (
     ModelError,
     SolverError,
 )
-from flexplant.lti import StateSpace, tustin
+from flexplant.lti import StateSpace, lft, tustin
 from flexplant.lti.preparation import prepared
 from flexplant.synthesis import Lmi, Riccati, design_hinf
 from flexplant.synthesis.certificate import certified_norm
@@ -252,7 +252,7 @@ def test_compleib_with_full_rank(name):
         D = found.system.D.copy()
         D[i] *= -1
         with pytest.raises(CertificateError):
-            certified_norm(P, found.system.replace(C=flipped, D=D), found.gamma)
+            certified_norm(lft(P, found.system.replace(C=flipped, D=D)), found.gamma)
 
 
 @needs_data

@@ -7,12 +7,10 @@ from typing import TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-import scipy.linalg as la
 
 from ..errors import ModelError
 from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray, IntArray
-from .scaling import state_scale
 from .statespace import StateSpace
 
 #: entries of the largest intermediate array of a back substitution (complex): it stays in cache
@@ -317,17 +315,10 @@ def _substitution(
 
 
 def _schur(g: StateSpace) -> Solver:
-    """Any A: back substitution with the Schur form of the balanced A.
-
-    Balancing first: the orthogonal transformation mixes rounding with the norm of all of A, which
-    plain (q, dq/dt) states let grow with the square of the fastest mode.
-    """
-    d = state_scale(g.A, g.B, g.C)
-    A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
-    T, U = la.schur(A, output="complex")
-    n, m = B.shape
-
-    turned, seen = U.conj().T @ B, C @ U
+    """Any A: back substitution with the Schur form of A in even units."""
+    d, T, U = g.schur_form
+    n, m = g.B.shape
+    turned, seen = U.conj().T @ (g.B / d[:, None]), (g.C * d) @ U
 
     def add(s: ComplexArray, out: ComplexArray) -> None:
         X = np.broadcast_to(turned[:, :, None], (n, m, s.size)).copy()

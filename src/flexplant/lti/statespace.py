@@ -23,6 +23,7 @@ from ..values import (
     signal_names,
 )
 from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series, short_list
+from .scaling import state_scale
 
 if TYPE_CHECKING:
     import control
@@ -137,6 +138,18 @@ class StateSpace(Value):
         if self.blocks is None:
             return np.asarray(la.eigvals(self.A), dtype=np.complex128)
         return block_eigenvalues(self.A, self.blocks)
+
+    @cached_property
+    def schur_form(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+        """Units d of the states, and T, U of the complex Schur form ``A d / d[:, None] = U T U*``.
+
+        Kept: a system is often swept again and again. Units first: the orthogonal transformation
+        mixes rounding with the norm of all of A, which plain (q, dq/dt) states let grow with the
+        square of the fastest mode.
+        """
+        d = state_scale(self.A, self.B, self.C)
+        T, U = la.schur(self.A * d / d[:, None], output="complex")
+        return d, T, U
 
     def poles(self) -> ComplexArray:
         """Return the eigenvalues of A, block by block where its blocks are known [rad/s or 1]."""

@@ -23,6 +23,7 @@ from ..synthesis import Controller, design_hinf
 from ..updating import Eigenvalues, UpdateResult, localise, update
 from ..values import Value, positive, whole
 from .response import Response
+from .simulate import simulate
 from .specification import Specification, Verdict
 
 
@@ -147,9 +148,8 @@ class MachinePipeline(Value):
             observer = design_kalman(plant, larger=many)
             blocks = self._designed(plant, many) if self.blocks is None else self.blocks
             loop = machine.loop(self.ports, *blocks)
-            run = machine.run(
-                self.ports,
-                *blocks,
+            run = simulate(
+                loop,
                 duration=self.duration,
                 reference=self.reference,
                 rng=None if rng is None else rng.spawn(1)[0],

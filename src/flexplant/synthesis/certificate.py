@@ -7,26 +7,29 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from ..errors import CertificateError
-from ..lti.frequency import frequency_response
-from ..lti.interconnection import lft
 from ..lti.norms import peak_gain
+from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray
+from ..values import ComplexArray, FloatArray
 
 #: the two norms agree to this part, and the claim holds to it
 AGREEMENT = 1e-3
 
 
-def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
-    """Return what was verified of the loop lft(P, K): its norm by two routes, and its stability.
+def certified_norm(
+    loop: StateSpace, claim: float, respond: Responder | None = None
+) -> dict[str, float]:
+    """Return what was verified of a closed loop: its norm by two routes, and its stability.
 
     Parameters
     ----------
-    P, K : StateSpace
-        The standard plant and its controller, in the user's units.
+    loop : StateSpace
+        lft(P, K) of the standard plant and its controller, in the user's units.
     claim : float
         The norm that the synthesis promised.
+    respond : function of frequency [Hz], optional
+        The loop's response, where it is kept for a second sweep.
 
     Returns
     -------
@@ -39,7 +42,6 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
     CertificateError
         When the loop is unstable, the norms differ by more than 1e-3, or exceed the claim.
     """
-    loop = lft(P, K)
     poles = loop.poles()
     if not poles.size:  # a static loop
         stability = 0.0 if loop.dt else -np.inf
@@ -52,7 +54,7 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
             "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
         )
     norm, _ = peak_gain(loop)
-    swept = swept_norm(loop)
+    swept = swept_norm(loop, respond)
     if not abs(norm - swept) <= AGREEMENT * norm:
         raise CertificateError(
             f"two routes to the norm disagree: {norm:.6g} by level sets, {swept:.6g} by a sweep. "
@@ -66,8 +68,8 @@ def certified_norm(P: StateSpace, K: StateSpace, claim: float) -> dict[str, floa
     return {"norm": norm, "swept norm": swept, "stability": stability, "claim": claim}
 
 
-def reached_norms(P: StandardPlant, K: StateSpace) -> dict[str, float]:
-    """Return the largest gain of lft(P, K) from each group of w to each group of z, by a sweep.
+def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:
+    """Return the largest gain of a loop from each group of w to each group of z, by a sweep.
 
     The groups follow from the names that `assemble_plant` gives: of w `references` (die:ref),
     `noises` (y1:noise) and `disturbances`, of z `efforts` (u1:effort) and `motions`. Empty for a
@@ -75,14 +77,11 @@ def reached_norms(P: StandardPlant, K: StateSpace) -> dict[str, float]:
     """
     if not P.is_assembled:
         return {}
-    loop = lft(P.system, K)
-    gain = frequency_response(loop, _sweep(loop)).data
+    gain = respond(_sweep(loop))
     w = {"references": ":ref", "noises": ":noise"}
     sides = [_grouped(P.z, {"efforts": ":effort"}, "motions"), _grouped(P.w, w, "disturbances")]
     return {
-        f"{to} from {source}": float(
-            np.linalg.norm(np.moveaxis(gain[rows][:, columns], 2, 0), 2, axis=(1, 2)).max()
-        )
+        f"{to} from {source}": _peak(gain[rows][:, columns])[0]
         for to, rows in sides[0].items()
         for source, columns in sides[1].items()
     }
@@ -97,18 +96,17 @@ def _grouped(names: Sequence[str], endings: Mapping[str, str], rest: str) -> dic
     return {group: places for group, places in groups.items() if places}
 
 
-def swept_norm(loop: StateSpace) -> float:
+def swept_norm(loop: StateSpace, respond: Responder | None = None) -> float:
     """Return the largest gain over a grid that is refined at resonances and at its own peak."""
     if not loop.D.size:
         return 0.0
     if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
-    freq = _sweep(loop)
+    find, freq = respond or responder(loop), _sweep(loop)
     best = float(np.linalg.norm(loop.D, 2)) if not loop.dt else 0.0
     for _ in range(3):
-        gains = _largest(loop, freq)
-        peak = int(np.argmax(gains))
-        best = max(best, float(gains[peak]))
+        largest, peak = _peak(find(freq))
+        best = max(best, largest)
         bracket = freq[max(peak - 1, 0)], freq[min(peak + 1, freq.size - 1)]
         freq = np.linspace(*bracket, 40)
     return best
@@ -134,6 +132,14 @@ def _sweep(loop: StateSpace) -> FloatArray:
     return np.asarray(np.unique(freq[(freq >= 0) & (freq <= nyquist)]))
 
 
-def _largest(loop: StateSpace, freq: FloatArray) -> FloatArray:
-    gain = frequency_response(loop, freq).data.transpose(2, 0, 1)
-    return np.asarray(np.linalg.norm(gain, 2, axis=(1, 2)))
+def _peak(H: ComplexArray) -> tuple[float, int]:
+    """Return the largest singular value of responses (p, m, n_freq), and at which frequency.
+
+    It lies between the Frobenius norm over the root of the rank and the Frobenius norm: where the
+    latter is too small there is nothing to compute.
+    """
+    size = np.sqrt(np.sum(H.real**2 + H.imag**2, axis=(0, 1)))
+    near = np.flatnonzero(size >= size.max() * (1.0 - 1e-12) / np.sqrt(min(H.shape[:2])))
+    gains = np.linalg.norm(np.moveaxis(H[:, :, near], 2, 0), 2, axis=(1, 2))
+    largest = int(np.argmax(gains))
+    return float(gains[largest]), int(near[largest])

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
+from ..lti.interconnection import lft
 from ..lti.preparation import Prepared, prepared
+from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
@@ -109,10 +111,13 @@ def design_hinf(
         plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
     try:
-        method, found, controller, certificate = _certified(plant, problem, method, progress)
+        method, found, controller = _designed(plant, problem, method, progress)
+        loop = lft(plant.system, controller)
+        respond = remembered(responder(loop))  # swept twice over the same frequencies
+        certificate = certified_norm(loop, found.gamma, respond)
     except (AssumptionError, SolverError, CertificateError) as error:
         raise _blamed(problem, error) from error
-    reached = reached_norms(plant, controller)
+    reached = reached_norms(plant, loop, respond)
     left_out = spill_over(plant, [controller], larger)
     return Controller(
         controller,
@@ -145,13 +150,13 @@ def _require_channels(plant: StandardPlant) -> None:
             )
 
 
-def _certified(
+def _designed(
     plant: StandardPlant,
     problem: Prepared,
     method: SynthesisMethod | None,
     progress: bool | None,
-) -> tuple[SynthesisMethod, SolvedController, StateSpace, dict[str, float]]:
-    """Return the method, its answer, the controller and what was verified of its loop."""
+) -> tuple[SynthesisMethod, SolvedController, StateSpace]:
+    """Return the method, its answer, and the controller in the user's channels and units."""
     _require_reach(problem)
     if plant.is_assembled:  # whatever a method makes of it: this motion would drift
         require_shown(problem)
@@ -164,7 +169,7 @@ def _certified(
     controller = problem.restored(found.A, found.B, found.C, found.D).replace(
         name="hinf", units=plant.units
     )
-    return method, found, controller, certified_norm(plant.system, controller, found.gamma)
+    return method, found, controller
 
 
 def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:

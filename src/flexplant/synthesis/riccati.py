@@ -209,9 +209,11 @@ def _seen(problem: Prepared, controller: StateSpace) -> float:
         loop = lft(problem.system, controller)
     except FlexplantError:
         return np.inf
-    if not loop.is_stable:
+    if not loop.n_states:
+        return float(np.linalg.norm(loop.D, 2))
+    poles = loop.schur_form[1].diagonal()  # of the form that its gains need
+    if poles.real.max() >= 0:
         return np.inf
-    poles = loop.poles()
     freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)
     gains = np.linalg.norm(responses(loop, freq).transpose(2, 0, 1), 2, axis=(1, 2))
     return max(float(gains.max()), float(np.linalg.norm(loop.D, 2)))
