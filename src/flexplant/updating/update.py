@@ -8,28 +8,28 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, FlexplantWarning, ModelError, SolverError
-from ..values import FloatArray, Rng, flag, generator, instance, positive
-from .approach import approached
+from ..errors import FlexplantWarning, ModelError, SolverError
+from ..structure.model import FEModel
+from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
+from .full_basis import MOST_ROUNDS, FullBasis, is_large
 from .judgement.covariance import covariance
-from .judgement.goodness import chance, chi_square, is_bad, worst
+from .judgement.goodness import chi_square, is_bad, worst
 from .parameters.added import Parameter
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
+from .rounds import corrected, moved
 from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
-from .search.update_method import Trail
-from .sensitivities import checked_parameters
-from .starts import all_starts, scattered, summary
+from .searching import from_one_start, from_starts
+from .sensitivities import checked_parameters, checked_values
+from .starts import all_starts, summary
 from .unit_check import check_units
 from .update_result import History, UpdateResult
 from .updated_model import changed_model
 
 #: a parameter this close to its bound, relative to their distance, is at it
 AT_BOUND = 1e-6
-#: part of the measured power that a minimum leaves which has little to do with the measurement
-ABSURD = 0.1
-#: other starts that are tried after such an end, for models of up to so many DOFs and larger ones
-RETRIES, SMALL, RETRIES_LARGE = 20, 100, 4
+#: standard deviations by which the last round of defect correction may move the estimate
+UNSETTLED = 0.5
 
 
 def update(
@@ -44,6 +44,8 @@ def update(
     prior: bool = True,
     max_iterations: int | None = None,
     tolerance: float = 1e-10,
+    full: FEModel | None = None,
+    rounds: int = 4,
 ) -> UpdateResult:
     """Find the parameters with which the model reproduces the measurement.
 
@@ -66,7 +68,8 @@ def update(
     Parameters
     ----------
     model : ReducedModel or FEModel
-        The model; an FEModel is treated densely.
+        The model. An FEModel of more than 300 DOFs is updated in a basis of its modes that is made
+        anew at the estimate until that moves no more; one of more than 20 000 should be reduced.
     parameters : sequence of q Parameter
         `AddedMass`, `AddedDamping`, `AddedStiffness`, `ModeDamping`, `MatrixParameter`.
     residuals : sequence of Residual
@@ -95,6 +98,15 @@ def update(
     tolerance : float
         Done when a full step, or the residual, changes no eigenvalue by more than this,
         relatively.
+    full : FEModel, optional
+        That the reduced model was made from. The reduction makes an error that can be larger than
+        the noise and that chi-square does not always show; with the full model it is taken out by
+        defect correction: solve the full model at the estimate, add the difference of its residuals
+        from those of the reduced one, fit again. Damping is that of the full model's D; where it
+        has none, that of the reduced model.
+    rounds : int
+        Of defect correction, at most; fewer where one moves the estimate by less than 0.01
+        standard deviations.
 
     Returns
     -------
@@ -106,7 +118,8 @@ def update(
     FlexplantWarning
         When the tolerance was not met; when the noise is known and the fit leaves more than noise
         does in one of 10 000 cases (the covariance is then widened by chi-square over its degrees
-        of freedom).
+        of freedom); when the last round of defect correction still moved the estimate by more than
+        half a standard deviation.
 
     Raises
     ------
@@ -136,6 +149,7 @@ def update(
     enough = positive(tolerance, "tolerance")
     rng = generator(rng)
     takes_part = flag(prior, "prior")
+    rounds = whole(rounds, "rounds")
     bounded = any(getattr(q, "bounds", None) is not None for q in listed)
     known = any(getattr(q, "prior", None) is not None for q in listed)
     # the paper's problem: eigenvalues alone, nothing known beforehand
@@ -148,18 +162,39 @@ def update(
         )
     if plain and method.weighs_poles:
         given = tuple(r.replace(weights=r.W) for r in given if isinstance(r, Eigenvalues))
-    objective = Objective(model, listed, given, prior=takes_part)
+    basis, used = None, model
+    if full is not None:
+        basis = FullBasis(full, listed, given, model)
+    elif is_large(model):
+        basis, rounds = FullBasis(model, listed, given), MOST_ROUNDS
+        used = basis.at(checked_values(start, listed, "start"))
+    objective = Objective(used, listed, given, prior=takes_part)
     begins = all_starts(objective, start, starts, rng)
     cold = start is None and starts is None and not method.penalised
     try:
         if cold:
-            best, begins, ends = _cold(objective, begins[0], method, max_iterations, enough, rng)
+            best, begins, ends = from_one_start(
+                objective, begins[0], method, max_iterations, enough, rng
+            )
         else:
-            best, ends = _searched(objective, begins, method, max_iterations, enough)
+            best, ends = from_starts(objective, begins, method, max_iterations, enough)
     except (ModelError, SolverError):
         check_units(objective, begins[0])
         raise
     check_units(objective, begins[0], best.trail.poles[0])
+    estimates = [best.p]
+    if basis is not None:
+        best, estimates = corrected(
+            objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
+        )
+        if moved(objective, best.p, estimates[-2]) > UNSETTLED:
+            warnings.warn(
+                f"defect correction has not settled: round {len(estimates) - 1} still moved the "
+                f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
+                "Give more rounds=, or a reduced model with more modes.",
+                FlexplantWarning,
+                stacklevel=2,
+            )
     if not best.converged:
         error = best.trail.error
         warnings.warn(
@@ -169,90 +204,12 @@ def update(
             FlexplantWarning,
             stacklevel=2,
         )
-    fit = _result(model, objective, method, best, begins[0]).replace(starts=summary(begins, ends))
+    fit = _result(model, objective, method, best, begins[0])
+    fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates))
     if method.least_squares and is_bad(fit.p_value):
         fit = _widened(fit)
         warnings.warn(_complaint(fit, objective, best.p), FlexplantWarning, stacklevel=2)
     return fit
-
-
-def _approach(
-    objective: Objective, begin: FloatArray, most: int | None, tolerance: float
-) -> Trail | None:
-    """Return the way to a better start, None where there is none; `objective` follows it."""
-    path = approached(objective, begin, most, tolerance)
-    if len(path) == 1:
-        return None
-    trail = Trail()
-    objective.begin(begin)
-    for p in path:
-        objective.at(p, refer=True)
-        trail.add(objective, p, 1.0 if trail.p else 0.0)
-    objective.path = path[:-1]
-    return trail
-
-
-def _cold(
-    objective: Objective,
-    begin: FloatArray,
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
-    rng: Rng,
-) -> tuple[SearchEnd, list[FloatArray], list[SearchEnd | None]]:
-    """Return the best end, the objective being there, all starts that were tried and their ends.
-
-    Where responses alone are fitted and the first end explains nothing of them (a peak of the
-    model lies on a wrong measured one), other starts are tried until one does.
-    """
-    begins = [begin]
-    best = _led(objective, begin, method, most, tolerance)
-    ends: list[SearchEnd | None] = [best]
-    if objective.numbers or not _absurd(objective, best.p):
-        return best, begins, ends
-    small = len(objective.family.V) <= SMALL
-    for other in scattered(objective, RETRIES if small else RETRIES_LARGE, rng):
-        begins.append(other)
-        try:
-            found = _led(objective, other, method, most, tolerance)
-        except (ModelError, SolverError):
-            ends.append(None)
-            continue
-        ends.append(found)
-        best = min(best, found, key=lambda one: one.cost)
-        if best is found and not _absurd(objective, best.p):
-            break
-    objective.path = []
-    objective.begin(best.trail.p[0])
-    for p in best.trail.p[1:]:
-        objective.at(p, refer=True)
-    return best, begins, ends
-
-
-def _led(
-    objective: Objective,
-    begin: FloatArray,
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
-) -> SearchEnd:
-    """Return the end of a search from `begin` that goes through easier problems first."""
-    objective.path = []
-    before = _approach(objective, begin, most, tolerance)
-    first = begin if before is None else before.p[-1]
-    found = method.search(objective, first, most=most, tolerance=tolerance)
-    if before is not None:
-        found.trail = before.joined(found.trail)
-    return found
-
-
-def _absurd(objective: Objective, p: FloatArray) -> bool:
-    """Return whether a fit leaves far more than noise or a small error of the model would."""
-    point = objective.at(p)
-    r, size = objective.values(point, prior=False), objective.size(point)
-    chi2, dof = chi_square(objective, point, np.ones(p.size, dtype=bool))
-    likely = chi2 is not None and not is_bad(chance(chi2, dof))
-    return not likely and bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
 
 
 def _result(
@@ -273,7 +230,7 @@ def _result(
         values=best.p,
         covariance=None if method.penalised else spread,
         correlation=correlation,
-        model=changed_model(model, objective.family, best.p),
+        model=changed_model(model, objective.parameters, best.p, objective.family),
         history=History(
             np.array(trail.p),
             np.array(trail.poles),
@@ -310,36 +267,6 @@ def _complaint(fit: UpdateResult, objective: Objective, p: FloatArray) -> str:
         f"widened by {(fit.chi2 or 0.0) / max(fit.dof, 1):.3g} and holds for small errors of the "
         "model only."
     )
-
-
-def _searched(
-    objective: Objective,
-    begins: list[FloatArray],
-    method: UpdateMethod,
-    most: int | None,
-    tolerance: float,
-) -> tuple[SearchEnd, list[SearchEnd | None]]:
-    """Return the best end, the objective being there, and what every start led to."""
-    ends: list[SearchEnd | None] = []
-    trouble: FlexplantError | None = None
-    for begin in begins:
-        try:
-            ends.append(method.search(objective, begin, most=most, tolerance=tolerance))
-        except (ModelError, SolverError) as error:
-            if len(begins) == 1:
-                raise
-            trouble = error
-            ends.append(None)
-    reached = [found for found in ends if found is not None]
-    if not reached:
-        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {trouble}")
-    best = min(reached, key=lambda found: found.cost)
-    # the modes of the best end are numbered from its own start
-    if len(begins) > 1:
-        objective.begin(begins[[f is best for f in ends].index(True)])
-        for p in best.trail.p[1:]:
-            objective.at(p, refer=True)
-    return best, ends
 
 
 def _at_bound(objective: Objective, p: FloatArray) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import ModelError, unknown_label
 from ..modes import Modes, solve_modes
-from ..values import ComplexArray, FloatArray, Rng, Value, generator, positive, short
+from ..values import ComplexArray, FloatArray, Rng, Value, generator, positive, short, whole
 from .judgement.goodness import chance
 from .parameters.added import AddedMass, Parameter
 from .updated_model import applied
@@ -129,6 +129,8 @@ class UpdateResult(Value):
     dof : int
         Degrees of freedom: residuals and priors less the parameters that were fitted and did not
         end at a bound.
+    rounds : (r, q) array or None
+        The estimate of the reduced model alone and after each round of defect correction.
     """
 
     parameters: tuple[str, ...]
@@ -145,9 +147,11 @@ class UpdateResult(Value):
     unknowns: tuple[Parameter, ...] = ()
     chi2: float | None = None
     dof: int = 0
+    rounds: FloatArray | None = None
 
     def __post_init__(self) -> None:
         self._set(values=self.values, covariance=self.covariance, correlation=self.correlation)
+        self._set(rounds=self.rounds)
 
     def __getitem__(self, name: str) -> float:
         if name not in self.parameters:
@@ -287,10 +291,16 @@ class UpdateResult(Value):
             raise ModelError("this result does not hold its parameters: run update() once more.")
         return applied(model, self.unknowns, self.values)
 
-    def modes(self) -> Modes:
+    def modes(self, *, count: int | None = None) -> Modes:
         """Return the modes of the updated model on all DOFs of the structure.
 
         Those of a reduced model are expanded by the paper's (7) and (4): ``phi_n = T phi_k``.
+
+        Parameters
+        ----------
+        count : int, optional
+            How many, rigid-body modes included. None: all; of an FEModel of more than 1500 DOFs
+            there must be a count.
 
         Returns
         -------
@@ -300,11 +310,13 @@ class UpdateResult(Value):
         Raises
         ------
         ModelError
-            When dampers to the ground drag the rigid-body modes.
+            When dampers to the ground drag the rigid-body modes, or the count is none.
         """
         if not hasattr(self.model, "T"):
-            return solve_modes(self.model)
+            return solve_modes(self.model, count=count)
         reduced: Modes = self.model.modes()
+        if count is not None:
+            reduced = reduced.select(range(whole(count, "count", maximum=reduced.n_modes)))
         if not self.model.is_physical:
             return reduced  # generalised coordinates: the shapes are expanded already
         return reduced.replace(phi=self.model.T @ reduced.phi, dofs=self.model.full_dofs)

@@ -19,47 +19,59 @@ from .family import Family
 from .parameters.added import Parameter
 
 
-def changed_model(model: Any, family: Family, p: FloatArray) -> Any:
-    """Return the model with the parameters at `p`; its own rigid-body basis, as far as left."""
+def changed_model(
+    model: Any, parameters: Sequence[Parameter], p: FloatArray, family: Family | None = None
+) -> Any:
+    """Return the model with the parameters at `p`; a sparse FEModel stays sparse.
+
+    Of a reduced model the rigid-body basis is brought up to date, as far as it is left; `family`
+    is that of the model and the parameters, where it is there already.
+    """
+    if isinstance(model, FEModel):
+        return _changed_structure(model, parameters, p)
+    family = Family(model, parameters) if family is None else family
     changes: dict[str, Any] = {
-        name: _sum(getattr(model, name), change if np.any(change) else None)
+        name: summed(getattr(model, name), change if np.any(change) else None)
         for name, change in zip("MDK", family.changes(p), strict=True)
     }
     if hasattr(model, "T"):
         # Gram-Schmidt keeps translations first and moves the rotations to the new centre
         left = model.rigid_body @ family.rigid_left(p)
         changes["rigid_body"] = orthonormalised(changes["M"], left)
-    return _replaced(model, changes, family.parameters, p)
+    return _replaced(model, changes, parameters, p)
 
 
 def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
-    """Return another model of the same structure with the parameters at `p`.
-
-    A large FEModel stays sparse; of a reduced model the rigid-body basis is brought up to date.
-    """
-    if not isinstance(model, FEModel):
-        return changed_model(model, Family(model, parameters), p)
-    total: dict[str, Matrix | None] = dict.fromkeys("MDK")
-    for parameter, value in zip(parameters, p.tolist(), strict=True):
-        for name, part in zip("MDK", parameter.matrices(model), strict=True):
-            if part is not None and value:
-                total[name] = _sum(total[name], value * part)
-    if total["D"] is not None and model.D is None:
+    """Return another model of the same structure with the parameters at `p`."""
+    damped = isinstance(model, FEModel) and model.D is None
+    if damped and any(
+        q.matrices(model)[1] is not None and v for q, v in zip(parameters, p, strict=True)
+    ):
         warnings.warn(
             "the model has no D of its own: that of the updated model holds the parameters of the "
             "update alone, and solve_modes(..., damping=) would replace it. Apply the update to a "
             "model that has its damping, model.with_damping(ModalDamping(0.01)), say.",
             FlexplantWarning,
-            stacklevel=4,
+            stacklevel=3,
         )
-    changes = {name: _sum(getattr(model, name), change) for name, change in total.items()}
+    return changed_model(model, parameters, p)
+
+
+def _changed_structure(model: FEModel, parameters: Sequence[Parameter], p: FloatArray) -> FEModel:
+    total: dict[str, Matrix | None] = dict.fromkeys("MDK")
+    for parameter, value in zip(parameters, p.tolist(), strict=True):
+        for name, part in zip("MDK", parameter.matrices(model), strict=True):
+            if part is not None and value:
+                total[name] = summed(total[name], value * part)
+    changes = {name: summed(getattr(model, name), change) for name, change in total.items()}
     try:
-        return _replaced(model, changes, parameters, p)
+        changed: FEModel = _replaced(model, changes, parameters, p)
     except ModelError:
         found = _with_drag(model, changes)
         if found is None:
             raise
         return found
+    return changed
 
 
 def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
@@ -83,7 +95,7 @@ def _with_drag(model: FEModel, changes: dict[str, Any]) -> FEModel | None:
     if drag > RIGID_DRAG * float(first):
         return None
     # the rigid-body part of D + d M comes out at 0 in theory, so twice d: above rounding
-    shifted = _sum(D, 2.0 * drag * held.M)
+    shifted = summed(D, 2.0 * drag * held.M)
     try:
         model.replace(D=shifted)
     except ModelError:
@@ -103,7 +115,7 @@ def _replaced(
         ) from None
 
 
-def _sum(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
+def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
     """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
     if matrix is None or change is None:
         return change if matrix is None else matrix

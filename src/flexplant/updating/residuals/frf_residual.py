@@ -123,6 +123,18 @@ class FrfResidual(Residual):
             f"{frf.freq.size} lines, {kind}, noise {known}{held}{late}>"
         )
 
+    @property
+    def loaded(self) -> tuple[tuple[Place, str], ...]:
+        """Places and directions of its channels."""
+        channels = [*self.measured.outputs, *self.measured.inputs]
+        return tuple((place, self.direction) for place in channel_places(channels, self.places))
+
+    @property
+    def top(self) -> float:
+        """The highest frequency [rad/s] of its lines; of the hold, where there is one."""
+        highest = float(np.max(self.measured.freq[self.lines]))
+        return 2 * np.pi * max(highest, self.hold or 0.0)
+
     def select(self, lines: Sequence[int]) -> FrfResidual:
         """Return the residual on some of the lines (numbers in the measured Frf)."""
         if lines is None:

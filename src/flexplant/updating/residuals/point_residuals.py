@@ -78,6 +78,16 @@ class Antiresonances(Residual):
         freq = ", ".join(f"{f:.1f}" for f in np.abs(self.zeros[:4]) / (2 * np.pi))
         return f"<Antiresonances: {self.input} -> {self.output} at {freq} Hz>"
 
+    @property
+    def loaded(self) -> tuple[tuple[Place, str], ...]:
+        """Places and directions of the output and the input."""
+        return (self.output, self.direction), (self.input, self.direction)
+
+    @property
+    def top(self) -> float:
+        """The highest frequency [rad/s] of its zeros; of the hold, where there is one."""
+        return max(float(np.max(np.abs(self.zeros))), 2 * np.pi * (self.hold or 0.0))
+
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""
         return _BoundZeros(self, family)
@@ -204,6 +214,11 @@ class StaticCompliance(Residual):
 
     def __repr__(self) -> str:
         return f"<StaticCompliance: {self.input} -> {self.output}, {self.value:.4g} m/N>"
+
+    @property
+    def loaded(self) -> tuple[tuple[Place, str], ...]:
+        """Places and directions of the output and the input."""
+        return (self.output, self.direction), (self.input, self.direction)
 
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""

@@ -17,6 +17,17 @@ from ..point_model import Point
 class Residual(Value):
     """A measurement that the model should reproduce."""
 
+    @property
+    def loaded(self) -> tuple[tuple[Place, str], ...]:
+        """Places and directions whose compliance the residual sees: of responses, not of modes."""
+        return ()
+
+    @property
+    def top(self) -> float:
+        """The highest frequency [rad/s] of the measurement."""
+        measured: Any = getattr(self, "measured", None)
+        return float(np.max(np.abs(getattr(measured, "poles", [0.0]))))
+
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to the rows of one family of models."""
         raise NotImplementedError

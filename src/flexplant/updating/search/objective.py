@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -16,6 +16,15 @@ from ..repeated_modes import PoleRows, turned
 from ..residuals.eigenvalues import BoundEigenvalues
 from ..residuals.residual import Bound, Residual
 from ..sensitivities import mode_columns
+
+
+class Defect(NamedTuple):
+    """What a better model's residuals, and their derivatives, are more than those of the model."""
+
+    #: parameters where both models were compared
+    p: FloatArray
+    values: FloatArray
+    slopes: FloatArray
 
 
 class Objective:
@@ -51,9 +60,9 @@ class Objective:
     ) -> None:
         self.parameters = tuple(parameters)
         self.residuals = checked_residuals(residuals)
-        numbers = [n for r in self.residuals for n in _numbers(r)]
+        own = [n for r in self.residuals for n in numbers(r)]
         if family is None:
-            family = Family(model, parameters, highest=max(numbers, default=6))
+            family = Family(model, parameters, highest=max(own, default=6))
         self.family = family
         self.bounds = [residual.bound(family) for residual in self.residuals]
         self.numbers = tuple(dict.fromkeys(n for b in self.bounds for n in b.numbers))
@@ -72,6 +81,8 @@ class Objective:
         self._point: Point | None = None
         #: points through which modes are followed to where a search begins, numbered at the first
         self.path: list[FloatArray] = []
+        #: what is added to the residuals, to first order about the parameters it was found at
+        self.defect: Defect | None = None
 
     @property
     def default_start(self) -> FloatArray:
@@ -112,7 +123,12 @@ class Objective:
         if np.array_equal(self.reference.p, p):
             return self._set(self.reference, refer=refer)
         point = self.reference.continued(np.array(p))
-        return self._set(self._assigned(self._turned(point)), refer=refer)
+        point = self._assigned(self._turned(point))
+        return self._set(point, refer=refer)
+
+    def place(self, point: Point) -> Point:
+        """Return a point whose modes are numbered already, as the reference."""
+        return self._set(self._assigned(self._turned(point)), refer=True)
 
     def _set(self, point: Point, *, refer: bool) -> Point:
         self._point = point
@@ -133,6 +149,9 @@ class Objective:
     def values(self, point: Point, *, prior: bool = True) -> FloatArray:
         """Return the residuals, then those of the priors."""
         rows = [bound.values(point) for bound in self.bounds]
+        if self.defect is not None:
+            moved = self.defect.slopes @ (point.p - self.defect.p)
+            rows = [np.concatenate(rows) + self.defect.values + moved]
         if prior and self.uses_prior:
             gap = (self.prior_mean - point.p) / self.prior_std
             rows.append(gap[self.has_prior])
@@ -141,6 +160,8 @@ class Objective:
     def slopes(self, point: Point, *, prior: bool = True) -> FloatArray:
         """Return the derivatives of `values`."""
         rows = [bound.slopes(point) for bound in self.bounds]
+        if self.defect is not None:
+            rows = [np.vstack(rows) + self.defect.slopes]
         if prior and self.uses_prior:
             rows.append(-np.diag(1 / self.prior_std)[self.has_prior])
         return np.vstack(rows)
@@ -204,6 +225,7 @@ def _from_bounds(parameter: Parameter) -> tuple[float, float] | None:
     return mean, max(high - mean, mean - low) / 3
 
 
-def _numbers(residual: Residual) -> tuple[int, ...]:
+def numbers(residual: Residual) -> tuple[int, ...]:
+    """Return the numbers of the modes a residual compares."""
     measured = getattr(residual, "measured", None)
     return tuple(getattr(measured, "modes", None) or ())

@@ -1,0 +1,230 @@
+"""The full structure at one set of parameters, in a basis that is good there."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ..errors import ModelError, ShapeError
+from ..modes import solve_modes
+from ..modes.attachment_vectors import static_response
+from ..modes.shifted import stiffness_factor
+from ..modes.sparse_modes import counted_modes
+from ..reduction import ReducedModel
+from ..sparse.factor import DENSE_LIMIT
+from ..structure.model import FEModel
+from ..values import FloatArray
+from .pairing import pair
+from .parameters.added import Parameter, PointParameter
+from .point_model import Point
+from .residuals.residual import Residual
+from .search import Objective
+from .search.objective import numbers
+from .updated_model import summed
+
+#: modes of the basis for each coordinate of the reduced model
+WIDER = 4
+#: of the diagonal of a scaled Gram matrix: vectors below it depend on the others
+DEPENDENT = 1e-10
+#: DOFs from which an FEModel is updated in such a basis, and from which it is too large for that
+LARGE, TOO_LARGE = 300, 20_000
+#: DOFs from which few modes (one of so many) are found faster by Lanczos than densely
+SPARSE, FEW = 600, 10
+#: bases of a large FEModel until its estimate moves no more
+MOST_ROUNDS = 10
+
+
+def is_large(model: Any) -> bool:
+    """Return whether a model is an FEModel that is updated in a basis.
+
+    Raises
+    ------
+    ModelError
+        When it is too large for that too.
+    """
+    if not isinstance(model, FEModel) or model.n_dof <= LARGE:
+        return False
+    if model.n_dof > TOO_LARGE:
+        raise ModelError(
+            f"updating an FEModel of {model.n_dof} DOFs (limit {TOO_LARGE}) solves it anew for "
+            "each estimate. Reduce it, rom = reduce(...), and pass update(rom, ..., full=model): "
+            "a few solutions then do."
+        )
+    return True
+
+
+class FullBasis:
+    """The full model ``M + p dM`` and so on, at any `p`, as a large reduced model made at this p.
+
+    Its basis holds the lowest modes of the full structure at `p`, four times as many as the
+    reduced model has coordinates, the static response ``u = G f`` to unit forces f at all places of
+    the measurement and of the parameters, and ``G M u``. Modes are those of the full model up to
+    rounding; responses have an error of order ``(f / f_cut)^8`` of what the truncated modes give.
+
+    Parameters
+    ----------
+    full : FEModel
+        The full structure. Where it has no D, the damping forces of the reduced model act on the
+        motions that it knows: ``D = (M T) M*^-1 D* M*^-1 (M T)^T``, so that ``T^T D T = D*``.
+    parameters : sequence of q Parameter
+        What changes.
+    residuals : sequence of Residual
+        The measurement.
+    reduced : ReducedModel, optional
+        What was made from it. None: the basis holds the modes up to four times the highest number
+        and frequency of the measurement.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When one is no model, they are not of one structure, or a parameter has matrices of the
+        reduced model only.
+    """
+
+    def __init__(
+        self,
+        full: Any,
+        parameters: Sequence[Parameter],
+        residuals: Sequence[Residual],
+        reduced: Any = None,
+    ) -> None:
+        if not isinstance(full, FEModel) or not isinstance(reduced, ReducedModel | None):
+            raise ModelError(
+                f"full= needs a reduced model and the FEModel it was made from, got "
+                f"{type(reduced).__name__} and {type(full).__name__}. Pass update(reduced, ..., "
+                "full=model)."
+            )
+        if reduced is not None and full.dofs.labels != reduced.full_dofs.labels:
+            raise ModelError(
+                f"full has {len(full.dofs)} DOFs that are not the {len(reduced.full_dofs)} of the "
+                "reduced model's structure, in this order: they are not of one structure. Pass "
+                "the FEModel that was reduced."
+            )
+        self.full, self.reduced = full, reduced
+        self.parameters, self.residuals = tuple(parameters), tuple(residuals)
+        loaded = [pair for residual in residuals for pair in residual.loaded]
+        loads = [full.dofs.row(place, direction) for place, direction in loaded]
+        for q in parameters:
+            if isinstance(q, PointParameter):
+                loads.append(full.dofs.row(q.at, q.direction))
+                if q.to is not None:
+                    loads.append(full.dofs.row(q.to, q.direction))
+        try:
+            self.changes = [q.matrices(full) for q in parameters]
+        except ShapeError as error:
+            raise ShapeError(
+                f"{error} The full model needs the matrices of all its DOFs: give those, they are "
+                "projected on the reduced model."
+            ) from None
+        self.loads = np.array(loads).reshape(-1, full.n_dof).T
+
+    def at(self, p: FloatArray) -> ReducedModel:
+        """Return the full model, its parameters at zero, in the basis that is good at `p`."""
+        full, V = self.full, self._basis(p)
+        M, K = (np.asarray(V.T @ (part @ V)) for part in (full.M, full.K))
+        D = np.zeros_like(M)
+        if full.D is not None:
+            D = np.asarray(V.T @ (full.D @ V))
+        elif self.reduced is not None:
+            known = la.lstsq(self.reduced.M, self.reduced.T.T @ np.asarray(full.M @ V))[0]
+            D = known.T @ self.reduced.D @ known
+        rigid = V.T @ np.asarray(full.M @ full.rigid_body)
+        return ReducedModel(
+            M=(M + M.T) / 2,
+            D=(D + D.T) / 2,
+            K=(K + K.T) / 2,
+            T=V,
+            dofs=full.dofs.select(()),
+            full_dofs=full.dofs,
+            rigid_body=rigid,
+            method="a basis at the estimate",
+            coordinates=[f"vector {i + 1}" for i in range(V.shape[1])],
+        )
+
+    def objective(self, near: Point) -> Objective:
+        """Return the residuals of the full model at a point of the reduced one, modes paired."""
+        model = self.at(near.p)
+        objective = Objective(model, self.parameters, self.residuals, prior=False)
+        family, eigen = objective.family, objective.family.at(near.p)
+        # shapes of both in coordinates where the mass matrix is the unit matrix
+        known: Any = near.family.model
+        seen = known.T @ (near.family.V @ near.eigen.X)
+        old = family.V.T @ (model.T.T @ np.asarray(self.full.M @ seen))
+        found = pair(near.eigen.poles, old, family.weighted(eigen.X))
+        labels = np.zeros(eigen.poles.size, dtype=np.int64)
+        labels[found[found >= 0]] = near.labels[found >= 0]
+        objective.place(Point(family, near.p, eigen, labels))
+        return objective
+
+    def _basis(self, p: FloatArray) -> FloatArray:
+        """Return the M-orthonormal basis (n, k) at `p`, rigid-body motions of the model first."""
+        changed = self._changed(p)
+        phi = self._modes(changed)
+        static = self._static(changed, self.loads)
+        further = self._static(changed, np.asarray(changed.M @ static))
+        M: Any = self.full.M
+        V = np.array(self.full.rigid_body)
+        for part in (phi, static, further):
+            V = np.hstack([V, _beyond(M, V, part)])
+        return V
+
+    def _modes(self, model: FEModel) -> FloatArray:
+        """Return the shapes of a changed model that take part."""
+        n = model.n_dof
+        if self.reduced is not None:
+            return _lowest(model, min(WIDER * self.reduced.n_dof, n))[1]
+        highest = max((number for r in self.residuals for number in numbers(r)), default=6)
+        top = WIDER * max(residual.top for residual in self.residuals)
+        omega, phi = _lowest(model, min(WIDER * highest, n))
+        if omega.size < n and omega[-1] < top:
+            _, phi = _lowest(model, n, top)
+        return phi
+
+    def _static(self, model: FEModel, loads: FloatArray) -> FloatArray:
+        if not loads.shape[1]:
+            return loads
+        if sp.issparse(model.K) and sp.issparse(model.M) and model.n_dof > DENSE_LIMIT:
+            return stiffness_factor(model).static(loads)
+        return static_response(model.M, model.K, model.rigid_body, loads)
+
+    def _changed(self, p: FloatArray) -> FEModel:
+        changes: dict[str, Any] = {"M": self.full.M, "K": self.full.K}
+        for (dM, _, dK), value in zip(self.changes, p.tolist(), strict=True):
+            for name, part in (("M", dM), ("K", dK)):
+                if part is not None and value:
+                    changes[name] = summed(changes[name], value * part)
+        return self.full.replace(**changes, D=None)
+
+
+def _lowest(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray, FloatArray]:
+    """Return omega and shapes of the lowest modes, up to `top` [rad/s]."""
+    r = model.rigid_body.shape[1]
+    sparse = sp.issparse(model.K) and sp.issparse(model.M) and not model.n_unstable
+    few = model.n_dof > SPARSE and FEW * count < model.n_dof
+    if sparse and few and np.isinf(top) and count > r:
+        squares, phi, _ = counted_modes(model, count - r)
+        omega = np.concatenate([np.zeros(r), np.sqrt(squares)])
+        return omega, np.hstack([model.rigid_body, phi])
+    below = None if np.isinf(top) else top / (2 * np.pi)
+    modes = solve_modes(model, count=None if below else count, below=below)
+    return modes.omega, np.real(modes.phi)
+
+
+def _beyond(M: Any, V: FloatArray, part: FloatArray) -> FloatArray:
+    """Return M-orthonormal vectors that span, with V, what V and `part` span."""
+    length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))
+    part = part / np.where(length > 0, length, 1.0)
+    for _ in range(2):
+        part = part - V @ (V.T @ np.asarray(M @ part))
+    gram = part.T @ np.asarray(M @ part)
+    size, mix = la.eigh((gram + gram.T) / 2)
+    keep = size > DEPENDENT
+    new = part @ (mix[:, keep] / np.sqrt(size[keep]))
+    # once more: what was nearly dependent has lost digits
+    new = new - V @ (V.T @ np.asarray(M @ new))
+    factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
+    return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)

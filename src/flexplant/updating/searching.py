@@ -1,0 +1,127 @@
+"""Searches from one start, through easier problems, and from several."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import FlexplantError, ModelError, SolverError
+from ..values import FloatArray, Rng
+from .approach import approached
+from .judgement.goodness import chance, chi_square, is_bad
+from .search import Objective, SearchEnd, UpdateMethod
+from .search.update_method import Trail
+from .starts import scattered
+
+#: part of the measured power that a minimum leaves which has little to do with the measurement
+ABSURD = 0.1
+#: other starts that are tried after such an end, for models of up to so many DOFs and larger ones
+RETRIES, SMALL, RETRIES_LARGE = 20, 100, 4
+
+
+def _approach(
+    objective: Objective, begin: FloatArray, most: int | None, tolerance: float
+) -> Trail | None:
+    """Return the way to a better start, None where there is none; `objective` follows it."""
+    path = approached(objective, begin, most, tolerance)
+    if len(path) == 1:
+        return None
+    trail = Trail()
+    objective.begin(begin)
+    for p in path:
+        objective.at(p, refer=True)
+        trail.add(objective, p, 1.0 if trail.p else 0.0)
+    objective.path = path[:-1]
+    return trail
+
+
+def from_one_start(
+    objective: Objective,
+    begin: FloatArray,
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+    rng: Rng,
+) -> tuple[SearchEnd, list[FloatArray], list[SearchEnd | None]]:
+    """Return the best end, the objective being there, all starts that were tried and their ends.
+
+    Where responses alone are fitted and the first end explains nothing of them (a peak of the
+    model lies on a wrong measured one), other starts are tried until one does.
+    """
+    begins = [begin]
+    best = _led(objective, begin, method, most, tolerance)
+    ends: list[SearchEnd | None] = [best]
+    if objective.numbers or not _absurd(objective, best.p):
+        return best, begins, ends
+    small = len(objective.family.V) <= SMALL
+    for other in scattered(objective, RETRIES if small else RETRIES_LARGE, rng):
+        begins.append(other)
+        try:
+            found = _led(objective, other, method, most, tolerance)
+        except (ModelError, SolverError):
+            ends.append(None)
+            continue
+        ends.append(found)
+        best = min(best, found, key=lambda one: one.cost)
+        if best is found and not _absurd(objective, best.p):
+            break
+    objective.path = []
+    objective.begin(best.trail.p[0])
+    for p in best.trail.p[1:]:
+        objective.at(p, refer=True)
+    return best, begins, ends
+
+
+def _led(
+    objective: Objective,
+    begin: FloatArray,
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+) -> SearchEnd:
+    """Return the end of a search from `begin` that goes through easier problems first."""
+    objective.path = []
+    before = _approach(objective, begin, most, tolerance)
+    first = begin if before is None else before.p[-1]
+    found = method.search(objective, first, most=most, tolerance=tolerance)
+    if before is not None:
+        found.trail = before.joined(found.trail)
+    return found
+
+
+def _absurd(objective: Objective, p: FloatArray) -> bool:
+    """Return whether a fit leaves far more than noise or a small error of the model would."""
+    point = objective.at(p)
+    r, size = objective.values(point, prior=False), objective.size(point)
+    chi2, dof = chi_square(objective, point, np.ones(p.size, dtype=bool))
+    likely = chi2 is not None and not is_bad(chance(chi2, dof))
+    return not likely and bool(np.sum(r**2) > ABSURD * np.sum(size[: r.size] ** 2))
+
+
+def from_starts(
+    objective: Objective,
+    begins: list[FloatArray],
+    method: UpdateMethod,
+    most: int | None,
+    tolerance: float,
+) -> tuple[SearchEnd, list[SearchEnd | None]]:
+    """Return the best end, the objective being there, and what every start led to."""
+    ends: list[SearchEnd | None] = []
+    trouble: FlexplantError | None = None
+    for begin in begins:
+        try:
+            ends.append(method.search(objective, begin, most=most, tolerance=tolerance))
+        except (ModelError, SolverError) as error:
+            if len(begins) == 1:
+                raise
+            trouble = error
+            ends.append(None)
+    reached = [found for found in ends if found is not None]
+    if not reached:
+        raise SolverError(f"none of {len(begins)} starts leads anywhere; the last: {trouble}")
+    best = min(reached, key=lambda found: found.cost)
+    # the modes of the best end are numbered from its own start
+    if len(begins) > 1:
+        objective.begin(begins[[f is best for f in ends].index(True)])
+        for p in best.trail.p[1:]:
+            objective.at(p, refer=True)
+    return best, ends
