@@ -69,7 +69,7 @@ class FullBasis:
     ----------
     full : FEModel
         The full structure. Where it has no D, the damping forces of the reduced model act on the
-        motions that it knows: ``D = (M T) M*^-1 D* M*^-1 (M T)^T``, so that ``T^T D T = D*``.
+        motions that it can make: ``D = (M T) M*^-1 D* M*^-1 (M T)^T``, so that ``T^T D T = D*``.
     parameters : sequence of q Parameter
         What changes.
     residuals : sequence of Residual
