@@ -96,7 +96,7 @@ def pipeline(blocks: Any = None) -> fx.simulation.MachinePipeline:
         RATE,
         DELAY,
         MEASURED,
-        starts=8,
+        starts=3,
         bandwidth=OWN,
         blocks=blocks,
         specification=fx.Specification(ma=10e-9, modulus_margin=0.4, start=0.3),

@@ -66,18 +66,36 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
 
 
 @pytest.mark.slow
-def test_a_mass_that_is_searched_for_among_candidates(fleet):
-    """Places that are not chosen have no mass; nothing else is updated."""
-    truth = fleet.loaded((0.6, 0.0, 0.0)).with_damping(fx.ModalDamping(fleet.DAMPING))
+def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
+    """Identify, localise among three places, update, design, verify on the larger model."""
+    truth = fleet.loaded((0.6, 0.0, 0.0), 1.01).with_damping(fx.ModalDamping(fleet.DAMPING))
     machine = fx.testbeds.WaferStage(truth, fleet.RATE, fleet.DELAY)
-    candidates = [fx.AddedMass(label) for label in fleet.LABELS]
+    shaken = {"period": 0.25, "periods": 2, "discard": 1, "amplitude": 5.0}
+    frf = machine.measure_frf(fleet.PORTS, **shaken, rng=1)
     chain = fleet.pipeline().replace(
-        starts=None, parameters=(), candidates=candidates, bandwidth=20.0, duration=0.4
-    )
-    row = chain(machine, np.random.default_rng(0))
-    masses = [row[f"mass at {label}"] for label in fleet.LABELS]
-    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=1e-3)
-    assert row["stable"]
+        modes=None, band=(200.0, 1300.0), hold=fleet.RATE, starts=None, bandwidth=20.0,
+        parameters=fleet.pipeline().parameters[3:], duration=0.4,
+        candidates=[fx.AddedMass(label) for label in fleet.LABELS], folder=tmp_path,
+    )  # fmt: skip
+    report = chain.report(frf, 1)
+    masses = [report.row[f"mass at {label}"] for label in fleet.LABELS]
+    np.testing.assert_allclose(masses, [0.6, 0.0, 0.0], atol=3e-3)
+    assert report.row["stiffness"] == pytest.approx(0.01, abs=1e-4)
+    assert report.places.chosen == (f"mass at {fleet.LABELS[0]}",)
+    # the larger model has what decides on the machine, whose loop the chain never sees
+    own = machine.loop(fleet.PORTS, *report.blocks)
+    assert report.row["stable"] and own.is_stable
+    assert report.row["modulus margin"] == pytest.approx(own.modulus_margin, rel=0.01)
+    assert report.row["bandwidth"] == pytest.approx(fx.loop.bandwidth(own), rel=0.01)
+    assert report.row["margin expected"] == report.row["modulus margin"]
+    report.write(tmp_path / "report.txt")
+    text = (tmp_path / "report.txt").read_text()
+    headings = [line for line in text.splitlines() if line and not line.startswith(" ")]
+    assert headings[:6] == ["Measured", "Localised", "Updated", "Observer", "Controller",
+                            "Loop on the larger model"]  # fmt: skip
+    assert "plant 164 states" in text and "specification: " in text
+    poles = report.measured  # numbered by now: measuring again is not needed
+    assert chain.replace(candidates=()).report(poles, 1).measured.modes == poles.modes
 
 
 def test_the_chain_refuses_what_it_cannot_use(fleet):
@@ -89,3 +107,5 @@ def test_the_chain_refuses_what_it_cannot_use(fleet):
         chain.replace(ports=chain.ports.replace(references=()))
     with pytest.raises(ModelError, match="bandwidth"):
         chain.replace(bandwidth=(80.0, -1.0))
+    with pytest.raises(ModelError, match=r"it is not said what to measure on it. Give modes="):
+        chain.replace(modes=None).report(fleet.fleet(1)[0])

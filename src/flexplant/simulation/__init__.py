@@ -17,6 +17,7 @@ from .inverse import inverse_forces as inverse_forces
 from .learning import LearnedFeedforward as LearnedFeedforward
 from .learning import learn_feedforward as learn_feedforward
 from .machine_pipeline import MachinePipeline as MachinePipeline
+from .machine_report import MachineReport as MachineReport
 from .motion import Motion as Motion
 from .motion import SetPoint as SetPoint
 from .response import Response as Response

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,29 +12,40 @@ from typing import Any
 import numpy as np
 
 from ..errors import AssumptionError, ModelError
-from ..estimation import KalmanEstimator, design_kalman
-from ..loop import ClosedLoop, bandwidth
-from ..modes import solve_modes
+from ..estimation import design_kalman
+from ..identification import MeasuredModes, identify_modes, numbered
+from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
+from ..lti.frequency import Frf
+from ..modes import Modes, solve_modes
 from ..plant import Ports, StandardPlant, assemble_plant, reference_errors, stage_weights
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..synthesis import Controller, design_hinf
-from ..updating import Eigenvalues, UpdateResult, localise, update
-from ..values import Value, positive, whole
-from .response import Response
+from ..synthesis import design_hinf
+from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
+from ..values import Value, generator, positive, short, whole
+from .machine_report import MachineReport
 from .simulate import simulate
-from .specification import Specification, Verdict
+from .specification import Specification
+
+#: times that measured modes are paired with those of a model, at most
+_PAIRINGS = 5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class MachinePipeline(Value):
-    """The chain measure, localise, update, plant, observer, controller, verify, for `study`.
+    """The chain identify, localise, update, plant, observer, controller, verify, for `study`.
 
-    Called with a machine it returns a row: the parameters found, what the observer predicts, and
-    what the controller reaches *on the machine*, beside the specification. A machine answers to
-    ``poles(modes)`` with MeasuredModes (ideal ones, or those that `identify_modes` and `numbered`
-    find in its FRFs), to ``loop(ports, *blocks)`` and to ``run(ports, *blocks, duration=,
-    reference=, rng=)``, as `fx.testbeds.WaferStage` does.
+    Called with a machine it returns a row: the parameters found, what the observer predicts, what
+    the controller reaches with the modes left out, and what it reaches *on the machine*, beside the
+    specification. A machine is
+
+    - an `Frf` that was measured: its modes are identified, and paired by frequency and shape with
+      those of the model, then of the updated model until the pairs stay. The loop runs on the
+      larger model, the updated full structure;
+    - `MeasuredModes` with the numbers of the model's modes, in place of an FRF;
+    - a virtual one, which answers to ``loop(ports, *blocks)``, on which the loop runs, and to
+      ``poles(modes)``, or to ``measure_frf(ports, **measurement)``, as `fx.testbeds.WaferStage`
+      does.
 
     Parameters
     ----------
@@ -46,13 +56,21 @@ class MachinePipeline(Value):
     parameters : sequence
         What is updated on each machine.
     ports : Ports
-        Channels of every machine, with a reference for its POI.
+        Channels of every machine, with a reference for its POI; the outputs of an FRF are sensors
+        of these, or DOFs of the model.
     rate : float [Hz]
         Of the controller.
     delay : int [samples]
         From measurement to actuation.
-    modes : sequence of int
-        Numbers of the modes whose poles are measured.
+    modes : sequence of int, optional
+        Numbers of the modes whose poles are used; all that were identified when not given.
+    measurement : mapping, optional
+        Options of `measure_frf` (period, amplitude, ...) of virtual machines, which are then
+        identified from FRFs.
+    band : (low, high) [Hz], optional
+        In which modes are identified; all frequencies of the FRF when not given.
+    hold : float [Hz], optional
+        Rate of the zero-order hold through which FRFs were measured.
     starts : int, optional
         From how many places each update searches, for parameters with bounds: poles alone may be
         explained nearly as well by masses elsewhere.
@@ -66,15 +84,15 @@ class MachinePipeline(Value):
     blocks : sequence, optional
         A controller for all machines (StateSpaces or Controllers), in place of a design for each.
     specification : Specification, optional
-        What the loop on the machine is checked against.
+        What the loop that is run is checked against.
     reference : SetPoint, array or mapping, optional
-        Of the run on the machine.
+        Of the run.
     duration : float [s]
         Of that run.
     larger : int
         Modes of the updated full structure that are known beyond the reduced model's.
     folder : path, optional
-        Where one report for each machine is written, a text file.
+        Where the report of each machine is written, a text file; the table names it.
 
     Raises
     ------
@@ -88,7 +106,10 @@ class MachinePipeline(Value):
     ports: Ports
     rate: float
     delay: int
-    modes: Sequence[int]
+    modes: Sequence[int] | None = None
+    measurement: Mapping[str, Any] | None = None
+    band: tuple[float, float] | None = None
+    hold: float | None = None
     starts: int | None = None
     candidates: Sequence[Any] = ()
     bandwidth: float | Sequence[float] = 50.0
@@ -110,7 +131,9 @@ class MachinePipeline(Value):
             parameters=tuple(self.parameters),
             rate=positive(self.rate, "rate"),
             delay=whole(self.delay, "delay", minimum=0),
-            modes=tuple(self.modes),
+            modes=None if self.modes is None else tuple(self.modes),
+            measurement=None if self.measurement is None else dict(self.measurement),
+            band=None if self.band is None else tuple(self.band),
             candidates=tuple(self.candidates),
             bandwidth=tuple(sorted(map(_hertz, np.atleast_1d(self.bandwidth)), reverse=True)),
             margin=positive(self.margin, "margin"),
@@ -131,50 +154,118 @@ class MachinePipeline(Value):
         return f"{self.ports.references[0].poi}:error"
 
     def __call__(self, machine: Any, rng: Any = None) -> dict[str, Any]:
-        """Return the row of one machine.
+        """Return the row of one machine, and write its report where there is a folder.
 
         Parameters
         ----------
-        machine : object
-            Answers to what is named above.
-        rng : numpy.random.Generator, optional
-            Of the noise of its run.
+        machine : Frf, MeasuredModes or a virtual machine
+            See above.
+        rng : int or numpy.random.Generator, optional
+            Of the noise of its run, and of a virtual measurement.
         """
+        report = self.report(machine, rng)
+        row = dict(report.row)
+        if self.folder is not None:
+            name = hashlib.sha256(repr(report).encode()).hexdigest()[:12]
+            row["report"] = f"machine-{name}.txt"
+            Path(self.folder).mkdir(parents=True, exist_ok=True)
+            report.write(Path(self.folder) / row["report"])
+        return row
+
+    def report(self, machine: Any, rng: Any = None) -> MachineReport:
+        """Return all that is found for one machine.
+
+        Parameters
+        ----------
+        machine, rng
+            As for a call.
+        """
+        of_run, of_measurement = (None, None) if rng is None else generator(rng).spawn(2)
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
-            fit = self._updated(machine)
+            measured, places, fit = self._fitted(self._measured(machine, of_measurement))
             many = solve_modes(fit.applied_to(self.full), count=self.larger)
             plant = assemble_plant(fit.model, self.ports).discretized(self.rate, delay=self.delay)
             observer = design_kalman(plant, larger=many)
-            blocks = self._designed(plant, many) if self.blocks is None else self.blocks
-            loop = machine.loop(self.ports, *blocks)
-            run = simulate(
+            if self.blocks is None:
+                blocks, left_out = self._designed(plant, many)
+            else:
+                blocks = tuple(self.blocks)
+                left_out = close_loop(plant, *blocks, larger=many).left_out
+            loop = self._loop(machine, plant, blocks, many)
+            run = simulate(loop, duration=self.duration, reference=self.reference, rng=of_run)
+            check = self.specification
+            report = MachineReport(
+                {},
+                measured,
+                fit,
+                observer,
+                blocks,
+                left_out,
                 loop,
-                duration=self.duration,
-                reference=self.reference,
-                rng=None if rng is None else rng.spawn(1)[0],
+                run,
+                None if check is None else check.check(loop, run),
+                places,
             )
-            verdict = None if self.specification is None else self.specification.check(loop, run)
-        row = self._row(fit, observer, loop, run, verdict)
+            row = self._row(report)
         row["warnings"] = len(said)
-        if self.folder is not None:
-            parts = (fit, plant, observer, *blocks, loop, verdict or "no specification")
-            lines = [*map(repr, parts), *(str(one.message) for one in said)]
-            row["report"] = _written(Path(self.folder), "\n\n".join(lines) + "\n")
-        return row
+        return report.replace(row=row, warned=[str(one.message) for one in said])
 
-    def _updated(self, machine: Any) -> UpdateResult:
-        residuals = [Eigenvalues(machine.poles(self.modes))]
-        chosen = []
-        if self.candidates:
-            places = localise(
-                self.model, residuals, self.candidates, nuisance=list(self.parameters)
+    def _measured(self, machine: Any, rng: Any) -> MeasuredModes:
+        """Return the modes of a machine; those of an FRF without numbers."""
+        if isinstance(machine, MeasuredModes):
+            return machine
+        if isinstance(machine, Frf):
+            return identify_modes(machine, band=self.band, hold=self.hold)
+        if self.measurement is not None:
+            frf = machine.measure_frf(self.ports, **self.measurement, rng=rng)
+            return identify_modes(frf, band=self.band, hold=self.hold)
+        if self.modes is None:
+            raise ModelError(
+                f"the machine {short(machine)} is no FRF, and it is not said what to measure on "
+                "it. Give modes= (numbers, for its poles) or measurement= (options of its "
+                "measure_frf, or {})."
             )
-            chosen = [one for one in self.candidates if one.name in places.chosen]
-        return update(self.model, [*self.parameters, *chosen], residuals, starts=self.starts)
+        poles: MeasuredModes = machine.poles(self.modes)
+        return poles
 
-    def _designed(self, plant: StandardPlant, many: Any) -> tuple[Any, Controller]:
-        """Return the errors that the H-infinity controller reads, and the controller."""
+    def _fitted(
+        self, found: MeasuredModes
+    ) -> tuple[MeasuredModes, Localisation | None, UpdateResult]:
+        """Return the modes that are used, the places of a change, and the update.
+
+        Modes without numbers are paired with those of the drawing, then with those of the updated
+        model, until the pairs stay: a change that is not small turns the shapes of close modes.
+        """
+        known = self._numbered(found, self.model)
+        for _ in range(_PAIRINGS):
+            places, fit = self._updated(known)
+            used, known = known, self._numbered(found, fit.model)
+            if known.modes == used.modes:
+                break
+        return used, places, fit
+
+    def _numbered(self, found: MeasuredModes, model: ReducedModel) -> MeasuredModes:
+        if found.modes is not None:
+            return found
+        at = {sensor.name: sensor.at for sensor in self.ports.y}
+        known = numbered(found, model, at=at, partial=True)
+        if self.modes is None:
+            return known
+        return known.select([i for i, mode in enumerate(known.modes or ()) if mode in self.modes])
+
+    def _updated(self, measured: MeasuredModes) -> tuple[Localisation | None, UpdateResult]:
+        residuals, unknowns, places = [Eigenvalues(measured)], list(self.parameters), None
+        if self.candidates:
+            places = localise(self.model, residuals, self.candidates, nuisance=unknowns)
+            chosen = [one for one in self.candidates if one.name in places.chosen]
+            unknowns = [*unknowns, *chosen]
+        return places, update(self.model, unknowns, residuals, starts=self.starts)
+
+    def _designed(
+        self, plant: StandardPlant, many: Modes
+    ) -> tuple[tuple[Any, ...], SpillOver | None]:
+        """Return the errors that an H-infinity controller reads, and it; and how both hold."""
         errors = reference_errors(plant)
         for wanted in np.atleast_1d(self.bandwidth):
             weights = stage_weights(plant, float(wanted))
@@ -182,19 +273,28 @@ class MachinePipeline(Value):
             found = design_hinf(weighted, larger=many)
             if found.left_out is not None and found.left_out.modulus_margin >= self.margin:
                 break
-        return errors, found
+        return (errors, found), found.left_out
 
-    def _row(
-        self,
-        fit: UpdateResult,
-        observer: KalmanEstimator,
-        loop: ClosedLoop,
-        run: Response,
-        verdict: Verdict | None,
-    ) -> dict[str, Any]:
+    def _loop(
+        self, machine: Any, plant: StandardPlant, blocks: Sequence[Any], many: Modes
+    ) -> ClosedLoop:
+        """Return the loop on a virtual machine, else on the larger model."""
+        if hasattr(machine, "loop"):
+            own: ClosedLoop = machine.loop(self.ports, *blocks)
+            return own
+        loop = close_loop(plant, *blocks, larger=many)
+        return loop.completed or loop
+
+    def _row(self, found: MachineReport) -> dict[str, Any]:
+        fit, loop = found.fit, found.loop
         row: dict[str, Any] = {one.name: 0.0 for one in self.candidates}
         row |= {one.name: float(p) for one, p in zip(fit.unknowns, fit.values, strict=True)}
-        row["estimate rms"] = observer.rms(self.error.replace(":error", ":z"))
+        row["modes measured"] = len(found.measured)
+        row["p value"] = fit.p_value if fit.p_value is not None else float("nan")
+        row["estimate rms"] = found.observer.rms(self.error.replace(":error", ":z"))
+        row["margin expected"] = (
+            float("nan") if found.left_out is None else found.left_out.modulus_margin
+        )
         row["stable"] = loop.is_stable
         row["spectral radius"] = loop.spectral_radius
         row["modulus margin"] = loop.modulus_margin
@@ -202,23 +302,13 @@ class MachinePipeline(Value):
             row["bandwidth"] = bandwidth(loop)
         except AssumptionError:  # not stable, or |S| is nowhere below 0 dB
             row["bandwidth"] = float("nan")
-        steady = float(np.max(run.rms(self.error, start=0.5 * self.duration)))
+        steady = float(np.max(found.run.rms(self.error, start=0.5 * self.duration)))
         row["error rms"] = steady if loop.is_stable else float("nan")
-        if verdict is not None:
-            row |= {name: verdict[name] for name in verdict.names if name not in row}
-            row["passed"] = verdict.passed
+        if found.verdict is not None:
+            row |= {n: found.verdict[n] for n in found.verdict.names if n not in row}
+            row["passed"] = found.verdict.passed
         return row
 
 
 def _hertz(value: Any) -> float:
     return positive(value, "bandwidth")
-
-
-def _written(folder: Path, text: str) -> str:
-    """Write a report, named by its content, at once or not at all; return the file's name."""
-    name = f"machine-{hashlib.sha256(text.encode()).hexdigest()[:12]}.txt"
-    folder.mkdir(parents=True, exist_ok=True)
-    part = folder / f".{name}.{os.getpid()}"
-    part.write_text(text)
-    part.replace(folder / name)
-    return name
