@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 
 from flexplant.errors import ModelError
 from flexplant.lti import StateSpace, frequency_response, matched
-from flexplant.lti.matching import finite_zeros
 from oracles_lti import matched_filter
 from systems_lti import machine
 
@@ -45,7 +44,7 @@ def test_poles_zeros_and_gain(seed):
     n = int(rng.integers(1, 6))
     poles, zeros = roots(rng, n), roots(rng, int(rng.integers(0, n + 1)))
     g = from_roots(poles, zeros, rng.choice([-3.0, 0.2]))
-    assert_same_roots(finite_zeros(g), zeros, 1e-6)
+    assert_same_roots(g.zeros(), zeros, 1e-6)
     found = matched(g, RATE)
     assert (found.inputs, found.outputs, found.name) == (("e",), ("u",), "filter")
     assert found.dt == pytest.approx(1 / RATE)
@@ -118,9 +117,9 @@ def test_refusals():
         matched(lag, RATE, at=100.0)
     with pytest.raises(ModelError, match="rate"):
         matched(lag, 0.0)
-    with pytest.raises(ModelError, match=r"cannot be matched|has no response"):
+    with pytest.raises(ModelError, match="cannot be matched"):
         matched(lag.replace(B=[[0.0]]), RATE)
-    with pytest.raises(ModelError, match="StateSpace"):
+    with pytest.raises(ModelError, match="python-control or SciPy"):
         matched("filter", RATE)
     gain = StateSpace([], [], [], [[3.0]])
     assert matched(gain, RATE).dt == 1 / RATE
@@ -129,9 +128,9 @@ def test_refusals():
 def test_a_filter_without_response_is_refused():
     """Zero in its matrices, or with an input whose states the output does not see."""
     lag = StateSpace([[-1.0]], [[1.0]], [[1.0]], [[0.0]])
-    with pytest.raises(ModelError, match="is zero: it has no zeros"):
-        finite_zeros(lag.replace(B=[[0.0]]))
-    assert finite_zeros(lag.replace(B=[[0.0]], D=[[1.0]])) == pytest.approx([-1.0])
     apart = StateSpace([[-1.0, 0.0], [0.0, -2.0]], [[1.0], [0.0]], [[0.0, 1.0]], [[0.0]])
-    with pytest.raises(ModelError, match="its input does not reach its output"):
-        finite_zeros(apart)
+    for mute in (lag.replace(B=[[0.0]]), apart):
+        with pytest.raises(ModelError, match="cannot be matched"):
+            matched(mute, RATE)
+    # a state that the input does not reach is a zero
+    assert lag.replace(B=[[0.0]], D=[[1.0]]).zeros() == pytest.approx([-1.0])

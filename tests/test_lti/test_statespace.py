@@ -30,8 +30,6 @@ def test_control_system_without_stated_time_is_refused():
     for dt in (None, True):
         with pytest.raises(ModelError, match="sampling time"):
             StateSpace.from_control(control.ss([[0.5]], [[1]], [[1]], [[0]], dt))
-    with pytest.raises(ModelError, match="StateSpace"):
-        as_statespace(control.tf([1], [1, 1]))
 
 
 def test_pickle_and_save(tmp_path):

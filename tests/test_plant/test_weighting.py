@@ -51,10 +51,18 @@ def test_nothing_named_changes_nothing():
     assert not same.asd  # H-infinity sees the noise only through weights
 
 
+def test_a_continuous_weight_is_sampled_at_the_plants_rate():
+    plant = assemble_plant(some_modes(), ports()).discretized(RATE)
+    heavy, wanted = (plant.weighted(z={"die:z": weight})
+                     for weight in (lowpass(10.0), tustin(lowpass(10.0), RATE)))  # fmt: skip
+    np.testing.assert_array_equal(heavy.system.A, wanted.system.A)
+    np.testing.assert_array_equal(heavy.system.C, wanted.system.C)
+
+
 def test_weights_of_python_control():
     plant = assemble_plant(some_modes(), ports())
     twin = control.tf([1.0], [0.01, 1.0])
-    heavy = plant.weighted(z={"die:z": control.ss(twin)})
+    heavy = plant.weighted(z={"die:z": twin})
     wanted = gain_of(plant.Gzw)[0] / (0.02j * np.pi * FREQ + 1)
     np.testing.assert_allclose(gain_of(heavy.Gzw)[0], wanted, rtol=1e-9, atol=1e-20)
 
@@ -97,8 +105,8 @@ def test_refusals():
         plant.weighted(z={"dye:z": 1.0})
     with pytest.raises(LabelError, match="no channel of w 'amp9'"):
         plant.weighted(w={"amp9": 1.0})
-    with pytest.raises(ModelError, match=r"has dt 0 s, the plant 0.0001 s.*Discretise the weight"):
-        plant.weighted(z={"die:z": lowpass(10.0)})
+    with pytest.raises(ModelError, match=r"has dt 0.01 s, the plant 0.0001 s.*continuous system"):
+        plant.weighted(z={"die:z": tustin(lowpass(10.0), 100.0)})
     with pytest.raises(ModelError, match=r"one input and one output.*one by one"):
         plant.weighted(z={"die:z": StateSpace([], [], [], np.eye(2))})
     with pytest.raises(ModelError, match="left out: keep at least one"):

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.lyapunov import scale_of
-from ..lti.statespace import System
+from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, UncertainPlant
 from ..values import FloatArray, short, whole
@@ -141,7 +141,7 @@ def _checked(plant: StandardPlant, machines: Sequence[StandardPlant]) -> list[St
     return [same_pois(plant, other) for other in machines]
 
 
-def _means(machines: Sequence[StandardPlant], system: System, sizes: FloatArray) -> FloatArray:
+def _means(machines: Sequence[StandardPlant], system: StateSpace, sizes: FloatArray) -> FloatArray:
     """Return the mean relative variance of a filter on each machine."""
     found = [error_variances(machine, system).values for machine in machines]
     return np.asarray(np.mean(np.array(found) / sizes**2, axis=1))

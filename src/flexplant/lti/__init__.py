@@ -38,6 +38,8 @@ from .splitting import Split as Split
 from .splitting import split_stable as split_stable
 from .statespace import StateSpace as StateSpace
 from .statespace import as_statespace as as_statespace
+from .transfer import tf as tf
+from .transfer import zpk as zpk
 from .weights import highpass as highpass
 from .weights import inverse_sensitivity as inverse_sensitivity
 from .weights import leadlag as leadlag

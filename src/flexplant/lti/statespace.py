@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import ModelError, unknown_label
+from ..errors import LabelError, ModelError
 from ..values import (
     ComplexArray,
     FloatArray,
@@ -20,16 +20,21 @@ from ..values import (
     known_units,
     positive,
     real_array,
+    short,
     signal_names,
 )
+from .channels import Channels, chosen_names, rows_of
+from .foreign import foreign_fields
 from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series, short_list
 from .scaling import state_scale
+from .zeros import invariant_zeros
 
 if TYPE_CHECKING:
     import control
+    from scipy import signal
 
-#: what functions of systems accept: ours, or a labelled one of python-control
-System: TypeAlias = "StateSpace | control.StateSpace"
+#: what functions of systems accept: ours, or one of python-control or SciPy
+System: TypeAlias = "StateSpace | control.StateSpace | control.TransferFunction | signal.lti"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -165,11 +170,11 @@ class StateSpace(Value):
 
     def input_index(self, names: Iterable[str]) -> IntArray:
         """Return the columns of the named inputs."""
-        return _rows(self.inputs, names, "input", self.name)
+        return rows_of(self.inputs, names, "input", self.name)
 
     def output_index(self, names: Iterable[str]) -> IntArray:
         """Return the rows of the named outputs."""
-        return _rows(self.outputs, names, "output", self.name)
+        return rows_of(self.outputs, names, "output", self.name)
 
     def select(
         self, outputs: Iterable[str] | None = None, inputs: Iterable[str] | None = None
@@ -194,12 +199,20 @@ class StateSpace(Value):
             chosen.__dict__["_poles"] = self._poles
         return chosen
 
-    def __getitem__(self, key: tuple[str | Sequence[str], str | Sequence[str]]) -> StateSpace:
-        """Return the channel `sys["output", "input"]`; lists of names select several."""
-        outputs, inputs = key
+    def __getitem__(self, key: tuple[Channels, Channels]) -> StateSpace:
+        """Return the channel `sys["output", "input"]` or `sys[0, 1]`; lists and slices: several.
+
+        Raises
+        ------
+        LabelError
+            When a name or number is unknown, or the key is not a pair.
+        """
+        if not isinstance(key, tuple) or len(key) != 2:
+            raise LabelError(
+                f"a channel is a pair, sys[output, input], by name or number, got {short(key)}."
+            )
         return self.select(
-            [outputs] if isinstance(outputs, str) else outputs,
-            [inputs] if isinstance(inputs, str) else inputs,
+            chosen_names(self.outputs, key[0], "output"), chosen_names(self.inputs, key[1], "input")
         )
 
     #: arrays leave `2.0 * g` with a numpy number to this class
@@ -272,10 +285,56 @@ class StateSpace(Value):
             A=new[:, :n], B=new[:, n:], C=self.C @ matrix, states=tuple(states), blocks=None
         )
 
+    def __call__(self, s: complex) -> complex | ComplexArray:
+        """Return the gain at one complex frequency s (z when sampled).
+
+        A number for one input and one output, else (p, m), as systems of python-control answer.
+
+        Raises
+        ------
+        ModelError
+            When s is a pole.
+        """
+        gain = self.evaluated(s)
+        return complex(gain[0, 0]) if gain.shape == (1, 1) else gain
+
+    def dcgain(self) -> float | FloatArray:
+        """Return the static gain ``C (-A)^-1 B + D`` (at z = 1 when sampled).
+
+        A number for one input and one output, else (p, m).
+
+        Raises
+        ------
+        ModelError
+            When a pole lies at zero frequency, such as that of a free mass or an integrator.
+        """
+        gain = self.evaluated(1.0 if self.dt else 0.0).real
+        return float(gain[0, 0]) if gain.shape == (1, 1) else gain
+
+    def zeros(self) -> ComplexArray:
+        """Return the finite invariant zeros [rad/s, or z]: where inputs leave no trace in outputs.
+
+        Of states that inputs do not reach or outputs do not see too.
+        """
+        return invariant_zeros(self)
+
     def evaluated(self, s: complex) -> ComplexArray:
-        """Return the gain ``C (s I - A)^-1 B + D`` at one complex frequency s (z when sampled)."""
+        """Return the gain ``C (s I - A)^-1 B + D`` (p, m) at one complex s (z when sampled).
+
+        Raises
+        ------
+        ModelError
+            When s is a pole.
+        """
         shifted = s * np.eye(self.n_states) - self.A
-        return np.asarray(self.C @ np.linalg.solve(shifted, self.B) + self.D, dtype=np.complex128)
+        try:
+            gain = self.C @ np.linalg.solve(shifted, self.B) + self.D
+        except np.linalg.LinAlgError as error:
+            raise ModelError(
+                f"the gain at {s:g} is infinite: a pole lies there, at zero frequency that of a "
+                "free mass or an integrator. Evaluate beside it."
+            ) from error
+        return np.asarray(gain, dtype=np.complex128)
 
     def to_control(self) -> control.StateSpace:
         """Return the system as a `control.StateSpace` with the same names."""
@@ -296,34 +355,17 @@ class StateSpace(Value):
 
     @classmethod
     def from_control(cls, sys: Any) -> StateSpace:
-        """Return a `control.StateSpace` as ours, names kept.
+        """Return a system of python-control or SciPy as ours, names kept.
+
+        A transfer function becomes sections in series, each channel of a matrix with its own
+        states: `minimal` removes what they share.
 
         Raises
         ------
         ModelError
-            When it is not a state-space system, or its sampling time is not stated.
+            When it is none, or its sampling time is not stated.
         """
-        if not all(hasattr(sys, part) for part in ("A", "B", "C", "D", "dt", "input_labels")):
-            raise ModelError(
-                f"need a flexplant or python-control StateSpace, got {type(sys).__name__}. "
-                "Convert it first: control.ss(...)."
-            )
-        if sys.dt is None or sys.dt is True:
-            raise ModelError(
-                f"the sampling time of {sys.name!r} is {sys.dt}: state it in seconds (0 for "
-                "continuous time), frequencies depend on it."
-            )
-        return cls(
-            sys.A,
-            sys.B,
-            sys.C,
-            sys.D,
-            float(sys.dt),
-            inputs=sys.input_labels,
-            outputs=sys.output_labels,
-            states=sys.state_labels,
-            name=sys.name,
-        )
+        return cls(**foreign_fields(sys))
 
 
 def as_statespace(sys: System | FloatArray) -> StateSpace:
@@ -331,7 +373,7 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
 
     Parameters
     ----------
-    sys : StateSpace, control.StateSpace, a value with a `.system`, or (p, m) array
+    sys : StateSpace, system of python-control or SciPy, value with a `.system`, or (p, m) array
         An array is a static gain.
 
     Raises
@@ -363,15 +405,3 @@ def is_block_diagonal(g: StateSpace) -> bool:
         return False
     owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
     return not np.any(g.A[owner[:, None] != owner[None, :]])
-
-
-def _rows(known: Sequence[str], names: Iterable[str], side: str, owner: str | None) -> IntArray:
-    position = {name: i for i, name in enumerate(known)}
-    if isinstance(names, str):
-        names = [names]
-    rows = []
-    for name in names:
-        if name not in position:
-            raise unknown_label(side, name, known, owner or "")
-        rows.append(position[name])
-    return np.array(rows, dtype=np.int64)

@@ -1,21 +1,98 @@
-"""Invariant zeros on the stability limit, for plants with more outputs than inputs too."""
+"""Invariant zeros: all of a system, and those on the stability limit.
+
+Systems are anything with A, B, C, D, dt and poles(): `StateSpace.zeros` is built upon this.
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
 from ..values import ComplexArray, FloatArray
-from .scaling import mean_speed
-from .statespace import StateSpace
+from .scaling import mean_speed, state_scale
 
 #: a zero closer to the limit than this, relative to its size, is tested as if it were on it
 _NEAR = 1e-6
 #: smallest singular value of the scaled system matrix, at which its rank is lost
 _LOST = 1e-9
+#: singular values below this, relative to the scaled system matrix, are rounding
+_ROUNDING = 1e-11
 
 
-def axis_zeros(g: StateSpace) -> ComplexArray:
+def invariant_zeros(g: Any) -> ComplexArray:
+    """Return the finite invariant zeros, where ``[A - s I, B; C, D]`` loses its normal rank.
+
+    The system is compressed until D has full row and column rank: outputs that do not feel an
+    input directly are states, and states of the rest. What is left is a regular pencil, whose
+    eigenvalues are the zeros; those at infinity have left with the compressed states.
+
+    Parameters
+    ----------
+    g : StateSpace
+        Continuous or sampled, with any numbers of inputs and outputs.
+
+    Returns
+    -------
+    (k,) complex array [rad/s, or z]
+
+    References
+    ----------
+    Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable systems, Automatica 18,
+    1982.
+    """
+    A, B, C, D = _even(*_scaled(g))
+    A, B, C, D = _compressed(A, B, C, D)
+    A, C, B, D = (part.T for part in _compressed(A.T, C.T, B.T, D.T))
+    n, m = B.shape
+    if not n:
+        return np.zeros(0, dtype=np.complex128)
+    if not m:
+        return np.asarray(la.eigvals(A) * _speed(g), dtype=np.complex128)
+    # columns that [C D] does not see: the pencil [A - s I, B] on them is square
+    unseen = la.qr(np.hstack([C, D]).T)[0][:, -n:]
+    alpha, beta = la.eigvals(np.hstack([A, B]) @ unseen, unseen[:n], homogeneous_eigvals=True)
+    finite = np.abs(beta) > _ROUNDING * np.abs(alpha)
+    return np.asarray(alpha[finite] / beta[finite] * _speed(g), dtype=np.complex128)
+
+
+def _compressed(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return a system of the same finite zeros whose D has full row rank."""
+    limit = _ROUNDING * float(np.linalg.norm(np.block([[A, B], [C, D]])))
+    while True:
+        turn, rank = _row_space(D, limit)
+        C, D = turn.T @ C, turn.T @ D
+        C_direct, C_late, D = C[:rank], C[rank:], D[:rank]
+        turn, fixed = _row_space(C_late.T, limit)  # states that C_late sees come first
+        if not fixed:
+            return A, B, C_direct, D
+        # outputs without feedthrough that are zero hold these states at zero: their rates are
+        # the next outputs
+        A, B, C_direct = turn.T @ A @ turn, turn.T @ B, C_direct @ turn
+        C = np.vstack([C_direct[:, fixed:], A[:fixed, fixed:]])
+        D = np.vstack([D, B[:fixed]])
+        A, B = A[fixed:, fixed:], B[fixed:]
+
+
+def _row_space(matrix: FloatArray, limit: float) -> tuple[FloatArray, int]:
+    """Return an orthogonal Q and r: the first r columns of Q span the columns of the matrix."""
+    if not matrix.size:
+        return np.eye(matrix.shape[0]), 0
+    left, values, _ = np.linalg.svd(matrix)
+    return left, int(np.sum(values > limit))
+
+
+def _even(
+    A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    d = state_scale(A, B, C) if A.size else np.ones(0)
+    return A * d / d[:, None], B / d[:, None], C * d, D
+
+
+def axis_zeros(g: Any) -> ComplexArray:
     """Return the invariant zeros on the imaginary axis (unit circle), upper half plane.
 
     Where ``[A - s I, B; C, D]`` loses column rank. With more outputs than inputs they are among
@@ -62,12 +139,12 @@ def axis_zeros(g: StateSpace) -> ComplexArray:
     return np.array(found, dtype=np.complex128) * speed
 
 
-def _speed(g: StateSpace) -> float:
+def _speed(g: Any) -> float:
     """Return a frequency [rad/s] that makes A of order one; 1 when sampled."""
     return 1.0 if g.dt else mean_speed(g.poles())
 
 
-def _scaled(g: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+def _scaled(g: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the matrices with time in units of the poles, inputs and outputs of unit size."""
     A, B = g.A / _speed(g), g.B / _speed(g)
     into = _inverse(np.linalg.norm(B, axis=0) + 0.0)

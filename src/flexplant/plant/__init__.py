@@ -10,6 +10,7 @@ from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
 from .forces import OutputDisturbance as OutputDisturbance
+from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .moving import Along as Along
 from .origin import Assembled as Assembled
 from .origin import Foreign as Foreign

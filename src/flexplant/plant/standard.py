@@ -97,8 +97,9 @@ class StandardPlant(Partition):
         Parameters
         ----------
         z, w : mapping {name: weight}
-            A weight is a number or a system with one input and one output, of this plant's dt.
-            None leaves the channel out; a channel that is not named is kept as it is.
+            A weight is a number or a system with one input and one output, of this plant's dt or
+            continuous: then it is sampled at the plant's rate (Tustin). None leaves the channel
+            out; a channel that is not named is kept as it is.
 
         Returns
         -------

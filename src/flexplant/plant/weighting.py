@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, unknown_label
+from ..lti.discretisation import tustin
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import short
@@ -84,13 +85,23 @@ def _weight(plant: Partition, weight: Any, name: str) -> StateSpace:
             f"the weight of {name!r} must have one input and one output, got {sys!r}. "
             "Weight channels one by one."
         )
-    if sys.n_states and not np.isclose(sys.dt, plant.dt, rtol=1e-9, atol=0.0):
-        raise ModelError(
-            f"the weight of {name!r} has dt {sys.dt:g} s, the plant {plant.dt:g} s. "
-            "Discretise the weight at the plant's rate."
-        )
+    sys = at_rate(sys, name, plant.dt)
     states = [f"{name}|{state}" for state in sys.states]
-    return sys.replace(dt=plant.dt, inputs=[name], outputs=[name], states=states)
+    return sys.replace(inputs=[name], outputs=[name], states=states)
+
+
+def at_rate(weight: StateSpace, name: str, dt: float) -> StateSpace:
+    """Return a weight of sampling time dt; a continuous one is sampled (Tustin)."""
+    if not weight.n_states:
+        return weight.replace(dt=dt)
+    if dt and not weight.dt:
+        return tustin(weight, 1.0 / dt)
+    if not np.isclose(weight.dt, dt, rtol=1e-9, atol=0.0):
+        raise ModelError(
+            f"the weight of {name!r} has dt {weight.dt:g} s, the plant {dt:g} s. Give it as a "
+            "continuous system, which is sampled at the plant's rate."
+        )
+    return weight
 
 
 def _through(plant: Partition, names: tuple[str, ...]) -> StateSpace:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
+from ..errors import AssumptionError, FlexplantError, InfeasibleError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import peak_gain
 from ..lti.preparation import Prepared
@@ -191,7 +191,7 @@ def _bound_at(problem: Prepared, omega: float) -> float:
     m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
     try:
         P = problem.system.evaluated(1j * omega)
-    except la.LinAlgError:  # an undamped pole lies there
+    except ModelError:  # an undamped pole lies there
         return 0.0
     out_of_reach = la.svd(P[:p1, m1:])[0][:, P.shape[1] - m1 :]
     unseen = la.svd(P[p1:, :m1])[2].conj().T[:, P.shape[0] - p1 :]

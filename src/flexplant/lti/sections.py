@@ -1,0 +1,149 @@
+"""Transfer functions as chains of real first- and second-order sections.
+
+The functions return the fields of a system: `StateSpace` and what reads foreign systems are
+built upon them.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError
+from ..values import ComplexArray, FloatArray, real_array
+from .joining import stacked
+
+
+def zpk_fields(
+    zeros: npt.ArrayLike, poles: npt.ArrayLike, gain: float, dt: float = 0.0
+) -> dict[str, Any]:
+    """Return A, B, C, D and blocks of ``gain prod(s - zeros) / prod(s - poles)``.
+
+    Each pair of poles is a block of two states with the zeros nearest to it, the least damped
+    first, so that A keeps its poles to rounding: a companion form of many poles does not.
+
+    Raises
+    ------
+    ModelError
+        When a complex number lacks its conjugate, or there are more zeros than poles.
+    """
+    z, p = _roots(zeros, "zeros"), _roots(poles, "poles")
+    if z.size > p.size:
+        raise ModelError(
+            f"the transfer function has {z.size} zeros and {p.size} poles: it differentiates its "
+            "input, which no state space does. Add poles beyond the band, such as a low-pass."
+        )
+    left = paired(z)
+    A, B, C = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
+    D = np.array([[1.0]])
+    blocks: list[int] = []
+    factor = float(real_array(gain, "gain", ()))
+    for pair in sorted(paired(p), key=lambda pole: _damping(pole[0], dt)):
+        nearest = _nearest(pair, left)
+        left = [part for part in left if part is not nearest]
+        a, b, c, d = _section(pair, nearest)
+        # sections of moderate gain: what they lack of the poles' size goes to the factor
+        size = float(np.abs(pair).max()) or 1.0
+        lacking = size ** (pair.size - nearest.size)
+        c, d, factor = c * lacking, d * lacking, factor / lacking
+        # the later section's states first: A stays block upper triangular
+        A = np.block([[a, b @ C], [np.zeros((A.shape[0], pair.size)), A]])
+        B, C, D = np.vstack([b @ D, B]), np.hstack([c, d @ C]), d @ D
+        blocks = [pair.size, *blocks]
+    return {"A": A, "B": B, "C": factor * C, "D": factor * D, "blocks": blocks}
+
+
+def tf_fields(
+    numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt: float = 0.0
+) -> dict[str, Any]:
+    """Return A, B, C, D and blocks of a ratio of polynomials, highest power first.
+
+    Raises
+    ------
+    ModelError
+        When the denominator is zero, or of a lower degree than the numerator.
+    """
+    num, den = (
+        np.trim_zeros(np.atleast_1d(real_array(part, name)), "f")
+        for part, name in ((numerator, "the numerator"), (denominator, "the denominator"))
+    )
+    if not den.size:
+        raise ModelError("the denominator is zero: a transfer function needs one that is not.")
+    if not num.size:
+        return zpk_fields([], [], 0.0)
+    return zpk_fields(np.roots(num), np.roots(den), num[0] / den[0], dt)
+
+
+def matrix_fields(channels: list[list[dict[str, Any]]]) -> dict[str, Any]:
+    """Return the fields of a matrix of transfer functions, each with states of its own."""
+    every = [part for row in channels for part in row]
+    inputs = [np.eye(len(row))[j : j + 1] for row in channels for j in range(len(row))]
+    outputs = [np.eye(len(channels))[:, i : i + 1] for i, row in enumerate(channels) for _ in row]
+    return {
+        "A": stacked([part["A"] for part in every]),
+        "B": np.vstack([part["B"] @ side for part, side in zip(every, inputs, strict=True)]),
+        "C": np.hstack([side @ part["C"] for part, side in zip(every, outputs, strict=True)]),
+        "D": np.array([[part["D"][0, 0] for part in row] for row in channels]),
+        "blocks": [size for part in every for size in part["blocks"]],
+    }
+
+
+def _roots(values: npt.ArrayLike, name: str) -> ComplexArray:
+    roots = np.atleast_1d(np.asarray(values, dtype=np.complex128)).ravel()
+    if not np.all(np.isfinite(roots)):
+        raise ModelError(f"{name} must be finite numbers, got {values!r}.")
+    lonely = [root for root in roots if not np.isclose(roots, root.conj(), rtol=1e-6).any()]
+    if lonely:
+        raise ModelError(
+            f"{name} need the conjugate of {lonely[0]:.6g}: complex ones of a real system come in "
+            "pairs."
+        )
+    return roots
+
+
+def _damping(pole: complex, dt: float) -> float:
+    return 1.0 - abs(pole) if dt else abs(pole.real) / (abs(pole) or 1.0)
+
+
+def paired(values: ComplexArray) -> list[ComplexArray]:
+    """Return conjugate pairs, pairs of neighbouring real values, and one that is left over."""
+    upper = values.imag > 1e-12 * np.abs(values)
+    pairs = [np.array([v, np.conj(v)]) for v in values[upper]]
+    real = np.sort(values[np.abs(values.imag) <= 1e-12 * np.abs(values)].real).astype(complex)
+    return pairs + [real[i : i + 2] for i in range(0, real.size, 2)]
+
+
+def _nearest(pair: ComplexArray, left: list[ComplexArray]) -> ComplexArray:
+    """Return the zeros nearest to a pair of poles, none where it cannot hold them."""
+    fitting = [z for z in left if z.size == pair.size] or [z for z in left if z.size < pair.size]
+    if not fitting:
+        return np.zeros(0, dtype=np.complex128)
+    return min(fitting, key=lambda z: float(np.abs(z[0] - pair[0])))
+
+
+def _section(
+    poles: ComplexArray, zeros: ComplexArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return ``prod (s - zero) / prod (s - pole)`` of order one or two, with no more zeros."""
+    through = np.array([[float(zeros.size == poles.size)]])
+    if poles.size == 1:
+        p = float(poles[0].real)
+        gain = p - float(zeros[0].real) if zeros.size else 1.0
+        return np.array([[p]]), np.array([[1.0]]), np.array([[gain]]), through
+    # through + (n1 s + n0) / den, zeros and poles compared before they are multiplied out
+    if zeros.size == 2:
+        n1 = float((poles.sum() - zeros.sum()).real)
+        n0 = float((np.prod(zeros) - np.prod(poles)).real)
+    else:
+        n1, n0 = (1.0, -float(zeros[0].real)) if zeros.size else (0.0, 1.0)
+    B = np.array([[0.0], [1.0]])
+    real = float(poles[0].real)
+    if poles[0].imag:
+        imag = abs(float(poles[0].imag))
+        A = np.array([[real, imag], [-imag, real]])
+        return A, B, np.array([[(n0 + n1 * real) / imag, n1]]), through
+    size = float(np.abs(poles).max()) or 1.0
+    A = np.array([[real, size], [0.0, float(poles[1].real)]])
+    return A, B, np.array([[(n0 + n1 * real) / size, n1]]), through
