@@ -108,6 +108,8 @@ def made():
     yield from (plant, sampled, sampled.weighted(z={"die:z": 2.0}), uncertain, plant.check())
     yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
     yield from (static, servo, loop, point, response)
+    law = fx.Pid(1e3, 1.0, 20.0, 200.0) * fx.Lead(30.0) * fx.Notch(300.0) * fx.LowPass(400.0)
+    yield from (*law.factors, law, fx.design_loops(sampled, law))
     yield from of_estimators(sampled, small)
     yield from (fx.Riccati(), fx.testbeds.wafer_stage(), sensors, solution)
     more = a_system()

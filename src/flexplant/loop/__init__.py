@@ -1,5 +1,6 @@
 """Closing the loop by names, its sensitivities and margins."""
 
+from .axes import in_axes as in_axes
 from .budget import ErrorBudget as ErrorBudget
 from .closed import ClosedLoop as ClosedLoop
 from .closing import close_loop as close_loop
@@ -8,6 +9,9 @@ from .comparison import LoopFigures as LoopFigures
 from .comparison import compare_loops as compare_loops
 from .margins import bandwidth as bandwidth
 from .margins import modulus_margin as modulus_margin
+from .report import LoopMargins as LoopMargins
+from .report import LoopReport as LoopReport
+from .report import report_loops as report_loops
 from .sensitivity import complementary_sensitivity as complementary_sensitivity
 from .sensitivity import control_sensitivity as control_sensitivity
 from .sensitivity import loop_gain as loop_gain

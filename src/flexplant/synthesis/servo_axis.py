@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
-from ..lti.discretisation import discretized, tustin
-from ..lti.interconnection import series
+from ..lti.discretisation import discretized
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
-from ..lti.weights import leadlag, lowpass, notch
 from ..values import ComplexArray, FloatArray
+from .elements import LowPass, Notch, Pid
+from .law import Law
 
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body
 #: then peaks near 4 dB with the roll-off and integrator below
@@ -23,7 +23,7 @@ DEPTH, WIDTH = 0.05, 0.3
 
 @dataclass(frozen=True)
 class Axis:
-    """``k (1 + w_i / s) (1 + 4 s / w_b) / (1 + s / (4 w_b)) F(s)``, sampled by Tustin's rule.
+    """``k (1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)``, sampled by Tustin's rule.
 
     F is a second-order low-pass and the notches; k makes ``1 / s^2`` cross 1 at the bandwidth.
 
@@ -34,7 +34,11 @@ class Axis:
     notches : tuple of float [Hz]
         Centres.
     rate : float [Hz]
-        Sampling rate.
+        Sampling rate; 0 when continuous.
+    lead : float
+        The factor r.
+    prewarped : bool
+        As for `Law`.
     """
 
     bandwidth: float
@@ -42,45 +46,37 @@ class Axis:
     integrator: float
     notches: tuple[float, ...]
     rate: float
+    lead: float = LEAD
+    prewarped: bool = False
 
     @cached_property
-    def system(self) -> StateSpace:
+    def law(self) -> Law:
         """Error to acceleration."""
-        omega_i = 2.0 * np.pi * self.integrator
-        parts = [
-            StateSpace([[0.0]], [[omega_i]], [[1.0]], [[1.0]]),
-            leadlag(self.bandwidth / LEAD, LEAD * self.bandwidth),
-            lowpass(self.rolloff, order=2),
-            *(notch(freq, depth=DEPTH, width=WIDTH) for freq in self.notches),
-        ]
-        joined = parts[0]
-        for part in parts[1:]:
-            joined = series(joined, part)
-        joined = tustin(joined, self.rate)
-        gain = self._gain
-        return joined.replace(
-            C=gain * joined.C, D=gain * joined.D, inputs=["error"], outputs=["acceleration"]
+        pid = Pid.corners(
+            1.0,
+            integrator=self.integrator,
+            zero=self.bandwidth / self.lead,
+            pole=self.bandwidth * self.lead,
         )
-
-    def response(self, freq: FloatArray) -> ComplexArray:
-        """Return the response at frequencies [Hz] below half the rate."""
-        return np.asarray(self._gain * self._shape(freq))
+        notches = tuple(Notch(freq, DEPTH, WIDTH) for freq in self.notches)
+        shape = Law(
+            (pid, LowPass(self.rolloff), *notches), rate=self.rate, prewarped=self.prewarped
+        )
+        at = abs(shape.response(np.array([self.bandwidth]))[0])
+        return shape * float((2.0 * np.pi * self.bandwidth) ** 2 / at)
 
     @property
-    def _gain(self) -> float:
-        at = self._shape(np.array([self.bandwidth]))[0]
-        return float((2.0 * np.pi * self.bandwidth) ** 2 / abs(at))
+    def system(self) -> StateSpace:
+        """Error to acceleration."""
+        return self.law.system.replace(outputs=["acceleration"])
 
-    def _shape(self, freq: FloatArray) -> ComplexArray:
-        # Tustin's s in units of 1 rad/s: 2 rate (z - 1) / (z + 1)
-        s = 2j * self.rate * np.tan(np.pi * freq / self.rate)
-        wb, wr, wi = 2.0 * np.pi * np.array([self.bandwidth, self.rolloff, self.integrator])
-        value = (1.0 + wi / s) * (1.0 + LEAD * s / wb) / (1.0 + s / (LEAD * wb))
-        value = value / ((s / wr) ** 2 + np.sqrt(2.0) * s / wr + 1.0)
-        for centre in self.notches:
-            p = s / (2.0 * np.pi * centre)
-            value *= (p**2 + 2.0 * DEPTH * WIDTH * p + 1.0) / (p**2 + 2.0 * WIDTH * p + 1.0)
-        return np.asarray(value)
+    def response(self, freq: FloatArray) -> ComplexArray:
+        """Return the response at increasing frequencies [Hz] below half the rate."""
+        return self.law.response(freq)
+
+    def with_notch(self, freq: float) -> Axis:
+        """Return the axis with one notch more [Hz]."""
+        return replace(self, notches=(*self.notches, freq))
 
 
 def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:

@@ -57,6 +57,8 @@ class ServoLoop:
         if not np.any(acts):
             return 1.0
         loop = gain[acts, None, None] * self.through[acts]
+        if loop.shape[-1] == 1:
+            return float(1.0 / np.min(np.abs(1.0 + loop)))
         S = np.linalg.inv(np.eye(loop.shape[-1]) + loop)
         # sigma_max is between the Frobenius norm and that over sqrt(m): only candidates by SVD
         size = np.sqrt(np.sum(np.abs(S) ** 2, axis=(1, 2)))
@@ -83,7 +85,7 @@ class ServoLoop:
             if peak <= TARGET and stable(axis):
                 break
             left = [f for f in self.resonant(axis).tolist() if f not in axis.notches][:_TRIED]
-            tried = [_with(axis, freq) for freq in left]
+            tried = [axis.with_notch(freq) for freq in left]
             if not tried:
                 break
             peaks = [self.peak(one) for one in tried]
@@ -92,10 +94,6 @@ class ServoLoop:
                 break
             axis, peak = tried[best], peaks[best]
         return axis
-
-
-def _with(axis: Axis, freq: float) -> Axis:
-    return Axis(axis.bandwidth, axis.rolloff, axis.integrator, (*axis.notches, freq), axis.rate)
 
 
 def servo_loop(

@@ -1,0 +1,253 @@
+"""report_loops: crossovers, margins and stability, loop by loop, of a model or a measured Frf."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.optimize import brentq
+
+from ..errors import unknown_label
+from ..values import ComplexArray, FloatArray, Value, whole
+from .broken import BrokenLoop, inverted
+from .nyquist import NyquistCount, continued, nyquist_count
+from .sensitivity import Loop, taken_apart
+
+#: a pole of the controller this near to zero frequency integrates
+_INTEGRATES = 1e-9
+#: a loop gain at the first or last line that counts as real
+_REAL = 0.05
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopMargins(Value):
+    """One loop, broken at one place while the others stay closed.
+
+    Parameters
+    ----------
+    name : str
+        The channel where it is broken.
+    crossovers : tuple of float [Hz]
+        Where the loop gain crosses 1; the bandwidth is the first, resonances may add more.
+    gain_margin, gain_reduction : float
+        Factors on the gain, above and below 1, at which the loop reaches the critical point;
+        infinite and 0 where none does.
+    phase_margin : float [deg]
+        The least at the crossovers; 180 without one.
+    modulus_margin : float
+        Least distance to the critical point, 1 / max |S|.
+    freq : float [Hz]
+        Where it is.
+    """
+
+    name: str
+    crossovers: tuple[float, ...]
+    gain_margin: float
+    gain_reduction: float
+    phase_margin: float
+    modulus_margin: float
+    freq: float
+
+    def __post_init__(self) -> None:
+        self._set(crossovers=tuple(float(f) for f in self.crossovers))
+
+    def __repr__(self) -> str:
+        first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4]) or "none"
+        more = ", ..." if len(self.crossovers) > 4 else ""
+        decibel = 20.0 * np.log10(self.gain_margin)
+        return (
+            f"{self.name}: crosses 1 at {first}{more} Hz, gain margin {decibel:.1f} dB, phase "
+            f"margin {self.phase_margin:.0f} deg, modulus margin {self.modulus_margin:.3f} "
+            f"({self.freq:.4g} Hz)"
+        )
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopReport(Value, Mapping[str, LoopMargins]):
+    """What `report_loops` found: `report["u1"]` is one loop.
+
+    Parameters
+    ----------
+    loops : tuple of LoopMargins
+        Of each channel where the loops are broken.
+    modulus_margin : float
+        Of all together, ``1 / max sigma_max(S)``; 0 when unstable.
+    unstable : int, optional
+        Poles of the closed loop outside the stability region; None where that is not known.
+    reason : str
+        Why it is not known.
+    """
+
+    loops: tuple[LoopMargins, ...]
+    modulus_margin: float
+    unstable: int | None
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        self._set(loops=tuple(self.loops))
+
+    @property
+    def is_stable(self) -> bool | None:
+        """Whether the closed loop is stable; None where it cannot be judged."""
+        return None if self.unstable is None else self.unstable == 0
+
+    def __getitem__(self, name: str) -> LoopMargins:
+        for loop in self.loops:
+            if loop.name == name:
+                return loop
+        raise unknown_label("loop", name, list(self))
+
+    def __iter__(self) -> Iterator[str]:
+        return (loop.name for loop in self.loops)
+
+    def __len__(self) -> int:
+        return len(self.loops)
+
+    def __repr__(self) -> str:
+        state = {True: "stable", False: f"unstable, {self.unstable} poles", None: "not judged"}
+        margin = f"modulus margin {self.modulus_margin:.3f} of {len(self)} loops together"
+        lines = [f"<LoopReport: {state[self.is_stable]}, {margin}>"]
+        lines += [f"  {loop!r}" for loop in self.loops[:4]]
+        lines += [f"  and {len(self) - 4} more"] if len(self) > 4 else []
+        lines += [f"  stability: {self.reason}"] if self.reason else []
+        return "\n".join(lines)
+
+
+def report_loops(
+    loop: Loop, *, at: Literal["u", "y"] = "u", rigid: int = 0, unstable: int = 0
+) -> LoopReport:
+    """Return crossovers, gain, phase and modulus margin of each loop, and whether all are stable.
+
+    Each loop is broken while the others stay closed: ``L_i = 1 - 1 / S_ii`` with
+    ``S = (I - L)^-1``. Stability of a model follows from the poles; that of a measured plant from
+    the Nyquist count, with the poles at zero and outside the stability region that are stated for
+    the plant and known of the controller.
+
+    Parameters
+    ----------
+    loop : ClosedLoop, or (plant, controller)
+        As for `loop_gain`; the plant may be a measured Frf, in decoupled axes by `in_axes`.
+    at : {"u", "y"}
+        Where the loops are broken.
+    rigid : int
+        Of a measured plant: its rigid-body modes (two poles at zero each); those on springs too
+        when the suspension lies below the lines.
+    unstable : int
+        Of a measured plant: poles outside the stability region (negative stiffness).
+
+    Returns
+    -------
+    LoopReport
+
+    Raises
+    ------
+    LabelError
+        When channels of plant and controller do not match.
+    ModelError
+        When `loop` is of another type, or a number of poles is none.
+    """
+    rigid, unstable = whole(rigid, "rigid", minimum=0), whole(unstable, "unstable", minimum=0)
+    parts = taken_apart(loop)
+    grid = parts.grid
+    S = inverted(parts.gain(grid, at))
+    count = _count(parts, grid, rigid, unstable)
+    names = parts.u if at == "u" else parts.y
+
+    def one(i: int) -> LoopMargins:
+        exact = None
+        if parts.measured is None:
+
+            def exact(freq: float) -> complex:
+                there = inverted(parts.gain(np.array([freq]), at))
+                return complex(1.0 - 1.0 / there[0, i, i])
+
+        return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact)
+
+    margin = 0.0 if count.unstable else 1.0 / parts.worst[0]
+    loops = tuple(one(i) for i in range(len(names)))
+    return LoopReport(loops, margin, count.unstable, count.reason)
+
+
+def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> NyquistCount:
+    poles = parts.poles()
+    distance = np.log(np.where(poles == 0, 1e-300, poles)) if parts.dt else poles
+    scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=1e-300)
+    if parts.measured is None:
+        return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
+    zero = np.abs(distance) <= _INTEGRATES * scale
+    own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
+    at_zero = 2 * rigid + int(np.count_nonzero(zero))
+    plant = parts.plant(grid)
+    low = grid <= max(1.5 * grid[0], grid[min(3, grid.size - 1)])
+    size = np.linalg.norm(plant[:, :, low], axis=(0, 1))
+    slope = -float(np.polyfit(np.log(grid[low]), np.log(np.maximum(size, 1e-300)), 1)[0])
+    if abs(slope - (2 if rigid else 0)) > 1.0:
+        return NyquistCount(
+            None,
+            f"at the lowest lines, from {grid[0]:.4g} Hz, the plant falls with slope {slope:.2g}, "
+            f"but {rigid} rigid-body modes were stated: a free body falls with slope 2, a held one "
+            "does not. State rigid=, or measure at lower frequencies",
+        )
+    freq, L = continued(grid, plant, parts.controller, 2 if rigid else 0)
+    return nyquist_count(freq, L, at_zero=at_zero, unstable=unstable + own)
+
+
+def loop_margins(
+    name: str,
+    freq: FloatArray,
+    L: ComplexArray,
+    exact: Callable[[float], complex] | None = None,
+) -> LoopMargins:
+    """Return the margins of one loop gain (n_freq,); the critical point is +1.
+
+    Parameters
+    ----------
+    name : str
+        Of the channel.
+    freq : (n_freq,) array [Hz]
+        Increasing.
+    L : (n_freq,) complex array
+        The loop gain.
+    exact : function of frequency [Hz], optional
+        The loop gain between the lines; interpolated unless given.
+    """
+
+    def between(f: float) -> complex:
+        return complex(np.interp(f, freq, L.real) + 1j * np.interp(f, freq, L.imag))
+
+    find = between if exact is None else exact
+    crossovers = _roots(freq, np.abs(L) - 1.0, lambda f: abs(find(f)) - 1.0)
+    phases = [abs(np.degrees(np.angle(find(f)))) for f in crossovers]
+    # L is real where the imaginary part changes sign; positive: towards the critical point
+    reals = [find(f).real for f in _roots(freq, L.imag, lambda f: find(f).imag)]
+    # and at both ends, zero frequency and half the rate, where it comes to lie on the real axis
+    reals += [end.real for end in (L[0], L[-1]) if abs(end.imag) < _REAL * abs(end.real)]
+    below = [x for x in reals if 0.0 < x < 1.0]
+    above = [x for x in reals if x > 1.0]
+    size = np.abs(1.0 - L)
+    least = int(np.argmin(size))
+    return LoopMargins(
+        name,
+        tuple(crossovers),
+        1.0 / max(below) if below else float("inf"),
+        1.0 / min(above) if above else 0.0,
+        float(min(phases, default=180.0)),
+        float(size[least]),
+        float(freq[least]),
+    )
+
+
+def _roots(freq: FloatArray, values: FloatArray, function: Callable[[float], float]) -> list[float]:
+    """Return the zeros of a function of frequency between the lines where its sign changes."""
+    places = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
+    found = []
+    for i in places.tolist():
+        low, high = float(freq[i]), float(freq[i + 1])
+        ends = function(low), function(high)
+        if ends[0] * ends[1] >= 0:  # rounding at a line
+            found.append(low if abs(ends[0]) < abs(ends[1]) else high)
+        else:
+            found.append(float(brentq(function, low, high, xtol=1e-9 * low)))
+    return found

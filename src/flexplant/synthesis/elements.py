@@ -1,0 +1,190 @@
+"""What a control engineer multiplies by hand: PID, lead, notch and low-pass, as values."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import ModelError
+from ..values import positive, real_array, whole
+from .law import Section, SingleElement
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Pid(SingleElement):
+    """``p + i / s + d s / (1 + s / w)``: proportional, integral and derivative action.
+
+    Parameters
+    ----------
+    p, i, d : float
+        Gains [command per error, per s, times s].
+    pole : float [Hz], optional
+        Corner w above which the derivative no longer grows; needed with d.
+    """
+
+    p: float
+    i: float = 0.0
+    d: float = 0.0
+    pole: float | None = None
+
+    def __post_init__(self) -> None:
+        gains = {name: float(real_array(getattr(self, name), name, ())) for name in "pid"}
+        if gains["d"] and self.pole is None:
+            raise ModelError(
+                "a derivative without a pole has unbounded gain, and no system: give pole= [Hz], "
+                "some 3 to 10 times the bandwidth."
+            )
+        self._set(**gains, pole=None if self.pole is None else positive(self.pole, "pole"))
+
+    @classmethod
+    def corners(
+        cls,
+        gain: float,
+        *,
+        integrator: float = 0.0,
+        zero: float | None = None,
+        pole: float | None = None,
+    ) -> Pid:
+        """Return ``gain (1 + w_i / s) (1 + s / w_z) / (1 + s / w_p)``.
+
+        Parameters
+        ----------
+        gain : float
+            Between the corner of the integrator and the zero.
+        integrator : float [Hz]
+            Corner of the integral action; 0 without.
+        zero, pole : float [Hz], optional
+            Of the lead; both or none.
+
+        Raises
+        ------
+        ModelError
+            When one of zero and pole is missing, or a number is not positive.
+        """
+        k = float(real_array(gain, "gain", ()))
+        w_i = 2.0 * np.pi * positive(integrator, "integrator", zero=True)
+        if zero is None and pole is None:
+            return cls(k, k * w_i)
+        if zero is None or pole is None:
+            raise ModelError("a lead has a zero and a pole: give both [Hz], or none.")
+        w_z = 2.0 * np.pi * positive(zero, "zero")
+        w_p = 2.0 * np.pi * positive(pole, "pole")
+        p = k * (1.0 + w_i / w_z - w_i / w_p)
+        return cls(p, k * w_i, k / w_z - p / w_p, float(pole))
+
+    def __repr__(self) -> str:
+        parts = [f"{name} {getattr(self, name):.4g}" for name in "pid" if getattr(self, name)]
+        pole = "" if self.pole is None else f" pole {self.pole:g} Hz"
+        return f"Pid {' '.join(parts) or 'p 0'}{pole}"
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        if self.pole is None:
+            return Section((0.0, self.p, self.i), (0.0, 1.0, 0.0), 1.0)
+        w = 2.0 * np.pi * self.pole
+        b = (self.p + self.d * w, self.p + self.i / w, self.i / w)
+        if not self.i:  # no state that integrates nothing
+            return Section((0.0, b[0], self.p), (0.0, 1.0, 1.0), w)
+        return Section(b, (1.0, 1.0, 0.0), w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Lead(SingleElement):
+    """``(1 + sqrt(r) p) / (1 + p / sqrt(r)) / sqrt(r)``, p = s / w: gain 1 where it leads most.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Where the phase is largest, ``asin((r - 1) / (r + 1))``; the zero lies at freq / sqrt(r).
+    ratio : float
+        Pole over zero; below 1 it is a lag.
+    """
+
+    freq: float
+    ratio: float = 9.0
+
+    def __post_init__(self) -> None:
+        self._set(freq=positive(self.freq, "freq"), ratio=positive(self.ratio, "ratio"))
+
+    def __repr__(self) -> str:
+        return f"Lead {self.freq:g} Hz ratio {self.ratio:g}"
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        root, w = float(np.sqrt(self.ratio)), 2.0 * np.pi * self.freq
+        return Section((0.0, 1.0, 1.0 / root), (0.0, 1.0 / root, 1.0), w, w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Notch(SingleElement):
+    """``(p^2 + 2 depth width p + 1) / (p^2 + 2 width p + 1)``, p = s / w.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Centre.
+    depth : float
+        Gain at the centre, below 1; above 1 it is a resonance.
+    width : float
+        Damping ratio of the poles: half the relative width.
+    """
+
+    freq: float
+    depth: float = 0.05
+    width: float = 0.3
+
+    def __post_init__(self) -> None:
+        self._set(
+            freq=positive(self.freq, "freq"),
+            depth=positive(self.depth, "depth", zero=True),
+            width=positive(self.width, "width"),
+        )
+
+    def __repr__(self) -> str:
+        return f"Notch {self.freq:.4g} Hz depth {self.depth:g} width {self.width:g}"
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w, two = 2.0 * np.pi * self.freq, 2.0 * self.width
+        return Section((1.0, self.depth * two, 1.0), (1.0, two, 1.0), w, w)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LowPass(SingleElement):
+    """``1 / (p^2 + 2 damping p + 1)``, or ``1 / (p + 1)`` of order 1, p = s / w.
+
+    Parameters
+    ----------
+    freq : float [Hz]
+        Corner.
+    order : {1, 2}
+        Slope above it.
+    damping : float
+        Of order 2; Butterworth unless given.
+    """
+
+    freq: float
+    order: int = 2
+    damping: float = float(np.sqrt(0.5))
+
+    def __post_init__(self) -> None:
+        self._set(
+            freq=positive(self.freq, "freq"),
+            order=whole(self.order, "order", maximum=2),
+            damping=positive(self.damping, "damping"),
+        )
+
+    def __repr__(self) -> str:
+        return f"LowPass {self.freq:g} Hz order {self.order}"
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        w = 2.0 * np.pi * self.freq
+        if self.order == 1:
+            return Section((0.0, 0.0, 1.0), (0.0, 1.0, 1.0), w, w)
+        return Section((0.0, 0.0, 1.0), (1.0, 2.0 * self.damping, 1.0), w, w)

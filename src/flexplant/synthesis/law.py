@@ -1,0 +1,247 @@
+"""The law of one axis: elements multiplied, continuous or sampled, in closed form and as system."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import ModelError
+from ..lti.discretisation import tustin
+from ..lti.frequency import sampled_freq
+from ..lti.interconnection import series
+from ..lti.statespace import StateSpace
+from ..values import ComplexArray, FloatArray, Value, flag, positive, real_array
+
+
+class Section(NamedTuple):
+    """``(b2 p^2 + b1 p + b0) / (a2 p^2 + a1 p + a0)``, p = s / omega; order 2, or 1 with a2 = 0.
+
+    Parameters
+    ----------
+    b, a : tuples of float
+        Coefficients of p^2, p and 1.
+    omega : float [rad/s]
+        Unit of p.
+    centre : float [rad/s]
+        Where a sampled section keeps its response exactly; 0: nowhere in particular.
+    """
+
+    b: tuple[float, float, float]
+    a: tuple[float, float, float]
+    omega: float
+    centre: float = 0.0
+
+    def at(self, rate: float) -> Section:
+        """Return the section whose Tustin equivalent at a rate [Hz] keeps the centre."""
+        if not rate or not self.centre:
+            return self
+        stretch = 2.0 * rate * np.tan(0.5 * self.centre / rate) / self.centre
+        return self._replace(omega=float(stretch * self.omega))
+
+    def gain(self, s: ComplexArray) -> ComplexArray:
+        """Return the response at complex frequencies s [rad/s]."""
+        p = s / self.omega
+        (b2, b1, b0), (a2, a1, a0) = self.b, self.a
+        return np.asarray(((b2 * p + b1) * p + b0) / ((a2 * p + a1) * p + a0))
+
+    @property
+    def system(self) -> StateSpace:
+        """The section as a continuous system."""
+        (b2, b1, b0), (a2, a1, a0), w = self.b, self.a, self.omega
+        if not a2:
+            b1, b0, a0 = b1 / a1, b0 / a1, a0 / a1
+            g = StateSpace([[-a0 * w]], [[w]], [[b0 - b1 * a0]], [[b1]])
+        else:
+            b2, b1, b0, a1, a0 = b2 / a2, b1 / a2, b0 / a2, a1 / a2, a0 / a2
+            A = [[0.0, w], [-a0 * w, -a1 * w]]
+            g = StateSpace(A, [[0.0], [w]], [[b0 - b2 * a0, b1 - b2 * a1]], [[b2]])
+        return g.replace(inputs=["error"], outputs=["command"])
+
+
+class Element(Value):
+    """A factor of a law: multiply elements, and numbers, to a `Law`."""
+
+    @property
+    def law(self) -> Law:
+        """The law of this element alone."""
+        raise NotImplementedError
+
+    @property
+    def system(self) -> StateSpace:
+        """The continuous system from error to command."""
+        return self.law.system
+
+    def sampled(self, rate: float) -> Law:
+        """Return the law as it runs at a rate [Hz].
+
+        Parameters
+        ----------
+        rate : float [Hz]
+            Above twice the frequency of each notch and low-pass.
+
+        Raises
+        ------
+        ModelError
+            When it is not.
+        """
+        return self.law.sampled(rate)
+
+    def __mul__(self, other: Element | float) -> Law:
+        """Return the law of both in series; a number scales it."""
+        return self.law * other
+
+    def __rmul__(self, other: float) -> Law:
+        """Return the law times a number."""
+        return self.law * other
+
+
+class SingleElement(Element):
+    """An element with one section."""
+
+    @property
+    def section(self) -> Section:
+        """Its transfer function."""
+        raise NotImplementedError
+
+    @property
+    def law(self) -> Law:
+        """The law of this element alone."""
+        return Law((self,))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Law(Element):
+    """A product of elements, from error to command: ``gain F1(s) F2(s) ...``.
+
+    Sampled, each factor is mapped by Tustin's rule.
+
+    Parameters
+    ----------
+    factors : sequence of elements
+        `Pid`, `Lead`, `Notch`, `LowPass`.
+    gain : float
+        A factor.
+    rate : float [Hz]
+        Sampling rate; 0 when continuous.
+    prewarped : bool
+        Sampled, whether a notch, a lead and the corner of a low-pass stay where they are.
+
+    Examples
+    --------
+    >>> from flexplant.synthesis import LowPass, Notch, Pid
+    >>> law = Pid.corners(2e5, integrator=5.0, zero=15.0, pole=300.0) * Notch(830.0)
+    >>> print(law.sampled(1e4))
+    Pid p 2.633e+05 i 6.283e+06 d 1982 pole 300 Hz * Notch 830 Hz depth 0.05 width 0.3, at 10000 Hz
+    """
+
+    factors: Sequence[SingleElement] = ()
+    gain: float = 1.0
+    rate: float = 0.0
+    prewarped: bool = True
+
+    def __post_init__(self) -> None:
+        factors = tuple(self.factors)
+        for factor in factors:
+            if not isinstance(factor, SingleElement):
+                raise ModelError(
+                    f"a law is a product of elements, got {type(factor).__name__} among them. "
+                    "Multiply Pid, Lead, Notch and LowPass, and numbers."
+                )
+        rate = positive(self.rate, "rate", zero=True)
+        for factor in factors:
+            centre = factor.section.centre / (2.0 * np.pi)
+            if rate and centre >= 0.5 * rate:
+                raise ModelError(
+                    f"{factor} lies at {centre:g} Hz, not below half the rate, {0.5 * rate:g} Hz: "
+                    "sampled, it would act at another frequency. Leave it out, or raise the rate."
+                )
+        gain = float(real_array(self.gain, "gain", ()))
+        self._set(
+            factors=factors, gain=gain, rate=rate, prewarped=flag(self.prewarped, "prewarped")
+        )
+
+    def __repr__(self) -> str:
+        gain = [f"{self.gain:.4g}"] if self.gain != 1.0 or not self.factors else []
+        rate = f", at {self.rate:g} Hz" if self.rate else ""
+        return " * ".join([*gain, *map(repr, self.factors)]) + rate
+
+    @property
+    def law(self) -> Law:
+        """The law itself."""
+        return self
+
+    def sampled(self, rate: float) -> Law:
+        """Return the law as it runs at a rate [Hz].
+
+        Parameters
+        ----------
+        rate : float [Hz]
+            Above twice the frequency of each notch and low-pass.
+
+        Raises
+        ------
+        ModelError
+            When it is not.
+        """
+        return self.replace(rate=positive(rate, "rate"))
+
+    def __mul__(self, other: Element | float) -> Law:
+        """Return the law of both in series; a number scales it."""
+        if isinstance(other, Element):
+            law = other.law
+            if self.rate and law.rate and self.rate != law.rate:
+                raise ModelError(
+                    f"the laws run at {self.rate:g} and {law.rate:g} Hz: multiply them continuous, "
+                    "then sample the product."
+                )
+            factors, gain = (*self.factors, *law.factors), self.gain * law.gain
+            return self.replace(factors=factors, gain=gain, rate=self.rate or law.rate)
+        if isinstance(other, int | float | np.number):
+            return self.replace(gain=self.gain * float(other))
+        return NotImplemented
+
+    @cached_property
+    def _sections(self) -> tuple[Section, ...]:
+        rate = self.rate if self.prewarped else 0.0
+        return tuple(factor.section.at(rate) for factor in self.factors)
+
+    @cached_property
+    def system(self) -> StateSpace:
+        """The system from error to command, sampled where the law is."""
+        static = StateSpace([], [], [], [[1.0]], inputs=["error"], outputs=["command"])
+        parts = [section.system for section in self._sections]
+        if self.rate:  # each on its own: states of one size
+            parts = [tustin(part, self.rate) for part in parts]
+        joined = self.gain * reduce(series, parts, static)
+        dt = 1.0 / self.rate if self.rate else 0.0
+        return joined.replace(dt=dt, states=[f"x{i}" for i in range(1, joined.n_states + 1)])
+
+    def response(self, freq: npt.ArrayLike) -> ComplexArray:
+        """Return the response (n_freq,), in closed form.
+
+        Parameters
+        ----------
+        freq : (n_freq,) array [Hz]
+            Increasing; below half the rate of a sampled law.
+
+        Raises
+        ------
+        ModelError
+            When it is not.
+        """
+        return self._response(sampled_freq(freq, 1.0 / self.rate if self.rate else 0.0))
+
+    def _response(self, freq: FloatArray) -> ComplexArray:
+        # Tustin's s: 2 rate (z - 1) / (z + 1)
+        rate = self.rate
+        omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq
+        s = np.asarray(1j * omega, dtype=np.complex128)
+        value = np.full(freq.shape, self.gain, dtype=np.complex128)
+        for section in self._sections:
+            value = value * section.gain(s)
+        return value

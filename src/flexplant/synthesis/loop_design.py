@@ -1,0 +1,287 @@
+"""design_loops: laws made by hand, one for each decoupled axis, and the loops that they make."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
+from ..loop import LoopReport, SpillOver, in_axes, report_loops
+from ..lti.frequency import Frf
+from ..lti.interconnection import append, series
+from ..lti.statespace import StateSpace, System, as_statespace
+from ..parallel import one_thread
+from ..plant import StandardPlant, decouple
+from ..values import FloatArray, Value, name_list
+from .law import Element, Law
+from .spill_over import spill_over, unchecked
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class LoopDesign(Value):
+    """A decoupled controller ``u = -before diag(laws) after y`` and its loops, axis by axis.
+
+    Parameters
+    ----------
+    system : StateSpace
+        From y (and references) to u: what `close_loop` and `frequency_response` take.
+    laws : mapping {axis: Law}
+        Error to command of each axis, positive for negative feedback.
+    report : LoopReport
+        Crossovers and margins of each axis, the others closed, and stability.
+    left_out : SpillOver, optional
+        How the loop stands on a model with the modes left out, where these are known.
+    notes : sequence of str
+        What is worth knowing.
+    """
+
+    system: StateSpace
+    laws: Mapping[str, Law]
+    report: LoopReport
+    left_out: SpillOver | None = None
+    notes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        self._set(laws=dict(self.laws), notes=tuple(self.notes))
+
+    def __repr__(self) -> str:
+        axes = ", ".join(self.laws)
+        lines = [f"<LoopDesign of {axes}: {self.system.n_states} states>"]
+        lines += [f"  {line.strip()}" for line in repr(self.report).splitlines()]
+        if self.left_out is not None:
+            lines.append(f"  with the modes left out: {self.left_out.summary}")
+        return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
+
+
+@dataclass(frozen=True)
+class Axes:
+    """A square plant in its axes, and the way there from y and from there to u.
+
+    Parameters
+    ----------
+    plant : Frf or StateSpace
+        ``after G before``, with hold and delay where it is sampled.
+    before, after : StateSpace
+        Static transformations between the plant's channels and the axes.
+    rate : float [Hz]
+        Of the controller; 0 when continuous.
+    given : StandardPlant, optional
+        Where it came from.
+    """
+
+    plant: Any
+    before: StateSpace
+    after: StateSpace
+    rate: float
+    given: StandardPlant | None = None
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The axes."""
+        return tuple(self.after.outputs)
+
+
+def axes_of(
+    plant: Any,
+    before: System | FloatArray | None,
+    after: System | FloatArray | None,
+    rate: float | None,
+    delay: float,
+    hold: bool,
+) -> Axes:
+    """Return a plant in its decoupled axes; parameters as for `design_loops`.
+
+    Raises
+    ------
+    ModelError
+        When there are not as many commands as motions, or rate and plant do not go together.
+    """
+    given = plant if isinstance(plant, StandardPlant) else None
+    if hasattr(plant, "frdata"):
+        plant = Frf.from_control(plant)
+    if given is not None:
+        if before is None and after is None and given.is_assembled:
+            axes = decouple(given)
+            before, after = axes.accelerations, axes.to_motions
+        plant = given.Gyu
+    if isinstance(plant, Frf):
+        inside: Any = in_axes(plant, before=before, after=after, rate=rate, delay=delay, hold=hold)
+        inputs, outputs = plant.inputs, plant.outputs
+    else:
+        plant = as_statespace(plant)
+        if rate is not None or delay:
+            raise ModelError("a model has its rate and delay in it: plant.discretized(rate, delay)")
+        rate, inputs, outputs = (1.0 / plant.dt if plant.dt else None), plant.inputs, plant.outputs
+    first = as_statespace(np.eye(len(inputs)) if before is None else before)
+    last = as_statespace(np.eye(len(outputs)) if after is None else after)
+    if before is None or isinstance(before, np.ndarray | list | tuple):
+        named = inputs if before is None else first.inputs
+        first = first.replace(inputs=named, outputs=inputs)
+    if after is None or isinstance(after, np.ndarray | list | tuple):
+        last = last.replace(inputs=outputs, outputs=outputs if after is None else last.outputs)
+    if not isinstance(plant, Frf):
+        static = [s.replace(dt=plant.dt) for s in (first, last)]
+        inside = series(series(static[0], plant.select(last.inputs, first.outputs)), static[1])
+    if len(first.inputs) != len(last.outputs):
+        raise ModelError(
+            f"{len(first.inputs)} commands act on {len(last.outputs)} motions: a law for each axis "
+            "needs as many. Pass before= and after=, such as those of decouple(plant)."
+        )
+    return Axes(inside, first, last, float(rate or 0.0), given)
+
+
+def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
+    """Return motions to commands of the axes, ``-diag(laws)``."""
+    each = [
+        (-laws[name].system).replace(
+            inputs=[name],
+            outputs=[command],
+            states=[f"{name}|{s}" for s in laws[name].system.states],
+        )
+        for name, command in zip(axes.names, axes.before.inputs, strict=True)
+    ]
+    dt = 1.0 / axes.rate if axes.rate else 0.0
+    return append(*(one.replace(dt=dt) for one in each))
+
+
+@one_thread()
+def design_loops(
+    plant: StandardPlant | System | Frf,
+    laws: Element | Mapping[str, Element],
+    *,
+    before: System | FloatArray | None = None,
+    after: System | FloatArray | None = None,
+    rate: float | None = None,
+    delay: float = 0.0,
+    hold: bool = True,
+    rigid: int = 0,
+    unstable: int = 0,
+    references: Mapping[str, str] | None = None,
+    larger: Any = None,
+) -> LoopDesign:
+    """Return the controller of laws made by hand, ``u = -before diag(laws) after y``, and a report.
+
+    Each law is a product of elements, `Pid`, `Lead`, `Notch`, `LowPass`. The plant may be known by
+    its measured Frf alone; stability follows by the Nyquist count then.
+
+    Parameters
+    ----------
+    plant : StandardPlant, StateSpace or Frf
+        Of an assembled StandardPlant the rigid-body axes are taken (`decouple`), unless `before`
+        and `after` are given.
+    laws : Law or mapping {axis: Law}
+        Error to command; one for all axes, or one each. Sampled at the rate of the plant.
+    before, after : StateSpace or array, optional
+        Static transformations: commands of the axes to u, y to motions of the axes.
+    rate, delay, hold
+        Of an Frf: the rate of the controller (continuous unless given), its samples of delay, and
+        whether its hold is still to be applied, as for `in_axes`.
+    rigid, unstable : int
+        Of an Frf: its rigid-body modes and its poles outside the stability region, as for
+        `report_loops`.
+    references : mapping {axis: channel of y}, optional
+        References that an axis follows, such as ``{"cog:z": "die:ref"}``.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+
+    Returns
+    -------
+    LoopDesign
+
+    Raises
+    ------
+    LabelError
+        When an axis has no law, or a name is unknown.
+    ModelError, ShapeError
+        When plant, transformations, laws and rate do not go together.
+    AssumptionError
+        When the rigid-body axes cannot be decoupled.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the loop is unstable, or is with the modes left out.
+    """
+    axes = axes_of(plant, before, after, rate, delay, hold)
+    found = made(axes, _checked(axes, laws), rigid, unstable, references, larger)
+    if found.report.is_stable is False:
+        closest = min(found.report.loops, key=lambda loop: loop.modulus_margin)
+        warnings.warn(
+            f"the loops are unstable ({found.report.unstable} poles); closest to the critical "
+            f"point is {closest.name} at {closest.freq:.4g} Hz. Notch what resonates there, add "
+            "lead, or lower the gain.",
+            FlexplantWarning,
+            stacklevel=3,
+        )
+    return found
+
+
+def made(
+    axes: Axes,
+    laws: Mapping[str, Law],
+    rigid: int,
+    unstable: int,
+    references: Mapping[str, str] | None,
+    larger: Any,
+) -> LoopDesign:
+    """Return the design of laws that were checked; parameters as for `design_loops`."""
+    inner = axes_controller(axes, laws)
+    report = report_loops((axes.plant, inner), at="y", rigid=rigid, unstable=unstable)
+    followed = dict(references or {})
+    for name in followed:
+        if name not in axes.names:
+            raise unknown_label("axis", name, axes.names, "the laws")
+    shown = np.zeros((len(axes.names), len(followed)))  # the reference is taken from the motion
+    for column, name in enumerate(followed):
+        shown[axes.names.index(name), column] = -1.0
+    after = axes.after.replace(
+        D=np.hstack([axes.after.D, shown]),
+        B=np.zeros((0, shown.shape[1] + len(axes.after.inputs))),
+        inputs=[*axes.after.inputs, *name_list(followed.values(), "references")],
+        dt=inner.dt,
+    )
+    system = series(series(after, inner), axes.before.replace(dt=inner.dt))
+    system = system.replace(name="loops", inputs=after.inputs, outputs=axes.before.outputs)
+    left_out = None if axes.given is None else spill_over(axes.given, [system], larger)
+    lacking = axes.given is not None and left_out is None
+    return LoopDesign(
+        system, laws, report, left_out, unchecked(axes.given) if lacking and axes.given else ()
+    )
+
+
+def _checked(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law]:
+    """Return a law for each axis, at the rate of the plant.
+
+    Raises
+    ------
+    LabelError, ModelError
+        When one is missing, unknown or no law, or runs at another rate.
+    """
+    each = dict.fromkeys(axes.names, laws) if isinstance(laws, Element) else laws
+    if not isinstance(each, Mapping):
+        raise ModelError(
+            f"laws must be a law or a mapping {{axis: law}}, got {type(laws).__name__}: multiply "
+            "Pid, Lead, Notch and LowPass."
+        )
+    for name in each:
+        if name not in axes.names:
+            raise unknown_label("axis", name, axes.names)
+    found = {}
+    for name in axes.names:
+        if name not in each:
+            raise LabelError(f"axis {name!r} has no law: give one for each of {axes.names}.")
+        element = each[name]
+        if not isinstance(element, Element):
+            raise ModelError(f"the law of {name!r} is no product of elements: {element!r}.")
+        law = element.law
+        if law.rate and law.rate != axes.rate:
+            raise ModelError(
+                f"the law of {name!r} runs at {law.rate:g} Hz, the plant at {axes.rate:g} Hz "
+                "(0: continuous). Pass it continuous: it is sampled here."
+            )
+        found[name] = law.sampled(axes.rate) if axes.rate else law
+    return found

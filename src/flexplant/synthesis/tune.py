@@ -1,0 +1,210 @@
+"""tune_loops: for each decoupled axis the law of highest bandwidth that keeps a modulus margin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError, SolverError
+from ..loop import report_loops
+from ..loop.nyquist import continued, nyquist_count
+from ..lti.frequency import Frf, frequency_response
+from ..lti.grid import resonance_grid
+from ..lti.statespace import StateSpace, System
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray, positive, whole
+from .law import Law
+from .loop_design import LoopDesign, axes_controller, axes_of, made
+from .servo_axis import Axis
+from .servo_loop import TARGET, ServoLoop, highest
+
+#: shapes that are tried one after the other: factor of the lead, roll-off beside the bandwidth
+_SHAPES = ((4.0, 8.0), (3.0, None), (6.0, None), (None, 4.0), (None, 16.0))
+#: corner of the integrator beside the bandwidth
+_INTEGRATOR = 0.1
+#: bandwidths that are tried for each, and steps of 3 % down while the axes disturb each other
+_TRIALS, _STEPS = 20, 20
+#: resonances that may be notched, and how far they rise above the line of the rigid body
+_RESONANCES, _RISE = 12, 2.0
+
+
+@one_thread()
+def tune_loops(
+    plant: StandardPlant | System | Frf,
+    *,
+    before: System | FloatArray | None = None,
+    after: System | FloatArray | None = None,
+    rate: float | None = None,
+    delay: float = 0.0,
+    hold: bool = True,
+    peak: float = TARGET,
+    rigid: int | None = None,
+    larger: Any = None,
+) -> LoopDesign:
+    """Return the laws of highest bandwidth that keep |S| of each axis below a peak.
+
+    Each axis gets ``k (1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)`` as `design_servo`
+    does, with notches at resonances where they serve. For several r and corners of the low-pass
+    the bandwidth w_b, where the loop first crosses 1, is raised until |S| reaches the peak or the
+    loop is no longer stable (by the Nyquist count). No model is needed: the plant may be an Frf.
+
+    Parameters
+    ----------
+    plant, before, after, rate, delay, hold
+        As for `design_loops`.
+    peak : float
+        Bound on |S|; 2 is a modulus margin of 6 dB.
+    rigid : int, optional
+        Rigid-body modes that the axes show; as many as axes unless given. 0 on springs whose modes
+        lie within the lines.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+
+    Returns
+    -------
+    LoopDesign
+        Verified in all axes together, each broken with the others closed.
+
+    Raises
+    ------
+    SolverError
+        When no bandwidth within the lines holds the peak, with the axis; or when the axes disturb
+        each other too much.
+    ModelError, ShapeError, LabelError, AssumptionError
+        As for `design_loops`; ModelError when peak is not above 1.
+    """
+    if positive(peak, "peak") <= 1.0:
+        raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")
+    axes = axes_of(plant, before, after, rate, delay, hold)
+    rigid = len(axes.names) if rigid is None else whole(rigid, "rigid", minimum=0)
+    frf = axes.plant if isinstance(axes.plant, Frf) else _response(axes.plant)
+    found = {
+        name: _Axis(name, frf.freq, frf.data[i, i], axes.rate, peak, rigid > 0).best()
+        for i, name in enumerate(axes.names)
+    }
+    for step in range(_STEPS):
+        laws = {name: one.law(one.bandwidth * 0.97**step) for name, one in found.items()}
+        report = report_loops((axes.plant, axes_controller(axes, laws)), at="y", rigid=rigid)
+        if report.is_stable and all(one.modulus_margin >= 1.0 / peak for one in report.loops):
+            return made(axes, laws, rigid, 0, None, larger)
+    raise SolverError(
+        f"each axis alone holds |S| below {peak:g}, all together do not, even {3 * _STEPS} % "
+        f"slower: {report.reason or 'they disturb each other'}. Decouple the axes better "
+        "(before=, after=), or close them one after the other with design_loops."
+    )
+
+
+@dataclass(frozen=True)
+class _Axis:
+    """One axis of the plant; of its law the bandwidth, the lead's factor, roll-off by bandwidth."""
+
+    name: str
+    freq: FloatArray
+    G: ComplexArray
+    rate: float
+    peak: float
+    free: bool
+    lead: float = 4.0
+    rolloff: float = 8.0
+    bandwidth: float = 0.0
+
+    def best(self) -> _Axis:
+        """Return the axis with the shape and bandwidth that hold the peak.
+
+        Raises
+        ------
+        SolverError
+            When none does.
+        """
+        # the line of the rigid body ends at the first resonance
+        ends = [0.25 * self.freq[-1], *self._resonances, *([0.19 * self.rate] if self.rate else [])]
+        top, low = float(min(ends)), 4.0 * float(self.freq[0])
+        best = replace(self, bandwidth=low)
+        for lead, rolloff in _SHAPES:
+            one = replace(best, lead=lead or best.lead, rolloff=rolloff or best.rolloff)
+            trials = np.geomspace(top, best.bandwidth, _TRIALS) if top > low else np.zeros(0)
+            reached = highest(trials[:-1].tolist(), one.holds)
+            if reached is not None:
+                best = replace(one, bandwidth=reached)
+        if best.bandwidth > low:
+            return best
+        raise SolverError(
+            f"axis {self.name!r}: no bandwidth from {low:.3g} to {top:.3g} Hz is stable with |S| "
+            f"below {20 * np.log10(self.peak):.2g} dB. Is the axis a rigid body at the lowest "
+            "lines (state rigid=0 when it is on springs), and its sign right? Else raise the "
+            "rate, lower the delay, or measure at lower frequencies."
+        )
+
+    def holds(self, bandwidth: float) -> bool:
+        """Return whether a bandwidth keeps the peak, with the notches that serve it."""
+        inertia, late = self._line(bandwidth)
+        axis = self._plain(bandwidth)
+        if not inertia or _rigid_peak(axis, late) > self.peak:
+            return False
+        loop = ServoLoop(self.freq, inertia * self.G[:, None, None], self._resonances)
+        axis = loop.notched(axis, lambda one: self._is_stable(one, inertia))
+        return loop.peak(axis) <= self.peak and self._is_stable(axis, inertia)
+
+    def law(self, bandwidth: float) -> Law:
+        """Return the law of a bandwidth [Hz]."""
+        inertia, _ = self._line(bandwidth)
+        loop = ServoLoop(self.freq, inertia * self.G[:, None, None], self._resonances)
+        axis = loop.notched(self._plain(bandwidth), lambda one: self._is_stable(one, inertia))
+        return axis.law * inertia
+
+    def _plain(self, bandwidth: float) -> Axis:
+        rolloff = self.rolloff * bandwidth
+        rolloff = min(rolloff, 0.4 * self.rate) if self.rate else rolloff
+        slow = _INTEGRATOR * bandwidth
+        return Axis(bandwidth, rolloff, slow, (), self.rate, self.lead, prewarped=True)
+
+    def _line(self, bandwidth: float) -> tuple[float, float]:
+        """Return the inertia, with its sign, and the lateness [s] of the lines below a bandwidth.
+
+        ``G = exp(-s late) / (inertia s^2)`` there; 0 without a line.
+        """
+        near = (self.freq >= 0.25 * bandwidth) & (self.freq <= bandwidth)
+        if not np.any(near):
+            return 0.0, 0.0
+        omega = 2.0 * np.pi * self.freq[near]
+        turned = -self.G[near] * omega**2
+        sign = 1.0 if np.median(turned.real) >= 0.0 else -1.0
+        late = float(np.median(-np.angle(sign * turned) / omega))
+        return sign / float(np.median(np.abs(turned))), max(late, 0.0)
+
+    @cached_property
+    def _resonances(self) -> FloatArray:
+        """The frequencies [Hz] of the highest peaks above the line of the rigid body."""
+        size = np.abs(self.G) * self.freq**2
+        inner = (size[1:-1] >= size[:-2]) & (size[1:-1] > size[2:])
+        peaks = 1 + np.flatnonzero(inner & (size[1:-1] > _RISE * np.median(size)))
+        if self.rate:
+            peaks = peaks[self.freq[peaks] < 0.45 * self.rate]
+        order = np.argsort(-np.abs(self.G[peaks]), kind="stable")[:_RESONANCES]
+        return self.freq[peaks[order]]
+
+    def _is_stable(self, axis: Axis, inertia: float) -> bool:
+        def respond(freq: FloatArray) -> ComplexArray:
+            return -inertia * axis.response(freq)[None, None]
+
+        slope = 2 if self.free else 0
+        freq, L = continued(self.freq, self.G[None, None], respond, slope)
+        return nyquist_count(freq, L, at_zero=slope + 1, unstable=0).unstable == 0
+
+
+def _rigid_peak(axis: Axis, late: float) -> float:
+    """Return max |S| of the rigid body alone, with its lateness."""
+    top = 0.49 * axis.rate if axis.rate else 1e2 * axis.bandwidth
+    freq = np.geomspace(1e-2 * axis.bandwidth, top, 300)
+    s = 2j * np.pi * freq
+    return float(np.max(1.0 / np.abs(1.0 + axis.response(freq) * np.exp(-s * late) / s**2)))
+
+
+def _response(plant: StateSpace) -> Frf:
+    """Return the response over a grid through the resonances of a model."""
+    grid = resonance_grid(plant.poles(), plant.dt, points=1000)
+    return frequency_response(plant, grid[grid < 0.4999 / plant.dt] if plant.dt else grid)

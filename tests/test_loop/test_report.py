@@ -1,0 +1,172 @@
+"""Loop-by-loop margins and the Nyquist count, against closed forms and polynomial roots."""
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.loop import in_axes, report_loops
+from flexplant.lti import Frf, StateSpace, append, discretized, frequency_response
+from flexplant.plant import assemble_plant, decouple
+from stages import RATE, ports, reduced
+
+LINES = np.arange(0.5, 400.0, 0.05)
+
+
+def of(num, den, **names):
+    """A transfer function as a system, in controllable form."""
+    den = np.asarray(den, dtype=float)
+    num = np.concatenate([np.zeros(den.size - len(num)), num]) / den[0]
+    den = den / den[0]
+    n = den.size - 1
+    A = np.vstack([-den[1:], np.eye(n)[:-1]])
+    C = num[1:] - num[0] * den[1:]
+    return StateSpace(A, np.eye(n)[:, :1], [C], [[num[0]]], **names)
+
+
+def test_margins_in_closed_form():
+    """L = 2 / (s (s + 1) (s + 2)): gain margin 3 at sqrt(2) rad/s; S by a fine sweep."""
+    G = of([1.0], [1.0, 3.0, 2.0, 0.0], inputs=["u"], outputs=["y"])
+    report = report_loops((G, StateSpace([], [], [], [[-2.0]], inputs=["y"], outputs=["u"])))
+    loop = report["u"]
+    assert report.is_stable
+    assert loop.gain_margin == pytest.approx(3.0, rel=1e-9)
+    assert loop.gain_reduction == 0.0
+    omega = np.roots([1.0, 0.0, 5.0, 0.0, 4.0, 0.0, -4.0])  # |L| = 1
+    omega = float(omega[(abs(omega.imag) < 1e-9) & (omega.real > 0)][0].real)
+    assert loop.crossovers == pytest.approx([omega / (2 * np.pi)], rel=1e-9)
+    phase = 180 - 90 - np.degrees(np.arctan(omega) + np.arctan(omega / 2))
+    assert loop.phase_margin == pytest.approx(phase, rel=1e-9)
+    s = 1j * np.geomspace(0.1, 10.0, 20000)
+    least = np.abs(1 + 2.0 / (s * (s + 1) * (s + 2))).min()
+    assert loop.modulus_margin == pytest.approx(least, rel=2e-3)
+    assert "phase margin 33 deg" in repr(report)
+
+
+def test_an_unstable_plant_may_lose_gain_too():
+    """1 / (s - 1) with gain 4 (and a lag at 20 rad/s): it may fall to a quarter."""
+    G = of([20.0], np.polymul([1.0, -1.0], [1.0, 20.0]), inputs=["u"], outputs=["y"])
+    K = StateSpace([], [], [], [[-4.0]], inputs=["y"], outputs=["u"])
+    frf = frequency_response(G, np.geomspace(1e-3, 100.0, 2000))
+    for plant in (G, frf):
+        report = report_loops((plant, K), unstable=1)
+        assert report.is_stable
+        assert report["u"].gain_reduction == pytest.approx(0.25, rel=1e-2)
+    assert report_loops((frf, K.replace(D=[[-0.5]])), unstable=1).unstable == 1
+    assert report_loops((frf, K.replace(D=[[4.0]])), unstable=1).unstable == 1
+
+
+def machine(rng, springs):
+    """A mass with three modes, free or on springs (negative: magnets): numerator, denominator."""
+    body = [1.0, 0.02 * np.sqrt(abs(springs)), springs]
+    parts = [(1.0, body)]
+    for freq in rng.uniform(20.0, 200.0, 3):
+        omega = 2 * np.pi * freq
+        parts.append((rng.choice([1.0, -0.5]), [1.0, 0.01 * omega, omega**2]))
+    den = np.array([1.0])
+    for _, factor in parts:
+        den = np.polymul(den, factor)
+    num = np.zeros(1)
+    for i, (gain, _) in enumerate(parts):
+        rest = np.array([gain])
+        for j, (_, factor) in enumerate(parts):
+            rest = rest if i == j else np.polymul(rest, factor)
+        num = np.polyadd(num, rest)
+    return num, den
+
+
+@pytest.mark.parametrize("springs", [0.0, (2 * np.pi * 2.0) ** 2, -((2 * np.pi * 2.0) ** 2)])
+def test_the_count_is_that_of_the_characteristic_polynomial(springs):
+    """PID of many gains on machines with light modes; unstable ones among them."""
+    rng = np.random.default_rng(3)
+    seen = set()
+    for _ in range(12):
+        num, den = machine(rng, springs)
+        freq = rng.uniform(5.0, 60.0)
+        omega = 2 * np.pi * freq
+        a = omega / 3
+        top = omega**2 / 3 * np.polymul([1.0, 0.1 * omega], [1 / a, 1.0])
+        bottom = np.polymul([1.0, 0.0], [1 / (3 * omega), 1.0])
+        K = of(-top, bottom, inputs=["y"], outputs=["u"])
+        s = 2j * np.pi * LINES
+        data = np.polyval(num, s) / np.polyval(den, s)
+        frf = Frf(LINES, data[None, None], ["u"], ["y"])
+        roots = np.roots(np.polyadd(np.polymul(top, num), np.polymul(bottom, den)))
+        wanted = int(np.count_nonzero(roots.real > 0))
+        states = {"rigid": int(springs == 0), "unstable": int(springs < 0)}
+        report = report_loops((frf, K), **states)
+        assert report.unstable == wanted, report.reason
+        assert (report.modulus_margin == 0.0) == (wanted > 0)
+        seen.add(wanted > 0)
+    assert seen == {True, False}
+
+
+def test_what_cannot_be_judged_says_why():
+    num, den = machine(np.random.default_rng(1), 0.0)
+    top = (2 * np.pi * 20.0) ** 2 / 3 * np.array([1 / 40.0, 1.0])
+    K = of(-top, [1e-3, 1.0], inputs=["y"], outputs=["u"])
+
+    def judged(freq, **states):
+        s = 2j * np.pi * freq
+        frf = Frf(freq, (np.polyval(num, s) / np.polyval(den, s))[None, None], ["u"], ["y"])
+        return report_loops((frf, K), **states)
+
+    assert judged(LINES, rigid=1).is_stable is not None
+    stated_wrong = judged(LINES, rigid=0)
+    assert stated_wrong.is_stable is None
+    assert "slope 2, but 0 rigid-body modes" in stated_wrong.reason
+    coarse = judged(np.arange(1.0, 400.0, 20.0), rigid=1)
+    assert coarse.is_stable is None
+    assert "finer resolution" in coarse.reason
+    short = judged(LINES[LINES < 15.0], rigid=1)
+    assert "measure at higher frequencies" in short.reason
+
+
+def test_each_loop_is_broken_with_the_others_closed():
+    """Two coupled masses: L_1 with loop 2 closed, by hand."""
+    M = np.array([[2.0, 0.7], [0.7, 1.0]])
+    G = StateSpace(
+        np.block([[np.zeros((2, 2)), np.eye(2)], [np.zeros((2, 4))]]),
+        np.vstack([np.zeros((2, 2)), np.linalg.inv(M)]),
+        np.eye(2, 4),
+        np.zeros((2, 2)),
+        inputs=["a", "b"],
+        outputs=["ya", "yb"],
+    )
+    law = fx.Pid.corners(400.0, zero=2.0, pole=40.0)
+    one = -law.system
+    K = append(
+        one.replace(inputs=["ya"], outputs=["a"], states=["k1"]),
+        (2.0 * one).replace(inputs=["yb"], outputs=["b"], states=["k2"]),
+    )
+    freq = np.geomspace(0.1, 100.0, 4000)
+    s = 2j * np.pi * freq
+    k = law.law.response(freq)
+    P = np.linalg.inv(M)[:, :, None] / s**2
+    other = P[0, 0] - P[0, 1] * P[1, 0] * 2 * k / (1 + 2 * k * P[1, 1])
+    wanted = np.abs(1 + k * other).min()
+    for plant, states in ((G, {}), (frequency_response(G, freq), {"rigid": 2})):
+        report = report_loops((plant, K), **states)
+        assert report.is_stable
+        assert report["a"].modulus_margin == pytest.approx(wanted, rel=2e-3)
+        assert report.modulus_margin <= report["a"].modulus_margin * (1 + 1e-9)
+        at_y = report_loops((plant, K), at="y", **states)
+        assert list(at_y) == ["ya", "yb"]
+
+
+def test_a_measured_plant_in_axes_with_hold_and_delay():
+    """The Frf of the continuous stage beside the discretised one, below its aliases."""
+    continuous = assemble_plant(reduced(), ports(references=[]))
+    axes = decouple(continuous)
+    freq = np.arange(5.0, 300.0, 5.0)
+    frf = frequency_response(continuous.Gyu, freq)
+    found = in_axes(frf, before=axes.accelerations, after=axes.to_motions, rate=RATE, delay=1.5)
+    sampled = frequency_response(discretized(continuous.Gyu, RATE, delay=1.5), freq).data
+    wanted = np.einsum("ay,yuf,ub->abf", axes.T_y, sampled, axes.T_u @ axes.mass)
+    size = np.abs(wanted[0, 0])
+    assert np.max(np.abs(found.data - wanted) / size) < 2e-2
+    assert np.max(np.abs(found.data[0, 0] / wanted[0, 0] - 1)) < 3e-3
+    rigid = -np.exp(-4j * np.pi * freq[:3] / RATE) / (2 * np.pi * freq[:3]) ** 2
+    assert np.max(np.abs(found.data[0, 0, :3] / rigid - 1)) < 2e-3
+    assert (found.inputs, found.outputs) == (axes.accelerations.inputs, axes.to_motions.outputs)
+    held = in_axes(frf, before=np.eye(4)[:, :2], rate=RATE, hold=False)
+    np.testing.assert_allclose(held.data, frf.data[:, :2], rtol=1e-12)

@@ -1,0 +1,168 @@
+"""Loops made by hand and tuned on a frequency response alone: verified on the models behind it."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from test_spill_over import many, small
+
+import flexplant as fx
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverError
+from flexplant.lti import StateSpace, discretized, frequency_response
+from flexplant.plant import assemble_plant, decouple
+from flexplant.synthesis import Law, LowPass, Notch, Pid, design_loops, tune_loops
+from flexplant.testbeds import wafer_stage
+from stages import RATE, ports, reduced, sampled
+
+
+def law(bandwidth=40.0, gain=1.0):
+    pid = Pid.corners(
+        gain * (2 * np.pi * bandwidth) ** 2 / 4,
+        integrator=bandwidth / 10,
+        zero=bandwidth / 4,
+        pole=4 * bandwidth,
+    )
+    return pid * LowPass(10 * bandwidth) * Notch(458.0) * Notch(640.0)
+
+
+@cache
+def plant():
+    return sampled(reduced(0.001))
+
+
+@cache
+def measured():
+    """The continuous stage, its Frf on lines, and its axes."""
+    continuous = assemble_plant(reduced(0.001), ports(references=[]))
+    axes = decouple(continuous)
+    frf = frequency_response(continuous.Gyu, np.arange(2.0, 3000.0, 0.5))
+    return frf, {"before": axes.accelerations, "after": axes.to_motions}
+
+
+def test_a_law_for_each_decoupled_axis():
+    """u = -T_u diag(laws) T_y (y), the reference taken from its axis; the loop is stable."""
+    P, axes = plant(), decouple(plant())
+    laws = {"cog:z": law(), "cog:rx": law(45.0), "cog:ry": law(50.0)}
+    found = design_loops(P, laws, references={"cog:z": "die:ref"})
+    assert found.system.inputs == ("y1", "y2", "y3", "y4", "die:ref")
+    assert found.system.outputs == P.u
+    freq = np.array([3.0, 40.0, 900.0])
+    K = frequency_response(found, freq).data
+    each = [one.sampled(RATE).response(freq) for one in laws.values()]
+    wanted = -np.einsum("ua,af,ay->uyf", axes.T_u @ axes.mass, each, axes.T_y)
+    np.testing.assert_allclose(K[:, :4], wanted, rtol=1e-7, atol=1e-9 * abs(wanted).max())
+    reference = (axes.T_u @ axes.mass)[:, :1] * each[0]
+    np.testing.assert_allclose(K[:, 4], reference, rtol=1e-7, atol=1e-9 * abs(reference).max())
+    loop = fx.close_loop(P, found)
+    assert loop.is_stable and found.report.is_stable
+    crossings = [found.report[name].crossovers[0] for name in laws]
+    assert crossings == pytest.approx([40.3, 45.3, 50.4], rel=0.02)
+
+
+def test_the_measured_plant_gives_the_same_report():
+    """Lines of 0.5 Hz with the hold and the delay put on: what the model says, count included."""
+    frf, axes = measured()
+    states = {"rate": RATE, "delay": 1, "rigid": 3}
+    model = design_loops(plant(), law()).report
+    found = design_loops(frf, law(), **axes, **states).report
+    assert found.is_stable
+    for name, one in found.items():
+        assert one.crossovers == pytest.approx(model[name].crossovers, rel=1e-3)
+        assert one.phase_margin == pytest.approx(model[name].phase_margin, abs=0.2)
+        assert one.gain_margin == pytest.approx(model[name].gain_margin, rel=0.02)
+        assert one.modulus_margin == pytest.approx(model[name].modulus_margin, rel=5e-3)
+    with pytest.warns(FlexplantWarning, match=r"unstable \(6 poles\); closest .* cog:"):
+        fast = design_loops(frf, law(gain=8.0), **axes, **states).report
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        assert design_loops(plant(), law(gain=8.0)).report.unstable == fast.unstable
+
+
+def test_modes_left_out_are_checked():
+    """Tuned on 12 modes up to 1.3 kHz: the loop reaches those above."""
+    P = sampled(small(12), ports(references=[]))
+    gentle = Pid.corners(300.0, zero=3.0, pole=50.0) * LowPass(100.0)
+    fine = design_loops(P, gentle, larger=many()).left_out
+    assert fine is not None and fine.is_fine
+    with pytest.warns(FlexplantWarning, match="with the modes that the plant left out"):
+        fast = tune_loops(P, larger=many())
+    assert fast.report.is_stable and not fast.left_out.is_fine
+
+
+@pytest.mark.slow
+def test_tuned_on_lines_verified_on_the_model():
+    """Each loop uses its 6 dB up; dense eigenvalues and a sweep of the model agree."""
+    frf, axes = measured()
+    found = tune_loops(frf, **axes, rate=RATE, delay=1)
+    loop = fx.close_loop(sampled(reduced(0.001), ports(references=[])), found)
+    poles = np.abs(la.eigvals(loop.system.A))
+    assert poles.max() < 1.0
+    on_model = design_loops(plant(), found.laws).report
+    for name, one in found.report.items():
+        assert 0.5 <= one.modulus_margin < 0.52
+        assert on_model[name].modulus_margin == pytest.approx(one.modulus_margin, rel=0.05)
+        assert one.crossovers[0] > 1.5 * fx.servo_bandwidth(plant())
+
+
+def body(late):
+    """2 kg with a mode at 600 Hz of 0.1 %, sampled with some delay."""
+    w = 2 * np.pi * 600.0
+    A = la.block_diag([[0, 1], [0, 0]], [[0, 1], [-(w**2), -2e-3 * w]])
+    G = StateSpace(A, [[0], [0.5], [0], [0.5]], [[1, 0, -0.4, 0]], [[0]], inputs=["f"])
+    return discretized(G, RATE, delay=late)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_less_delay_or_a_lower_margin_buys_bandwidth(sign):
+    """A plant that counts backwards is met by a law of negative gain."""
+    reached = []
+    for late, peak in ((6, 2.0), (1, 2.0), (1, 3.0)):
+        G = sign * body(late)
+        found = tune_loops(G, peak=peak)
+        (one,) = found.report.loops
+        assert 1 / peak <= one.modulus_margin < 1.05 / peak
+        assert np.sign(found.laws["y1"].gain) == sign
+        K = found.system
+        z = np.exp(2j * np.pi * np.geomspace(5.0, 4990.0, 4000) / RATE)
+        gains = [(K.evaluated(p) @ G.evaluated(p))[0, 0] for p in z]
+        assert np.abs(1.0 / (1.0 - np.array(gains))).max() < peak * 1.01
+        reached.append(one.crossovers[0])
+    assert reached == sorted(reached)
+    assert reached[1] > 1.2 * reached[0]
+
+
+@pytest.mark.slow
+def test_tuned_on_the_measured_machine_stable_on_the_truth():
+    """Noise, lines of 1 Hz, a hidden mass: no model but the rigid-body axes of the drawing."""
+    machine = wafer_stage()
+    channels = ports(asd=1e-4, references=[])
+    frf = machine.measure_frf(channels, period=1.0, periods=2, amplitude=30.0, rng=3)
+    found = tune_loops(frf, **measured()[1], rate=RATE, delay=1, hold=False)
+    truth = assemble_plant(machine.truth, ports(references=[])).discretized(RATE, delay=1)
+    loop = fx.close_loop(truth, found)
+    assert loop.is_stable
+    assert loop.modulus_margin > 0.4
+    assert min(one.crossovers[0] for one in found.report.loops) > 90.0
+
+
+def test_what_does_not_go_together_is_refused():
+    frf, axes = measured()
+    with pytest.raises(LabelError, match="axis 'cog:ry' has no law"):
+        design_loops(plant(), {"cog:z": law(), "cog:rx": law()})
+    with pytest.raises(LabelError, match="no axis 'z'"):
+        design_loops(plant(), {"z": law()})
+    with pytest.raises(ModelError, match="runs at 2000 Hz, the plant at 10000 Hz"):
+        design_loops(plant(), law().sampled(2000.0))
+    with pytest.raises(ModelError, match="4 commands act on 3 motions"):
+        design_loops(frf, law(), after=axes["after"])
+    with pytest.raises(ModelError, match="a model has its rate"):
+        design_loops(plant(), law(), rate=RATE)
+    with pytest.raises(ModelError, match="above 1"):
+        tune_loops(frf, **axes, peak=1.0)
+    late = frf.replace(data=frf.data * np.exp(-2j * np.pi * frf.freq * 0.1))
+    with pytest.raises(
+        SolverError, match=r"axis 'cog:z': no bandwidth from 8 to .* raise the rate"
+    ):
+        tune_loops(late, **axes, rate=RATE)
+    assert Law().system.n_states == 0
