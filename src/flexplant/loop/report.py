@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from scipy.optimize import brentq
 
 from ..errors import unknown_label
 from ..values import ComplexArray, FloatArray, Value, whole
@@ -241,6 +240,8 @@ def loop_margins(
 
 def _roots(freq: FloatArray, values: FloatArray, function: Callable[[float], float]) -> list[float]:
     """Return the zeros of a function of frequency between the lines where its sign changes."""
+    from scipy.optimize import brentq
+
     places = np.flatnonzero((values[1:] > 0) != (values[:-1] > 0))
     found = []
     for i in places.tolist():
