@@ -149,7 +149,7 @@ CALLS = [
     ("design_loops laws", lambda x: fx.design_loops(plant(), x), ()),
     ("design_loops before", lambda x: fx.design_loops(plant(), fx.Pid(1.0), before=x), ("none",)),
     ("tune_loops", lambda x: fx.tune_loops(x), ()),
-    ("tune_loops peak", lambda x: fx.tune_loops(plant(), peak=x), ()),
+    ("tune_loops peak", lambda x: fx.tune_loops(plant(), peak=x), ("fraction",)),
     ("Pid", lambda x: fx.Pid(x), ("negative", "fraction", "bool")),
     ("Pid pole", lambda x: fx.Pid(1.0, pole=x), ("none", "fraction")),
     ("Lead", lambda x: fx.Lead(x), ("fraction",)),

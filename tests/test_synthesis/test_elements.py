@@ -87,7 +87,7 @@ def test_what_makes_no_law_is_refused():
         Pid.corners(1.0, zero=3.0)
     with pytest.raises(ModelError, match="not below half the rate"):
         Notch(600.0).sampled(1e3)
-    with pytest.raises(ModelError, match="product of elements"):
+    with pytest.raises(ModelError, match="a factor of a law must be"):
         Law((1.0,))
     with pytest.raises(ModelError, match="run at 1000 and 2000 Hz"):
         _ = Pid(1.0).sampled(1e3) * Pid(1.0).sampled(2e3)

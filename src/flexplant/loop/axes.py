@@ -51,7 +51,7 @@ def in_axes(
     ModelError, ShapeError, LabelError
         When frf is none, a transformation is not static or does not fit, or a number is wrong.
     """
-    frf = instance(frf, Frf, "frf", "A model is decoupled by series(series(before, G), after).")
+    frf = instance(frf, Frf, "frf", "Pass a measured one.")
     first = _static(before, frf.inputs, "before")
     last = _static(after, frf.outputs, "after")
     chosen = frf.select(outputs=last.inputs, inputs=first.outputs)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, reduce
 from typing import NamedTuple
@@ -15,7 +15,7 @@ from ..lti.discretisation import tustin
 from ..lti.frequency import sampled_freq
 from ..lti.interconnection import series
 from ..lti.statespace import StateSpace
-from ..values import ComplexArray, FloatArray, Value, flag, positive, real_array
+from ..values import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
 
 
 class Section(NamedTuple):
@@ -145,13 +145,9 @@ class Law(Element):
     prewarped: bool = True
 
     def __post_init__(self) -> None:
-        factors = tuple(self.factors)
+        factors = tuple(self.factors) if isinstance(self.factors, Iterable) else (self.factors,)
         for factor in factors:
-            if not isinstance(factor, SingleElement):
-                raise ModelError(
-                    f"a law is a product of elements, got {type(factor).__name__} among them. "
-                    "Multiply Pid, Lead, Notch and LowPass, and numbers."
-                )
+            instance(factor, SingleElement, "a factor of a law", "Pass Pid, Lead, Notch, LowPass.")
         rate = positive(self.rate, "rate", zero=True)
         for factor in factors:
             centre = factor.section.centre / (2.0 * np.pi)
@@ -203,7 +199,9 @@ class Law(Element):
             return self.replace(factors=factors, gain=gain, rate=self.rate or law.rate)
         if isinstance(other, int | float | np.number):
             return self.replace(gain=self.gain * float(other))
-        return NotImplemented
+        raise ModelError(
+            f"a law is multiplied by elements and numbers, got {short(other)}. Pass one."
+        )
 
     @cached_property
     def _sections(self) -> tuple[Section, ...]:

@@ -264,8 +264,8 @@ def _checked(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law
     each = dict.fromkeys(axes.names, laws) if isinstance(laws, Element) else laws
     if not isinstance(each, Mapping):
         raise ModelError(
-            f"laws must be a law or a mapping {{axis: law}}, got {type(laws).__name__}: multiply "
-            "Pid, Lead, Notch and LowPass."
+            f"laws must be a law or a mapping {{axis: law}}, got {type(laws).__name__}. Pass a "
+            "product of Pid, Lead, Notch and LowPass."
         )
     for name in each:
         if name not in axes.names:
@@ -276,7 +276,9 @@ def _checked(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law
             raise LabelError(f"axis {name!r} has no law: give one for each of {axes.names}.")
         element = each[name]
         if not isinstance(element, Element):
-            raise ModelError(f"the law of {name!r} is no product of elements: {element!r}.")
+            raise ModelError(
+                f"the law of {name!r} is no product of elements: {element!r}. Pass one."
+            )
         law = element.law
         if law.rate and law.rate != axes.rate:
             raise ModelError(

@@ -134,9 +134,9 @@ class _Axis:
             return best
         raise SolverError(
             f"axis {self.name!r}: no bandwidth from {low:.3g} to {top:.3g} Hz is stable with |S| "
-            f"below {20 * np.log10(self.peak):.2g} dB. Is the axis a rigid body at the lowest "
-            "lines (state rigid=0 when it is on springs), and its sign right? Else raise the "
-            "rate, lower the delay, or measure at lower frequencies."
+            f"below {20 * np.log10(self.peak):.2g} dB. The axis has to be a rigid body "
+            "at the lowest lines. Give rigid=0 when it is on springs; raise the rate, lower the "
+            "delay, or measure at lower frequencies."
         )
 
     def holds(self, bandwidth: float) -> bool:
