@@ -5,6 +5,7 @@ import pytest
 
 from flexplant.errors import AssumptionError, LabelError, ModelError
 from flexplant.lti import frequency_response
+from flexplant.modes import solve_modes
 from flexplant.plant import (
     Disturbance,
     Poi,
@@ -15,9 +16,10 @@ from flexplant.plant import (
     reference_errors,
     stage_weights,
 )
+from flexplant.structure import ModalDamping, PointMass
 from flexplant.synthesis import design_hinf
 from oracles_synthesis import rigid_sensor
-from stages import AXES, CORNERS, INSET, NOISE, OFF_NODE, L, ports, sampled, some_modes
+from stages import AXES, CORNERS, INSET, NOISE, OFF_NODE, L, full, ports, sampled, some_modes
 
 MASS = L * L * 0.0272 * 2702
 
@@ -82,6 +84,16 @@ def test_a_disturbing_moment_is_a_force_at_the_arm():
     w = [Disturbance("force", at=INSET[0]), Disturbance("moment", at=INSET[0], direction="rx")]
     weights = stage_weights(sampled(some_modes(), ports(w=w)), 30.0)
     assert weights.w["moment"] == pytest.approx(L / 2 * weights.w["force"], rel=1e-6)
+
+
+def test_the_arm_is_a_length_whatever_masses_tilt_the_basis_of_the_motions():
+    """The same sensors, the centre of mass elsewhere: rounding chooses how the basis mixes."""
+    places = {(L / 8, L / 2, 0.0): 1.0, (3 * L / 8, 7 * L / 8, 0.0): 0.4}
+    loaded = full().with_parts([PointMass(place, mass) for place, mass in places.items()])
+    modes = solve_modes(loaded, count=10, damping=ModalDamping(0.01))
+    weights = stage_weights(sampled(modes), 30.0)
+    arm = size(weights.z["die:rx"], 10.0)[0] / size(weights.z["die:error"], 10.0)[0]
+    assert arm == pytest.approx(L / 2, rel=1e-6)
 
 
 def test_a_bandwidth_moves_all_frequencies_together():

@@ -272,14 +272,23 @@ def _stage(given: StandardPlant) -> tuple[StandardPlant, RigidModes]:
 
 
 def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:
-    """Return the length that makes rotations displacements: how far the sensors are, in shape."""
+    """Return the length that makes rotations displacements: how far the sensors are, in shape.
+
+    The largest rms displacement of the sensors for a unit rotation of the POI about the axis for
+    which it is least: what is added to it by moving without turning does not count, so that the
+    arbitrary basis of the motions (columns of ``t = R v, s = S v``) does not enter.
+    """
     turning = [p.channel(a) for p in ports.z for a in p.axes if a.startswith("r")]
     if not turning:
         return 1.0
-    ratio = np.linalg.norm(seen(plant, motions, [s.name for s in ports.y]), axis=0)
-    ratio = ratio / np.sqrt(len(ports.y))
-    turns = np.linalg.norm(seen(plant, motions, turning), axis=0)
-    return float(np.max(ratio[turns > 1e-6 * turns.max()] / turns[turns > 1e-6 * turns.max()]))
+    R = seen(plant, motions, turning)
+    S = seen(plant, motions, [s.name for s in ports.y]) / np.sqrt(len(ports.y))
+    turn = np.linalg.pinv(R, rcond=1e-6)
+    straight = S @ (np.eye(R.shape[1]) - turn @ R)
+    sheared = S @ turn
+    return float(
+        np.linalg.norm(sheared - straight @ (np.linalg.pinv(straight, rcond=1e-6) @ sheared), 2)
+    )
 
 
 def _sampled(weight: StateSpace, plant: StandardPlant) -> StateSpace:
