@@ -13,7 +13,10 @@ import flexplant
 ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
-    ("errors", "values", "store", "parallel", "places", "dof_columns", "dof_index", "labels"),
+    (
+        *("errors", "values", "store", "surviving", "parallel", "checkpoint", "work"),
+        *("places", "dof_columns", "dof_index", "labels"),
+    ),
     "lti",
     "sparse",
     "structure",

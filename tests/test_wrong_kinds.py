@@ -363,8 +363,8 @@ def test_a_system_where_a_plant_is_needed_is_told_what_it_lacks():
         fx.design_static: r"assembled from a structure.*assemble_plant\(",
         lambda s: fx.design_servo(s, bandwidth=50.0): r"assembled from a structure.*assemble_plant",
         lambda s: fx.stage_weights(s, 30.0): r"assembled from a structure.*assemble_plant\(",
-        lambda s: fx.place_sensors(s, names, 4): r"from a structure.* Make it by assemble_plant\(",
-        lambda s: fx.score_sensors(s, [names]): r"from a structure.* Make it by assemble_plant\(",
+        lambda s: fx.place_sensors(s, names, 4): r"no noise density.*from_statespace\(sys",
+        lambda s: fx.score_sensors(s, [names]): r"no noise density.*from_statespace\(sys",
         lambda s: fx.sensor_map(s, [(0.3, 0.3, 0.0)], asd=1e-12): r"from a structure.* Make it by",
     }
     for sys in (plant().system, plant().system.to_control()):

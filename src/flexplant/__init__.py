@@ -48,6 +48,7 @@ from .modes import solve_modes as solve_modes
 from .placement import Placement as Placement
 from .placement import PoiVariance as PoiVariance
 from .placement import place_actuators as place_actuators
+from .placement import place_both as place_both
 from .placement import place_sensors as place_sensors
 from .placement import score_actuators as score_actuators
 from .placement import score_sensors as score_sensors

@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Executor
 from contextlib import contextmanager
 from functools import cache
 from time import perf_counter
@@ -18,7 +18,8 @@ from typing import Any, Self, TypeVar
 
 import numpy as np
 
-from .errors import ModelError
+from .errors import ModelError, SolverError
+from .surviving import DIED, Died, survived
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -117,6 +118,8 @@ def mapped(
     progress: bool | None = None,
     rng: int | np.random.SeedSequence | np.random.Generator | None = None,
     description: str = "items",
+    known: Mapping[int, Result] | None = None,
+    each: Callable[[int, Result], None] | None = None,
 ) -> list[Result]:
     """Return ``[function(item) for item in items]``, computed on an executor.
 
@@ -130,13 +133,18 @@ def mapped(
     executor : concurrent.futures.Executor, optional
         Threads, processes, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; only
         `submit` is used. The first items are computed here to learn how long one takes, the rest
-        goes out in chunks of about half a second. None: a plain loop.
+        goes out in chunks of about half a second. When a process of a pool dies, its chunks are
+        done once more, each in a process of its own. None: a plain loop.
     progress : bool, optional
         A bar: None shows one on a terminal for work of more than two seconds.
     rng : int, SeedSequence or Generator, optional
         From it a seed is spawned for each item, whoever computes it.
     description : str
         Name of the bar.
+    known : mapping {int: result}, optional
+        Results of items, by their place, that are not computed again.
+    each : callable, optional
+        Called with the place of an item and its result as soon as it is here, in any order.
 
     Returns
     -------
@@ -147,6 +155,8 @@ def mapped(
     ------
     ModelError
         When the function cannot be called or the executor has no `submit`.
+    SolverError
+        When a worker died twice at the same items.
 
     Examples
     --------
@@ -164,41 +174,46 @@ def mapped(
     calls: list[tuple[Any, ...]] = [(item,) for item in listed]
     if rng is not None:
         calls = [(*call, seed) for call, seed in zip(calls, _seeds(rng, len(calls)), strict=True)]
+    results: dict[int, Result] = dict(known or {})
+    left = [(i, call) for i, call in enumerate(calls) if i not in results]
+
+    def keep(number: int, result: Result) -> None:
+        results[number] = result
+        if each is not None:
+            each(number, result)
+        bar.advance()
+
     with one_thread(), Progress(len(calls), description, progress=progress) as bar:
-        results: list[Result] = []
+        bar.advance(len(results))
         start = perf_counter()
-        for call in calls:
-            if executor is not None and results and perf_counter() - start > PROBE:
+        for done, (number, call) in enumerate(left):
+            if executor is not None and done and perf_counter() - start > PROBE:
+                seconds = (perf_counter() - start) / done
+                _send(function, left[done:], seconds, executor, keep)
                 break
-            results.append(_call(function, call))
-            bar.advance()
-        if executor is None or len(results) == len(calls):
-            return results
-        each = (perf_counter() - start) / len(results)
-        size = max(1, round(CHUNK / max(each, 1e-9)))
-        return results + _sent(function, calls[len(results) :], size, executor, bar)
+            keep(number, _call(function, call))
+        return [results[i] for i in range(len(calls))]
 
 
-def _sent(
+def _send(
     function: Callable[..., Result],
-    calls: Sequence[tuple[Any, ...]],
-    size: int,
+    calls: Sequence[tuple[int, tuple[Any, ...]]],
+    seconds: float,
     executor: Executor,
-    bar: Progress,
-) -> list[Result]:
-    """Return the results of chunks of calls; an error stops those that have not begun."""
+    keep: Callable[[int, Result], None],
+) -> None:
+    """Compute calls, each of which takes so many seconds, in chunks on an executor."""
+    size = max(1, round(CHUNK / max(seconds, 1e-9)))
     chunks = [calls[i : i + size] for i in range(0, len(calls), size)]
-    futures: list[Future[list[Result]]] = []
-    results: list[Result] = []
-    try:
-        futures += [executor.submit(_chunk, function, chunk) for chunk in chunks]
-        for future, chunk in zip(futures, chunks, strict=True):
-            results += future.result()
-            bar.advance(len(chunk))
-    finally:
-        for future in futures:
-            future.cancel()
-    return results
+    out = {i: (function, [call for _, call in chunk]) for i, chunk in enumerate(chunks)}
+    for i, found in survived(_chunk, out, executor):
+        if isinstance(found, Died):
+            raise SolverError(
+                f"items from number {chunks[i][0][0]}: {DIED}. Give the workers more memory, or "
+                "compute without an executor."
+            )
+        for (number, _), result in zip(chunks[i], found, strict=True):
+            keep(number, result)
 
 
 def _chunk(function: Callable[..., Result], calls: Sequence[tuple[Any, ...]]) -> list[Result]:

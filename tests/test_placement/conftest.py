@@ -1,36 +1,18 @@
 """Small random machines: a plate with random candidates, die, disturbances."""
 
-from functools import cache
-
 import numpy as np
 import pytest
 
 import flexplant.parallel
-from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
-from flexplant.structure import ModalDamping, kirchhoff_plate
-
-SIZE = (0.5, 0.35)
-
-
-@cache
-def modes():
-    plate = kirchhoff_plate(
-        size=SIZE,
-        thickness=0.02,
-        elements=(4, 4),
-        density=2700,
-        youngs_modulus=70e9,
-        poisson_ratio=0.33,
-    )
-    return solve_modes(plate, count=8, damping=ModalDamping(0.03))
+from placement_plate import SIZE, plate_modes
 
 
 def points(rng, count):
     return [(x * SIZE[0], y * SIZE[1], 0.0) for x, y in rng.uniform(0, 1, (count, 2))]
 
 
-def machine(seed, *, delay=1.0, count=9):
+def machine(seed, *, delay=1.0, count=9, thickness=0.02):
     """Return a sampled plant, sensor candidates and actuator candidates."""
     rng = np.random.default_rng(seed)
     noises = 10.0 ** rng.uniform(-11, -10, count)
@@ -48,7 +30,11 @@ def machine(seed, *, delay=1.0, count=9):
         z=[Poi("die", at=points(rng, 1)[0], axes=("z", "rx", "ry"))],
         y=sensors[:3],
     )
-    return assemble_plant(modes(), ports).discretized(4e3, delay=delay), sensors, actuators
+    return (
+        assemble_plant(plate_modes(8, thickness), ports).discretized(4e3, delay=delay),
+        sensors,
+        actuators,
+    )
 
 
 @pytest.fixture(scope="session")

@@ -60,13 +60,13 @@ class Drawn(Search):
 
     draws: int = 30
 
-    def search(self, problem, rng, executor, progress):
-        random = np.random.default_rng(rng)
+    def search(self, problem, work):
+        random = np.random.default_rng(work.rng)
         total = len(problem.layouts.candidates)
         sets = [
             tuple(random.choice(total, problem.count, replace=False)) for _ in range(self.draws)
         ]
-        values = problem.layouts.scores(sets, executor=executor, progress=progress)
+        values = problem.layouts.scores(sets, work)
         best = int(np.argmin(values))
         value = float(values[best])
         return Found(sets[best], value, problem.bound(), len(sets), ((value,),))

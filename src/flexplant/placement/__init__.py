@@ -1,6 +1,11 @@
 """Where sensors and actuators go: criteria, scores, search and bounds."""
 
+from .among import Among as Among
+from .auto_mac import AutoMac as AutoMac
 from .branch_and_bound import BranchAndBound as BranchAndBound
+from .by_rows import ByRows as ByRows
+from .candidates import PlantChannel as PlantChannel
+from .closed_loop_h2 import ClosedLoopH2 as ClosedLoopH2
 from .constraints import Budget as Budget
 from .constraints import Constraint as Constraint
 from .constraints import Excluded as Excluded
@@ -15,16 +20,26 @@ from .exchange import Exchange as Exchange
 from .exhaustive import Exhaustive as Exhaustive
 from .gramian import ModalControllability as ModalControllability
 from .gramian import ModalObservability as ModalObservability
+from .hinf_level import HinfLevel as HinfLevel
+from .kinetic_energy import KineticEnergy as KineticEnergy
+from .modal_indices import ActuatorIndices as ActuatorIndices
+from .modal_indices import SensorIndices as SensorIndices
+from .mode_information import ModeInformation as ModeInformation
+from .penalised import LeftOutModes as LeftOutModes
+from .penalised import Penalised as Penalised
+from .placement import Placement as Placement
 from .poi_lqr import PoiLqr as PoiLqr
 from .poi_variance import PoiVariance as PoiVariance
 from .problem import Found as Found
 from .problem import Problem as Problem
 from .problem import Search as Search
+from .robust import AfterLoss as AfterLoss
+from .robust import OverMachines as OverMachines
 from .scores import Scores as Scores
 from .scores import score_actuators as score_actuators
 from .scores import score_sensors as score_sensors
-from .search import Placement as Placement
 from .search import place_actuators as place_actuators
+from .search import place_both as place_both
 from .search import place_sensors as place_sensors
 from .sensor_map import SensorMap as SensorMap
 from .sensor_map import sensor_map as sensor_map

@@ -6,10 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import combinations, product
 from math import comb, prod
+from typing import TypeAlias
 
 import numpy as np
 
 from ..values import FloatArray, IntArray
+
+#: disjoint groups of candidates, and how many of each are chosen
+Groups: TypeAlias = tuple[tuple[IntArray, int], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,7 +26,7 @@ class Branch:
         Indices of candidates, ascending, and how many of them are chosen, at least one.
     """
 
-    groups: tuple[tuple[IntArray, int], ...]
+    groups: Groups
 
     @property
     def members(self) -> IntArray:

@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import heapq
 import warnings
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..errors import FlexplantWarning, ModelError
-from ..parallel import Progress, mapped
-from ..values import FloatArray, Rng, positive, whole
-from .branch import Branch
+from ..parallel import Progress
+from ..values import FloatArray, positive, whole
+from ..work import Work
+from .branch import Branch, Groups
 from .exchange import best_start
 from .problem import Found, Problem, Search
 from .tangent import Convex
@@ -68,9 +69,7 @@ class BranchAndBound(Search):
         if self.gap >= 1:
             raise ModelError(f"gap is a part of the value, below 1, got {self.gap:g}. Try 0.05.")
 
-    def search(
-        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
-    ) -> Found:
+    def search(self, problem: Problem, work: Work) -> Found:
         """Return the best choice and the bound that was proven; see `Search.search`.
 
         Raises
@@ -86,17 +85,17 @@ class BranchAndBound(Search):
                 "without a filter or delay of their own. Use Exhaustive() or Exchange()."
             )
         end = monotonic() + self.time_limit
-        chosen, history, evaluations = best_start(problem, self.starts, rng, executor, progress)
+        chosen, history, evaluations = best_start(problem, self.starts, problem.relaxed(), work)
         value = min(steps[-1] for steps in history)
         tree = _Tree(problem, scorer, self.gap, chosen, value)
-        with Progress(problem.root.size, "choices settled", progress=progress) as bar:
+        with Progress(problem.root.size, "choices settled", progress=work.progress) as bar:
             while (batch := tree.next_batch()) and monotonic() < end:
                 tree.pop(len(batch))
-                opened = mapped(
+                opened = work.mapped(
                     partial(_open, problem, scorer, tree.cutoff),
                     batch,
-                    executor=executor,
                     progress=False,
+                    restored=_restored,
                 )
                 bar.advance(sum(map(tree.take, opened)))
         bound = tree.bound
@@ -120,17 +119,21 @@ class BranchAndBound(Search):
         )
 
 
-@dataclass(frozen=True, eq=False)
-class _Node:
+class _Node(NamedTuple):
     """A branch that is not settled: a lower bound of its choices, and weights near the least."""
 
     bound: float
-    branch: Branch
+    groups: Groups
     weights: FloatArray
 
+    @classmethod
+    def of(cls, bound: float, groups: Any, weights: Any) -> _Node:
+        """Return the node of nested lists."""
+        parts = tuple((np.array(group, dtype=np.int64), count) for group, count in groups)
+        return cls(bound, parts, np.array(weights))
 
-@dataclass(frozen=True, eq=False)
-class _Opened:
+
+class _Opened(NamedTuple):
     """What opening a branch showed."""
 
     nodes: list[_Node]
@@ -139,6 +142,12 @@ class _Opened:
     settled: int
     left: float
     evaluations: int
+
+
+def _restored(row: Any) -> _Opened:
+    """Return what opening a branch showed, from the nested lists of a file."""
+    nodes, value, chosen, *rest = row
+    return _Opened([_Node.of(*node) for node in nodes], value, tuple(chosen), *rest)
 
 
 class _Tree:
@@ -152,7 +161,7 @@ class _Tree:
         branch = problem.root
         bound, weights = scorer.relaxation(branch)
         self.heap: list[tuple[float, int, _Node]] = []
-        self._push(_Node(bound, branch, weights))
+        self._push(_Node(bound, branch.groups, weights))
 
     @property
     def cutoff(self) -> float:
@@ -193,7 +202,7 @@ class _Tree:
 
 def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Opened:
     """Settle a small branch choice by choice, or cut it in parts with bounds of their own."""
-    branch = node.branch
+    branch = Branch(node.groups)
     # no choice in it satisfies the constraints or has a score
     if not problem.rows.possible(branch) or problem.layouts.missing(branch.members.tolist()):
         return _Opened([], np.inf, (), branch.size, np.inf, 0)
@@ -220,7 +229,7 @@ def _open(problem: Problem, scorer: Convex, cutoff: float, node: _Node) -> _Open
             found, near = tangent.least(part, near)
             low = max(bound, found)
         if low < cutoff:
-            nodes.append(_Node(low, part, near))
+            nodes.append(_Node(low, part.groups, near))
         else:
             left, settled = min(left, low), settled + part.size
     return _Opened(nodes, np.inf, (), settled, left, 0)

@@ -3,23 +3,60 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..plant import Actuator, SensorPort, StandardPlant, standard_plant
-from ..values import short
+from ..values import Value, short
 
-Port: TypeAlias = "SensorPort | Actuator"
-Side: TypeAlias = Literal["y", "u"]
+
+@dataclass(frozen=True, eq=False)
+class PlantChannel(Value):
+    """A candidate that a plant made elsewhere has already: a row of C or a column of B.
+
+    Parameters
+    ----------
+    name : str
+        Of the channel.
+    side : {"y", "u"}
+        Whether it is a sensor or an actuator.
+    """
+
+    name: str
+    side: str
+
+
+Port: TypeAlias = "SensorPort | Actuator | PlantChannel"
+#: what is chosen: sensors, actuators, or both
+Side: TypeAlias = Literal["y", "u", "yu"]
 
 _NAME = {"y": "Sensor", "u": "Actuator"}
-KIND: dict[str, type[Any]] = {"y": SensorPort, "u": Actuator}
+_KIND: dict[str, type[Any]] = {"y": SensorPort, "u": Actuator}
 
 
-def checked_plant(plant: StandardPlant) -> None:
-    """Raise ModelError unless the plant is sampled, not weighted, and made of a structure."""
-    plant = standard_plant(plant)  # a system with labels is one too, without a structure
-    _ = plant.assembled
+def side_of(port: Port) -> str:
+    """Return "y" of a sensor and "u" of an actuator."""
+    if isinstance(port, PlantChannel):
+        return port.side
+    return "y" if isinstance(port, SensorPort) else "u"
+
+
+def sides_of(ports: Iterable[Port]) -> Any:
+    """Return "y", "u" or "yu": what there is among some ports."""
+    found = {side_of(port) for port in ports}
+    return "".join(side for side in "yu" if side in found)
+
+
+def checked_plant(given: Any) -> StandardPlant:
+    """Return a plant that is sampled and not weighted.
+
+    Raises
+    ------
+    ModelError
+        When it is another one.
+    """
+    plant: StandardPlant = standard_plant(given)
     if plant.is_weighted:
         raise ModelError(
             f"the plant is {plant.alteration}, placement needs the one before: plant.unweighted."
@@ -29,14 +66,30 @@ def checked_plant(plant: StandardPlant) -> None:
             "the plant is continuous, scores are of the sampled one: use "
             "plant.discretized(rate, delay=1)."
         )
+    return plant
 
 
-def with_side(plant: StandardPlant, side: Side, chosen: Sequence[Port]) -> StandardPlant:
-    """Return the plant with these sensors or actuators instead of its own."""
-    return plant.with_ports(plant.assembled.ports.replace(**{side: tuple(chosen)}))
+def with_side(plant: StandardPlant, side: str, chosen: Sequence[Port]) -> StandardPlant:
+    """Return the plant with these sensors (actuators, or both) instead of its own."""
+    parts = {s: tuple(port for port in chosen if side_of(port) == s) for s in side}
+    if plant.is_assembled:
+        return plant.with_ports(plant.assembled.ports.replace(**parts))
+    return _restricted(plant, {s: [port.name for port in part] for s, part in parts.items()})
 
 
-def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> dict[str, Port]:
+def _restricted(plant: StandardPlant, kept: dict[str, list[str]]) -> StandardPlant:
+    """Return a plant with some of its sensors and actuators, without noise and effort of others."""
+    y, u = kept.get("y", list(plant.y)), kept.get("u", list(plant.u))
+    silent = {f"{name}:noise" for name in plant.y if name not in y}
+    idle = {f"{name}:effort" for name in plant.u if name not in u}
+    w = [name for name in plant.w if name not in silent]
+    z = [name for name in plant.z if name not in idle]
+    asd = {name: size for name, size in plant.asd.items() if name not in silent}
+    system = plant.system.select([*z, *y], [*w, *u])
+    return StandardPlant(system, tuple(w), tuple(u), tuple(z), tuple(y), asd, plant.origin)
+
+
+def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> dict[str, Port]:
     """Return candidates by name; a text stands for the plant's own sensor (actuator).
 
     Raises
@@ -51,7 +104,7 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
             f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "
             "Put them in a list."
         )
-    own: dict[str, Port] = {p.name: p for p in getattr(plant.assembled.ports, side)}
+    own = _own(plant, side)
     found: dict[str, Port] = {}
     for item in given:
         port = item
@@ -59,7 +112,13 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
             port = found.get(item) or own.get(item)
             if port is None:
                 raise unknown_label(_NAME[side].lower(), item, [*own, *found])
-        if not isinstance(port, KIND[side]):
+        if not plant.is_assembled and not isinstance(port, PlantChannel):
+            raise ModelError(
+                f"the plant was not assembled from a structure, which would be needed for "
+                f"{short(port)}: its candidates are names of its channels. Pass names, or make "
+                "the plant by assemble_plant(model, ports)."
+            )
+        if plant.is_assembled and not isinstance(port, _KIND[side]):
             raise ModelError(
                 f"candidates are {_NAME[side]}s or names of the plant's, got "
                 f"{short(port)}. Pass {_NAME[side]}(name, at=...)."
@@ -71,3 +130,9 @@ def known_candidates(plant: StandardPlant, side: Side, given: Iterable[Any]) -> 
                 "Rename one."
             )
     return found
+
+
+def _own(plant: StandardPlant, side: str) -> dict[str, Port]:
+    if plant.is_assembled:
+        return {port.name: port for port in getattr(plant.assembled.ports, side)}
+    return {name: PlantChannel(name, side) for name in (plant.y if side == "y" else plant.u)}

@@ -115,14 +115,7 @@ class Within(Constraint):
     at_most: int | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        low, high = (
-            None if n is None else whole(n, name, minimum=0)
-            for n, name in ((self.at_least, "at_least"), (self.at_most, "at_most"))
-        )
-        if low is not None and high is not None and low > high:
-            raise ModelError(
-                f"at_least {low} is above at_most {high}: no choice is both. Exchange them."
-            )
+        low, high = limits(self.at_least, self.at_most)
         self._set(zones=_zones(self.zones, "a zone"), at_least=low, at_most=high)
 
     def rows(self, places: Places) -> LinearRows:
@@ -231,6 +224,7 @@ class Mirrored(Constraint):
 
     def rows(self, places: Places) -> LinearRows:
         """Return x_i - x_j = 0 for images, x_i <= 0 without one."""
+        places.inside(())  # refuses where places are not known
         k = "xyz".index(self.axis)
         images = []
         for points in places.points:
@@ -290,6 +284,25 @@ class Budget(Constraint):
         return LinearRows(costs[None], np.array([0.0]), np.array([self.total]))
 
 
+def limits(at_least: Any, at_most: Any) -> tuple[int | None, int | None]:
+    """Return two counts, checked; None where there is no limit.
+
+    Raises
+    ------
+    ModelError
+        When they are no whole numbers, or at_least is above at_most.
+    """
+    low, high = (
+        None if n is None else whole(n, name, minimum=0)
+        for n, name in ((at_least, "at_least"), (at_most, "at_most"))
+    )
+    if low is not None and high is not None and low > high:
+        raise ModelError(
+            f"at_least {low} is above at_most {high}: no choice is both. Exchange them."
+        )
+    return low, high
+
+
 def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
     """Return the rows of all constraints, OffPoi() among them for sensors unless one is given.
 
@@ -315,7 +328,7 @@ def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:
                 f"a constraint is Excluded(...), MinimumDistance(...) or another such value, got "
                 f"{short(item)}. Write Excluded(Disc((0.3, 0.3), radius=0.05)), say."
             )
-    usual = side == "y" and not any(isinstance(item, OffPoi) for item in given)
+    usual = "y" in side and not any(isinstance(item, OffPoi) for item in given)
     return (*given, OffPoi()) if usual else tuple(given)
 
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, short
-from .candidates import KIND, Port, Side, with_side
+from ..values import FloatArray, Value, short, with_unit
+from .candidates import Port, Side, sides_of, with_side
 
 
 class Scorer:
@@ -83,6 +83,8 @@ class Criterion(Value):
 
     #: what it depends on: sensors "y", actuators "u"
     sides: ClassVar[str] = "yu"
+    #: values are compared by differences of this size where they pass through zero
+    scale: ClassVar[float] = 0.0
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the criterion on a plant."""
@@ -101,8 +103,11 @@ class Criterion(Value):
         candidates : sequence of Sensor or Actuator
             All that may be chosen, of one kind.
         """
-        side: Side = "y" if all(isinstance(port, KIND["y"]) for port in candidates) else "u"
-        return OnPlant(plant, side, tuple(candidates), self)
+        return OnPlant(plant, sides_of(candidates), tuple(candidates), self)
+
+    def unit(self, plant: StandardPlant) -> str:
+        """Return the unit of its square root where it is a mean square of a motion; else ""."""
+        return ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -118,7 +123,7 @@ class _Function(Criterion):
         return self.function(plant)
 
 
-def as_criterion(given: Any, side: Side) -> Criterion:
+def as_criterion(given: Any, side: str = "") -> Criterion:
     """Return a criterion of one side, made of any callable from plant to float.
 
     Raises
@@ -132,9 +137,17 @@ def as_criterion(given: Any, side: Side) -> Criterion:
             f"plant to float, got {short(given)}. Pass one, or none for the usual."
         )
     criterion = given if isinstance(given, Criterion) else _Function(given)
-    if side not in criterion.sides:
-        raise ModelError(
-            f"{criterion!r} does not depend on {'sensors' if side == 'y' else 'actuators'}: use "
-            "a criterion that does, or any callable from plant to float."
-        )
+    for part in side:
+        if part not in criterion.sides:
+            raise ModelError(
+                f"{criterion!r} does not depend on {'sensors' if part == 'y' else 'actuators'}: "
+                "use a criterion that does, or any callable from plant to float."
+            )
     return criterion
+
+
+def in_words(value: float, unit: str) -> str:
+    """Return a value as people read it: the root of a mean square as `0.071 nm rms`."""
+    if not unit or not np.isfinite(value):
+        return f"{value:.4g}"
+    return f"{with_unit(float(np.sqrt(max(value, 0.0))), unit)} rms"

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
 
-from ..parallel import mapped
-from ..values import FloatArray, Rng, seed_sequence, whole
+from ..values import FloatArray, whole
+from ..work import Work
 from .problem import Found, Problem, Search
 
 #: an exchange must gain this, relative, to be made: rounding must not make it go round in circles
@@ -19,14 +18,15 @@ _GAIN = 1e-12
 
 @dataclass(frozen=True, eq=False)
 class Exchange(Search):
-    """Greedy choice, then exchanges of one candidate at a time; again from random starts.
+    """Greedy choice, then exchanges of one candidate at a time; again from other starts.
 
     Each start ends where no single exchange helps.
 
     Parameters
     ----------
     starts : int
-        Starts in all: the greedy one and `starts - 1` random ones.
+        The greedy one and `starts - 1` random ones. Where the criterion has a relaxation the choice
+        of the largest relaxed weights is one more.
 
     Raises
     ------
@@ -39,50 +39,64 @@ class Exchange(Search):
     def __post_init__(self) -> None:
         self._set(starts=whole(self.starts, "starts"))
 
-    def search(
-        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
-    ) -> Found:
+    def search(self, problem: Problem, work: Work) -> Found:
         """Return the best of all starts, bounded by relaxation; see `Search.search`."""
-        chosen, history, evaluations = best_start(problem, self.starts, rng, executor, progress)
+        relaxed = problem.relaxed()
+        chosen, history, evaluations = best_start(problem, self.starts, relaxed, work)
         value = min(steps[-1] for steps in history)
-        bound = min(problem.bound(), value) if np.isfinite(value) else -np.inf
+        bound = relaxed[0] if relaxed is not None else problem.bound()
+        bound = min(bound, value) if np.isfinite(value) else -np.inf
         return Found(chosen, value, bound, evaluations, history)
 
 
 def best_start(
-    problem: Problem, starts: int, rng: Rng, executor: Executor | None, progress: bool | None
+    problem: Problem, starts: int, relaxed: tuple[float, FloatArray] | None, work: Work
 ) -> tuple[tuple[int, ...], tuple[tuple[float, ...], ...], int]:
-    """Return the best choice of several starts, the values on the way of each, evaluations."""
-    runs = mapped(
+    """Return the best choice of several starts, the values on the way of each, evaluations.
+
+    Parameters
+    ----------
+    problem : Problem
+        What is sought.
+    starts : int
+        How many.
+    relaxed : (bound, weights) or None
+        From `problem.relaxed`.
+    work : Work
+        What it runs on.
+    """
+    rounded = None if relaxed is None else problem.rounded(relaxed[1])
+    runs = work.mapped(
         partial(_run, problem),
-        range(starts),
-        executor=executor,
-        progress=progress,
-        rng=seed_sequence(rng),
+        ["greedy", *["random"] * (starts - 1), *([] if rounded is None else [rounded])],
+        rng=work.rng,
         description="starts",
+        restored=lambda row: (tuple(row[0]), tuple(row[1]), row[2]),
     )
     chosen, _, _ = min(runs, key=lambda run: run[1][-1])
     return chosen, tuple(run[1] for run in runs), sum(run[2] for run in runs)
 
 
 def _run(
-    problem: Problem, start: int, rng: np.random.Generator
+    problem: Problem, first: tuple[int, ...] | str, rng: np.random.Generator
 ) -> tuple[tuple[int, ...], tuple[float, ...], int]:
-    return _Run(problem).from_start(start, rng)
+    run = _Run(problem)
+    if isinstance(first, str):
+        return run.exchanged(run.greedy() if first == "greedy" else run.drawn(rng))
+    return run.exchanged(first)
 
 
 class _Run:
-    """One start and its exchanges; start 0 is greedy."""
+    """Exchanges from a first choice; scores that are known are not computed again."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem = problem
         self.seen: dict[tuple[int, ...], float] = {}
 
-    def from_start(
-        self, start: int, rng: np.random.Generator
-    ) -> tuple[tuple[int, ...], tuple[float, ...], int]:
+    def exchanged(self, first: Sequence[int]) -> tuple[tuple[int, ...], tuple[float, ...], int]:
         """Return the choice, the values on the way to it and the number of evaluations."""
-        chosen = self._start(start, rng)
+        units = {i: unit for unit in self.problem.units for i in unit}
+        chosen = list(dict.fromkeys(units.get(int(i), (int(i),)) for i in first))
         values = [float(self._values([_flat(chosen)])[0])]
         movable = [i for i, unit in enumerate(chosen) if not set(unit) & set(self.problem.required)]
         idle = 0
@@ -110,18 +124,20 @@ class _Run:
         self.seen.update(zip(new, self.problem.score(new).tolist(), strict=True))
         return np.array([self.seen[key] for key in keys])
 
-    def _start(self, start: int, rng: np.random.Generator) -> list[tuple[int, ...]]:
-        """Return the first choice, as units."""
-        problem = self.problem
-        chosen = list(problem.start(rng if start else None))
-        rest = [i for i in problem.free if i not in chosen]
-        if start:
-            chosen += list(rng.permutation(rest)[: problem.count - len(chosen)])
-        while len(chosen) < problem.count:
+    def greedy(self) -> list[int]:
+        """Return a choice made of the best next candidate, again and again."""
+        chosen = list(self.problem.start(None))
+        rest = [i for i in self.problem.free if i not in chosen]
+        while len(chosen) < self.problem.count:
             best = int(np.argmin(self._values([[*chosen, i] for i in rest])))
             chosen.append(rest.pop(best))
-        units = {i: unit for unit in problem.units for i in unit}
-        return list(dict.fromkeys(units.get(int(i), (int(i),)) for i in chosen))
+        return chosen
+
+    def drawn(self, rng: np.random.Generator) -> list[int]:
+        """Return a choice by chance."""
+        chosen = list(self.problem.start(rng))
+        rest = [i for i in self.problem.free if i not in chosen]
+        return [*chosen, *rng.permutation(rest)[: self.problem.count - len(chosen)].tolist()]
 
 
 def _flat(units: Sequence[tuple[int, ...]]) -> list[int]:

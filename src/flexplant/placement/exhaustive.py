@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..errors import ModelError
-from ..values import Rng, whole
+from ..values import whole
+from ..work import Work
 from .problem import Found, Problem, Search
 
 
@@ -32,9 +32,7 @@ class Exhaustive(Search):
     def __post_init__(self) -> None:
         self._set(limit=whole(self.limit, "limit"))
 
-    def search(
-        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
-    ) -> Found:
+    def search(self, problem: Problem, work: Work) -> Found:
         """Return the best of all subsets; see `Search.search`. Nothing is random.
 
         Raises
@@ -49,9 +47,7 @@ class Exhaustive(Search):
                 "a higher limit."
             )
         sets = list(problem.choices())
-        values = problem.layouts.scores(
-            sets, executor=executor, progress=progress, description="every subset"
-        )
+        values = problem.layouts.scores(sets, work, "every subset")
         best = int(np.argmin(values))
         value = float(values[best])
         return Found(sets[best], value, value, len(sets), ((value,),))

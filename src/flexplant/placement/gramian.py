@@ -2,74 +2,84 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from ..errors import ModelError
 from ..plant import StandardPlant
+from ..plant.realisation import ModalRealisation
 from ..values import FloatArray, one_of
-from .criterion import Criterion
-
-_MEASURES = ("trace", "log det", "least")
+from .criterion import Criterion, Scorer
+from .summed import MEASURES, summed
 
 
 @dataclass(frozen=True, eq=False)
-class _Gramian(Criterion):
-    """Minus a measure of a Gramian; the base of both.
+class ModalGramian(Criterion):
+    """Minus a measure of a Gramian of the elastic modes; the base of one for each side.
+
+    In continuous time, in states whose square is twice the energy of a mode, every entry of
+    ``W_ij = -conj(c_i) c_j / (conj(lambda_i) + lambda_j)`` for the eigenvectors: modes of one
+    frequency that are alike count as one, which the diagonal alone takes for two. Rigid-body modes,
+    whose Gramian is infinite, are left out; filters and delays do not count. It is the sum of the
+    Gramians of single devices.
 
     Parameters
     ----------
     measure : {"trace", "log det", "least"}
         Sum of the eigenvalues, sum of their logarithms, or the least one.
+
+    Raises
+    ------
+    ModelError
+        When the measure is none of these; when called, for a plant without elastic modes.
     """
 
+    scale: ClassVar[float] = 1.0
     measure: str = "log det"
 
     def __post_init__(self) -> None:
-        self._set(measure=one_of(self.measure, "measure", _MEASURES))
+        self._set(measure=one_of(self.measure, "measure", MEASURES))
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return minus the measure: infinite where a mode is missed, for log det."""
-        sizes = np.linalg.eigvalsh(self.matrix(plant))
-        if self.measure == "trace":
-            return -float(np.sum(sizes))
-        if self.measure == "least":
-            return -float(sizes[0])
-        # what rounding leaves of an eigenvalue of zero is zero
-        if sizes[0] <= 1e-13 * sizes[-1]:
-            return np.inf
-        return -float(np.sum(np.log(sizes)))
+        return float(summed(self.matrix(plant)[None], self.measure).score([(0,)])[0])
 
     def matrix(self, plant: StandardPlant) -> FloatArray:
         """Return the Gramian (2 m, 2 m) of the m elastic modes."""
-        real = plant.assembled.realisation
+        ports = getattr(plant.assembled.ports, self.sides)
+        return np.asarray(self._each(plant.assembled.realisation, ports).sum(axis=0))
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the measure of sums of the candidates' Gramians."""
+        return summed(self._each(plant.assembled.realisation, candidates), self.measure)
+
+    def _each(self, real: ModalRealisation, ports: Sequence[Any]) -> FloatArray:
+        """Return the Gramians (N, 2 m, 2 m) of single ports."""
         start = 2 * real.n_rigid
-        A, rows = real.A[start:, start:], self._rows(plant)[:, start:]
+        A = real.A[start:, start:]
+        rows = np.array([self._row(real, port) for port in ports])[:, start:]
         if not A.size:
             raise ModelError("the plant has no elastic mode, so no Gramian. Keep some modes.")
-        if self.sides == "u":
-            A = A.T
-        poles, modes = np.linalg.eig(A)
+        poles, modes = np.linalg.eig(A.T if self.sides == "u" else A)
         part = rows @ modes
-        W = -(part.conj().T @ part) / (poles.conj()[:, None] + poles)
+        sums = poles.conj()[:, None] + poles
+        W = -(part.conj()[:, :, None] * part[:, None, :]) / sums
         back = np.linalg.inv(modes)
         found = (back.conj().T @ W @ back).real
-        return np.asarray(0.5 * (found + found.T))
+        return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
 
-    def _rows(self, plant: StandardPlant) -> FloatArray:
+    def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
         raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)
-class ModalObservability(_Gramian):
+class ModalObservability(ModalGramian):
     """Minus a measure of the observability Gramian of the elastic modes, which sensors see.
 
-    In continuous time, in states whose square is twice the energy of a mode, every entry of
-    ``W_ij = -conj(c_i) c_j / (conj(lambda_i) + lambda_j)`` for the eigenvectors: modes of one
-    frequency that are alike count as one, which the diagonal alone takes for two. Rigid-body modes,
-    whose Gramian is infinite, are left out; filters and delays do not count.
+    See `ModalGramian`. One row per sensor, in units of its noise where it has any.
 
     Parameters
     ----------
@@ -84,20 +94,15 @@ class ModalObservability(_Gramian):
 
     sides: ClassVar[str] = "y"
 
-    def _rows(self, plant: StandardPlant) -> FloatArray:
-        """Return one row per sensor, in units of its noise where it has any."""
-        real = plant.assembled.realisation
-        return np.array([s.see(real).row / (s.asd or 1.0) for s in plant.assembled.ports.y])
+    def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
+        return np.asarray(port.see(real).row / (port.asd or 1.0))
 
 
 @dataclass(frozen=True, eq=False)
-class ModalControllability(_Gramian):
+class ModalControllability(ModalGramian):
     """Minus a measure of the controllability Gramian of the elastic modes, which actuators move.
 
-    In continuous time, in states whose square is twice the energy of a mode, every entry of
-    ``W_ij = -conj(c_i) c_j / (conj(lambda_i) + lambda_j)`` for the eigenvectors: modes of one
-    frequency that are alike count as one, which the diagonal alone takes for two. Rigid-body modes,
-    whose Gramian is infinite, are left out; filters and delays do not count.
+    See `ModalGramian`. One row per actuator: what a newton (newton metre) of it does.
 
     Parameters
     ----------
@@ -112,7 +117,5 @@ class ModalControllability(_Gramian):
 
     sides: ClassVar[str] = "u"
 
-    def _rows(self, plant: StandardPlant) -> FloatArray:
-        """Return one row per actuator: what a newton (newton metre) of it does."""
-        real = plant.assembled.realisation
-        return np.array([real.force(a.push(real)) for a in plant.assembled.ports.u])
+    def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
+        return real.force(port.push(real))

@@ -3,24 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..errors import AssumptionError, CertificateError
-from ..parallel import mapped
-from ..plant import Assumption, SensorPort, StandardPlant, assemble_plant
+from ..plant import Assumption, StandardPlant, assemble_plant
 from ..values import FloatArray
+from ..work import Work
 from .candidates import Port, Side, checked_plant, with_side
+from .closed_loop_h2 import ClosedLoopH2
 from .criterion import Criterion, OnPlant, Scorer, as_criterion
 from .poi_lqr import PoiLqr
 from .poi_variance import PoiVariance
+from .rigid_part import RigidPart
 
 ASSUMPTION = {"y": "detectable", "u": "stabilisable"}
-#: a rigid-body motion weaker than this beside the strongest counts as absent (as in plant.check)
-WEAK = 1e-8
 #: choices that are scored at once: always as many, so that rounding does not depend on the executor
 _BLOCK = 64
 
@@ -39,8 +38,8 @@ class Layouts:
         All of them.
     criterion : Criterion
         Plant to float.
-    rigid : (N, r) array
-        Part of each candidate in each rigid-body mode, rows of unit size or zero.
+    rigid : RigidPart
+        Part of each candidate in the rigid-body modes.
     scorer : Scorer
         The criterion over these candidates.
     """
@@ -49,40 +48,28 @@ class Layouts:
     side: Side
     candidates: tuple[Port, ...]
     criterion: Criterion
-    rigid: FloatArray
+    rigid: RigidPart
     scorer: Scorer
 
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return the scores (n,) of choices, infinite where there is none."""
         ordered = [sorted(chosen) for chosen in sets]
-        scored = [i for i, chosen in enumerate(ordered) if not self.missing(chosen)]
+        scored = np.flatnonzero(self.rigid.all_missing(ordered) == 0).tolist() if ordered else []
         values = np.full(len(ordered), np.inf)
         values[scored] = self.scorer.score([ordered[i] for i in scored])
         return values
 
     def scores(
-        self,
-        sets: Sequence[Sequence[int]],
-        *,
-        executor: Executor | None = None,
-        progress: bool | None = None,
-        description: str = "layouts",
+        self, sets: Sequence[Sequence[int]], work: Work, description: str = "layouts"
     ) -> FloatArray:
         """Return the scores (n,) of many choices, computed on an executor."""
         blocks = [sets[i : i + _BLOCK] for i in range(0, len(sets), _BLOCK)]
-        found = mapped(
-            self.score, blocks, executor=executor, progress=progress, description=description
-        )
+        found = work.mapped(self.score, blocks, description=description, restored=_floats)
         return np.concatenate(found) if found else np.zeros(0)
 
     def missing(self, chosen: Sequence[int]) -> int:
-        """Return how many rigid-body modes a choice has no part in: ranks decide."""
-        rows = self.rigid[list(chosen)]
-        wanted = int(rows.shape[1])
-        if not wanted or not np.any(rows):
-            return wanted
-        sizes = np.linalg.svd(rows, compute_uv=False)
-        return wanted - int(np.count_nonzero(sizes > WEAK * sizes[0]))
+        """Return how many rigid-body modes a choice has no part in."""
+        return self.rigid.missing(chosen)
 
     def reason(self, chosen: Sequence[int]) -> str:
         """Return in words why a choice has no score; empty when it has one."""
@@ -107,7 +94,7 @@ class Layouts:
             return
         ports = [self.candidates[i] for i in sorted(chosen)]
         direct = float(self.criterion(with_side(self.plant, self.side, ports)))
-        if not abs(direct - value) <= 1e-6 * abs(direct):
+        if not abs(direct - value) <= 1e-6 * max(abs(direct), self.criterion.scale):
             raise CertificateError(
                 f"the fast score {value:.9g} of the best choice differs from {self.criterion!r} on "
                 f"its plant, {direct:.9g}. No score can be trusted: the problem is too badly "
@@ -115,9 +102,14 @@ class Layouts:
             )
 
     def _finding(self, chosen: Sequence[int]) -> Assumption:
-        own = self.plant.assembled
-        only = own.ports.replace(**{self.side: [self.candidates[i] for i in chosen]})
-        return assemble_plant(own.realisation, only).check()[ASSUMPTION[self.side]]
+        own = with_side(self.plant, self.side, [self.candidates[i] for i in chosen]).assembled
+        report = assemble_plant(own.realisation, own.ports).check()
+        found = [report[ASSUMPTION[part]] for part in self.side]
+        return next((item for item in found if not item.holds), found[0])
+
+
+def _floats(row: Any) -> FloatArray:
+    return np.array(row, dtype=np.float64)
 
 
 def layouts_of(
@@ -135,29 +127,17 @@ def layouts_of(
     LabelError
         When a candidate is off the structure, or a name is used twice.
     """
-    checked_plant(plant)
+    plant = checked_plant(plant)
     if criterion is None:
-        criterion = PoiVariance() if side == "y" else PoiLqr()
+        criterion = {"y": PoiVariance(), "u": PoiLqr(), "yu": ClosedLoopH2()}[side]
     criterion = as_criterion(criterion, side)
     candidates = tuple(candidates)
     with_side(plant, side, candidates)  # names and places, all at once
+    rigid = RigidPart.of(plant, side, candidates)
     plainly = OnPlant(plant, side, candidates, criterion)
-    layouts = Layouts(plant, side, candidates, criterion, _rigid(plant, candidates), plainly)
+    layouts = Layouts(plant, side, candidates, criterion, rigid, plainly)
     criterion.check(plant, candidates)
     # without a single feasible choice there is nothing that choices could share
     if layouts.missing(range(len(candidates))):
         return layouts
     return replace(layouts, scorer=criterion.scorer(plant, candidates))
-
-
-def _rigid(plant: StandardPlant, candidates: Sequence[Port]) -> FloatArray:
-    """Return unit rows (N, r): a sensor sees positions, an actuator moves velocities."""
-    realisation = plant.assembled.realisation
-    rows = np.zeros((len(candidates), realisation.n_rigid))
-    for i, port in enumerate(candidates):
-        if isinstance(port, SensorPort):
-            rows[i] = port.see(realisation).row[0 : 2 * realisation.n_rigid : 2]
-        else:
-            rows[i] = realisation.force(port.push(realisation))[1 : 2 * realisation.n_rigid : 2]
-    sizes = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.asarray(rows / np.where(sizes > 0, sizes, 1.0))

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import ModelError
 from ..plant import StandardPlant
 from ..structure import Disc, Rectangle
 from ..values import FloatArray
@@ -38,20 +39,35 @@ class Places:
 
     def inside(self, zones: Sequence[Zone]) -> FloatArray:
         """Return 1 for candidates with any point in any zone, seen from above, else 0."""
+        self._require_places()
         hit = [any(np.any(zone.holds(p[:, :2])) for zone in zones) for p in self.points]
         return np.array(hit, dtype=np.float64)
 
     def distances(self, others: Sequence[FloatArray]) -> FloatArray:
         """Return the least distance [m] of each candidate (rows) to each of other points."""
+        self._require_places()
         found = [
             [np.min(np.linalg.norm(p[:, None] - q[None], axis=2)) for q in others]
             for p in self.points
         ]
         return np.array(found, dtype=np.float64).reshape(self.total, len(others))
 
+    def _require_places(self) -> None:
+        if len(self.points) < self.total:
+            raise ModelError(
+                "the plant was made elsewhere, and where its sensors and actuators are is not "
+                "known: constraints on places have no meaning. Use Together, Among or Budget, "
+                "which go by names, or leave candidates out of the list."
+            )
+
 
 def places_of(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
-    """Return where candidates and POIs are; a port with several points is at each of them."""
+    """Return where candidates and POIs are; a port with several points is at each of them.
+
+    Of a plant made elsewhere no places are known.
+    """
+    if not plant.is_assembled:
+        return Places(tuple(port.name for port in candidates), (), ())
     dofs = plant.assembled.realisation.model.full_dofs
 
     def points(at: Any) -> FloatArray:

@@ -1,4 +1,4 @@
-"""The axes of a POI that a criterion sums over, and their rows in a plant."""
+"""The axes of POIs that a criterion sums over, and their rows in a plant."""
 
 from __future__ import annotations
 
@@ -7,71 +7,109 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import LabelError, unknown_label
-from ..plant import Actuator, Disturbance, Poi, StandardPlant
+from ..errors import LabelError, ModelError, unknown_label
+from ..lti.discretisation import discretized
+from ..lti.statespace import StateSpace
+from ..plant import Actuator, Disturbance, StandardPlant
 from ..values import FloatArray, positive
+from .candidates import PlantChannel
 
-#: axes of a POI that count, each once or by a factor
-Axes: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
+#: POIs, or axes of a POI, that count, each once or by a factor
+Named: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
 
 
-def checked_axes(axes: Axes) -> tuple[str, ...] | Mapping[str, float] | None:
-    """Return axes as a tuple, or as a mapping to factors.
+def checked_names(given: Any, what: str) -> tuple[str, ...] | Mapping[str, float] | None:
+    """Return names as a tuple, or as a mapping to factors; None stays None.
 
     Raises
     ------
     LabelError
-        When an axis appears twice, or there is none.
+        When a name appears twice, or there is none.
     ModelError
-        When a factor is not positive.
+        When a factor is not positive, or these are no names.
     """
-    if axes is None:
+    if given is None:
         return None
-    if isinstance(axes, Mapping):
-        named = {str(a): positive(f, f"factor of axis {a!r}") for a, f in axes.items()}
-    else:
-        listed = (axes,) if isinstance(axes, str) else tuple(str(a) for a in axes)
+    if isinstance(given, Mapping):
+        named = {str(a): positive(f, f"factor of {what} {a!r}") for a, f in given.items()}
+    elif isinstance(given, str | Sequence):
+        listed = (given,) if isinstance(given, str) else tuple(str(a) for a in given)
         if len(set(listed)) != len(listed):
-            raise LabelError(f"axes {listed} hold one twice: name each once, with a factor.")
+            raise LabelError(f"{what} {listed} twice: name each once, with a factor.")
         named = dict.fromkeys(listed, 1.0)
+    else:
+        raise ModelError(f"{what} is a name, several, or a mapping to factors, got {given!r}.")
     if not named:
-        raise LabelError("a criterion without axes has nothing to sum over: name one.")
-    return named if isinstance(axes, Mapping) else tuple(named)
+        raise LabelError(f"a criterion without any {what} has nothing to sum over: name one.")
+    return named if isinstance(given, Mapping) else tuple(named)
 
 
-def shown(poi: str | None, axes: Axes) -> str:
-    """Return a POI and its axes as arguments, for a repr."""
-    parts = [] if poi is None else [repr(poi)]
-    if axes is not None:
-        parts.append(f"axes={dict(axes) if isinstance(axes, Mapping) else axes!r}")
-    return ", ".join(parts)
+def shown(poi: Named, axes: Named) -> list[str]:
+    """Return POIs and their axes as arguments, for a repr."""
+    parts = [] if poi is None else [repr(_plain(poi))]
+    return parts if axes is None else [*parts, f"axes={_plain(axes)!r}"]
 
 
-def poi_of(plant: StandardPlant, name: str | None) -> Poi:
-    """Return the POI of this name, or the only one."""
-    ports = plant.assembled.ports
-    if name is not None:
-        return ports.poi(name)
-    if len(ports.z) != 1:
+def _plain(named: Any) -> Any:
+    if isinstance(named, Mapping):
+        return dict(named)
+    return named[0] if isinstance(named, tuple) and len(named) == 1 else named
+
+
+def channels_of(plant: StandardPlant) -> dict[str, dict[str, str]]:
+    """Return {POI: {axis: z channel}}; of a plant made elsewhere by the channels' names."""
+    if plant.is_assembled:
+        pois = plant.assembled.ports.z
+        return {poi.name: {axis: poi.channel(axis) for axis in poi.axes} for poi in pois}
+    found: dict[str, dict[str, str]] = {}
+    for name in plant.z:
+        poi, _, axis = name.partition(":")
+        if axis not in ("effort", "error"):
+            found.setdefault(poi, {})[axis] = name
+    return found
+
+
+def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) -> dict[str, float]:
+    """Return {z channel: factor}, the factor of the POI times that of the axis.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        With POIs.
+    poi, axes : names, or mappings to factors
+        None: the only POI; its first axis.
+    every : bool
+        Whether all axes count where none is named.
+    """
+    known = channels_of(plant)
+    if poi is None and len(known) != 1:
         raise LabelError(
-            f"the plant has {len(ports.z)} POIs ({', '.join(p.name for p in ports.z)}): say which "
-            f"one counts, such as PoiVariance({ports.z[0].name!r})."
+            f"the plant has {len(known)} POIs ({', '.join(known)}): say which count, such as "
+            f"PoiVariance({next(iter(known), 'die')!r}), or all of them in a list."
         )
-    return ports.z[0]
+    found: dict[str, float] = {}
+    for name, weight in _factors(poi if poi is not None else tuple(known)).items():
+        if name not in known:
+            raise unknown_label("POI", name, known)
+        own = known[name]
+        usual = tuple(own) if every else tuple(own)[:1]
+        for axis, factor in _factors(usual if axes is None else axes).items():
+            if axis not in own:
+                raise unknown_label(f"axis of POI {name!r}", axis, own)
+            found[own[axis]] = weight * factor
+    return found
 
 
-def factors_of(
-    plant: StandardPlant, name: str | None, axes: Axes, *, every: bool
-) -> dict[str, float]:
-    """Return {z channel: factor}."""
-    poi = poi_of(plant, name)
-    if axes is None:
-        axes = poi.axes if every else poi.axes[:1]
-    named = dict(axes) if isinstance(axes, Mapping) else dict.fromkeys(axes, 1.0)
-    for axis in named:
-        if axis not in poi.axes:
-            raise unknown_label(f"axis of POI {poi.name!r}", axis, poi.axes)
-    return {poi.channel(axis): factor for axis, factor in named.items()}
+def _factors(named: Any) -> dict[str, float]:
+    if isinstance(named, Mapping):
+        return dict(named)
+    return dict.fromkeys((named,) if isinstance(named, str) else named, 1.0)
+
+
+def unit_of(plant: StandardPlant, factors: Mapping[str, float]) -> str:
+    """Return "rad" where only rotations count, each by the factor 1; else "m"."""
+    units = {plant.system.units.get(name) for name in factors}
+    return "rad" if units == {"rad"} and set(factors.values()) == {1.0} else "m"
 
 
 def poi_rows(plant: StandardPlant, factors: Mapping[str, float]) -> FloatArray:
@@ -85,8 +123,37 @@ def structure_part(
     plant: StandardPlant, factors: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, the noise factor and the rows of the POI on the structure's own states."""
-    n = plant.assembled.realisation.outputs.shape[1]
+    n = plant.system.n_states
+    if plant.is_assembled:
+        n = plant.assembled.realisation.outputs.shape[1]
     return plant.system.A[:n, :n], plant.noise_factor[:n], poi_rows(plant, factors)[:, :n]
+
+
+def measured_rows(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
+    """Return what sensors see of the structure's states, over the deviation of one sample."""
+    n, rows = plant.system.n_states, []
+    if plant.is_assembled:
+        n = plant.assembled.realisation.outputs.shape[1]
+    for port in candidates:
+        if isinstance(port, PlantChannel):
+            i = plant.y.index(port.name)
+            rows.append(plant.C2[i] / np.sqrt(plant.sensor_noise[i, i]))
+        else:
+            row = port.see(plant.assembled.realisation).row
+            rows.append(row / np.sqrt(0.5 * port.asd**2 / plant.dt))
+    return np.array(rows, dtype=np.float64).reshape(-1, n)
+
+
+def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
+    """Return what a unit of each actuator, held over one sample, does to the structure's states."""
+    if not plant.is_assembled:
+        return np.asarray(plant.B2[:, [plant.u.index(port.name) for port in candidates]])
+    real = plant.assembled.realisation
+    n = real.outputs.shape[1]
+    B = np.array([real.force(port.push(real)) for port in candidates]).T
+    D = np.zeros((0, len(candidates)))
+    slow = StateSpace(real.A, B, np.zeros((0, n)), D, blocks=real.blocks)
+    return discretized(slow, 1.0 / plant.dt).B
 
 
 def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
@@ -95,10 +162,12 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
     Parameters
     ----------
     plant : StandardPlant
-        With ports.
+        With ports, or made elsewhere.
     candidates : sequence of Sensor or Actuator
         All that may be chosen.
     """
+    if not plant.is_assembled:
+        return not np.any(plant.D22)
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     forces = all(isinstance(port, Disturbance) for port in ports.w)
     rigidly = not realisation.static_inputs.size

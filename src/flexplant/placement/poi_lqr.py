@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -14,17 +14,18 @@ from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import positive
+from ..values import FloatArray, IntArray, positive
 from .criterion import Criterion, Scorer
 from .poi_axes import (
-    Axes,
-    checked_axes,
+    Named,
+    checked_names,
     factors_of,
     plain,
-    poi_of,
     poi_rows,
+    pushed_columns,
     shown,
     structure_part,
+    unit_of,
 )
 from .quadratic import quadratic
 
@@ -38,10 +39,10 @@ class PoiLqr(Criterion):
 
     Parameters
     ----------
-    poi : str, optional
-        The POI's name; not needed when the plant has one only.
+    poi : str, sequence of str or mapping {name: factor}, optional
+        The POIs; not needed when the plant has one only.
     axes : str, sequence of str or mapping {axis: factor}, optional
-        The POI's axes to sum over; all of them when not given, a rotation with the factor 1 m.
+        Axes of each of them; all when not given, a rotation with the factor 1 m.
         Together they must see every rigid-body mode.
     effort : float [m/N]
         The motion of the POI that one newton of one actuator is worth. Small: the disturbance is
@@ -56,16 +57,19 @@ class PoiLqr(Criterion):
     """
 
     sides = "u"
-    poi: str | None = None
-    axes: Axes = field(default=None)
+    poi: Named = None
+    axes: Named = field(default=None)
     effort: float = field(default=1e-9, kw_only=True)
 
     def __post_init__(self) -> None:
-        self._set(axes=checked_axes(self.axes), effort=positive(self.effort, "effort"))
+        self._set(
+            poi=checked_names(self.poi, "POI"),
+            axes=checked_names(self.axes, "axis"),
+            effort=positive(self.effort, "effort"),
+        )
 
     def __repr__(self) -> str:
-        given = shown(self.poi, self.axes)
-        return f"PoiLqr({given}{', ' if given else ''}effort={self.effort:g})"
+        return f"PoiLqr({', '.join([*shown(self.poi, self.axes), f'effort={self.effort:g}'])})"
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the cost [m^2] on a sampled plant.
@@ -101,12 +105,11 @@ class PoiLqr(Criterion):
 
     def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
         """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
-        factors = factors_of(plant, self.poi, self.axes, every=True)
-        plant.check().require(("excited",), "a stationary controller")
-        poi = poi_of(plant, self.poi)
-        axes = tuple(axis for axis in poi.axes if poi.channel(axis) in factors)
-        seen = plant.assembled.ports.replace(z=[poi.replace(axes=axes)], references=())
-        plant.with_ports(seen).check().require(("performance",), f"a controller for {self!r}")
+        require_control(plant, factors_of(plant, self.poi, self.axes, every=True), repr(self))
+
+    def unit(self, plant: StandardPlant) -> str:
+        """Return the unit of the square root."""
+        return unit_of(plant, factors_of(plant, self.poi, self.axes, every=True))
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
         """Return the cost as a function of the actuators alone; all else is computed once.
@@ -118,27 +121,15 @@ class PoiLqr(Criterion):
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)
         A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=True))
-        realisation = plant.assembled.realisation
-        n, count = A.shape[0], len(candidates)
-        whole, fraction = divmod(plant.delay, 1.0)
+        n = A.shape[0]
+        # a plant made elsewhere holds its delay in its states
+        whole, fraction = divmod(plant.delay if plant.is_assembled else 0.0, 1.0)
         constant = 0.0
         for _ in range(int(whole)):
             constant += float(np.sum((rows @ noise) ** 2))
             noise = A @ noise
         constant += float(np.sum((rows @ noise) ** 2))
-        B = [realisation.force(c.push(realisation)) for c in candidates]
-        late = discretized(
-            StateSpace(
-                realisation.A,
-                np.array(B).T,
-                rows,
-                np.zeros((rows.shape[0], count)),
-                blocks=[2] * (n // 2),
-            ),
-            1.0 / plant.dt,
-            delay=fraction,
-        )
-        held = n + np.arange(late.n_states - n).reshape(count, -1)
+        held, late = _late(plant, rows, candidates, fraction)
         S = np.zeros((noise.shape[1], late.n_states))
         S[:, :n] = noise.T
         try:
@@ -155,3 +146,37 @@ class PoiLqr(Criterion):
                 f"{error} The effort of {self.effort:g} m/N may be too small to distinguish gains: "
                 "try a larger one."
             ) from error
+
+
+def require_control(plant: StandardPlant, factors: Mapping[str, float], what: str) -> None:
+    """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
+    plant.check().require(("excited",), "a stationary controller")
+    if not plant.is_assembled:
+        return
+    parts = []
+    for poi in plant.assembled.ports.z:
+        axes = tuple(axis for axis in poi.axes if poi.channel(axis) in factors)
+        parts += [poi.replace(axes=axes)] if axes else []
+    seen = plant.assembled.ports.replace(z=parts, references=())
+    plant.with_ports(seen).check().require(("performance",), f"a controller for {what}")
+
+
+def _late(
+    plant: StandardPlant, rows: FloatArray, candidates: Sequence[Any], fraction: float
+) -> tuple[IntArray, StateSpace]:
+    """Return the plant of all candidates with a part of a sample of delay, and the states it adds.
+
+    A row (N, m) of states for each candidate.
+    """
+    n = rows.shape[1]
+    if not fraction:
+        A = plant.system.A[:n, :n]
+        B = pushed_columns(plant, candidates)
+        late = StateSpace(A, B, rows, np.zeros((len(rows), len(candidates))), dt=plant.dt)
+    else:
+        real = plant.assembled.realisation
+        B = np.array([real.force(c.push(real)) for c in candidates]).T
+        D = np.zeros((len(rows), len(candidates)))
+        slow = StateSpace(real.A, B, rows, D, blocks=real.blocks)
+        late = discretized(slow, 1.0 / plant.dt, delay=fraction)
+    return n + np.arange(late.n_states - n).reshape(len(candidates), -1), late

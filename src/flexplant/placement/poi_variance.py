@@ -1,42 +1,60 @@
-"""The variance of a POI's estimate: where sensors go."""
+"""The variance of POIs' estimates: where sensors go."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ..errors import AssumptionError, ModelError
-from ..estimation import design_kalman
+from ..estimation import Filter, FixedLag, KalmanEstimator, Predictor, design_kalman
 from ..modes import Modes
 from ..plant import StandardPlant, larger_plant
 from ..plant.ground import followed
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import flag, short
+from ..values import FloatArray, flag, one_of, short
 from .criterion import Criterion, Scorer
-from .poi_axes import Axes, bare, checked_axes, factors_of, plain, shown, structure_part
+from .poi_axes import (
+    Named,
+    bare,
+    checked_names,
+    factors_of,
+    measured_rows,
+    plain,
+    poi_rows,
+    shown,
+    structure_part,
+    unit_of,
+)
 from .quadratic import quadratic
+from .worst_row import WorstRow
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoiVariance(Criterion):
-    """Variance of the stationary Kalman estimate's error at a POI: for sensors, smaller is better.
+    """Variance of the stationary Kalman estimate's error at POIs: for sensors, smaller is better.
 
-    ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, P after the measurement, at sample instants: the
-    square of `design_kalman(plant).rms(...)`. Of the plant's own modes more sensors never make it
-    larger, a score is one Riccati equation, and searches have a bound. With modes left out it is
-    the error on the plant with these modes: each choice is a filter of its own, without a bound.
+    ``sum_a (f_a^2 C1_a P C1_a')`` over the axes a, or the largest of these terms, P after the
+    measurement, at sample instants: the square of `design_kalman(plant).rms(...)`. Of the plant's
+    own modes more sensors never make it larger, a score is one Riccati equation, and searches have
+    a bound. With modes left out it is the error on the plant with these modes: each choice is a
+    filter of its own, without a bound.
 
     Parameters
     ----------
-    poi : str, optional
-        The POI's name; not needed when the plant has one only.
+    poi : str, sequence of str or mapping {name: factor}, optional
+        The POIs; not needed when the plant has one only.
     axes : str, sequence of str or mapping {axis: factor}, optional
-        The POI's axes to sum over; its first when not given. A rotation is turned into a
+        Axes of each of them; its first when not given. A rotation is turned into a
         displacement by a factor [m], such as half the width of the die.
+    measure : {"sum", "max"}
+        Of the terms.
+    lag : Predictor, Filter or FixedLag, optional
+        When the estimate is wanted: before the measurement, with it (when not given), or some
+        samples later. Of predictor and lag the plant's own modes alone are counted.
     larger : Modes, FEModel or ReducedModel, optional
         The structure with the modes left out, as for `design_kalman`: best as Modes, which are
         solved once. None: the modes of the plant's reduced model beyond those it kept, if it has
@@ -47,9 +65,10 @@ class PoiVariance(Criterion):
     Raises
     ------
     LabelError
-        When an axis appears twice; when called, for a POI or an axis that the plant lacks.
+        When a name appears twice; when called, for a POI or an axis that the plant lacks.
     ModelError
-        When a factor is not positive, larger is no structure, or is given with own_modes.
+        When a factor is not positive, the measure or the lag is none of these, larger is no
+        structure, or is given with own_modes or a lag.
 
     Examples
     --------
@@ -58,15 +77,30 @@ class PoiVariance(Criterion):
     """
 
     sides = "y"
-    poi: str | None = None
-    axes: Axes = field(default=None)
+    poi: Named = None
+    axes: Named = field(default=None)
+    measure: str = field(default="sum", kw_only=True)
+    lag: Predictor | Filter | FixedLag | None = field(default=None, kw_only=True)
     larger: Any = field(default=None, kw_only=True)
     own_modes: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
-        self._set(axes=checked_axes(self.axes), own_modes=flag(self.own_modes, "own_modes"))
-        if self.larger is not None and self.own_modes:
-            raise ModelError("larger= gives modes left out, own_modes=True leaves them: pass one.")
+        self._set(
+            poi=checked_names(self.poi, "POI"),
+            axes=checked_names(self.axes, "axis"),
+            measure=one_of(self.measure, "measure", ("sum", "max")),
+            own_modes=flag(self.own_modes, "own_modes"),
+        )
+        if not isinstance(self.lag, Predictor | Filter | FixedLag | None):
+            raise ModelError(
+                f"lag must be Predictor(), Filter() or FixedLag(samples), got {short(self.lag)}: "
+                "the end of a record does not depend on a sample. Pass one of them."
+            )
+        if self.larger is not None and (self.own_modes or self._lagging):
+            raise ModelError(
+                "larger= gives modes left out, own_modes=True (and a predictor or lag) leaves "
+                "them: pass one."
+            )
         if not isinstance(self.larger, FEModel | Modes | ReducedModel | None):
             raise ModelError(
                 f"larger must be a structure, got {short(self.larger)}: every choice of sensors "
@@ -74,7 +108,9 @@ class PoiVariance(Criterion):
             )
 
     def __repr__(self) -> str:
-        given = [shown(self.poi, self.axes)] if shown(self.poi, self.axes) else []
+        given = shown(self.poi, self.axes)
+        given += [f"measure={self.measure!r}"] if self.measure != "sum" else []
+        given += [f"lag={self.lag!r}"] if self.lag is not None else []
         given += ["larger=..."] if self.larger is not None else []
         given += ["own_modes=True"] if self.own_modes else []
         return f"PoiVariance({', '.join(given)})"
@@ -87,46 +123,114 @@ class PoiVariance(Criterion):
         AssumptionError
             When no stationary filter exists: the message names what the sensors miss.
         """
-        estimator = design_kalman(plant, larger=plant if self.own_modes else self.larger)
-        factors = factors_of(plant, self.poi, self.axes, every=False)
-        return float(sum((f * estimator.rms(name)) ** 2 for name, f in factors.items()))
+        estimator = design_kalman(plant, larger=plant if self._own else self.larger)
+        factors = self._factors(plant)
+        if self._lagging:
+            terms = _lagged(estimator, poi_rows(plant, factors), self.lag)
+        else:
+            rms = [estimator.rms(name) for name in factors]
+            terms = np.array(list(factors.values())) ** 2 * np.square(rms)
+        return float(np.sum(terms) if self.measure == "sum" else np.max(terms))
+
+    def unit(self, plant: StandardPlant) -> str:
+        """Return the unit of the square root."""
+        return unit_of(plant, self._factors(plant))
 
     def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
         """Raise AssumptionError when w misses a rigid-body mode or a candidate fits no filter."""
-        factors_of(plant, self.poi, self.axes, every=False)
+        self._factors(plant)
+        _ = plant.noise_factor
         plant.check().require(("excited",), "a stationary Kalman filter")
-        ports, realisation = plant.assembled.ports, plant.assembled.realisation
-        silent = [sensor.name for sensor in candidates if sensor.asd <= 0]
+        noise = plant.sensor_noise.diagonal()
+        sizes = {name: noise[i] for i, name in enumerate(plant.y)}
+        sizes |= {p.name: p.asd for p in candidates if hasattr(p, "asd")}
+        silent = [sensor.name for sensor in candidates if sizes[sensor.name] <= 0]
         if silent:
             raise AssumptionError(
                 f"sensors {', '.join(silent[:6])} have no noise (asd 0): the filter would trust "
                 "them without limit. Give Sensor(..., asd=) what the data sheet says."
             )
-        # noise that is shaped first does not arrive at once
-        loud = [port for port in ports.forces if port.asd > 0 and bare(port)]
-        push = np.array([port.push(realisation) for port in loud])
-        ground = np.array([port.ground for port in loud])
-        for sensor in candidates:
-            if loud and np.any(followed(sensor.see(realisation), sensor.order, push, ground)):
-                raise AssumptionError(
-                    f"white noise of a disturbance reaches {sensor.name!r} at once "
-                    "(an acceleration, say), so a sample of it would have infinite variance. "
-                    "Measure displacement or velocity, or shape the disturbance."
-                )
+        if plant.is_assembled:
+            _check_direct(plant, candidates)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
         """Return the variance as a function of the sensors alone; all else is computed once.
 
         Delay lines of u are left out: their states are known exactly. Where ports have
         filters or delays every choice has states of its own, and with modes left out the noise of
-        its sensors is correlated: the plant is made anew.
+        its sensors is correlated: the plant is made anew. A prediction is
+        ``rows A X+ A' rows' + rows Q rows'``; for a lag the POI's motions some samples ago are
+        states as well.
         """
-        counted = not self.own_modes and larger_plant(plant, self.larger) is not None
+        counted = not self._own and larger_plant(plant, self.larger) is not None
         if counted or not plain(plant, candidates):
             return super().scorer(plant, candidates)
-        A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=False))
-        realisation = plant.assembled.realisation
-        items = np.zeros((len(candidates), A.shape[0]))
-        for i, sensor in enumerate(candidates):
-            items[i] = sensor.see(realisation).row / np.sqrt(0.5 * sensor.asd**2 / plant.dt)
-        return quadratic(A.T, noise @ noise.T, rows, items)
+        A, noise, rows = structure_part(plant, self._factors(plant))
+        items = measured_rows(plant, candidates)
+        constants = np.zeros(len(rows))
+        if isinstance(self.lag, Predictor):
+            constants, rows = np.sum((rows @ noise) ** 2, axis=1), rows @ A
+        if isinstance(self.lag, FixedLag):
+            A, noise, rows, items = _with_past(A, noise, rows, items, self.lag.samples)
+        if self.measure == "sum":
+            return quadratic(A.T, noise @ noise.T, rows, items, constant=float(constants.sum()))
+        return WorstRow(quadratic(A.T, noise @ noise.T, rows, items), constants)
+
+    @property
+    def _lagging(self) -> bool:
+        return not isinstance(self.lag, Filter | None)
+
+    @property
+    def _own(self) -> bool:
+        return self.own_modes or self._lagging
+
+    def _factors(self, plant: StandardPlant) -> Mapping[str, float]:
+        return factors_of(plant, self.poi, self.axes, every=False)
+
+
+def _with_past(
+    A: FloatArray, noise: FloatArray, rows: FloatArray, items: FloatArray, lag: int
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return a plant whose last states are its motions ``rows x`` some samples ago."""
+    n, q = A.shape[0], rows.shape[0]
+    past = np.zeros((n + q * lag, n + q * lag))
+    past[:n, :n] = A
+    past[n : n + q, :n] = rows
+    past[n + q :, n:-q] = np.eye(q * (lag - 1))
+    last = np.zeros((q, n + q * lag))
+    last[:, -q:] = np.eye(q)
+    more = ((0, 0), (0, q * lag))
+    return past, np.pad(noise, more[::-1]), last, np.pad(items, more)
+
+
+def _lagged(estimator: KalmanEstimator, rows: FloatArray, lag: Any) -> FloatArray:
+    """Return the variances of ``rows x`` before the measurement, or some samples after it.
+
+    ``P_k|k+L = P - sum_{i=0..L} W_i' S^-1 W_i`` with ``W_i = C M^i P`` and M of the predictor
+    (Anderson, Moore, Optimal Filtering, 1979, ch. 7).
+    """
+    model, P = estimator.model, estimator.predicted_covariance
+    found = np.einsum("ij,jk,ik->i", rows, P, rows)
+    M = model.A - estimator.predictor_gain @ model.C2
+    S, ahead = model.innovation(P), P @ rows.T
+    for _ in range(lag.samples + 1 if isinstance(lag, FixedLag) else 0):
+        W = model.C2 @ ahead
+        found = found - np.einsum("ij,ij->j", W, np.linalg.solve(S, W))
+        ahead = M @ ahead
+    return np.asarray(found)
+
+
+def _check_direct(plant: StandardPlant, candidates: Sequence[Any]) -> None:
+    """Raise AssumptionError when white noise of a disturbance reaches a sensor at once."""
+    ports, realisation = plant.assembled.ports, plant.assembled.realisation
+    # noise that is shaped first does not arrive at once
+    loud = [port for port in ports.forces if port.asd > 0 and bare(port)]
+    push = np.array([port.push(realisation) for port in loud])
+    ground = np.array([port.ground for port in loud])
+    for sensor in candidates:
+        if loud and np.any(followed(sensor.see(realisation), sensor.order, push, ground)):
+            raise AssumptionError(
+                f"white noise of a disturbance reaches {sensor.name!r} at once "
+                "(an acceleration, say), so a sample of it would have infinite variance. "
+                "Measure displacement or velocity, or shape the disturbance."
+            )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations, product
@@ -11,9 +10,11 @@ from math import comb, prod
 
 import numpy as np
 
-from ..values import FloatArray, Rng, Value
+from ..values import FloatArray, Value
+from ..work import Work
 from .branch import Branch
-from .layouts import WEAK, Layouts
+from .layouts import Layouts
+from .rigid_part import WEAK
 from .rows import LinearRows
 from .tangent import Convex
 
@@ -99,6 +100,16 @@ class Problem:
             return None
         return scorer.relaxation(root) if self.rows.possible(root) else None
 
+    def rounded(self, weights: FloatArray) -> tuple[int, ...] | None:
+        """Return the choice with the largest weights (N,); None where it misses something."""
+        if self.rows.A.size:
+            found = self.rows.best(weights, self.count, self.required)
+        else:
+            order = np.argsort(-weights, kind="stable")
+            rest = [i for i in order.tolist() if i not in self.required]
+            found = tuple(sorted((*self.required, *rest[: self.count - len(self.required)])))
+        return found if found is None or not self.layouts.missing(found) else None
+
     def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return the scores (n,) of choices, infinite where a constraint is not satisfied."""
         values = np.full(len(sets), np.inf)
@@ -154,7 +165,7 @@ class Problem:
         has. Weights (N,) favour some candidates.
         """
         chosen, shut = list(self.required), self.rows.shut(self.required)
-        left = self.layouts.rigid.copy()
+        left = self.layouts.rigid.rows.copy()
         for i in self.required:
             left = _without(left, left[i])
         while len(chosen) < self.count:
@@ -198,21 +209,16 @@ class Found:
 class Search(Value):
     """A way to search; the base of all of them."""
 
-    def search(
-        self, problem: Problem, rng: Rng, executor: Executor | None, progress: bool | None
-    ) -> Found:
+    def search(self, problem: Problem, work: Work) -> Found:
         """Return the best choice that was found.
 
         Parameters
         ----------
         problem : Problem
             With `score(sets)`, `bound()`, `choices()` and a `start`.
-        rng : int, SeedSequence or Generator, optional
-            For what is random.
-        executor : concurrent.futures.Executor, optional
-            The result is the same to the bit.
-        progress : bool, optional
-            A bar: None shows one on a terminal for work of more than two seconds.
+        work : Work
+            Its `mapped` and `rng`: the result is the same to the bit on any executor, and work
+            that was stopped goes on from a file.
         """
         raise NotImplementedError
 

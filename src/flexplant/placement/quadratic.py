@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -68,6 +68,15 @@ class Quadratic(Value, Convex):
         SolverError
             When no stationary solution exists.
         """
+        return float(np.sum(self.terms(chosen))) + self.constant
+
+    def terms(self, chosen: Sequence[int]) -> FloatArray:
+        """Return the parts (k,) of J that the rows of S see, without the constant."""
+        g, X, S = self.solution(chosen)
+        return _terms(S, X, g)
+
+    def solution(self, chosen: Sequence[int]) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return g, X and S of some candidates, in the states that are there with them."""
         rows = np.sort(np.asarray(chosen, dtype=np.int64))
         keep = np.ones(self.A.shape[0], dtype=bool)
         if self.owned.size:
@@ -75,8 +84,7 @@ class Quadratic(Value, Convex):
             keep[self.owned[rows].ravel()] = True
         inner = np.ix_(keep, keep)
         g = self.items[rows][:, keep]
-        S, A, H = self.S[:, keep], self.A[inner], self.H[inner]
-        return _cost(S, solved(A, H, g), g) + self.constant
+        return g, solved(self.A[inner], self.H[inner], g), self.S[:, keep]
 
     @property
     def total(self) -> int:
@@ -97,34 +105,31 @@ class Quadratic(Value, Convex):
 
         The information is the limit of iterates that are concave in w (a parallel sum is). Its
         derivative by w_i is ``(X+)^-1 D_i (X+)^-1`` with the Stein equation ``D_i = M D_i M' + X+
-        g_i g_i' X+``, solved for all i by the eigenvectors of M; the adjoint equation confirms the
-        slopes. Directions of no variance are left out: a compression of an inverse has an inverse
-        that is concave as well.
+        g_i g_i' X+``, solved for all i by the eigenvectors of M, or one by one where it lacks some;
+        the adjoint equation confirms the slopes. Directions of no variance are left out: a
+        compression of an inverse has an inverse that is concave as well.
 
         Raises
         ------
         SolverError
-            When J is infinite, or the eigenvectors do not confirm the gradient.
+            When J is infinite, or the slopes do not confirm the gradient.
         """
         cost, after, closed, adjoint, seen = self._stationary(weights)
         sizes, axes = np.linalg.eigh(0.5 * (after + after.T))
         kept = sizes > _NOTHING * sizes[-1]
         lost = (self.S @ axes[:, ~kept]) ** 2 @ np.abs(sizes[~kept])
         root = axes[:, kept] * np.sqrt(sizes[kept])
-        poles, modes = np.linalg.eig(closed)
-        part = np.linalg.solve(modes, seen.T.astype(complex)).T
-        into = (root / sizes[kept]).T @ modes
-        sums = part[:, :, None] * (part[:, None, :].conj() / (1.0 - poles[:, None] * poles.conj()))
-        slopes = (into @ sums @ into.conj().T).real
-        face = root.T @ self.S.T
+        face, into = root.T @ self.S.T, (root / sizes[kept]).T
         gradient = np.einsum("ij,jk,ik->i", seen, adjoint, seen)
-        found = np.einsum("ik,nij,jk->n", face, slopes, face, optimize=True)
         most = float(np.max(gradient))
-        if not (
-            np.max(np.abs(found - gradient)) <= _CONFIRMED * most
-            and float(np.sum(lost)) <= _CONFIRMED * (cost - self.constant)
-        ):
+        for slopes in _slopes(closed, seen, into):
+            found = np.einsum("ik,nij,jk->n", face, slopes, face, optimize=True)
+            if np.max(np.abs(found - gradient)) <= _CONFIRMED * most:
+                break
+        else:
             raise SolverError("the derivatives of the Riccati equation are not certain.")
+        if float(np.sum(lost)) > _CONFIRMED * (cost - self.constant):
+            raise SolverError("directions of no variance have a part in the cost.")
         value, vectors = np.linalg.eigh(adjoint)
         rows = seen @ (vectors * np.sqrt(np.maximum(value, 0.0)))
         return Tangent(face, slopes, np.array(weights), self.constant, rows)
@@ -141,7 +146,8 @@ class Quadratic(Value, Convex):
         after = left @ X @ left.T + gain @ gain.T
         closed = left @ self.A.T
         adjoint = doubled(closed.T, self.S.T @ self.S)
-        return _cost(self.S, X, g) + self.constant, after, closed, adjoint, self.items @ after
+        cost = float(np.sum(_terms(self.S, X, g))) + self.constant
+        return cost, after, closed, adjoint, self.items @ after
 
 
 def quadratic(
@@ -216,6 +222,20 @@ def _doubled(A: FloatArray, G: FloatArray, H: FloatArray) -> FloatArray | None:
     return None
 
 
+def _slopes(closed: FloatArray, seen: FloatArray, into: FloatArray) -> Iterator[FloatArray]:
+    """Yield ``into D_i into'`` (N, m, m) for all i with ``D_i = M D_i M' + s_i s_i'``, two ways."""
+    poles, modes = np.linalg.eig(closed)
+    try:
+        part = np.linalg.solve(modes, seen.T.astype(complex)).T
+    except np.linalg.LinAlgError:  # delay lines of a lag lack eigenvectors
+        part = np.zeros((0, len(poles)), dtype=complex)
+    if len(part):
+        sums = part[:, :, None] * (part[:, None, :].conj() / (1.0 - poles[:, None] * poles.conj()))
+        turned = into @ modes
+        yield (turned @ sums @ turned.conj().T).real
+    yield np.array([into @ doubled(closed, np.outer(row, row)) @ into.T for row in seen])
+
+
 def _gain(X: FloatArray, g: FloatArray) -> FloatArray:
     """Return K with ``X+ = (I - K g) X``."""
     seen = X @ g.T
@@ -226,8 +246,8 @@ def _gain(X: FloatArray, g: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.solve(unit, (seen / size).T).T / size)
 
 
-def _cost(S: FloatArray, X: FloatArray, g: FloatArray) -> float:
-    """Return ``tr(S X+ S')`` as a sum of squares: nothing cancels when sensors are good."""
+def _terms(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:
+    """Return the diagonal of ``S X+ S'`` as sums of squares: nothing cancels with good sensors."""
     gain = S @ _gain(X, g)
     left = S - gain @ g
-    return float(np.einsum("ij,jk,ik->", left, X, left) + np.sum(gain**2))
+    return np.asarray(np.einsum("ij,jk,ik->i", left, X, left) + np.sum(gain**2, axis=1))

@@ -13,8 +13,9 @@ from ..errors import LabelError, ModelError
 from ..parallel import mapped
 from ..plant import StandardPlant
 from ..values import FloatArray, IntArray, Value, short, whole
+from ..work import Work
 from .candidates import Port, Side, checked_plant, known_candidates, with_side
-from .criterion import Criterion
+from .criterion import Criterion, in_words
 from .layouts import layouts_of
 
 
@@ -38,6 +39,8 @@ class Scores(Value):
         All that appear in a layout.
     side : {"y", "u"}
         Whether they are sensors or actuators.
+    unit : str
+        Of the square roots of the values, where they are mean squares of a motion.
     """
 
     layouts: tuple[tuple[str, ...], ...]
@@ -47,6 +50,7 @@ class Scores(Value):
     criterion: str
     candidates: tuple[Port, ...]
     side: Side
+    unit: str = ""
 
     def __post_init__(self) -> None:
         self._set(values=self.values, order=self.order)
@@ -92,7 +96,7 @@ class Scores(Value):
         lines = []
         for i, value in enumerate(self.values[:count]):
             why = f": {self.reasons[i]:.90}" if self.reasons[i] else ""
-            lines.append(f"  {value:<11.4g} {' '.join(self.layouts[i]):.80}{why}")
+            lines.append(f"  {in_words(value, self.unit):<13} {' '.join(self.layouts[i]):.80}{why}")
         return lines
 
 
@@ -202,7 +206,7 @@ def _scored(
     executor: Executor | None,
     progress: bool | None,
 ) -> Scores:
-    checked_plant(plant)
+    plant = checked_plant(plant)
     if isinstance(layouts, str) or not isinstance(layouts, Sequence):
         raise ModelError(f"layouts are a list of lists of names, got {short(layouts)}. Pass such.")
     wrong = [layout for layout in layouts if not isinstance(layout, Iterable)]
@@ -221,7 +225,7 @@ def _scored(
     position = {port.name: i for i, port in enumerate(ports)}
     judged = layouts_of(plant, side, ports, criterion)
     chosen = [tuple(position[name] for name in layout) for layout in names]
-    values = judged.scores(chosen, executor=executor, progress=progress)
+    values = judged.scores(chosen, Work(executor, progress))
     lost = np.flatnonzero(~np.isfinite(values)).tolist()
     why = mapped(judged.reason, [chosen[i] for i in lost], executor=executor, progress=progress)
     reasons = dict(zip(lost, why, strict=True))
@@ -235,4 +239,5 @@ def _scored(
         repr(judged.criterion),
         ports,
         side,
+        judged.criterion.unit(plant),
     )

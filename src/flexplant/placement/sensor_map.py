@@ -14,9 +14,10 @@ from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
 from ..values import FloatArray, Value, positive, real_array
+from ..work import Work
 from .candidates import checked_plant
 from .constraints import Constraint, all_of, rows_of
-from .criterion import Criterion
+from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .places import places_of
 
@@ -37,6 +38,8 @@ class SensorMap(Value):
         What was scored.
     excluded : sequence of Rectangle or Disc
         Zones in which nothing was tried.
+    unit : str
+        Of the square roots of the values, where they are mean squares of a motion.
     """
 
     points: FloatArray
@@ -44,6 +47,7 @@ class SensorMap(Value):
     without: float
     criterion: str
     excluded: Sequence[Rectangle | Disc] = ()
+    unit: str = ""
 
     def __post_init__(self) -> None:
         self._set(points=self.points, values=self.values, excluded=tuple(self.excluded))
@@ -51,8 +55,10 @@ class SensorMap(Value):
     def __repr__(self) -> str:
         x, y, z = self.best
         return (
-            f"<SensorMap of {self.values.size} points by {self.criterion}: {self.without:.4g} "
-            f"without, {self.values.min():.4g} with a sensor at ({x:.4g}, {y:.4g}, {z:.4g}) m>"
+            f"<SensorMap of {self.values.size} points by {self.criterion}: "
+            f"{in_words(self.without, self.unit)} without, "
+            f"{in_words(float(self.values.min()), self.unit)} with a sensor at "
+            f"({x:.4g}, {y:.4g}, {z:.4g}) m>"
         )
 
     @property
@@ -123,7 +129,7 @@ def sensor_map(
     CertificateError
         When the best score is not confirmed by the other route.
     """
-    checked_plant(plant)
+    plant = checked_plant(plant)
     places = real_array(points, "points", (None, 3))
     noise = positive(asd, "asd", zero=True)
     own = plant.assembled.ports.y
@@ -146,7 +152,14 @@ def sensor_map(
     layouts.require_any()
     base = tuple(range(len(own)))
     sets = [base, *((*base, len(own) + i) for i in range(len(tried)))]
-    values = layouts.scores(sets, executor=executor, progress=progress, description="points")
+    values = layouts.scores(sets, Work(executor, progress), "points")
     best = 1 + int(np.argmin(values[1:]))
     layouts.confirm(sets[best], float(values[best]))
-    return SensorMap(places, values[1:], float(values[0]), repr(layouts.criterion), zones)
+    return SensorMap(
+        places,
+        values[1:],
+        float(values[0]),
+        repr(layouts.criterion),
+        zones,
+        layouts.criterion.unit(plant),
+    )

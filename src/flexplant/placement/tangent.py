@@ -9,6 +9,7 @@ import numpy as np
 
 from ..errors import SolverError
 from ..values import FloatArray
+from .ascent import ascended
 from .branch import Branch
 from .criterion import Scorer
 
@@ -20,8 +21,31 @@ _TANGENTS = 12
 _ROUNDING = 1e-9
 
 
+class Below:
+    """A function of weights that is nowhere above a cost of choices."""
+
+    #: effect of each candidate (N, r) on the cost; of like candidates alike
+    rows: FloatArray
+
+    def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return numbers (m,) below the cost of each choice."""
+        raise NotImplementedError
+
+    def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
+        """Return a number below the cost of every choice of a branch, and weights near the least.
+
+        Parameters
+        ----------
+        branch : Branch
+            The choices.
+        start : (N,) array
+            First weights.
+        """
+        raise NotImplementedError
+
+
 @dataclass(frozen=True, eq=False)
-class Tangent:
+class Tangent(Below):
     """``tr(F' (I + sum_i (w_i - v_i) Z_i)^-1 F) + constant``: below a cost, equal to it at v.
 
     The cost is ``tr(S Y(w)^-1 S') + constant``. Its information Y is concave in w, as a matrix, so
@@ -61,39 +85,31 @@ class Tangent:
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
         """Return a number below the cost of every choice of a branch, and weights near the least.
 
-        Projected gradient steps of Barzilai and Borwein (IMA J. Numer. Anal. 8, 1988) on
-        ``h = 1 / (cost - constant)``, which is concave in w (a harmonic sum of concave
-        information). So ``h(w) + h'(w) (x - w)`` is above h at every choice x, whatever w.
+        ``h = 1 / (cost - constant)`` is concave in w: a harmonic sum of concave information.
         """
-        weights, best, step = branch.nearest(start), -np.inf, 0.0
-        kept, highest = weights, -np.inf
-        before: tuple[FloatArray, FloatArray] | None = None
-        for _ in range(_STEPS):
-            try:
-                solved = np.linalg.solve(self._information(weights[None])[0], self.face)
-            except np.linalg.LinAlgError:
-                break
-            cost = float(np.sum(self.face * solved))
-            if not cost > 0.0:
-                break
-            rise = np.einsum("ik,nij,jk->n", solved, self.slopes, solved, optimize=True) / cost**2
-            most = 1.0 / cost - branch.least(-rise) - float(rise @ weights)
-            best = max(best, 1.0 / most)
-            if 1.0 / cost > highest:
-                kept, highest = weights, 1.0 / cost
-            if cost - best <= _GAP * (cost + abs(self.constant)):
-                break
-            if before is None:
-                step = 0.3 / max(float(np.max(rise)), 1e-300)
-            else:
-                moved, turned = weights - before[0], before[1] - rise
-                bend = float(moved @ turned)
-                step = float(moved @ moved) / bend if bend > 0 else 2.0 * step
-            before = weights, rise
-            weights = branch.nearest(weights + step * rise)
-            if np.max(np.abs(weights - before[0])) < 1e-9:
-                break
-        return float(_safe(np.array(best + self.constant))), kept
+        size = abs(self.constant)
+        most, weights = ascended(
+            self._inverse,
+            branch,
+            start,
+            steps=_STEPS,
+            close=lambda h, most: 1.0 / h - 1.0 / most <= _GAP * (1.0 / h + size),
+        )
+        if not np.isfinite(most):
+            return -np.inf, weights
+        return float(_safe(np.array(1.0 / most + self.constant))), weights
+
+    def _inverse(self, weights: FloatArray) -> tuple[float, FloatArray] | None:
+        """Return one over the cost, without the constant, and its gradient."""
+        try:
+            solved = np.linalg.solve(self._information(weights[None])[0], self.face)
+        except np.linalg.LinAlgError:
+            return None
+        cost = float(np.sum(self.face * solved))
+        if not cost > 0.0:
+            return None
+        rise = np.einsum("ik,nij,jk->n", solved, self.slopes, solved, optimize=True) / cost**2
+        return 1.0 / cost, rise
 
     def _information(self, weights: FloatArray) -> FloatArray:
         """Return ``I + sum_i (w_i - v_i) Z_i`` for rows of weights (m, N)."""
@@ -105,7 +121,7 @@ class Tangent:
 class Convex(Scorer):
     """Scores that are a convex cost of weights of the candidates, in [0, 1]: they have bounds."""
 
-    def tangent(self, weights: FloatArray) -> Tangent:
+    def tangent(self, weights: FloatArray) -> Below:
         """Return the tangent of the cost's information at weights (N,).
 
         Raises
@@ -115,7 +131,7 @@ class Convex(Scorer):
         """
         raise NotImplementedError
 
-    def inner_tangent(self, branch: Branch, weights: FloatArray) -> Tangent | None:
+    def inner_tangent(self, branch: Branch, weights: FloatArray) -> Below | None:
         """Return the tangent at weights of a branch moved slightly inwards; None if there is none.
 
         A weight of zero has no part in the cost: a rigid-body mode might be missed.
@@ -141,7 +157,7 @@ class Convex(Scorer):
             if tangent is None:
                 break
             found, weights = tangent.least(branch, weights)
-            if found <= best * (1.0 + _GAP):
+            if found <= best + _GAP * abs(best):
                 best = max(best, found)
                 break
             best = found

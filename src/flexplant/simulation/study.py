@@ -3,29 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    Executor,
-    Future,
-    ProcessPoolExecutor,
-    wait,
-)
+from concurrent.futures import Executor
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
+from ..checkpoint import Checkpoint, fingerprint
 from ..errors import ModelError
 from ..parallel import Progress, one_thread
+from ..surviving import DIED, Died, survived
 from ..values import seed_sequence, short
-from .study_log import StudyLog
 from .study_table import StudyTable, checked_row, tabled
-
-#: machines that are sent out at once
-_SENT = 64
-#: what is said of a machine whose process ended twice
-_DIED = "its worker died, twice (out of memory, or a crash of compiled code?)"
 
 #: a row of the table, or the reason why there is none
 Outcome: TypeAlias = Mapping[str, Any] | str
@@ -85,86 +74,36 @@ def study(
             "returns a mapping, or a MachinePipeline."
         )
     source = None if rng is None else seed_sequence(rng)
-    entropy = None if source is None else [source.entropy, list(source.spawn_key)]
-    fixed = not isinstance(rng, np.random.Generator)
-    path = None if checkpoint is None else Path(checkpoint)
-    log = StudyLog(path, items, pipeline, entropy, fixed)
+    log = Checkpoint(
+        checkpoint,
+        "study",
+        {
+            "machines": len(items),
+            "fingerprint": fingerprint([pipeline, *items]),
+            "rng": None if source is None else [source.entropy, list(source.spawn_key)],
+        },
+        free=("rng",) if isinstance(rng, np.random.Generator) else (),
+    )
     seeds: list[Any] = [None] * len(items)
-    if log.entropy is not None:
-        own = np.random.SeedSequence(log.entropy[0], spawn_key=tuple(log.entropy[1]))
-        seeds = list(own.spawn(len(items)))
+    if log.header["rng"] is not None:
+        entropy, key = log.header["rng"]
+        seeds = list(np.random.SeedSequence(entropy, spawn_key=tuple(key)).spawn(len(items)))
     left = [i for i in range(len(items)) if i not in log.rows]
     calls = {i: (pipeline, items[i], seeds[i]) for i in left}
     with Progress(len(items), "machines", progress=progress) as bar:
         bar.advance(len(log.rows))
         for number, outcome in _outcomes(calls, executor):
-            log.add(number, outcome)
+            log.add(number, _kept(outcome))
             bar.advance()
     return tabled([log.rows[i] for i in range(len(items))])
 
 
 def _outcomes(
-    calls: dict[int, tuple[Any, ...]], executor: Executor | None
-) -> Iterator[tuple[int, Outcome]]:
-    """Yield numbers and outcomes as they come; outcomes that are errors of the pipeline raise."""
-    if executor is None:
-        for number, call in calls.items():
-            yield number, _kept(_outcome(*call))
-        return
-    left, own = dict(calls), executor
-    while left:
-        lost: list[int] = []
-        for number, outcome in _pooled(left, own, lost):
-            del left[number]
-            yield number, outcome
-        if own is not executor:
-            own.shutdown(cancel_futures=True)
-        for number in lost:  # one of them ended the process
-            yield number, _alone(left.pop(number))
-        if left:
-            own = ProcessPoolExecutor()
-
-
-def _pooled(
-    calls: Mapping[int, tuple[Any, ...]], executor: Executor, lost: list[int]
-) -> Iterator[tuple[int, Outcome]]:
-    """Yield what an executor finds; when it breaks, the machines that were out go to lost."""
-    waiting = iter(list(calls.items()))
-    out: dict[Future[Any], int] = {}
-    broken = False
-    try:
-        while True:
-            while not broken and len(out) < _SENT and (item := next(waiting, None)) is not None:
-                try:
-                    out[executor.submit(_outcome, *item[1])] = item[0]
-                except BrokenExecutor:
-                    broken = True
-            if not out:
-                return
-            for future in wait(out, return_when=FIRST_COMPLETED).done:
-                number = out.pop(future)
-                error = future.exception()
-                if error is None:
-                    yield number, _kept(future.result())
-                elif isinstance(error, BrokenExecutor):
-                    broken = True
-                    lost.append(number)
-                elif type(error).__name__ == "KilledWorker":  # of dask, which tried it again
-                    yield number, _DIED
-                else:
-                    raise error
-    finally:
-        for future in out:
-            future.cancel()
-
-
-def _alone(call: tuple[Any, ...]) -> Outcome:
-    """Return the outcome of one machine in a process of its own."""
-    with ProcessPoolExecutor(1) as single:
-        try:
-            return _kept(single.submit(_outcome, *call).result())
-        except BrokenExecutor:
-            return _DIED
+    calls: Mapping[int, tuple[Any, ...]], executor: Executor | None
+) -> Iterator[tuple[int, Any]]:
+    if executor is not None:
+        return survived(_outcome, calls, executor)
+    return ((number, _outcome(*call)) for number, call in calls.items())
 
 
 def _outcome(pipeline: Callable[..., Any], machine: Any, seed: Any) -> Outcome | ModelError:
@@ -183,7 +122,8 @@ def _outcome(pipeline: Callable[..., Any], machine: Any, seed: Any) -> Outcome |
         return error
 
 
-def _kept(outcome: Outcome | ModelError) -> Outcome:
+def _kept(outcome: Outcome | ModelError | Died) -> Outcome:
+    """Return a row or a reason; what is an error of the pipeline is raised."""
     if isinstance(outcome, ModelError):
         raise outcome
-    return outcome
+    return DIED if isinstance(outcome, Died) else outcome

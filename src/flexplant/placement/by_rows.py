@@ -1,0 +1,102 @@
+"""Choices from the rows of mode shapes, without trials: effective independence, pivoted QR."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import InfeasibleError, ModelError
+from ..reduction import EffectiveIndependence
+from ..reduction.criteria import SelectionCriterion
+from ..values import flag, instance
+from ..work import Work
+from .mode_information import ModeRows
+from .problem import Found, Problem, Search
+
+
+@dataclass(frozen=True, eq=False)
+class ByRows(Search):
+    """A choice of rows of mode shapes, as `select_dofs` makes it: it needs `ModeInformation`.
+
+    Parameters
+    ----------
+    method : SelectionCriterion
+        EffectiveIndependence (when not given) leaves out the candidate of least
+        ``E_i = phi_i' F^-1 phi_i`` again and again, with the information ``F = sum phi_i phi_i'``:
+        without it the determinant of F is ``1 - E_i`` times as large. PivotedQr and Greedy take
+        one after the other; when all modes are covered, they begin anew among the rest.
+    driving_point : bool
+        Whether E_i is weighted by the driving-point residue ``sum_j phi_ij^2 / omega_j^2``, so
+        that places that move little are left out first (EfI-DPR).
+
+    Raises
+    ------
+    ModelError
+        When the method is no SelectionCriterion, or driving_point is given without
+        EffectiveIndependence.
+
+    References
+    ----------
+    Kammer, J. Guidance 14, 1991; Imamovic, PhD thesis, Imperial College, 1998; Manohar, Brunton,
+    Kutz, Brunton, IEEE Control Systems 38, 2018.
+    """
+
+    method: SelectionCriterion = field(default_factory=EffectiveIndependence)
+    driving_point: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        instance(self.method, SelectionCriterion, "method", "Pass EffectiveIndependence(), say.")
+        self._set(driving_point=flag(self.driving_point, "driving_point"))
+        if self.driving_point and not isinstance(self.method, EffectiveIndependence):
+            raise ModelError("driving_point weights EffectiveIndependence(): leave one out.")
+
+    def search(self, problem: Problem, work: Work) -> Found:
+        """Return the choice, bounded by relaxation; see `Search.search`. Nothing is random.
+
+        Raises
+        ------
+        ModelError
+            When the criterion has no rows of mode shapes.
+        InfeasibleError
+            When the choice does not satisfy the constraints.
+        """
+        scorer = problem.layouts.scorer
+        if not isinstance(scorer, ModeRows):
+            raise ModelError(
+                f"{self!r} chooses by rows of mode shapes, {problem.layouts.criterion!r} has none. "
+                "Pass criterion=ModeInformation(), or search by Exchange()."
+            )
+        kept, pool = list(problem.required), list(problem.free)
+        if self.driving_point:
+            kept = _by_driving_point(scorer, kept, pool, problem.count)
+        while len(kept) < problem.count:
+            more = problem.count - len(kept)
+            taken = scorer.rows[kept]
+            if not isinstance(self.method, EffectiveIndependence):
+                round_size = scorer.rows.shape[1]
+                more = min(more, round_size - len(kept) % round_size)
+                taken = taken[len(kept) - len(kept) % round_size :]
+            picked = self.method.chosen(taken, scorer.rows[pool], more)
+            kept += [pool[i] for i in picked]
+            pool = [i for i in pool if i not in kept]
+        found = tuple(sorted(kept))
+        if not problem.rows.hold([found])[0]:
+            raise InfeasibleError(
+                f"the choice by {self!r} does not satisfy the constraints: it only leaves out "
+                "candidates one by one. Use Exchange(), which satisfies all of them."
+            )
+        value = float(problem.score([found])[0])
+        return Found(found, value, min(problem.bound(), value), 1, ((value,),))
+
+
+def _by_driving_point(
+    scorer: ModeRows, required: list[int], pool: list[int], count: int
+) -> list[int]:
+    """Return what is left when as many as needed have been left out, the least weighted first."""
+    left = [*required, *pool]
+    while len(left) > count:
+        worth = EffectiveIndependence().values(scorer.rows[left]) * scorer.driving_point[left]
+        worth[: len(required)] = np.inf
+        del left[int(np.argmin(worth))]
+    return left

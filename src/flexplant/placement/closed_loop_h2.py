@@ -1,0 +1,163 @@
+"""The mean square of POIs' motion under the best controller: for actuators, sensors or both."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import CertificateError
+from ..estimation import design_kalman
+from ..lti.lyapunov import solve_stein
+from ..lti.riccati import control_dare
+from ..plant import StandardPlant
+from ..values import positive
+from .candidates import PlantChannel, Port, side_of
+from .criterion import Criterion, Scorer
+from .poi_axes import (
+    Named,
+    checked_names,
+    factors_of,
+    measured_rows,
+    plain,
+    poi_rows,
+    pushed_columns,
+    shown,
+    structure_part,
+    unit_of,
+)
+from .poi_lqr import require_control
+from .poi_variance import PoiVariance
+from .separation import Separation, of_actuators, of_sensors
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ClosedLoopH2(Criterion):
+    """Least mean square of POIs' motion and the effort it takes, with the estimate as it is.
+
+    The cost of LQG: ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising
+    controllers of y, the square of an H2 norm. With S and F of the control Riccati equation, W the
+    process noise and P the covariance of the estimate (on which u acts)::
+
+        J = tr(S W) + tr(F' (effort^2 I + B' S B) F P)
+
+    More sensors or actuators never make it larger. `PoiLqr` is its part without any error of the
+    estimate, `PoiVariance` that without any limit of control: it is above both.
+
+    Parameters
+    ----------
+    poi : str, sequence of str or mapping {name: factor}, optional
+        The POIs; not needed when the plant has one only.
+    axes : str, sequence of str or mapping {axis: factor}, optional
+        Axes of each of them; all when not given, a rotation with the factor 1 m.
+    effort : float [m/N]
+        The motion of the POI that one newton of one actuator is worth.
+
+    Raises
+    ------
+    LabelError
+        When a name appears twice; when called, for a POI or an axis that the plant lacks.
+    ModelError
+        When a factor or the effort is not positive.
+    """
+
+    poi: Named = None
+    axes: Named = field(default=None)
+    effort: float = field(default=1e-9, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._set(
+            poi=checked_names(self.poi, "POI"),
+            axes=checked_names(self.axes, "axis"),
+            effort=positive(self.effort, "effort"),
+        )
+
+    def __repr__(self) -> str:
+        given = [*shown(self.poi, self.axes), f"effort={self.effort:g}"]
+        return f"ClosedLoopH2({', '.join(given)})"
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return the cost [m^2] on a sampled plant.
+
+        By the formula, checked against the stationary covariance of the loop of filter and gain.
+
+        Raises
+        ------
+        AssumptionError
+            When u does not reach, y does not see, w does not excite or the axes do not see a
+            rigid-body mode.
+        CertificateError
+            When the two costs differ.
+        """
+        self.check(plant, ())
+        plant.check().require(("stabilisable", "detectable"), "a stationary controller")
+        rows = poi_rows(plant, self._factors(plant))
+        A, B, C, W = plant.system.A, plant.B2, plant.C2, plant.process_noise
+        R = self.effort**2 * np.eye(B.shape[1])
+        control = control_dare(A, B, Q=rows.T @ rows, R=R)
+        S, F = control.P, control.gain
+        estimator = design_kalman(plant, larger=plant)
+        P, K = estimator.covariance, estimator.gain
+        V = F.T @ (R + B.T @ S @ B) @ F
+        cost = float(np.sum(S * W) + np.sum(V * P))
+        # states and the errors of their prediction: u = -F (x - (I - K C) e) + F K noise
+        n, seen = A.shape[0], np.eye(A.shape[0]) - K @ C
+        loop = np.block([[A - B @ F, B @ F @ seen], [np.zeros((n, n)), A @ seen]])
+        push = np.vstack([-B @ F @ K, -A @ K])
+        both = np.block([[W, W], [W, W]]) + push @ plant.sensor_noise @ push.T
+        X = solve_stein(loop, both)
+        out = np.block([[rows, np.zeros_like(rows)], [-self.effort * F, self.effort * F @ seen]])
+        noise = self.effort * F @ K
+        found = float(np.einsum("ij,jk,ik->", out, X, out))
+        found += float(np.einsum("ij,jk,ik->", noise, plant.sensor_noise, noise))
+        if not abs(found - cost) <= 1e-6 * abs(cost):
+            raise CertificateError(
+                f"the loop costs {found:.9g}, its Riccati equations say {cost:.9g}: the problem is "
+                "too badly conditioned. Give a larger effort."
+            )
+        return cost
+
+    def unit(self, plant: StandardPlant) -> str:
+        """Return the unit of the square root."""
+        return unit_of(plant, self._factors(plant))
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Raise AssumptionError when a rigid-body mode is missed or a candidate fits no filter."""
+        require_control(plant, self._factors(plant), repr(self))
+        sensors = [port for port in candidates if side_of(port) == "y"]
+        PoiVariance(self.poi).check(plant, sensors)
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
+        """Return the cost as a function of the candidates alone; all else is computed once.
+
+        A delay of d whole samples costs what nobody can do meanwhile, and the control acts on the
+        state predicted d samples ahead, P_d. A fraction of a sample, filters and delays of ports:
+        the plant is made anew for each choice.
+        """
+        delay = plant.delay if plant.is_assembled else 0.0
+        if delay % 1.0 or not plain(plant, candidates):
+            return super().scorer(plant, candidates)
+        A, noise, rows = structure_part(plant, self._factors(plant))
+        own = plant.assembled.ports if plant.is_assembled else None
+        given = {side: [p for p in candidates if side_of(p) == side] for side in "yu"}
+        fixed = {
+            side: list(getattr(own, side)) if own else [PlantChannel(n, side) for n in names]
+            for side, names in (("y", plant.y), ("u", plant.u))
+        }
+        problem = Separation(
+            A,
+            noise,
+            rows,
+            measured_rows(plant, given["y"] or fixed["y"]),
+            pushed_columns(plant, given["u"] or fixed["u"]).T / self.effort,
+            int(delay),
+            np.array([side_of(port) == "y" for port in candidates]),
+        )
+        if not given["u"]:
+            return of_sensors(problem)
+        return of_actuators(problem) if not given["y"] else problem
+
+    def _factors(self, plant: StandardPlant) -> dict[str, float]:
+        return factors_of(plant, self.poi, self.axes, every=True)

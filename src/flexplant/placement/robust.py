@@ -1,0 +1,178 @@
+"""Criteria over several machines, and after the loss of a device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import FlexplantError, ModelError
+from ..plant import StandardPlant
+from ..values import FloatArray, one_of, short
+from .candidates import Port, checked_plant, side_of, with_side
+from .criterion import Scorer
+from .rigid_part import RigidPart
+from .wrapping import Wrapping
+
+_MEASURES = ("worst", "mean")
+
+
+@dataclass(frozen=True, eq=False)
+class ManyScores(Scorer):
+    """The worst or the mean of several scores of the same choice."""
+
+    parts: tuple[Scorer, ...]
+    measure: str
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return it for one choice."""
+        return float(_over(self.measure, [part.value(chosen) for part in self.parts]))
+
+    def score(self, sets: Sequence[Sequence[int]]) -> FloatArray:
+        """Return it for several choices."""
+        found = np.array([part.score(sets) for part in self.parts])
+        return np.asarray(_over(self.measure, found))
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the worst or the mean of the bounds."""
+        bounds = [part.bound(count, required) for part in self.parts]
+        return float(_over(self.measure, bounds))
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class OverMachines(Wrapping):
+    """The worst or the mean of a criterion over several machines with the same devices.
+
+    Parameters
+    ----------
+    criterion : Criterion or callable
+        From plant to float.
+    machines : sequence of StandardPlant
+        Such as `plant.uncertain(fit).sample(rng, 20)`, or one plant for each machine of a fleet;
+        sampled, each gets the devices of the plant that is scored.
+    measure : {"worst", "mean"}
+        Over the machines.
+
+    Raises
+    ------
+    ModelError
+        When there are no machines, one of them is no sampled plant, the measure is none of these,
+        or the criterion is not callable.
+    """
+
+    machines: Sequence[StandardPlant]
+    measure: str = field(default="worst", kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if isinstance(self.machines, str) or not isinstance(self.machines, Sequence):
+            raise ModelError(f"machines are a list of plants, got {short(self.machines)}.")
+        if not self.machines:
+            raise ModelError("there are no machines: give at least one plant.")
+        machines = tuple(checked_plant(machine) for machine in self.machines)
+        self._set(machines=machines, measure=one_of(self.measure, "measure", _MEASURES))
+
+    def __repr__(self) -> str:
+        return f"OverMachines({self.criterion!r}, {len(self.machines)} machines, {self.measure!r})"
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return it with the devices of a plant."""
+        ports = plant.assembled.ports
+        values = [self.criterion(machine.with_ports(ports)) for machine in self.machines]
+        return float(_over(self.measure, values))
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Check the criterion on every machine."""
+        for machine in self._with(plant):
+            super().check(machine, candidates)
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the scores by those on each machine."""
+        inner = self.inner
+        parts = tuple(inner.scorer(machine, candidates) for machine in self._with(plant))
+        return ManyScores(parts, self.measure)
+
+    def _with(self, plant: StandardPlant) -> list[StandardPlant]:
+        return [machine.with_ports(plant.assembled.ports) for machine in self.machines]
+
+
+@dataclass(frozen=True, eq=False)
+class LossScores(Scorer):
+    """The worst or the mean score of a choice without any one of its devices."""
+
+    inner: Scorer
+    rigid: RigidPart
+    losable: tuple[bool, ...]
+    measure: str
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return it for one choice: infinite where a loss leaves a rigid-body mode unseen."""
+        lists = [[j for j in chosen if j != i] for i in chosen if self.losable[i]]
+        if not lists or np.any(self.rigid.all_missing(lists)):
+            return np.inf
+        return float(_over(self.measure, self.inner.score(lists)))
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the bound of choices of one less: what is left is one of them."""
+        return self.inner.bound(count - 1, ()) if count > 1 else -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class AfterLoss(Wrapping):
+    """The worst or the mean of a criterion after the loss of any one device.
+
+    Infinite where the others do not suffice: choose one more than the least number.
+
+    Parameters
+    ----------
+    criterion : Criterion or callable
+        From plant to float.
+    of : {"sensors", "actuators"}
+        Which devices may be lost.
+    measure : {"worst", "mean"}
+        Over the devices.
+
+    Raises
+    ------
+    ModelError
+        When `of` or the measure is none of these, or the criterion not callable.
+    """
+
+    of: str = field(default="sensors", kw_only=True)
+    measure: str = field(default="worst", kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        one_of(self.of, "of", ("sensors", "actuators"))
+        one_of(self.measure, "measure", _MEASURES)
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return it for the devices of a plant: infinite where the others do not suffice."""
+        side = self._side
+        own: tuple[Port, ...] = getattr(plant.assembled.ports, side)
+        values = []
+        for lost in own:
+            try:
+                left = with_side(plant, side, [port for port in own if port is not lost])
+                values.append(self.criterion(left))
+            except FlexplantError:
+                return np.inf
+        return float(_over(self.measure, values))
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
+        """Return the scores by those of choices of one less."""
+        inner = self.inner.scorer(plant, candidates)
+        losable = tuple(side_of(port) == self._side for port in candidates)
+        sides = "".join(s for s in "yu" if s in {side_of(port) for port in candidates})
+        return LossScores(inner, RigidPart.of(plant, sides, candidates), losable, self.measure)
+
+    @property
+    def _side(self) -> str:
+        return "y" if self.of == "sensors" else "u"
+
+
+def _over(measure: str, values: Any) -> Any:
+    """Return the largest or the mean along the first axis."""
+    return np.max(values, axis=0) if measure == "worst" else np.mean(values, axis=0)

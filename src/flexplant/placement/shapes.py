@@ -1,0 +1,82 @@
+"""Mode shapes where candidates are: what the classical criteria are made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+
+from ..plant import SensorPort, StandardPlant
+from ..values import FloatArray
+from .criterion import Criterion, Scorer
+
+
+@dataclass(frozen=True, eq=False)
+class Shapes:
+    """Mass-normalised shapes of a plant's modes, rigid-body modes first.
+
+    Parameters
+    ----------
+    phi : (N, m) array
+        At the candidates.
+    omega : (m,) array [rad/s]
+        Frequencies, 0 of rigid-body modes.
+    zeta : (m,) array
+        Damping ratios.
+    rows : (N, n) array
+        Of the candidates over the model's DOFs.
+    full : (n, m) array
+        Shapes at the model's DOFs.
+    asd : (N,) array
+        Noise of sensors, 1 of those without any and of actuators.
+    """
+
+    phi: FloatArray
+    omega: FloatArray
+    zeta: FloatArray
+    rows: FloatArray
+    full: FloatArray
+    asd: FloatArray
+
+    @property
+    def elastic(self) -> slice:
+        """The modes that are no rigid-body modes."""
+        return slice(int(np.count_nonzero(self.omega == 0)), None)
+
+
+def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
+    """Return the shapes at ports of a plant that was assembled from a structure."""
+    real = plant.assembled.realisation
+    m = real.n_modes
+    pairs = real.pairs[:m]
+    omega = np.sqrt(np.abs(np.linalg.det(pairs)))
+    omega[: real.n_rigid] = 0.0
+    zeta = -np.trace(pairs, axis1=1, axis2=2) / 2.0 / np.where(omega > 0, omega, 1.0)
+    full = real.inputs[:, 1 : 2 * m : 2]
+    rows = [p.row(real) if isinstance(p, SensorPort) else p.push(real) for p in ports]
+    stacked = np.array(rows).reshape(len(ports), -1)
+    asd = np.array([(p.asd or 1.0) if isinstance(p, SensorPort) else 1.0 for p in ports])
+    return Shapes(stacked @ full, omega, zeta, stacked, full, asd)
+
+
+class ByShapes(Criterion):
+    """A criterion of mode shapes at the sensors: a new one defines `of`."""
+
+    sides: ClassVar[str] = "y"
+    scale: ClassVar[float] = 1.0
+
+    def of(self, plant: StandardPlant, shapes: Shapes) -> Scorer:
+        """Return the scores of choices among the ports that the shapes belong to."""
+        raise NotImplementedError
+
+    def __call__(self, plant: StandardPlant) -> float:
+        """Return the criterion of the plant's own ports."""
+        ports = getattr(plant.assembled.ports, self.sides)
+        scorer = self.of(plant, shapes_of(plant, ports))
+        return float(scorer.score([tuple(range(len(ports)))])[0])
+
+    def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
+        """Return the criterion of choices among candidates."""
+        return self.of(plant, shapes_of(plant, candidates))
