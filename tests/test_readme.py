@@ -8,6 +8,7 @@ import pytest
 import scipy.io
 import scipy.linalg
 
+import flexplant
 from flexplant import h2_norm, solid_block
 
 ROOT = Path(__file__).parents[1]
@@ -33,6 +34,15 @@ def test_files_that_it_names_exist():
     assert "examples/wafer_stage.py" in named
     for path in named:
         assert (ROOT / path).exists() or path.startswith("examples/out"), path
+
+
+def test_names_that_it_gives_exist():
+    named = set(re.findall(r"\bfx((?:\.\w+)+)", README))
+    assert len(named) > 30
+    for name in named:
+        value = flexplant
+        for part in name[1:].split("."):
+            value = getattr(value, part)
 
 
 def write_stage(folder):
