@@ -233,7 +233,7 @@ def test_a_loop_above_its_gamma_is_not_accepted(monkeypatch):
         return K.replace(C=-K.C)
 
     monkeypatch.setattr(riccati, "central", wrong)
-    found = checked(*scalar(1.0))
+    found = checked(*scalar(1.0), Riccati())
     assert found.gamma > 1.1 * scalar_optimum(1.0)
     assert found.lower <= scalar_optimum(1.0)
 
@@ -268,7 +268,7 @@ def test_compleib_without_full_rank(name):
     for key, names in (("D12", u), ("D21", y)):
         rank = np.linalg.matrix_rank(parts[key])
         assert (f"{key} has rank {rank} of {len(names)}" in found.notes[0]) == (rank < len(names))
-    assert found.certificate["added noise"] in (1e-4, 1e-5, 1e-6, 1e-7)
+    assert found.certificate["added noise"] in (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 
 
 def turned(P, condition, seed=3, speed=1.0):
@@ -284,18 +284,19 @@ def turned(P, condition, seed=3, speed=1.0):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["AC4", "HE1", "TMD", "WEC1", "BDT1", "CM1", "JE3"])
 def test_coordinates_and_units_of_time_change_nothing(name):
-    """0.1 % of gamma, or a message that blames the coordinates."""
+    """0.1 % of gamma, or one closer to the bound, or a message that blames the coordinates."""
     P, u, y = compleib(name)
-    best = design_hinf(P, u=u, y=y).gamma
-    for condition, speed in ((1.0, 1.0), (1e3, 1.0), (1.0, 1e6), (1.0, 1e-6)):
-        found = design_hinf(turned(P, condition, speed=speed), u=u, y=y)
-        assert found.gamma == pytest.approx(best, rel=1e-3)
-    try:
-        found = design_hinf(turned(P, 1e6), u=u, y=y)
-    except SolverError as error:
-        assert "coordinates of the plant's states are badly conditioned" in str(error)
-    else:
-        assert found.gamma == pytest.approx(best, rel=1e-3)
+    best = design_hinf(P, u=u, y=y)
+    for condition, speed in ((1.0, 1.0), (1e3, 1.0), (1.0, 1e6), (1.0, 1e-6), (1e5, 1.0), (1e6, 1)):
+        try:
+            found = design_hinf(turned(P, condition, speed=speed), u=u, y=y)
+        except SolverError as error:
+            assert condition > 1e3
+            assert "coordinates of the plant's states are badly conditioned" in str(error)
+        else:
+            assert found.lower <= found.gamma * (1 + 1e-3)
+            assert best.lower * (1 - 1e-3) <= found.gamma <= best.gamma * (1 + 1e-3)
+            assert found.gamma >= best.gamma * (1 - 1e-3) or found.gamma < 1.01 * found.lower
 
 
 def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():

@@ -21,8 +21,12 @@ from .modal import modal_form
 from .scaling import bordered_scale, mean_speed, state_scale
 from .statespace import StateSpace
 
-#: a direction of D12 or D21 below this, beside columns of unit size, counts as missing
+#: a direction of D12 or D21 that is smaller beside what the plant does on its channels is missing
 _RANK = 1e-9
+#: where the plant's answers are looked at: at its own speed, away from its resonances
+_POINT, _DIRECT = complex(np.exp(0.25j * np.pi)), complex(1.5 * np.exp(1j))
+#: part of the motion of the states that counts for a channel which z or w does not know
+_HIDDEN = 1e-3
 #: departure from normal above which modal coordinates are taken; their largest condition beside it
 _MIXED, _CONDITION = 5.0, 1e3
 
@@ -87,6 +91,22 @@ class Prepared(Value):
             outputs=[f"z{i}" for i in range(1, self.C1.shape[0] + 1)] + list(self.y),
             dt=self.dt if self.direct else 0.0,
         )
+
+    @property
+    def own_sizes(self) -> tuple[FloatArray, FloatArray]:
+        """What the plant does on each channel: sizes of u in z (nu,) and of w in y (ny,).
+
+        Feedthrough included, at the plant's own speed and away from its resonances.
+        """
+        s = self._point
+        return (
+            np.hypot(_answers(self.A, self.B2, self.C1, s), np.linalg.norm(self.D12, axis=0)),
+            np.hypot(_answers(self.A.T, self.C2.T, self.B1.T, s), np.linalg.norm(self.D21, axis=1)),
+        )
+
+    @property
+    def _point(self) -> complex:
+        return _DIRECT if self.direct else _POINT
 
     def measured_in(self, unit: float) -> Prepared:
         """Return the problem with z in multiples of `unit`; u too, so that D12 is kept.
@@ -173,7 +193,7 @@ def prepared(
     # balanced first: whether I + A can be inverted must not depend on the units of the states
     s = np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles()))
     A, B, C = _balanced(P.A, P.B, P.C, s)
-    departure = _departure(A)
+    departure = departure_from_normal(A)
     if departure > _MIXED:
         form = modal_form(P, largest_condition=_CONDITION * departure)
         A, B, C = (A, B, C) if form.reason else _balanced(*_matrices(form.system), s)
@@ -185,8 +205,9 @@ def prepared(
     root = np.sqrt(speed)
     A, B, C = g.A / speed, g.B / root, g.C / root
     D12, D21 = g.D[:p1, m1:], g.D[p1:, :m1]
-    z_turn, u_scale = normalised(D12, np.linalg.norm(B[:, m1:], axis=0))
-    w_turn, y_scale_t = normalised(D21.T, np.linalg.norm(C[p1:], axis=1))
+    point = _DIRECT if direct else _POINT
+    z_turn, u_scale = normalised(D12, _answers(A, B[:, m1:], C[:p1], point))
+    w_turn, y_scale_t = normalised(D21.T, _answers(A.T, C[p1:].T, B[:, :m1].T, point))
     y_scale = y_scale_t.T
     A, B, C = _balanced(
         A,
@@ -215,16 +236,16 @@ def prepared(
     )
 
 
-def normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray]:
+def normalised(D: FloatArray, own: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return an orthogonal Z and a scaling S with ``Z' D S = [0; I]`` where D has full rank.
 
-    Columns are brought to unit size first, so that rank does not depend on their units; those
-    that are zero in D to unit `reach` (of B2, or C2). Directions that D does not see
-    (rank-deficient) are only turned.
+    Rank must depend neither on units nor on rounding: columns are brought to unit size first,
+    together with `own` (m,), what the plant itself does on their channels. A direction of D that
+    is nothing beside it (rank-deficient) is only turned.
     """
     m = D.shape[1]
-    columns = np.linalg.norm(D, axis=0)
-    columns = np.where(columns > 0, columns, np.where(reach > 0, reach, 1.0))
+    columns = np.hypot(np.linalg.norm(D, axis=0), own)
+    columns = np.where(columns > 0, columns, 1.0)
     left, values, right = la.svd(D / columns, full_matrices=True)
     sizes = np.zeros(m)
     sizes[: values.size] = values
@@ -235,11 +256,24 @@ def normalised(D: FloatArray, reach: FloatArray) -> tuple[FloatArray, FloatArray
     return Z, S / columns[:, None]
 
 
+def _answers(A: FloatArray, B: FloatArray, C: FloatArray, s: complex) -> FloatArray:
+    """Return the sizes (m,) of ``C (s I - A)^-1 B`` by column, at least a part of its terms'.
+
+    What u moves and z does not show has no size there but rounding.
+    """
+    try:
+        states = np.linalg.solve(s * np.eye(A.shape[0]) - A, B)
+    except np.linalg.LinAlgError:  # a pole at s
+        states = np.asarray(B, dtype=np.complex128)
+    terms = np.linalg.norm(C) * np.linalg.norm(states, axis=0)
+    return np.asarray(np.maximum(np.linalg.norm(C @ states, axis=0), _HIDDEN * terms))
+
+
 def _matrices(g: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray]:
     return g.A, g.B, g.C
 
 
-def _departure(A: FloatArray) -> float:
+def departure_from_normal(A: FloatArray) -> float:
     """Return the size of A beside that of its eigenvalues: 1 for a normal matrix (Henrici)."""
     size = float(np.linalg.norm(np.linalg.eigvals(A))) if A.size else 0.0
     return float(np.linalg.norm(A)) / size if size else 1.0

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
+from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
 from ..lti.preparation import Prepared, prepared
@@ -17,13 +17,11 @@ from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from .controller import Controller
 from .method import SolvedController
-from .singular import Regularised, missing_ranks
+from .singular import made_regular, missing_ranks
 from .spill_over import spill_over, unchecked
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
 AGREEMENT = 1e-5
-#: noise and effort added to a singular problem, and what a tenth of it may still gain
-_LEVELS, _GAIN = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7), 2e-3
 
 
 @one_thread()
@@ -68,6 +66,8 @@ def design_h2(
     AssumptionError
         When w reaches z at once in a continuous plant (infinite norm), or an undamped mode is
         not seen, reached, costly or excited.
+    InfeasibleError
+        When the norm falls to zero with what is added to a singular problem.
     SolverError
         When no stabilising controller was found.
     CertificateError
@@ -111,12 +111,12 @@ def design_h2(
     problem = prepared(plant.system, plant.u, plant.y, direct=True)
     lacking = missing_ranks(problem)
     if lacking:
-        found = _made_regular(problem, lacking)
+        found = made_regular(problem, _solved, lacking, h2_norm)
     else:
         try:
             found = _solved(problem)
         except AssumptionError as error:  # a mode on the stability boundary is missed by w or z
-            found = _made_regular(problem, (str(error),))
+            found = made_regular(problem, _solved, (str(error),), h2_norm)
     K = problem.restored(found.A, found.B, found.C, found.D).replace(name="h2", units=plant.units)
     # a norm of the scaled problem, in the user's unit of time
     certificate = _certified(plant.system, K, float(np.sqrt(problem.speed)) * found.gamma)
@@ -182,54 +182,6 @@ def _solved(p: Prepared) -> SolvedController:
     cost = float(np.sqrt(max(square, 0.0)))
     A = p.A + p.B2 @ F + L @ p.C2 - p.B2 @ L0 @ p.C2
     return SolvedController(A, p.B2 @ L0 - L, F - L0 @ p.C2, L0, cost, cost, residual)
-
-
-def _made_regular(problem: Prepared, lacking: Sequence[str]) -> SolvedController:
-    """Return the controller of a singular problem: a little noise and effort are added.
-
-    The norm of the loop without what was added falls with the level to its infimum.
-    """
-    found: list[tuple[float, SolvedController]] = []
-    errors: list[FlexplantError] = []
-    for level in _LEVELS:
-        try:
-            found.append((level, _with_level(problem, level)))
-        except FlexplantError as error:
-            errors.append(error)
-            continue
-        if len(found) > 1 and found[-2][1].gamma <= found[-1][1].gamma * (1.0 + _GAIN):
-            break
-    if not found:
-        raise errors[0]
-    level, K = min(found, key=lambda one: one[1].gamma)
-    gain = found[-2][1].gamma / found[-1][1].gamma - 1.0 if len(found) > 1 else np.nan
-    note = (
-        f"{'; '.join(lacking)}. Designed with noise of {level:.0e} on each sensor and as much "
-        "effort of each actuator, relative to the plant's own channels, and verified without "
-        f"them; the last step to a tenth of it changed the norm by {100 * gain:.2g} %."
-    )
-    return K._replace(certificate={"added noise": level}, notes=(note,))
-
-
-def _with_level(problem: Prepared, level: float) -> SolvedController:
-    """Return the controller for one level, its gamma the norm of its loop without the level."""
-    regular = Regularised(problem, level)
-    try:
-        answer = _solved(regular.problem)
-    except AssumptionError:  # a mode on the stability boundary is missed by w or z
-        regular = Regularised(problem, level, states=True)
-        answer = _solved(regular.problem)
-    A, B, C, D = regular.restored(answer)
-    system = problem.system
-    K = StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u, dt=system.dt)
-    norm = h2_norm(lft(system, K))
-    if not np.isfinite(norm):
-        raise SolverError(
-            f"with noise and effort of {level:.0e} added, the controller does not stabilise, or "
-            "its norm is infinite: a mode that z and w miss stays on the edge of stability. "
-            "Weight the efforts and that motion in z, and give each sensor noise in w."
-        )
-    return SolvedController(A, B, C, D, norm, 0.0)
 
 
 def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:

@@ -5,27 +5,22 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
-
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
-from ..lti.interconnection import lft
-from ..lti.preparation import Prepared, prepared
-from ..lti.responses import remembered, responder
-from ..lti.statespace import StateSpace, System
+from ..lti.preparation import Prepared, departure_from_normal, prepared
+from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import short
+from .attempts import Answer, answered, best_answer
 from .central import require_shown
-from .certificate import certified_norm, reached_norms
+from .certificate import reached_norms
 from .controller import Controller
-from .lower_bound import lower_bound
-from .method import SolvedController, SynthesisMethod
+from .method import SynthesisMethod
+from .reach import require_reach
 from .riccati import Riccati
 from .spill_over import spill_over, unchecked
 from .structured_lmi import StructuredLmi
 
-#: problems of at most so many states go to the LMIs where the Riccati equations fail
-_SMALL = 40
 #: A beside its poles, from which on coordinates are blamed for a failure
 _MIXED = 1e3
 
@@ -52,9 +47,10 @@ def design_hinf(
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
         serves too: by the names of its channels, or with u and y named.
     method : Riccati, StructuredLmi or Lmi, optional
-        Unless given `Riccati()`, which adds a little noise and effort where D12 or D21 is
-        singular, and `StructuredLmi()` for small problems on which it fails. `StructuredLmi()`
-        needs none of it, up to some 60 states; `Lmi()` is its readable form for less than 30.
+        Unless given they are tried in turn until one is verified close to its lower bound:
+        `Riccati()`, which adds a little noise and effort where D12 or D21 is singular;
+        `Riccati(regularised=True)`, which adds them anyway; `StructuredLmi()`, which needs none,
+        up to 40 states. `Lmi()` is its readable form for less than 30.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
@@ -111,20 +107,27 @@ def design_hinf(
         plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
     try:
-        method, found, controller = _designed(plant, problem, method, progress)
-        loop = lft(plant.system, controller)
-        respond = remembered(responder(loop))  # swept twice over the same frequencies
-        certificate = certified_norm(loop, found.gamma, respond)
+        require_reach(problem)
+        if plant.is_assembled:  # whatever a method makes of it: this motion would drift
+            require_shown(problem)
+        if method is None:
+            answer = best_answer(plant, problem, progress)
+        else:
+            if progress is not None and isinstance(method, (Riccati, StructuredLmi)):
+                method = method.replace(progress=progress)
+            answer = answered(plant, problem, method)
+        _require_known(problem, answer)
     except (AssumptionError, SolverError, CertificateError) as error:
         raise _blamed(problem, error) from error
-    reached = reached_norms(plant, loop, respond)
+    controller, found = answer.controller, answer.found
+    reached = reached_norms(plant, answer.loop, answer.respond)
     left_out = spill_over(plant, [controller], larger)
     return Controller(
         controller,
-        f"H-infinity by {type(method).__name__}",
-        gamma=certificate["norm"],
-        lower=lower_bound(problem, certificate["norm"], found.lower),
-        certificate=certificate
+        f"H-infinity by {type(answer.method).__name__}",
+        gamma=answer.gamma,
+        lower=answer.lower,
+        certificate=answer.certificate
         | dict(found.certificate)
         | (left_out.certificate if left_out is not None else {}),
         reached=reached,
@@ -150,26 +153,15 @@ def _require_channels(plant: StandardPlant) -> None:
             )
 
 
-def _designed(
-    plant: StandardPlant,
-    problem: Prepared,
-    method: SynthesisMethod | None,
-    progress: bool | None,
-) -> tuple[SynthesisMethod, SolvedController, StateSpace]:
-    """Return the method, its answer, and the controller in the user's channels and units."""
-    _require_reach(problem)
-    if plant.is_assembled:  # whatever a method makes of it: this motion would drift
-        require_shown(problem)
-    if method is None:
-        method, found = _solved(problem, progress)
-    else:
-        if progress is not None and isinstance(method, (Riccati, StructuredLmi)):
-            method = method.replace(progress=progress)
-        found = method.solve(problem)
-    controller = problem.restored(found.A, found.B, found.C, found.D).replace(
-        name="hinf", units=plant.units
-    )
-    return method, found, controller
+def _require_known(problem: Prepared, answer: Answer) -> None:
+    """Raise SolverError when rounding in the given coordinates may have made another plant."""
+    if problem.departure < _MIXED:
+        return
+    if departure_from_normal(problem.A) > _MIXED or not answer.is_close:
+        raise SolverError(
+            f"a controller with gamma {answer.gamma:.4g} was found, the lower bound is "
+            f"{answer.lower:.4g}, and both hang on rounding."
+        )
 
 
 def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
@@ -182,51 +174,3 @@ def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
         "what the plant is. Give it in modal, balanced or physical coordinates. "
         f"(What was found in these: {error})"
     )
-
-
-def _solved(problem: Prepared, progress: bool | None) -> tuple[SynthesisMethod, SolvedController]:
-    """Return the answer by Riccati equations, of a small problem that they fail on by LMIs."""
-    first: SynthesisMethod = Riccati(progress=progress)
-    try:
-        return first, first.solve(problem)
-    except SolverError as error:
-        if problem.A.shape[0] > _SMALL:
-            raise
-        second = StructuredLmi(progress=progress)
-        try:
-            return second, second.solve(problem)
-        except FlexplantError:
-            raise error from None
-
-
-def _require_reach(problem: Prepared) -> None:
-    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable.
-
-    Weights included. Hautus' rank test in the prepared coordinates, whatever the user's units.
-    """
-    A = problem.A
-    poles = np.linalg.eigvals(A)
-    size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, 1e-300)
-    # the poles of a chain of integrators come out of rounding as a ring around zero
-    poles = np.where(np.abs(poles) < 1e-6 * size, 0.0, poles)
-    for pole in poles[poles.real > -1e-10 * size]:
-        for matrix, gain, text in (
-            (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
-            (A.T, problem.C2.T, f"y ({', '.join(problem.y)}) does not see"),
-        ):
-            reach = size * gain / max(float(np.linalg.norm(gain, 2)), 1e-300)
-            pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
-            if np.linalg.svd(pencil, compute_uv=False)[-1] < 1e-12 * size:
-                raise AssumptionError(
-                    f"{text} a mode of the plant or of a weight that is not stable "
-                    f"({_described(problem, complex(pole))}): no controller can stabilise it. "
-                    "Add or move an actuator or a sensor, or give the weight finite gain."
-                )
-
-
-def _described(problem: Prepared, pole: complex) -> str:
-    if pole.imag:
-        return f"at {problem.frequency(abs(pole.imag)):.3g} Hz"
-    if pole.real > 1e-6:
-        return f"it grows e-fold in {1.0 / (problem.speed * pole.real):.3g} s"
-    return "at 0 Hz: rigid-body or integrating"

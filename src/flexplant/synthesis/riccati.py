@@ -18,7 +18,8 @@ from ..parallel import Progress
 from ..values import FloatArray, Value, positive
 from .central import OnAxisError, central, quadratic, riccati_solutions
 from .method import SolvedController
-from .singular import made_regular, missing_ranks
+from .reach import beyond_rounding
+from .singular import made_regular, missing_ranks, require_ranks
 
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
@@ -41,9 +42,10 @@ class Riccati(Value):
     lower bound is the largest gamma that was refuted, not the largest that failed.
 
     The equations need D12 and D21 of full rank, and z and w that miss no mode on the stability
-    boundary. A problem without these is solved with a little noise on each sensor and a little
-    effort of each actuator added, 1e-4 of the plant's own or less; the loop is verified without
-    them. The notes and the certificate say what was added and what it costs in gamma.
+    boundary. A problem without these, or on which they fail, is solved with a little noise on each
+    sensor and a little effort of each actuator added, 1e-3 of what the plant itself does there or
+    less; the loop is verified without them. The notes and the certificate say what was added and
+    what it costs in gamma.
 
     Parameters
     ----------
@@ -51,6 +53,8 @@ class Riccati(Value):
         Relative distance from the smallest gamma found.
     tolerance : float
         Relative width at which the bisection stops.
+    regularised : bool, optional
+        True adds noise and effort to any problem, False to none; None decides as above.
     progress : bool, optional
         True shows a bar of the bisection at once, False never; None after two seconds on a
         terminal.
@@ -63,6 +67,7 @@ class Riccati(Value):
 
     back_off: float = 0.05
     tolerance: float = 1e-3
+    regularised: bool | None = None
     progress: bool | None = None
 
     def __post_init__(self) -> None:
@@ -77,17 +82,21 @@ class Riccati(Value):
         Raises
         ------
         AssumptionError
-            When z or w misses a mode on the stability boundary.
+            When z or w misses a mode on the stability boundary, or D12 or D21 has not full rank
+            and nothing may be added.
         InfeasibleError
             When gamma has a greatest lower bound that only infinite gain reaches.
         SolverError
             When the plant is too badly conditioned to be stabilised in rounding.
         """
         lacking = missing_ranks(problem)
-        if not lacking:
+        if self.regularised is False:
+            require_ranks(lacking)
+            return self._regular(problem)
+        if not lacking and self.regularised is None:
             try:
                 return self._regular(problem)
-            except AssumptionError as error:
+            except (AssumptionError, SolverError) as error:
                 lacking = (str(error),)
         return made_regular(problem, self._regular, lacking)
 
@@ -100,10 +109,8 @@ class Riccati(Value):
             unit = np.inf
         if not np.isfinite(unit):
             raise SolverError(
-                "no controller of least quadratic cost stabilises in rounding: the plant is too "
-                "badly conditioned. Weight z and w so that their sizes are alike (metres beside "
-                "newtons are not; stage_weights), or leave out states that u hardly reaches or y "
-                "hardly sees."
+                "no controller of least quadratic cost stabilises in rounding: "
+                + beyond_rounding(problem)
             )
         if unit <= _ROUNDING * _open_size(problem):  # w reaches nothing in z
             return SolvedController(least.A, least.B, least.C, least.D, 0.0, 0.0)

@@ -11,24 +11,26 @@ import scipy.linalg as la
 
 from ..errors import AssumptionError, FlexplantError, InfeasibleError, SolverError
 from ..lti.interconnection import lft
-from ..lti.norms import peak_gain
+from ..lti.norms import hinf_norm
 from ..lti.preparation import Prepared, normalised
 from ..lti.statespace import StateSpace
 from ..values import FloatArray
 from .method import SolvedController
 
-#: a direction of D12 or D21 that is smaller counts as missing (their columns have unit size)
-_RANK = 1e-8
+#: a direction of D12 or D21 that is smaller is missing (in a prepared problem the others are 1)
+_RANK = 0.5
+#: what certificates call the size of what was added
+ADDED = "added noise"
 #: sizes of what is added, tried in turn: the largest that costs next to nothing in gamma is taken
-_LEVELS = (1e-4, 1e-5, 1e-6, 1e-7)
-#: where none of these works
-_LAST = 1e-3
+_LEVELS = (1e-3, 1e-4, 1e-5, 1e-6, 1e-7)
 #: relative: what a level may cost in gamma, compared with a tenth of it
-_COST = 2e-3
+_COST = 1e-3
 #: relative: a smaller gamma that is the same
 _SAME = 1e-6
 #: gamma falls by so much from level to level where its infimum is zero
 _FALL = 0.5
+#: a gamma that grows by less from one level to the next has settled, by more it is rounding
+_SETTLED = 1.2
 #: a fastest pole that grows so much when the level is a tenth has no limit
 _GROWTH = 3.0
 
@@ -49,11 +51,28 @@ def missing_ranks(problem: Prepared) -> tuple[str, ...]:
     return tuple(lacking)
 
 
+def require_ranks(lacking: Sequence[str]) -> None:
+    """Raise AssumptionError when something is lacking, with the cure of each."""
+    if lacking:
+        raise AssumptionError(
+            f"{'; '.join(lacking)}, and nothing may be added (regularised=False). "
+            f"{_cure(lacking)} Or use StructuredLmi(), which needs no rank."
+        )
+
+
+def _cure(lacking: Sequence[str]) -> str:
+    """Return what to do about what is lacking, that of D21 where only it lacks rank."""
+    effort, noise = (any(one.startswith(name) for one in lacking) for name in ("D12", "D21"))
+    cures = ["weight the efforts in z"] * (effort or not noise)
+    cures += ["give each sensor noise in w"] * (noise or not effort)
+    return " and ".join(cures).capitalize() + "."
+
+
 class Regularised:
     """A problem with noise of size `level` on each y and effort of that size for each u.
 
-    ``[w; v] -> y + level v`` and ``[z; level u]``, in the prepared channels, where the columns of
-    [B2; D12] and the rows of [C2, D21] have sizes alike. Any loop has at least the norm that it
+    ``[w; v] -> y + level v`` and ``[z; level u]``, in multiples of what the plant itself does on
+    the channel (`Prepared.own_sizes`). Any loop has at least the norm that it
     has without them: a gamma that is reached here is reached by the problem itself.
 
     Parameters
@@ -72,11 +91,12 @@ class Regularised:
         nx = n if states else 0
         B1 = np.hstack([problem.B1, level * np.eye(n)[:, :nx], np.zeros((n, ny))])
         C1 = np.vstack([problem.C1, level * np.eye(n)[:nx], np.zeros((nu, n))])
-        D12 = np.vstack([problem.D12, np.zeros((nx, nu)), level * np.eye(nu)])
-        D21 = np.hstack([problem.D21, np.zeros((ny, nx)), level * np.eye(ny)])
+        effort, noise = (level * np.diag(sizes) for sizes in problem.own_sizes)
+        D12 = np.vstack([problem.D12, np.zeros((nx, nu)), effort])
+        D21 = np.hstack([problem.D21, np.zeros((ny, nx)), noise])
         D11 = la.block_diag(problem.D11, np.zeros((nu + nx, ny + nx)))
-        z_turn, self._u = normalised(D12, np.ones(nu))
-        w_turn, y_scale = normalised(D21.T, np.ones(ny))
+        z_turn, self._u = normalised(D12, np.zeros(nu))
+        w_turn, y_scale = normalised(D21.T, np.zeros(ny))
         self._y = y_scale.T
         self.problem = problem.replace(
             B1=B1 @ w_turn,
@@ -102,7 +122,6 @@ class _Found(NamedTuple):
     level: float
     K: StateSpace
     gamma: float
-    claimed: float
 
     @property
     def speed(self) -> float:
@@ -113,6 +132,7 @@ def made_regular(
     problem: Prepared,
     solve: Callable[[Prepared], SolvedController],
     lacking: Sequence[str],
+    norm: Callable[[StateSpace], float] = hinf_norm,
 ) -> SolvedController:
     """Return the controller of a singular problem, found with a little noise and effort added.
 
@@ -124,6 +144,8 @@ def made_regular(
         Solves a regular problem.
     lacking : sequence of str
         What makes the problem singular, in words.
+    norm : callable
+        The norm of a closed loop; infinite when it is not stable.
 
     Raises
     ------
@@ -134,11 +156,9 @@ def made_regular(
     """
     found: list[_Found] = []
     errors: list[FlexplantError] = []
-    for level in (*_LEVELS, _LAST):
-        if level == _LAST and found:
-            break
+    for level in _LEVELS:
         try:
-            found.append(_solved(problem, solve, level))
+            found.append(_with_level(problem, solve, norm, level))
         except FlexplantError as error:
             errors.append(error)
             continue
@@ -149,11 +169,14 @@ def made_regular(
     least = min(one.gamma for one in found)
     _require_positive_infimum(problem, found, lacking)
     index = next(i for i, one in enumerate(found) if one.gamma <= least * (1.0 + _COST))
-    return _with_notes(found[index], found[min(index + 1, len(found) - 1)], lacking, problem)
+    return _with_notes(found, index, lacking, problem)
 
 
-def _solved(
-    problem: Prepared, solve: Callable[[Prepared], SolvedController], level: float
+def _with_level(
+    problem: Prepared,
+    solve: Callable[[Prepared], SolvedController],
+    norm: Callable[[StateSpace], float],
+    level: float,
 ) -> _Found:
     """Return the controller for one level, judged on the problem itself."""
     regular = Regularised(problem, level)
@@ -162,35 +185,42 @@ def _solved(
     except AssumptionError:  # a mode on the stability boundary is missed by w or z
         regular = Regularised(problem, level, states=True)
         answer = solve(regular.problem)
-    K = StateSpace(*regular.restored(answer), inputs=problem.y, outputs=problem.u)
-    loop = lft(problem.system, K)
-    if not loop.is_stable:
+    system = problem.system
+    A, B, C, D = regular.restored(answer)
+    K = StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u, dt=system.dt)
+    gamma = norm(lft(system, K))
+    if not np.isfinite(gamma):
         raise SolverError(
             f"with noise and effort of {level:.0e} added, the controller does not stabilise in "
-            "rounding. Weight the efforts in z and give each sensor noise in w."
+            "rounding, or a mode that z and w miss stays on the edge of stability. Weight the "
+            "efforts and that motion in z, and give each sensor noise in w."
         )
-    return _Found(level, K, peak_gain(loop)[0], answer.gamma)
+    return _Found(level, K, gamma)
 
 
 def _require_positive_infimum(
     problem: Prepared, found: Sequence[_Found], lacking: Sequence[str]
 ) -> None:
     gammas = [one.gamma for one in found]
+    least = int(np.argmin(gammas))
+    settled = any(later < _SETTLED * gammas[least] for later in gammas[least + 1 :])
+    gammas = gammas[: least + 1]
     falls = all(b < _FALL * a for a, b in pairwise(gammas))
-    if len(found) < 3 or not falls:
+    if len(gammas) < 3 or settled or not falls:
         return
     raise InfeasibleError(
         f"there is no smallest gamma: the infimum is 0. With noise and effort of "
-        f"{found[0].level:.0e} to {found[-1].level:.0e} added, {gammas[0]:.3g} to {gammas[-1]:.3g} "
-        f"are reached by ever larger gains, with which u ({', '.join(problem.u)}) cancels w in z "
-        f"at no cost. {'; '.join(lacking)}. Weight the efforts in z and give the sensors noise "
-        "in w."
+        f"{found[0].level:.0e} to {found[least].level:.0e} added, {gammas[0]:.3g} to "
+        f"{gammas[-1]:.3g} are reached by ever larger gains, with which u "
+        f"({', '.join(problem.u)}) cancels w in z at no cost. {'; '.join(lacking)}. "
+        f"{_cure(lacking)}"
     )
 
 
 def _with_notes(
-    one: _Found, finer: _Found, lacking: Sequence[str], problem: Prepared
+    found: Sequence[_Found], index: int, lacking: Sequence[str], problem: Prepared
 ) -> SolvedController:
+    one, finer = found[index], found[min(index + 1, len(found) - 1)]
     K = one.K
     cost = max(one.gamma / finer.gamma - 1.0, 0.0)
     note = (
@@ -204,13 +234,16 @@ def _with_notes(
             else "; a tenth of it gives no smaller gamma"
         )
     notes = [note + "."]
-    if cost > _SAME and finer.speed > _GROWTH * one.speed:
+    if any(
+        a.gamma > b.gamma * (1.0 + _SAME) and b.speed > _GROWTH * a.speed
+        for a, b in pairwise(found[max(index - 1, 0) : index + 2])
+    ):
         notes.append(
             "the smallest gamma is approached by infinite gain only: the controller's fastest pole "
             f"lies at {problem.speed * one.speed:.3g} rad/s and moves on as the added noise falls. "
-            "Weight the efforts and give the sensors noise to get a slower one."
+            f"{_cure(lacking)[:-1]} to get a slower one."
         )
-    certificate = {"added noise": one.level}
+    certificate = {ADDED: one.level}
     if finer is not one:
         certificate["gamma with a tenth of it"] = finer.gamma
     return SolvedController(K.A, K.B, K.C, K.D, one.gamma, 0.0, certificate, tuple(notes))

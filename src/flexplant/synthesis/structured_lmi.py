@@ -103,7 +103,16 @@ class StructuredLmi(Value):
         SolverError
             When the method stops early, or no controller keeps what the LMIs promise.
         """
-        found = self.smallest(problem)
+        return self.controller(problem, self.smallest(problem))
+
+    def controller(self, problem: Prepared, found: SmallestGamma) -> SolvedController:
+        """Return the controller for the smallest gamma that was found.
+
+        Raises
+        ------
+        SolverError
+            When no controller keeps what the LMIs promise.
+        """
         failures = []
         for back_off in self.back_off * _LOOSER:
             for point in found.points_below(1.0 + back_off)[:_POINTS]:

@@ -1,0 +1,168 @@
+"""The methods of H-infinity synthesis in turn, each answer judged by its own closed loop."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from ..errors import FlexplantError, InfeasibleError
+from ..lti.interconnection import lft
+from ..lti.preparation import Prepared
+from ..lti.responses import remembered, responder
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray
+from .certificate import certified_norm
+from .lower_bound import lower_bound, pointwise_bound
+from .method import SolvedController, SynthesisMethod
+from .riccati import Riccati
+from .singular import ADDED
+from .structured_lmi import SmallestGamma, StructuredLmi
+
+#: an answer so close to the lower bound is taken at once (the methods stay 5 % away from it)
+_CLOSE = 1.06
+#: and one so close to the best, found earlier, is preferred to it
+_SAME = 1.02
+#: problems of at most so many states go to the LMIs where no answer is close
+_SMALL = 40
+#: and have so long [s] where there is an answer already, and where there is none
+_SECONDS, _LONG = 10.0, 60.0
+
+
+class Answer(NamedTuple):
+    """A controller of the user's plant, what was verified of its loop, and how it was found."""
+
+    method: SynthesisMethod
+    found: SolvedController
+    controller: StateSpace
+    loop: StateSpace
+    respond: Callable[[FloatArray], ComplexArray]
+    certificate: dict[str, float]
+    lower: float
+
+    @property
+    def gamma(self) -> float:
+        """The verified norm."""
+        return self.certificate["norm"]
+
+    @property
+    def is_close(self) -> bool:
+        """Whether no controller can do much better."""
+        return self.gamma <= _CLOSE * self.lower
+
+
+def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
+    """Return the answer of one method, verified on the plant.
+
+    Raises
+    ------
+    FlexplantError
+        Whatever the method raises.
+    CertificateError
+        When the closed loop does not keep the promise.
+    """
+    one = _verified(plant, problem, method, method.solve(problem))
+    return one._replace(lower=lower_bound(problem, one.gamma, one.lower))
+
+
+def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) -> Answer:
+    """Return the first answer that is close to its lower bound, or the best of all methods.
+
+    Raises
+    ------
+    FlexplantError
+        When no method gives a controller: what the first one found, then what else was tried.
+    """
+    search = _Search(plant, problem)
+    riccati = Riccati(progress=progress)
+    search.attempt("Riccati()", riccati, riccati.solve)
+    small = 0 < problem.A.shape[0] <= _SMALL
+    if not search.is_close and small:
+        lmi = StructuredLmi(time_limit=_SECONDS if search.answers else _LONG, progress=progress)
+        bound = search.bounded(lmi)
+    if not search.is_close and not search.has_added:
+        added = Riccati(regularised=True, progress=progress)
+        search.attempt("Riccati(regularised=True)", added, added.solve)
+    if not search.is_close and small and bound is not None:
+        search.attempt("StructuredLmi()", lmi, lambda p: lmi.controller(p, bound))
+    return search.best()
+
+
+class _Search:
+    """The answers so far, the largest lower bound, and what failed."""
+
+    def __init__(self, plant: StandardPlant, problem: Prepared) -> None:
+        self.plant, self.problem = plant, problem
+        self.answers: list[Answer] = []
+        self.failures: list[tuple[str, FlexplantError]] = []
+        self.lower = pointwise_bound(problem)
+
+    @property
+    def is_close(self) -> bool:
+        return any(one.gamma <= _CLOSE * self.lower for one in self.answers)
+
+    @property
+    def has_added(self) -> bool:
+        return any(ADDED in one.found.certificate for one in self.answers)
+
+    def attempt(
+        self,
+        name: str,
+        method: SynthesisMethod,
+        solve: Callable[[Prepared], SolvedController],
+    ) -> None:
+        """Keep the answer of a method, or why it failed.
+
+        Raises
+        ------
+        InfeasibleError
+            When there is none: no other method finds what does not exist.
+        """
+        try:
+            one = _verified(self.plant, self.problem, method, solve(self.problem))
+        except InfeasibleError:
+            if not self.answers:
+                raise
+        except FlexplantError as error:
+            self.failures.append((name, error))
+        else:
+            self.answers.append(one)
+            self.lower = max(self.lower, one.lower)
+
+    def bounded(self, lmi: StructuredLmi) -> SmallestGamma | None:
+        """Return what the LMIs say of the smallest gamma, and raise the lower bound to it."""
+        try:
+            found = lmi.smallest(self.problem)
+        except FlexplantError as error:
+            self.failures.append(("StructuredLmi()", error))
+            return None
+        self.lower = max(self.lower, found.lower)
+        return found
+
+    def best(self) -> Answer:
+        """Return the answer with the smallest gamma, or an earlier one that is as good.
+
+        Raises
+        ------
+        FlexplantError
+            When there is none.
+        """
+        if self.answers:
+            least = min(one.gamma for one in self.answers)
+            one = next(one for one in self.answers if one.gamma <= _SAME * least)
+            return one._replace(lower=min(self.lower, one.gamma))
+        (_, first), *others = self.failures
+        said = [f"{name}: {'the same' if str(e) == str(first) else e}" for name, e in others]
+        raise type(first)(str(first) + (f" (Tried besides: {' '.join(said)})" if said else ""))
+
+
+def _verified(
+    plant: StandardPlant, problem: Prepared, method: SynthesisMethod, found: SolvedController
+) -> Answer:
+    controller = problem.restored(found.A, found.B, found.C, found.D).replace(
+        name="hinf", units=plant.units
+    )
+    loop = lft(plant.system, controller)
+    respond = remembered(responder(loop))  # swept twice over the same frequencies
+    certificate = certified_norm(loop, found.gamma, respond)
+    return Answer(method, found, controller, loop, respond, certificate, found.lower)

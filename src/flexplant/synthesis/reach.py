@@ -1,0 +1,65 @@
+"""Whether any controller can stabilise: u reaches, and y sees, each mode that is not stable."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..errors import AssumptionError
+from ..lti.preparation import Prepared
+
+#: relative: poles so small are zero, real parts above this are not stable
+_ZERO, _STABLE = 1e-6, -1e-10
+#: relative: a singular value of Hautus' matrix that is zero
+_MISSED = 1e-12
+
+
+def require_reach(problem: Prepared) -> None:
+    """Raise AssumptionError when u does not reach, or y does not see, a pole that is not stable.
+
+    Weights included. Hautus' rank test in the prepared coordinates, whatever the user's units.
+    """
+    A = problem.A
+    poles = np.linalg.eigvals(A)
+    size = max(float(np.linalg.norm(A, 2)) if A.size else 0.0, 1e-300)
+    # the poles of a chain of integrators come out of rounding as a ring around zero
+    poles = np.where(np.abs(poles) < _ZERO * size, 0.0, poles)
+    for pole in poles[poles.real > _STABLE * size]:
+        for matrix, gain, text in (
+            (A, problem.B2, f"u ({', '.join(problem.u)}) does not reach"),
+            (A.T, problem.C2.T, f"y ({', '.join(problem.y)}) does not see"),
+        ):
+            reach = size * gain / max(float(np.linalg.norm(gain, 2)), 1e-300)
+            pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
+            if np.linalg.svd(pencil, compute_uv=False)[-1] < _MISSED * size:
+                raise AssumptionError(
+                    f"{text} a mode of the plant or of a weight that is not stable "
+                    f"({_described(problem, complex(pole))}): no controller can stabilise it. "
+                    "Add or move an actuator or a sensor, or give the weight finite gain."
+                )
+
+
+def beyond_rounding(problem: Prepared) -> str:
+    """Return why no controller stabilises a problem in rounding, and what to do, in words."""
+    poles = np.linalg.eigvals(problem.A)
+    unstable = poles[poles.real > _ZERO * float(np.linalg.norm(problem.A, 2))]
+    if not unstable.size:
+        return (
+            "the plant is too badly conditioned. Weight z and w so that their sizes are alike "
+            "(metres beside newtons are not; stage_weights), or leave out states that u hardly "
+            "reaches or y hardly sees."
+        )
+    growth = problem.speed * float(np.max(unstable.real))
+    return (
+        f"the plant has {unstable.size} unstable pole(s), growing e-fold in {1.0 / growth:.3g} s, "
+        f"which u ({', '.join(problem.u)}) and y ({', '.join(problem.y)}) can hold only with gains "
+        "that 16 digits do not resolve. Add actuators and sensors that act on these modes one by "
+        "one, or correct the model where the machine is stable (signs of stiffness and damping)."
+    )
+
+
+def _described(problem: Prepared, pole: complex) -> str:
+    if abs(pole.imag) > _ZERO and abs(pole.imag) > pole.real:
+        return f"at {problem.frequency(abs(pole.imag)):.3g} Hz"
+    if pole.real > _ZERO:
+        return f"it grows e-fold in {1.0 / (problem.speed * pole.real):.3g} s"
+    return "at 0 Hz: rigid-body or integrating"

@@ -1,0 +1,187 @@
+"""The default call of design_hinf: units, rounding and methods that fail are not the caller's."""
+
+import numpy as np
+import pytest
+import scipy.signal
+
+import oracles_synthesis as oracle
+from flexplant.errors import AssumptionError, InfeasibleError, SolverError
+from flexplant.lti import StateSpace
+from flexplant.synthesis import Riccati, attempts, design_hinf
+
+
+def structure(seed, w=1, u=1, z=1, y=1, noise=0.0, effort=0.0, modes=3):
+    """Modes of 0.3 % damping between 10 and 100 Hz: A, B, C, D in [N] and [m], w forces.
+
+    Noise and effort are given in what the plant itself does on the channel, z and y in w.
+    """
+    rng = np.random.default_rng(seed)
+    omega = 2 * np.pi * np.geomspace(10.0, 100.0, modes)
+    A = np.block(
+        [[np.zeros((modes, modes)), np.eye(modes)], [-np.diag(omega**2), -np.diag(6e-3 * omega)]]
+    )
+    efforts, noises = u * bool(effort), y * bool(noise)
+    B = np.zeros((2 * modes, w + noises + u))
+    C = np.zeros((z + efforts + y, 2 * modes))
+    forces, motions = rng.normal(size=(modes, w + u)), rng.normal(size=(z + y, modes))
+    B[modes:] = np.insert(forces, [w] * noises, 0.0, axis=1)
+    C[:, :modes] = np.insert(motions, [z] * efforts, 0.0, axis=0)
+    D = np.zeros((C.shape[0], B.shape[1]))
+    size = np.abs(C @ np.linalg.solve(200.0 * np.exp(0.25j * np.pi) * np.eye(2 * modes) - A, B))
+    if effort:
+        D[z : z + u, -u:] = effort * size[:z, -u:].max() * np.eye(u)
+    if noise:
+        D[-y:, w : w + y] = noise * size[-y:, :w].max() * np.eye(y)
+    return A, B, C, D
+
+
+def solved(A, B, C, D, u=1, y=1, dt=0.0, method=None):
+    """The design, its loop judged from dense matrices."""
+    names = [f"u{i}" for i in range(u)], [f"y{i}" for i in range(y)]
+    P = StateSpace(
+        A,
+        B,
+        C,
+        D,
+        dt,
+        inputs=[*(f"w{i}" for i in range(B.shape[1] - u)), *names[0]],
+        outputs=[*(f"z{i}" for i in range(C.shape[0] - y)), *names[1]],
+    )
+    found = design_hinf(P, method, u=names[0], y=names[1])
+    K = found.system
+    loop = oracle.closed_loop(oracle.split(A, B, C, D, u, y), K.A, K.B, K.C, K.D)
+    assert oracle.stability(loop[0], dt) < 0
+    assert oracle.brute_norm(*loop, dt) == pytest.approx(found.gamma, rel=2e-3, abs=0)
+    return found
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-2])
+def test_the_rounding_of_tustin_gives_no_rank(noise):
+    """It keeps norms, so gamma; its D12 and D21 at half the rate are zero but for rounding."""
+    plant = structure(5, w=2, noise=noise)
+    best = solved(*plant)
+    A, B, C, D, dt = scipy.signal.cont2discrete(plant, 1e-3, method="bilinear")
+    at_half_the_rate = C @ np.linalg.solve(-np.eye(A.shape[0]) - A, B) + D
+    assert 0 < abs(at_half_the_rate[0, -1]) < 1e-10 * best.gamma
+    found = solved(A, B, C, D, dt=dt)
+    assert found.gamma == pytest.approx(best.gamma, rel=1e-2, abs=0)
+    assert found.notes[0].startswith("D12 has rank 0 of 1")
+    assert ("D21 has rank 0 of 1" in found.notes[0]) == (not noise)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_singular_structures_sampled_with_a_hold_are_served(seed):
+    plant = structure(seed, w=2, z=2, modes=4)
+    A, B, C, D, dt = scipy.signal.cont2discrete(plant, 2e-4, method="zoh")
+    found, best = solved(A, B, C, D, dt=dt), solved(*plant)
+    # the hold is a small delay
+    assert best.lower * 0.99 <= found.gamma <= 1.1 * best.gamma
+
+
+def test_d12_and_d21_of_rounding_are_zero():
+    A, B, C, D = structure(5, w=2)
+    best = solved(A, B, C, D).gamma
+    for size in (1e-17, 1e-14):
+        dirty = D.copy()
+        dirty[:1, 2:] = dirty[1:, :1] = size * best
+        assert solved(A, B, C, dirty).gamma == pytest.approx(best, rel=1e-6, abs=0)
+
+
+@pytest.mark.parametrize("tiny", [1e-6, 1e-8, 1e-10, 1e-12])
+def test_tiny_efforts_and_noises_beside_ordinary_ones(tiny):
+    """Gamma is between that of no effort and of a larger one, and the same within the back-off."""
+    A, B, C, D = structure(1, w=2, u=2, z=2, y=2, noise=1e-2, effort=1e-2)
+    small = D.copy()
+    small[3] *= tiny
+    small[-1] *= tiny
+    free = D.copy()
+    free[3] = free[-1] = 0.0
+    found, best = solved(A, B, C, small, 2, 2), solved(A, B, C, free, 2, 2)
+    assert best.lower * (1 - 1e-3) <= found.gamma <= 1.03 * best.gamma
+    assert found.gamma <= 1.08 * found.lower
+
+
+def test_units_of_u_and_y_change_nothing():
+    A, B, C, D = structure(2, w=2, u=2, z=2, y=2, noise=1e-2, effort=1e-2)
+    best = solved(A, B, C, D, 2, 2).gamma
+    columns, rows = np.ones(B.shape[1]), np.ones(C.shape[0])
+    columns[-2:], rows[-2:] = (1e-9, 1e3), (1e3, 1e-9)
+    D = rows[:, None] * D * columns
+    found = solved(A, B * columns, rows[:, None] * C, D, 2, 2)
+    assert found.gamma == pytest.approx(best, rel=1e-6, abs=0)
+
+
+def test_motions_in_nanometres_beside_efforts_in_kilonewtons():
+    """z is what it is, 1e-9 beside 1e3: gamma is that of the large channels."""
+    A, B, C, D = structure(3, w=2, z=2, effort=1e-2, noise=1e-2)
+    alone = solved(A, B, np.delete(C, 0, axis=0), np.delete(D, 0, axis=0))
+    rows = np.array([1e-12, 1.0, 1.0, 1.0])
+    found = solved(A, B, rows[:, None] * C, rows[:, None] * D)
+    assert found.gamma == pytest.approx(alone.gamma, rel=1e-2, abs=0)
+
+
+def test_a_method_that_fails_leaves_the_problem_to_the_next(monkeypatch):
+    plant = structure(5, w=2)
+    best = solved(*plant)
+
+    def failing(self, problem):
+        raise SolverError("these equations were not solved.")
+
+    monkeypatch.setattr(Riccati, "_regular", failing)
+    found = solved(*plant)
+    assert "by StructuredLmi" in found.method
+    assert found.gamma == pytest.approx(best.gamma, rel=0.05, abs=0)
+    assert found.lower == pytest.approx(best.lower, rel=1e-2, abs=0)
+
+
+def test_where_all_fail_each_says_why(monkeypatch):
+    plant = structure(5, w=2)
+
+    def failing(self, problem):
+        raise SolverError("these equations were not solved.")
+
+    monkeypatch.setattr(Riccati, "_regular", failing)
+    monkeypatch.setattr(attempts, "_LONG", 1e-3)
+    message = (
+        r"^these equations were not solved\. \(Tried besides: StructuredLmi\(\): the time limit "
+        r"of 0\.001 s was reached after 1 steps, .* Riccati\(regularised=True\): the same\)$"
+    )
+    with pytest.raises(SolverError, match=message):
+        solved(*plant)
+
+
+def test_nothing_is_added_where_it_must_not_be():
+    with pytest.raises(
+        AssumptionError,
+        match=r"D12 has rank 0 of 1.*; D21 has .*\. Weight the efforts in z and give each",
+    ):
+        solved(*structure(5), method=Riccati(regularised=False))
+    with pytest.raises(
+        AssumptionError, match=r"^D21 has rank 0 of 1: .*\. Give each sensor noise in w\."
+    ):
+        solved(*structure(5, effort=1e-2), method=Riccati(regularised=False))
+    plant = structure(5, w=2, noise=1e-2, effort=1e-2)
+    plain, added = solved(*plant), solved(*plant, method=Riccati(regularised=True))
+    assert not plain.notes
+    assert added.certificate["added noise"] <= 1e-3
+    assert added.gamma == pytest.approx(plain.gamma, rel=1e-2, abs=0)
+
+
+def test_an_infimum_of_zero_is_found_before_rounding_hides_it():
+    """Force and motion at one place, seen without noise: u cancels w, gamma falls to rounding."""
+    A, B, C, D = structure(0)
+    B[:, 1], C[:, : A.shape[0] // 2] = B[:, 0], B[A.shape[0] // 2 :, 0]
+    with pytest.raises(InfeasibleError, match=r"the infimum is 0\. .* Weight the efforts in z"):
+        solved(A, B, C, D)
+
+
+def test_poles_that_no_gain_holds_in_rounding_are_counted():
+    rng = np.random.default_rng(4006)
+    A = rng.normal(size=(6, 6))
+    A += (100.0 - np.max(np.linalg.eigvals(A).real)) * np.eye(6)
+    message = (
+        r"the plant has 6 unstable pole\(s\), growing e-fold in 0\.01 s, which u \(u0\) "
+        r"and y \(y0\) .* Add actuators and sensors"
+    )
+    with pytest.raises(SolverError, match=message):
+        solved(A, rng.normal(size=(6, 3)), rng.normal(size=(3, 6)), np.zeros((3, 3)))
