@@ -8,10 +8,9 @@ from typing import NamedTuple
 from ..errors import FlexplantError, InfeasibleError
 from ..lti.interconnection import lft
 from ..lti.preparation import Prepared
-from ..lti.responses import remembered, responder
+from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray
 from .certificate import certified_norm
 from .lower_bound import lower_bound, pointwise_bound
 from .method import SolvedController, SynthesisMethod
@@ -36,7 +35,7 @@ class Answer(NamedTuple):
     found: SolvedController
     controller: StateSpace
     loop: StateSpace
-    respond: Callable[[FloatArray], ComplexArray]
+    respond: Responder
     certificate: dict[str, float]
     lower: float
 
