@@ -23,7 +23,7 @@ from .statespace import StateSpace
 
 #: a direction of D12 or D21 that is smaller beside what the plant does on its channels is missing
 _RANK = 1e-9
-#: where the plant's answers are looked at: at its own speed, away from its resonances
+#: where the plant's answers are taken: at its own speed, away from its resonances
 _POINT, _DIRECT = complex(np.exp(0.25j * np.pi)), complex(1.5 * np.exp(1j))
 #: part of the motion of the states that counts for a channel which z or w does not know
 _HIDDEN = 1e-3
