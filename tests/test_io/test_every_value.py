@@ -110,6 +110,9 @@ def made():
     yield from (static, servo, loop, point, response)
     law = fx.Pid(1e3, 1.0, 20.0, 200.0) * fx.Lead(30.0) * fx.Notch(300.0) * fx.LowPass(400.0)
     yield from (*law.factors, law, fx.design_loops(sampled, law))
+    zero, one = np.zeros(1), {"mode6:freq": 1.0}
+    yield synthesis.RobustStability(0.5, 0.4, 10.0, one, plant, zero, zero, {"machines": 1.0})
+    yield synthesis.WorstCaseGain(2.0, 1.9, 1.0, 10.0, one, plant, zero, zero)
     yield from of_estimators(sampled, small)
     yield from (fx.Riccati(), fx.testbeds.wafer_stage(), sensors, solution)
     more = a_system()
@@ -118,6 +121,9 @@ def made():
         lti.split_stable(more),
         synthesis.Lmi(),
         synthesis.StructuredLmi(),
+        synthesis.RepeatedScalar(2),
+        synthesis.FullBlock(2, 3),
+        synthesis.mu(np.diag([1.0, 2.0]), [synthesis.FullBlock()] * 2),
         placement.Exchange(),
         placement.BranchAndBound(gap=0.1),
     )

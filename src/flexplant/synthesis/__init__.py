@@ -14,6 +14,14 @@ from .loop_design import design_loops as design_loops
 from .ncf import design_ncf as design_ncf
 from .ncf import ncf_margin as ncf_margin
 from .riccati import Riccati as Riccati
+from .robustness.blocks import FullBlock as FullBlock
+from .robustness.blocks import RepeatedScalar as RepeatedScalar
+from .robustness.gain import WorstCaseGain as WorstCaseGain
+from .robustness.gain import worst_case_gain as worst_case_gain
+from .robustness.mu import MuBounds as MuBounds
+from .robustness.mu import mu as mu
+from .robustness.stability import RobustStability as RobustStability
+from .robustness.stability import robust_stability as robust_stability
 from .servo import design_servo as design_servo
 from .servo import servo_bandwidth as servo_bandwidth
 from .structured_lmi import StructuredLmi as StructuredLmi

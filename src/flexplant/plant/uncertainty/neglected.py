@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -11,11 +12,14 @@ from ...errors import CertificateError, ModelError
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import append
 from ...lti.statespace import StateSpace, System
-from ...values import ComplexArray, FloatArray, Value, whole
-from ..building import with_modes_of
+from ...values import ComplexArray, FloatArray, IntArray, Value, whole
+from ..building import sampled_like, with_modes_of
 from ..partition import Partition, is_plant
 from ..realisation import Structure
 from .covering import covering
+
+#: a plant and the larger one, without rigid-body motions
+Pair: TypeAlias = tuple[StateSpace, StateSpace]
 
 #: the weights lie this far above the largest difference found
 _MARGIN = 1.05
@@ -49,6 +53,9 @@ class NeglectedModes(Value):
         Largest singular value of Delta over the frequencies that verified the bound: at most 1.
     looseness : float
         Median of its inverse, over the logarithm of frequency.
+    sampled : NeglectedModes, optional
+        The same bound for the sampled plant, delay and folding included: its weights are those of
+        the bilinear frequency ``tan(pi f dt) / (pi dt)``, in which a sampled plant is continuous.
     """
 
     weights: StateSpace
@@ -58,9 +65,26 @@ class NeglectedModes(Value):
     mirrored: Mapping[str, str]
     tightest: float
     looseness: float
+    sampled: NeglectedModes | None = None
 
     def __post_init__(self) -> None:
-        self._set(scales=self.scales, mirrored=dict(self.mirrored))
+        outputs, inputs = tuple(self.outputs), tuple(self.inputs)
+        self._set(scales=self.scales, mirrored=dict(self.mirrored), inputs=inputs, outputs=outputs)
+
+    def narrowed(self, outputs: Sequence[str]) -> NeglectedModes:
+        """Return the bound on some of the outputs, with the states of their weights alone."""
+        W = self.weights
+        heads = tuple(f"{name}:neglected:" for name in outputs)
+        kept = np.array([name.startswith(heads) for name in W.states], dtype=bool)
+        rows = W.output_index(outputs)
+        weights = StateSpace(
+            W.A[np.ix_(kept, kept)], W.B[np.ix_(kept, rows)], W.C[np.ix_(rows, kept)],
+            W.D[np.ix_(rows, rows)], W.dt, inputs=outputs, outputs=outputs,
+            states=[name for name, own in zip(W.states, kept, strict=True) if own],
+            blocks=_blocks_of(W, np.flatnonzero(kept)),
+        )  # fmt: skip
+        mirrored = {name: of for name, of in self.mirrored.items() if of in outputs}
+        return self.replace(weights=weights, outputs=tuple(outputs), mirrored=mirrored)
 
     def __repr__(self) -> str:
         return (
@@ -104,10 +128,18 @@ def neglected_modes(
     CertificateError
         When the verification finds a larger difference than the weights.
     """
-    small = Partition.of(plant).continuous
+    given = Partition.of(plant)
+    small = given.continuous
     big = Partition.of(larger).continuous if is_plant(larger) else with_modes_of(small, larger)
     follow = whole(resonances, "resonances")
-    pair = _elastic(small, big)
+    found = _bounded(_elastic(small, big), follow)
+    if not given.dt:
+        return found
+    return found.replace(sampled=_bounded(_elastic(given, sampled_like(given, big)), follow))
+
+
+def _bounded(pair: Pair, follow: int) -> NeglectedModes:
+    """Return the weights that bound the difference of two systems."""
     pair, mirrored = _distinct(*pair)
     if not pair[0].outputs or not pair[0].inputs:
         raise ModelError("the larger model does not differ from the plant: nothing is neglected.")
@@ -177,12 +209,12 @@ def opened(system: StateSpace, neglected: NeglectedModes, deltas: int) -> StateS
     if system.blocks is not None and W.blocks is not None:
         blocks = [*system.blocks, *W.blocks]
     return StateSpace(
-        A, B, C, D, inputs=inputs, outputs=outputs, states=[*system.states, *W.states],
+        A, B, C, D, system.dt, inputs=inputs, outputs=outputs, states=[*system.states, *W.states],
         name=system.name, blocks=blocks,
     )  # fmt: skip
 
 
-def _elastic(small: Partition, big: Partition) -> tuple[StateSpace, StateSpace]:
+def _elastic(small: Partition, big: Partition) -> Pair:
     """Return both systems with the channels of the small one, without their rigid-body motions."""
     names = (*small.z, *small.y), (*small.w, *small.u)
     if not set(names[0]) <= set(big.system.outputs) or not set(names[1]) <= set(big.system.inputs):
@@ -201,10 +233,18 @@ def _elastic(small: Partition, big: Partition) -> tuple[StateSpace, StateSpace]:
         bodies.append(np.asarray(body))
         systems.append(StateSpace(
             g.A[np.ix_(kept, kept)], g.B[kept], g.C[:, kept], g.D,
-            inputs=g.inputs, outputs=g.outputs,
+            g.dt, inputs=g.inputs, outputs=g.outputs, blocks=_blocks_of(g, kept),
         ))  # fmt: skip
     _same_body(*bodies)
     return systems[0], systems[1]
+
+
+def _blocks_of(g: StateSpace, kept: IntArray) -> list[int] | None:
+    """Return the sizes of the blocks of A that are kept, each of them whole."""
+    if g.blocks is None:
+        return None
+    owner = np.repeat(np.arange(len(g.blocks)), g.blocks)[kept]
+    return [g.blocks[i] for i in np.unique(owner).tolist()]
 
 
 def _same_body(one: FloatArray, other: FloatArray) -> None:
@@ -219,13 +259,11 @@ def _same_body(one: FloatArray, other: FloatArray) -> None:
         )
 
 
-def _distinct(
-    small: StateSpace, big: StateSpace
-) -> tuple[tuple[StateSpace, StateSpace], dict[str, str]]:
+def _distinct(small: StateSpace, big: StateSpace) -> tuple[Pair, dict[str, str]]:
     """Return the pair with the channels that differ, each output once, and which are mirrored."""
     probe = _grid(_swinging(small, big))[1::7]
     gap = _gap((small, big), probe)
-    size = np.abs(frequency_response(big, probe).data)
+    size = np.abs(_response(big, probe))
     moved = np.abs(gap).max(axis=2) > _ROUNDING * size.max(axis=2).max(initial=0.0)
     rows, columns = np.flatnonzero(moved.any(axis=1)), np.flatnonzero(moved.any(axis=0))
     kept: list[int] = []
@@ -243,8 +281,9 @@ def _distinct(
 
 def _swinging(small: StateSpace, big: StateSpace) -> ComplexArray:
     """Return the poles of both in the upper half plane, slowest first, each once."""
-    poles = np.concatenate([big.poles(), small.poles()])
-    poles = poles[poles.imag > 0]
+    poles = np.concatenate([_poles(big), _poles(small)])
+    # the rounding of delays at z = 0 has no frequency
+    poles = poles[(poles.imag > 0) & (-poles.real < 0.99 * np.abs(poles))]
     if not poles.size:
         raise ModelError("neither model has an elastic mode: nothing is neglected.")
     found: list[complex] = []
@@ -271,9 +310,21 @@ def _verifying(grid: FloatArray, poles: ComplexArray) -> FloatArray:
     return np.unique(np.concatenate([[0.0], beside.ravel(), *inner]))
 
 
-def _gap(pair: tuple[StateSpace, StateSpace], grid: FloatArray) -> ComplexArray:
+def _poles(g: StateSpace) -> ComplexArray:
+    """Return the poles [rad/s], of a sampled system in its bilinear frequency."""
+    poles = g.poles()
+    return np.asarray(2.0 / g.dt * (poles - 1.0) / (poles + 1.0)) if g.dt else poles
+
+
+def _response(g: StateSpace, grid: FloatArray) -> ComplexArray:
+    """Return the responses, of a sampled system at bilinear frequencies."""
+    freq = np.arctan(np.pi * g.dt * grid) / (np.pi * g.dt) if g.dt else grid
+    return frequency_response(g, freq).data
+
+
+def _gap(pair: Pair, grid: FloatArray) -> ComplexArray:
     """Return the difference of the responses (n_out, n_in, n_freq)."""
-    return frequency_response(pair[1], grid).data - frequency_response(pair[0], grid).data
+    return _response(pair[1], grid) - _response(pair[0], grid)
 
 
 def _evened(gap: ComplexArray) -> tuple[FloatArray, ComplexArray]:

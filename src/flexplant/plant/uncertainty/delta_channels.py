@@ -1,0 +1,273 @@
+"""An uncertain plant with the channels of each Delta side by side, sampled or not."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ...errors import CertificateError, ModelError
+from ...lti.discretisation import bilinear, discretized, tustin
+from ...lti.interconnection import lft
+from ...lti.scaling import state_scale
+from ...lti.statespace import StateSpace
+from ...values import FloatArray
+from .neglected import NeglectedModes, opened
+from .uncertain_plant import UncertainPlant
+
+#: directions of a Delta's change below this, relative to the largest, are left out
+_RANK = 1e-5
+#: relative curvature over a Delta above which another mapping is tried
+_CURVED = 0.01
+#: largest relative distance of the channels from machines at the corners of the uncertainty
+_LARGEST = 0.05
+
+
+class DeltaChannels(NamedTuple):
+    """``[z_Delta; neglected; z; y] = G [w_Delta; neglected; w; u]``, continuous.
+
+    Of a sampled plant G is its bilinear image, with the same gains and stability; the weights of
+    neglected modes are not in it: `neglected` has them.
+    """
+
+    system: StateSpace
+    #: name and number of channels of each Delta, in order
+    deltas: tuple[tuple[str, int], ...]
+    neglected: NeglectedModes | None
+    #: largest relative distance of G from sampled machines at the corners: 0 when continuous
+    distance: float = 0.0
+
+
+def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
+    """Return the channels of an uncertain plant's Deltas, those of each side by side.
+
+    A continuous plant is the exact LFT that `UncertainPlant.system` is. The matrices of a sampled
+    one, mapped to continuous time (``s = 2 / dt (z - 1) / (z + 1)``, which keeps an undamped mode
+    undamped), are nearly affine in the Deltas: each Delta's channels are the difference of the
+    machines at its ends, widened by what is curved, and the whole is compared with machines at
+    corners of the uncertainty.
+
+    Raises
+    ------
+    CertificateError
+        When the sampled machines are further from affine than 5 %.
+    ModelError
+        When the plant is sampled, its Deltas are parameters and its ports have delays.
+    """
+    plant = uncertain.plant
+    if not plant.dt:
+        system, sizes = _grouped(uncertain)
+        return _with_neglected(system, sizes, uncertain.neglected, 0.0)
+    system, sizes = _sampled_channels(uncertain)
+    distance = _distance(uncertain, system, sizes)
+    if distance > _LARGEST:
+        raise CertificateError(
+            f"sampled machines at the corners of the uncertainty lie {100 * distance:.3g} % off "
+            "the affine channels of their Deltas: the uncertainty is too large at this rate. "
+            "Lower deviations, measure better, or raise the rate."
+        )
+    if uncertain.neglected is not None and uncertain.neglected.sampled is None:
+        raise ModelError(
+            "the bound on neglected modes is of a continuous plant, this one is sampled: pass the "
+            "larger model itself, plant.uncertain(fit, neglected=larger)."
+        )
+    sampled = None if uncertain.neglected is None else uncertain.neglected.sampled
+    return _with_neglected(system, sizes, sampled, distance)
+
+
+def _grouped(uncertain: UncertainPlant[Any]) -> tuple[StateSpace, list[tuple[str, int]]]:
+    """Return the continuous system without weights, each Delta's channels side by side."""
+    g, channels, plant = uncertain.system, uncertain.channels, uncertain.plant
+    order, sizes = [], []
+    for delta in uncertain.deltas:
+        own = [channel for channel, name in channels.items() if name == delta.name]
+        order += own
+        sizes.append((delta.name, len(own)))
+    chosen = g.select(
+        [*(f"{name}:z" for name in order), *plant.z, *plant.y],
+        [*(f"{name}:w" for name in order), *plant.w, *plant.u],
+    )
+    if uncertain.neglected is None:
+        return chosen, sizes
+    n = g.n_states - uncertain.neglected.weights.n_states  # the last states are those of weights
+    blocks = None
+    if g.blocks is not None:
+        blocks = list(g.blocks[: int(np.searchsorted(np.cumsum(g.blocks), n, side="right"))])
+    return chosen.replace(
+        A=g.A[:n, :n], B=chosen.B[:n], C=chosen.C[:, :n], states=g.states[:n], blocks=blocks
+    ), sizes
+
+
+def _with_neglected(
+    system: StateSpace,
+    sizes: list[tuple[str, int]],
+    neglected: NeglectedModes | None,
+    distance: float,
+) -> DeltaChannels:
+    if neglected is None:
+        return DeltaChannels(system, tuple(sizes), None, distance)
+    count = len(neglected.outputs)
+    plain = StateSpace(
+        np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)), np.eye(count),
+        inputs=neglected.outputs, outputs=neglected.outputs,
+    )  # fmt: skip
+    total = sum(size for _, size in sizes)
+    whole = opened(system, neglected.replace(weights=plain), total)
+    return DeltaChannels(whole, tuple(sizes), neglected, distance)
+
+
+def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float]) -> StateSpace:
+    """Return the sampled [w; u] -> [z; y] at some values of the Deltas, its states comparable."""
+    plant = uncertain.plant
+    if uncertain.deltas[0].kind != "parameter":
+        exact: StateSpace = uncertain.lft(values).system
+        return exact
+    if plant.assembled.ports.latencies:
+        raise ModelError(
+            "Deltas on the parameters of a fit are sampled with one delay for all actuators, and "
+            "the ports of this plant have delays of their own. Model these by filters."
+        )
+    g, sizes = _grouped(uncertain)
+    amounts = np.concatenate([[values.get(name, 0.0)] * size for name, size in sizes])
+    count = amounts.size
+    block = StateSpace(
+        np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)), np.diag(amounts),
+        inputs=g.outputs[:count], outputs=g.inputs[:count],
+    )  # fmt: skip
+    return discretized(lft(g, block), 1.0 / plant.dt, delay=plant.delay, delayed=plant.u)
+
+
+class _Change(NamedTuple):
+    """Half the difference of the machines at both ends of a Delta, relative to the base."""
+
+    matrix: FloatArray
+    curved: float
+
+
+def _sampled_channels(
+    uncertain: UncertainPlant[Any],
+) -> tuple[StateSpace, list[tuple[str, int]]]:
+    """Return the bilinear image with channels, and the number of each Delta's."""
+    rate, deltas = 1.0 / uncertain.plant.dt, uncertain.deltas
+    machines = {
+        (delta.name, end): sampled_machine(uncertain, {delta.name: end})
+        for delta in deltas
+        for end in (1.0, -1.0)
+    }
+    base = sampled_machine(uncertain, {})
+    slow = bilinear(base, rate)
+    direct, mapped = _EvenUnits.of(base), _EvenUnits.of(slow)
+    found: dict[str, tuple[_Change, _Change]] = {}
+    for delta in deltas:
+        ends = [machines[delta.name, end] for end in (1.0, -1.0)]
+        images = [bilinear(g, rate) for g in ends]
+        found[delta.name] = direct.change(base, *ends), mapped.change(slow, *images)
+    # a mode near half the rate, which the bilinear map sends far away, is affine in z instead
+    far = {
+        delta.mode
+        for delta in deltas
+        if found[delta.name][1].curved > max(_CURVED, found[delta.name][0].curved)
+    }
+    sides: tuple[list[Any], list[Any]] = ([], [])
+    for delta in deltas:
+        side = 0 if delta.mode in far else 1
+        sides[side].append((delta.name, *(direct, mapped)[side].factors(found[delta.name][side])))
+    opened_z = bilinear(_with_channels(base, sides[0]), rate)
+    sizes = [(name, right.shape[0]) for part in sides for name, _, right in part]
+    return _with_channels(slow, sides[1], opened_z), sizes
+
+
+class _EvenUnits(NamedTuple):
+    """Factors of the rows of [A B; C D] and of its columns that even out their sizes."""
+
+    row: FloatArray
+    column: FloatArray
+
+    @classmethod
+    def of(cls, g: StateSpace) -> _EvenUnits:
+        d = state_scale(g.A, g.B, g.C)
+        size = max(float(np.linalg.norm(g.A * d / d[:, None], 2)), 1e-300)
+        into = np.abs(g.B / d[:, None]).max(axis=0, initial=0.0)
+        out = np.abs(g.C * d).max(axis=1, initial=0.0)
+        into, out = (np.where(part > 0, part, 1.0) for part in (into, out))
+        return cls(np.concatenate([1.0 / d, size / out]), np.concatenate([d, size / into]))
+
+    def scaled(self, g: StateSpace) -> FloatArray:
+        whole = np.block([[g.A, g.B], [g.C, g.D]])
+        return np.asarray(self.row[:, None] * whole * self.column)
+
+    def change(self, base: StateSpace, plus: StateSpace, minus: StateSpace) -> _Change:
+        up, down = self.scaled(plus) - self.scaled(base), self.scaled(minus) - self.scaled(base)
+        return _Change(0.5 * (up - down), float(la.norm(0.5 * (up + down)) / la.norm(up - down)))
+
+    def factors(self, change: _Change) -> tuple[FloatArray, FloatArray]:
+        """Return L, R with ``L R`` the change, widened by what is curved."""
+        left, values, right = la.svd(change.matrix, full_matrices=False)
+        rank = int(np.count_nonzero(values > _RANK * values[0]))
+        root = np.sqrt((1.0 + 2.0 * change.curved) * values[:rank])
+        return (left[:, :rank] * root) / self.row[:, None], root[:, None] * right[
+            :rank
+        ] / self.column
+
+
+def _with_channels(
+    g: StateSpace,
+    parts: list[tuple[str, FloatArray, FloatArray]],
+    opened: StateSpace | None = None,
+) -> StateSpace:
+    """Return g with channels of Deltas before its own, after those that `opened` has already."""
+    other = g if opened is None else opened
+    n = g.n_states
+    before = len(other.inputs) - len(g.inputs)
+    names = [f"{name}:{i}" for name, _, right in parts for i in range(1, right.shape[0] + 1)]
+    m, p = len(g.inputs), len(g.outputs)
+    left = np.hstack([np.zeros((n + p, 0)), *(one for _, one, _ in parts)])
+    right = np.vstack([np.zeros((0, n + m)), *(one for _, _, one in parts)])
+    k = len(names)
+    D = np.zeros((before + k + p, before + k + m))
+    D[:before, :before], D[:before, before + k :] = (
+        other.D[:before, :before],
+        other.D[:before, before:],
+    )
+    D[before + k :, :before], D[before + k :, before + k :] = (
+        other.D[before:, :before],
+        other.D[before:, before:],
+    )
+    D[before : before + k, before + k :] = right[:, n:]
+    D[before + k :, before : before + k] = left[n:]
+    return StateSpace(
+        other.A,
+        np.hstack([other.B[:, :before], left[:n], other.B[:, before:]]),
+        np.vstack([other.C[:before], right[:, :n], other.C[before:]]),
+        D,
+        g.dt,
+        inputs=[*other.inputs[:before], *(f"{name}:w" for name in names), *g.inputs],
+        outputs=[*other.outputs[:before], *(f"{name}:z" for name in names), *g.outputs],
+        states=g.states,
+    )
+
+
+def _distance(
+    uncertain: UncertainPlant[Any], system: StateSpace, sizes: list[tuple[str, int]]
+) -> float:
+    """Return how far sampled machines at corners are from the channels, relative to their change.
+
+    In z, where no frequency counts more than another.
+    """
+    base = sampled_machine(uncertain, {})
+    units = _EvenUnits.of(base)
+    count = sum(size for _, size in sizes)
+    found = 0.0
+    for corner in np.random.default_rng(0).choice([-1.0, 1.0], (4, len(sizes))):
+        values = dict(zip([name for name, _ in sizes], corner.tolist(), strict=True))
+        exact = units.scaled(sampled_machine(uncertain, values))
+        block = StateSpace(
+            np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)),
+            np.diag(np.repeat(corner, [size for _, size in sizes])),
+            inputs=system.outputs[:count], outputs=system.inputs[:count],
+        )  # fmt: skip
+        closed = units.scaled(tustin(lft(system, block), 1.0 / base.dt))
+        found = max(found, float(la.norm(exact - closed) / la.norm(exact - units.scaled(base))))
+    return found

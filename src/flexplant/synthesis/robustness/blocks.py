@@ -1,0 +1,227 @@
+"""The structure of an uncertainty: repeated scalars and full blocks, and the scalings it allows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import scipy.linalg as la
+
+from ...errors import ModelError, ShapeError
+from ...values import ComplexArray, FloatArray, IntArray, Value, flag, short, whole
+
+
+@dataclass(frozen=True, eq=False)
+class RepeatedScalar(Value):
+    """An uncertainty ``w = delta z`` on `size` channels alike, delta one number.
+
+    Parameters
+    ----------
+    size : int
+        How many channels it acts on.
+    real : bool
+        Whether delta is a real number (a parameter) or a complex one.
+    name : str
+        For messages.
+    """
+
+    size: int = 1
+    real: bool = True
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        self._set(size=whole(self.size, "size"), real=flag(self.real, "real"))
+
+    @property
+    def w(self) -> int:
+        """Number of its outputs."""
+        return self.size
+
+    @property
+    def z(self) -> int:
+        """Number of its inputs."""
+        return self.size
+
+
+@dataclass(frozen=True, eq=False)
+class FullBlock(Value):
+    """An uncertainty ``w = Delta z``, Delta any complex matrix (w, z): dynamics.
+
+    Parameters
+    ----------
+    w, z : int
+        Numbers of its outputs, which drive the plant, and of its inputs.
+    name : str
+        For messages.
+    """
+
+    w: int = 1
+    z: int = 1
+    name: str = ""
+
+    def __post_init__(self) -> None:
+        self._set(w=whole(self.w, "w"), z=whole(self.z, "z"))
+
+
+Block: TypeAlias = RepeatedScalar | FullBlock
+
+
+def checked_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
+    """Return blocks that fill w outputs and z inputs of an uncertainty.
+
+    Raises
+    ------
+    ModelError
+        When they are no blocks.
+    ShapeError
+        When their sizes do not add up.
+    """
+    if not isinstance(blocks, Sequence) or not blocks or any(
+        not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
+    ):  # fmt: skip
+        raise ModelError(
+            f"blocks must be a list of RepeatedScalar(...) and FullBlock(...), got {short(blocks)}."
+        )
+    found = sum(block.w for block in blocks), sum(block.z for block in blocks)
+    if found != (w, z):
+        raise ShapeError(
+            f"the blocks have {found[0]} outputs and {found[1]} inputs in all, M has {w} inputs "
+            f"and {z} outputs: w = Delta z goes into M. List the blocks in the order of channels."
+        )
+    return tuple(blocks)
+
+
+class Place(NamedTuple):
+    """A block and where its channels are."""
+
+    block: Block
+    w: slice
+    z: slice
+
+
+def places(blocks: Sequence[Block]) -> list[Place]:
+    """Return each block with its channels."""
+    found, w, z = [], 0, 0
+    for block in blocks:
+        found.append(Place(block, slice(w, w + block.w), slice(z, z + block.z)))
+        w, z = w + block.w, z + block.z
+    return found
+
+
+class Scalings:
+    """The matrices S(x) of scalings D and G, linear in real parameters x.
+
+    ::
+
+        S = [ level D_w    j G  ]     F = [I; M]* S [I; M]
+            [   -j G      -D_z  ]       = level D_w - M* D_z M + j (G M - M* G)
+
+    D of a repeated scalar is Hermitian of its size, of a full block a number; G, of real scalars
+    alone, is Hermitian. With F > 0 no w = Delta z of ``|Delta|^2 <= 1 / level`` closes the loop
+    z = M w: level = mu^2 from above (Fan, Tits, Doyle 1991). Blocks that are not `leveled` keep
+    level 1: their Delta is bounded by one (skewed mu).
+
+    Parameters
+    ----------
+    blocks : sequence of blocks
+        In the order of the channels.
+    leveled : sequence of bool, optional
+        One for each block; all when not given.
+    """
+
+    def __init__(self, blocks: Sequence[Block], leveled: Sequence[bool] | None = None) -> None:
+        self.places = places(blocks)
+        self.w, self.z = sum(b.w for b in blocks), sum(b.z for b in blocks)
+        chosen = [True] * len(blocks) if leveled is None else list(leveled)
+        self.skewed = not all(chosen)
+        entries: list[tuple[int, int, int, complex, bool]] = []
+        start: list[float] = []
+        self.d_ranges: list[tuple[slice, ComplexArray]] = []
+        for place, level in zip(self.places, chosen, strict=True):
+            basis = _hermitian(place.block.size if isinstance(place.block, RepeatedScalar) else 1)
+            first = len(start)
+            for B in basis:
+                p = len(start)
+                start.append(float(np.trace(B).real > 0))
+                if isinstance(place.block, FullBlock):
+                    entries += [(p, i, i, 1.0, level) for i in range(place.w.start, place.w.stop)]
+                    rows = range(self.w + place.z.start, self.w + place.z.stop)
+                    entries += [(p, i, i, -1.0, False) for i in rows]
+                    continue
+                for i, k in np.argwhere(B):
+                    w, z = place.w.start, self.w + place.z.start
+                    entries.append((p, w + i, w + k, B[i, k], level))
+                    entries.append((p, z + i, z + k, -B[i, k], False))
+            self.d_ranges.append((slice(first, len(start)), basis))
+            if isinstance(place.block, RepeatedScalar) and place.block.real:
+                for B in basis:
+                    p = len(start)
+                    start.append(0.0)
+                    for i, k in np.argwhere(B):
+                        w, z = place.w.start + i, self.w + place.z.start + k
+                        entries.append((p, w, z, 1j * B[i, k], False))
+                        entries.append((p, z, w, -1j * np.conj(B[i, k]), False))
+        self.count = len(start)
+        #: D = I, G = 0
+        self.start: FloatArray = np.array(start)
+        self.owner: IntArray = np.array([e[0] for e in entries])
+        self.row: IntArray = np.array([e[1] for e in entries])
+        self.column: IntArray = np.array([e[2] for e in entries])
+        self.value: ComplexArray = np.array([e[3] for e in entries], dtype=np.complex128)
+        self.leveled = np.array([e[4] for e in entries])
+        #: the first entry of each parameter, whose entries follow each other
+        self.first = np.searchsorted(self.owner, np.arange(self.count))
+
+    def coefficients(self, level: float) -> ComplexArray:
+        """Return the entries of S for x = 1, at a level."""
+        return np.asarray(np.where(self.leveled, level, 1.0) * self.value)
+
+    def matrix(self, x: FloatArray, level: float) -> ComplexArray:
+        """Return S (w + z, w + z)."""
+        S = np.zeros((self.w + self.z,) * 2, dtype=np.complex128)
+        np.add.at(S, (self.row, self.column), self.coefficients(level) * x[self.owner])
+        return S
+
+    def D(self, x: FloatArray) -> list[ComplexArray]:
+        """Return D of each block."""
+        return [np.einsum("p,pij->ij", x[own], basis) for own, basis in self.d_ranges]
+
+    def scaled(self, x: FloatArray, sizes: FloatArray) -> FloatArray:
+        """Return x for D and G of each block times a number."""
+        x = x.copy()
+        ends = [own.start for own, _ in self.d_ranges[1:]] + [self.count]
+        for (own, _), end, size in zip(self.d_ranges, ends, sizes, strict=True):
+            x[own.start : end] *= size
+        return x
+
+
+def _hermitian(size: int) -> ComplexArray:
+    """Return a real basis (size^2, size, size) of Hermitian matrices, the diagonal first."""
+    basis = [np.diag(row).astype(np.complex128) for row in np.eye(size)]
+    for i in range(size):
+        for k in range(i):
+            for number in (1.0, 1j):
+                B = np.zeros((size, size), dtype=np.complex128)
+                B[i, k], B[k, i] = number, np.conj(number)
+                basis.append(B)
+    return np.array(basis)
+
+
+def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
+    """Return the squares d of a number for each block that even out ``d_i^(1/2) M_ij d_j^(-1/2)``.
+
+    Frobenius norms of the blocks stand for their largest singular values (Osborne 1960).
+    """
+    k = len(where)
+    size = np.array([[la.norm(M[a.z, b.w]) for b in where] for a in where])
+    np.fill_diagonal(size, 0.0)
+    tiny = 1e-12 * max(float(size.max(initial=0.0)), 1e-300)
+    d = np.ones(k)
+    for _ in range(20):
+        for i in range(k):
+            row = np.sqrt(np.sum((size[i] / d) ** 2)) * d[i] + tiny
+            column = np.sqrt(np.sum((size[:, i] * d) ** 2)) / d[i] + tiny
+            d[i] *= np.sqrt(column / row)
+    return np.asarray((d / np.exp(np.mean(np.log(d)))) ** 2)

@@ -1,0 +1,453 @@
+"""Lower bounds of mu: power iterations give perturbations, eigenvalues of the loop verify them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ...lti.statespace import StateSpace
+from ...values import ComplexArray, FloatArray
+from .blocks import Block, FullBlock, Place, RepeatedScalar, places
+
+#: steps of a power iteration; change at which it has settled
+_STEPS, _SETTLED = 60, 1e-6
+#: multiples of the smallest size that are tried for instability; relative accuracy of the smallest
+_LADDER = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 100.0])
+_FINE = 1e-4
+#: phases of complex blocks that are tried
+_PHASES = 25
+#: steps towards worse signs of the real Deltas
+_ASCENTS = 6
+
+
+class Perturbation(NamedTuple):
+    """A perturbation of size one, at a frequency.
+
+    A number for each scalar block, and for each full block its vectors: ``Delta = b a*``, |a| =
+    |b| = 1.
+    """
+
+    scalars: tuple[complex, ...]
+    vectors: tuple[tuple[ComplexArray, ComplexArray], ...]
+    omega: float
+
+
+def power_iteration(
+    M: ComplexArray, where: Sequence[Place], rng: np.random.Generator, omega: float = 0.0
+) -> Perturbation:
+    """Return a perturbation of size one for which an eigenvalue of ``M Delta`` is large and real.
+
+    The iteration of Young and Doyle for real and complex blocks together. Real Deltas may come out
+    inside their interval. It need not converge: what it gives is judged by what it does.
+
+    References
+    ----------
+    Young, Doyle, Computation of mu with real and complex uncertainties, CDC 1990. Packard, Doyle,
+    The complex structured singular value, Automatica 29, 1993.
+    """
+    n = M.shape[1]
+    b, w = (_unit(_drawn(rng, n)) for _ in range(2))
+    q = {i: 1.0 + 0j for i, p in enumerate(where) if isinstance(p.block, RepeatedScalar)}
+    old, a = b, M @ b
+    for _ in range(_STEPS):
+        a = M @ b
+        if not np.any(a):
+            break
+        a = _unit(a)
+        left = np.zeros(M.shape[0], dtype=np.complex128)
+        for i, p in enumerate(where):
+            left[p.z] = _left(p, q, i, a, b, w)
+        w = M.conj().T @ left
+        if not np.any(w):
+            break
+        w = _unit(w)
+        b = np.zeros(n, dtype=np.complex128)
+        for i, p in enumerate(where):
+            b[p.w] = _right(p, q, i, a, old, w)
+        b = _unit(b)
+        if la.norm(b - old) < _SETTLED:
+            break
+        old = b
+    full = [p for p in where if isinstance(p.block, FullBlock)]
+    vectors = [(_unit(a[p.z]), _unit(w[p.w])) for p in full]
+    return Perturbation(tuple(q.values()), tuple(vectors), omega)
+
+
+def _left(
+    p: Place, q: dict[int, complex], i: int, a: ComplexArray, b: ComplexArray, w: ComplexArray
+) -> ComplexArray:
+    """Return the block of the next left vector."""
+    if isinstance(p.block, FullBlock):
+        return np.asarray(a[p.z] * (la.norm(w[p.w]) / max(la.norm(a[p.z]), 1e-300)))
+    if p.block.real:
+        q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
+        return np.asarray(q[i] * w[p.w])
+    inner = np.vdot(w[p.w], a[p.z])
+    return np.asarray(inner / (abs(inner) or 1.0) * w[p.w])
+
+
+def _right(
+    p: Place, q: dict[int, complex], i: int, a: ComplexArray, b: ComplexArray, w: ComplexArray
+) -> ComplexArray:
+    """Return the block of the next right vector."""
+    if isinstance(p.block, FullBlock):
+        return np.asarray(w[p.w] * (la.norm(a[p.z]) / max(la.norm(w[p.w]), 1e-300)))
+    if p.block.real:
+        q[i] = _real(q[i].real, a[p.z], b[p.w], w[p.w])
+        return np.asarray(q[i] * a[p.z])
+    inner = np.vdot(a[p.z], w[p.w])
+    q[i] = complex(inner / (abs(inner) or 1.0))
+    return np.asarray(q[i] * a[p.z])
+
+
+def _real(q: float, a: ComplexArray, b: ComplexArray, w: ComplexArray) -> float:
+    """Return the next number of a real scalar, on its interval."""
+    sign = 1.0 if q >= 0 else -1.0
+    moved = sign * la.norm(b) / max(la.norm(a), 1e-300) + float(np.vdot(a, w).real)
+    return float(np.clip(moved, -1.0, 1.0))
+
+
+def _drawn(rng: np.random.Generator, n: int) -> ComplexArray:
+    return np.asarray(rng.standard_normal(n) + 1j * rng.standard_normal(n))
+
+
+def _unit(v: ComplexArray) -> ComplexArray:
+    size = la.norm(v)
+    if not size > 0:
+        v = np.zeros_like(v)
+        v[0] = 1.0
+        return v
+    return np.asarray(v / size)
+
+
+def matrix_of(found: Perturbation, where: Sequence[Place]) -> ComplexArray:
+    """Return Delta (w, z) of a perturbation."""
+    total = np.zeros((where[-1].w.stop, where[-1].z.stop), dtype=np.complex128)
+    scalars, vectors = iter(found.scalars), iter(found.vectors)
+    for p in where:
+        if isinstance(p.block, FullBlock):
+            a, b = next(vectors)
+            total[p.w, p.z] = np.outer(b, a.conj())
+        else:
+            total[p.w, p.z] = next(scalars) * np.eye(p.block.size)
+    return total
+
+
+def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
+    """Return a real, stable system Delta(s) of norm one with the perturbation at its frequency.
+
+    Each entry of a and b is a number times an all-pass ``+-(s - p) / (s + p)`` of its phase, so
+    that the gain is one at all frequencies.
+    """
+    where = places(blocks)
+    scalars, vectors = iter(found.scalars), iter(found.vectors)
+    parts: list[StateSpace] = []
+    for p in where:
+        if isinstance(p.block, FullBlock):
+            a, b = next(vectors)
+            parts.append(_rank_one(a, b, found.omega))
+            continue
+        number = complex(next(scalars))
+        if p.block.real or not number.imag:
+            parts.append(_static(number.real * np.eye(p.block.size)))
+        else:
+            one = [_all_pass(number, found.omega) for _ in range(p.block.size)]
+            parts.append(_stacked(one))
+    return _stacked(parts)
+
+
+def _static(D: FloatArray) -> StateSpace:
+    return StateSpace(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D)
+
+
+def _all_pass(number: complex, omega: float) -> StateSpace:
+    """Return a real system of gain |number| that is the number at omega [rad/s]."""
+    phase, size = float(np.angle(number)), abs(number)
+    if abs(np.sin(phase)) < 1e-9 or not omega > 0:
+        return _static(np.array([[size * (1.0 if np.cos(phase) >= 0 else -1.0)]]))
+    sign = 1.0 if phase > 0 else -1.0
+    turn = phase if phase > 0 else phase + np.pi
+    p = omega / np.tan(0.5 * (np.pi - turn))
+    # sign size (s - p) / (s + p) = sign size (1 - 2 p / (s + p))
+    root = np.sqrt(2.0 * p * size)
+    return StateSpace([[-p]], [[root]], [[-sign * root]], [[sign * size]])
+
+
+def _stacked(parts: Sequence[StateSpace]) -> StateSpace:
+    D = la.block_diag(*[g.D for g in parts])
+    n = sum(g.n_states for g in parts)
+    A, B, C = np.zeros((n, n)), np.zeros((n, D.shape[1])), np.zeros((D.shape[0], n))
+    i = row = column = 0
+    for g in parts:
+        j, k, m = i + g.n_states, row + g.D.shape[0], column + g.D.shape[1]
+        A[i:j, i:j], B[i:j, column:m], C[row:k, i:j] = g.A, g.B, g.C
+        i, row, column = j, k, m
+    return StateSpace(A, B, C, D)
+
+
+def _rank_one(a: ComplexArray, b: ComplexArray, omega: float) -> StateSpace:
+    """Return ``b(s) a(s)'`` with the values b and conj(a) at omega."""
+    into = [_all_pass(complex(v), omega) for v in a.conj()]
+    out = [_all_pass(complex(v), omega) for v in b]
+    first, second = _stacked(into), _stacked(out)
+    ones_in, ones_out = np.ones((1, len(into))), np.ones((len(out), 1))
+    row = StateSpace(first.A, first.B, ones_in @ first.C, ones_in @ first.D)
+    column = StateSpace(second.A, second.B @ ones_out, second.C, second.D @ ones_out)
+    n1, n2 = row.n_states, column.n_states
+    return StateSpace(
+        np.block([[row.A, np.zeros((n1, n2))], [column.B @ row.C, column.A]]),
+        np.vstack([row.B, column.B @ row.D]),
+        np.hstack([column.D @ row.C, column.C]),
+        column.D @ row.D,
+    )
+
+
+class Destabilising(NamedTuple):
+    """The smallest multiple of a perturbation that makes the loop unstable."""
+
+    size: float
+    found: Perturbation
+    omega: float
+
+
+def smallest_multiple(
+    M: StateSpace,
+    blocks: Sequence[Block],
+    found: Perturbation,
+    least: float,
+    most: float,
+) -> Destabilising | None:
+    """Return the multiple t between two sizes at which ``t Delta`` makes M's loop unstable.
+
+    The loop's eigenvalues decide: on the size before it is stable, on this one it is not.
+    """
+    delta = realised(found, blocks)
+    ladder = least * _LADDER
+    if most < ladder[-1]:  # one loop decides whether this perturbation is worse than the best
+        ladder = np.array([most])
+    stable, unstable = 0.0, np.inf
+    for t in ladder:
+        if _growth(M, delta, t)[0] >= 0:
+            unstable = float(t)
+            break
+        stable = float(t)
+    if not np.isfinite(unstable):
+        return None
+    stable = max(stable, 0.99 * least)
+    while unstable - stable > _FINE * unstable:
+        middle = 0.5 * (stable + unstable)
+        if _growth(M, delta, middle)[0] >= 0:
+            unstable = middle
+        else:
+            stable = middle
+    return Destabilising(unstable, found, _growth(M, delta, unstable)[1])
+
+
+def crossing_multiple(
+    M: ComplexArray, where: Sequence[Place], found: Perturbation
+) -> tuple[float, Perturbation] | None:
+    """Return t and the perturbation, its complex blocks turned, with ``det(I - t M Delta) = 0``.
+
+    One phase common to all complex blocks is chosen so that an eigenvalue of M Delta is real.
+    """
+    fixed = np.zeros((where[-1].w.stop, where[-1].z.stop), dtype=np.complex128)
+    turned = matrix_of(found, where)
+    for p in where:
+        if isinstance(p.block, RepeatedScalar) and p.block.real:
+            fixed[p.w, p.z] = turned[p.w, p.z]
+            turned[p.w, p.z] = 0.0
+    if not np.any(turned):
+        return None
+
+    def eigenvalue(phase: float, near: complex | None) -> complex:
+        values = la.eigvals(M @ (fixed + np.exp(1j * phase) * turned))
+        worst = np.argmax(values.real if near is None else -np.abs(values - near))
+        return complex(values[worst])
+
+    best, phases = (0.0, 0.0), np.linspace(-np.pi, np.pi, _PHASES)
+    values = [eigenvalue(phase, None) for phase in phases]
+    for i in np.flatnonzero(np.diff(np.sign([v.imag for v in values]))).tolist():
+        low, high, value = phases[i], phases[i + 1], values[i]
+        sign = np.sign(value.imag)
+        for _ in range(50):
+            middle = 0.5 * (low + high)
+            value = eigenvalue(middle, value)
+            low, high = (middle, high) if np.sign(value.imag) == sign else (low, middle)
+        if abs(value.imag) < 1e-6 * abs(value) and value.real > best[0]:
+            best = value.real, 0.5 * (low + high)
+    if not best[0] > 0:
+        return None
+    turn = np.exp(1j * best[1])
+    kinds = [p.block.real for p in where if isinstance(p.block, RepeatedScalar)]
+    numbers = tuple(
+        number if real else number * turn for real, number in zip(kinds, found.scalars, strict=True)
+    )
+    vectors = tuple((a, b * turn) for a, b in found.vectors)
+    return 1.0 / best[0], found._replace(scalars=numbers, vectors=vectors)
+
+
+def smallest_with_block(
+    M: ComplexArray, where: Sequence[Place], start: Perturbation, least: float
+) -> tuple[float, Perturbation] | None:
+    """Return the smallest t for real scalars and one full block, the last, at a frequency.
+
+    With the reals closed at t q, the block needs ``t sigma_max(F(M, t q)) = 1``: its own worst is
+    known. The reals are moved one after the other to an end of their interval.
+    """
+    w, z = where[-1].w.start, where[-1].z.start
+    repeats = [p.block.w for p in where[:-1]]
+    sizes = least * np.geomspace(1.0, 100.0, 60)
+
+    def closed(q: FloatArray, t: FloatArray) -> ComplexArray:
+        delta = np.repeat(q, repeats)
+        scaled = t[:, None, None] * (M[:z, :w] * delta)
+        inner = np.linalg.solve(
+            np.eye(z) - scaled, np.broadcast_to(M[:z, w:], (t.size, z, M.shape[1] - w))
+        )
+        return np.asarray(M[z:, w:] + (t[:, None, None] * (M[z:, :w] * delta)) @ inner)
+
+    def first(q: FloatArray) -> float:
+        over = sizes * np.linalg.norm(closed(q, sizes), 2, axis=(1, 2)) >= 1.0
+        if not over.any():
+            return np.inf
+        i = int(np.argmax(over))
+        low, high = sizes[max(i - 1, 0)], sizes[i]
+        for _ in range(20):
+            t = 0.5 * (low + high)
+            there = t * np.linalg.norm(closed(q, np.array([t])), 2, axis=(1, 2))[0] >= 1.0
+            low, high = (low, t) if there else (t, high)
+        return float(high)
+
+    q = np.array([number.real for number in start.scalars])
+    best = first(q)
+    for _ in range(_ASCENTS):
+        before = best
+        for i in range(q.size):
+            for value in (-1.0, 1.0):
+                moved = q.copy()
+                moved[i] = value
+                if value != q[i] and (found := first(moved)) < best:
+                    best, q = found, moved
+        if not best < before * (1.0 - 1e-4):
+            break
+    if not np.isfinite(best):
+        return None
+    left, _, right = np.linalg.svd(closed(q, np.array([best]))[0])
+    pair = (np.asarray(left[:, 0]), np.asarray(right[0].conj()))
+    return best, Perturbation(tuple(q.astype(complex).tolist()), (pair,), start.omega)
+
+
+def loop_matrix(M: StateSpace, delta: StateSpace, t: float) -> FloatArray:
+    """Return A of the loop ``w = t Delta z, z = M w``."""
+    D, DD = M.D, t * delta.D
+    back = np.linalg.inv(np.eye(D.shape[0]) - D @ DD)
+    z_x, z_d = back @ M.C, back @ D @ (t * delta.C)
+    return np.block([
+        [M.A + M.B @ DD @ z_x, M.B @ (t * delta.C + DD @ z_d)],
+        [delta.B @ z_x, delta.A + delta.B @ z_d],
+    ])  # fmt: skip
+
+
+def _growth(M: StateSpace, delta: StateSpace, t: float) -> tuple[float, float]:
+    """Return the largest real part of the loop, and the frequency [rad/s] of that pole."""
+    poles = la.eigvals(loop_matrix(M, delta, t))
+    worst = int(np.argmax(poles.real))
+    return float(poles[worst].real), float(abs(poles[worst].imag))
+
+
+def worse_signs(
+    M: StateSpace, blocks: Sequence[Block], one: Destabilising, near: complex | None = None
+) -> Perturbation | None:
+    """Return the perturbation with real Deltas at the ends that move a pole out most.
+
+    The pole with the largest real part, or the one near some value. None where nothing changes.
+    """
+    delta = realised(one.found, blocks)
+    A = loop_matrix(M, delta, one.size)
+    eigen: Any = la.eig(A, left=True, right=True)
+    values, left, right = eigen
+    worst = int(np.argmax(values.real if near is None else -np.abs(values - near)))
+    n = M.n_states
+    own_l, own_r = left[:, worst], right[:, worst]
+    # w = t Delta z: a change of delta moves the pole by l* B d(w) with z of the loop
+    DD = one.size * delta.D
+    back = np.linalg.inv(np.eye(M.D.shape[0]) - M.D @ DD)
+    z = back @ (M.C @ own_r[:n] + M.D @ (one.size * delta.C) @ own_r[n:])
+    into = own_l[:n].conj() @ M.B @ np.linalg.inv(np.eye(M.D.shape[1]) - DD @ M.D)
+    into = into + own_l[n:].conj() @ delta.B @ back @ M.D
+    scalars = []
+    numbers = iter(one.found.scalars)
+    for p in places(blocks):
+        if isinstance(p.block, FullBlock):
+            continue
+        number = next(numbers)
+        if p.block.real:
+            gain = float((into[p.w] @ z[p.z] / np.vdot(own_l, own_r)).real)
+            number = complex(np.sign(gain) if gain else number)
+        scalars.append(number)
+    changed = one.found._replace(scalars=tuple(scalars))
+    return None if changed.scalars == one.found.scalars else changed
+
+
+def destabilising(
+    M: StateSpace,
+    blocks: Sequence[Block],
+    omegas: Sequence[float],
+    level: float,
+    *,
+    restarts: int = 4,
+    rng: np.random.Generator,
+) -> Destabilising | None:
+    """Return the smallest perturbation found that makes a loop unstable.
+
+    Parameters
+    ----------
+    M : StateSpace
+        Continuous and stable.
+    blocks : sequence of blocks
+        In the order of its channels.
+    omegas : sequence of float [rad/s]
+        Where to search.
+    level : float
+        mu from above: nothing smaller than its inverse destabilises.
+    restarts : int
+        Random starts at each frequency.
+    rng : Generator
+        Of the starts.
+    """
+    where = places(blocks)
+    least = 1.0 / max(level, 1e-300)
+    best: Destabilising | None = None
+    for omega in omegas:
+        gain = M.evaluated(1j * omega)
+        starts = [power_iteration(gain, where, rng, omega) for _ in range(restarts)]
+        first = Destabilising(0.0, starts[0], omega)
+        signs = worse_signs(M, blocks, first, near=1j * omega)
+        for start in [*starts, *([] if signs is None else [signs])]:
+            best = _ascended(M, blocks, start, least, best)
+            if best is not None and best.size < 1.001 * least:
+                return best
+    return best
+
+
+def _ascended(
+    M: StateSpace,
+    blocks: Sequence[Block],
+    start: Perturbation,
+    least: float,
+    best: Destabilising | None,
+) -> Destabilising | None:
+    """Return the best so far, after steps from one start to worse signs of its real Deltas."""
+    candidate: Perturbation | None = start
+    for _ in range(_ASCENTS):
+        most = best.size if best is not None else 100.0 * least
+        one = None if candidate is None else smallest_multiple(M, blocks, candidate, least, most)
+        if one is None:
+            break
+        if best is None or one.size < best.size * (1 - 1e-6):
+            best = one
+        candidate = worse_signs(M, blocks, one)
+    return best

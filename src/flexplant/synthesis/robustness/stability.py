@@ -1,0 +1,262 @@
+"""robust_stability: how large the uncertainty of a plant may be before a loop becomes unstable."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...errors import CertificateError, FlexplantError
+from ...loop import ClosedLoop, SpillOver
+from ...parallel import one_thread
+from ...plant import StandardPlant, larger_plant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...values import FloatArray, Value, generator, whole
+from .blocks import FullBlock, places
+from .lower import (
+    Destabilising,
+    destabilising,
+    power_iteration,
+    smallest_with_block,
+)
+from .machine import machine, neglected_delta, values_of
+from .mu import sought
+from .sweep import covered
+from .uncertain_loop import UncertainLoop, uncertain_loop
+
+#: mu below this is not resolved
+_RESOLVED = 0.05
+#: starts at each frequency
+_STARTS = 3
+#: the worst machine is shown this much beyond its edge of stability
+_BEYOND = 1e-3
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class RobustStability(Value):
+    """How large an uncertainty a loop endures, and the smallest found that makes it unstable.
+
+    Parameters
+    ----------
+    upper : float
+        mu: every machine with Deltas smaller than ``1 / upper`` is stable; below 1, all machines
+        of the uncertainty are. Values below 0.05 are not resolved.
+    lower : float
+        A machine with Deltas of ``1 / lower`` is not stable; 0 when none was found.
+    freq : float [Hz]
+        Where mu is largest.
+    values : mapping {str: float}
+        The Deltas of that machine.
+    machine : StandardPlant, optional
+        That machine, a little beyond its edge of stability; it can be simulated. None when it is
+        none that could exist (without stiffness or damping) or none was found.
+    frequencies, bounds : (k,) arrays [Hz, 1]
+        Upper bounds at single frequencies; where they are not near the largest they need not be
+        the smallest.
+    certificate : mapping {str: float}
+        Machines that were drawn and closed exactly, and how stable the least stable was; the
+        distance of sampled channels from sampled machines; the check with modes left out.
+    left_out : SpillOver, optional
+        How the nominal loop stands on the plant with the modes left out, where these are known.
+    """
+
+    upper: float
+    lower: float
+    freq: float
+    values: Mapping[str, float]
+    machine: StandardPlant | None
+    frequencies: FloatArray
+    bounds: FloatArray
+    certificate: Mapping[str, float]
+    left_out: SpillOver | None = None
+
+    def __post_init__(self) -> None:
+        self._set(
+            values=dict(self.values),
+            certificate=dict(self.certificate),
+            frequencies=self.frequencies,
+            bounds=self.bounds,
+        )
+
+    @property
+    def is_robust(self) -> bool:
+        """Whether every machine of the uncertainty is proven stable."""
+        return self.upper < 1.0
+
+    def __repr__(self) -> str:
+        verdict = "every machine is stable" if self.is_robust else "not proven for every machine"
+        if self.lower >= 1.0:
+            verdict = "a machine of the uncertainty is unstable"
+        bounds = f"{self.lower:.4g} <= mu <= {self.upper:.4g}"
+        lines = [f"<RobustStability: {verdict}, {bounds}, largest at {self.freq:.5g} Hz"]
+        if self.lower:
+            most = sorted(self.values.items(), key=lambda one: -abs(one[1]))[:4]
+            shown = ", ".join(f"{name} {value:+.3g}" for name, value in most)
+            lines.append(f"  unstable at {1 / self.lower:.4g} times the uncertainty: {shown}")
+        shown = ", ".join(f"{k} {v:.4g}" for k, v in self.certificate.items())
+        lines.append(f"  verified: {shown}")
+        if self.left_out is not None:
+            lines.append(f"  with the modes left out: {self.left_out.summary}")
+        return "\n".join(lines) + ">"
+
+
+@one_thread()
+def robust_stability(
+    uncertain: UncertainPlant[Any],
+    *blocks: Any,
+    larger: Any = None,
+    machines: int = 20,
+    rng: Any = 0,
+) -> RobustStability:
+    """Return bounds on the uncertainty that a loop endures: mu of its real and neglected Deltas.
+
+    Real Deltas (frequencies, damping, parameters) stay real, neglected modes are one full complex
+    block. The bound holds between grid points; a sampled loop is examined as it is sampled and
+    delayed. What it says is tried on machines drawn from the uncertainty, each closed exactly.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+        From `plant.uncertain(fit, neglected=larger)`.
+    *blocks : StateSpace, or values with a `system`
+        The controller, as for `close_loop`.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`: the nominal loop is
+        checked there too.
+    machines : int
+        How many are drawn, each Delta at an end of its interval.
+    rng : int, SeedSequence, Generator or None
+        Of the machines and of the search for the worst.
+
+    Returns
+    -------
+    RobustStability
+
+    Raises
+    ------
+    AssumptionError
+        When the nominal loop is not stable.
+    CertificateError
+        When a machine is unstable for which stability was proven, or sampled machines are too far
+        from affine in their Deltas.
+    ModelError
+        When `uncertain` is no uncertain plant.
+    SolverError
+        When intervals do not cover the frequency axis.
+
+    References
+    ----------
+    Zhou, Doyle, Glover, Robust and Optimal Control, 1996, chapter 11.
+    """
+    count = whole(machines, "machines", minimum=0)
+    chance = generator(rng)
+    loop = uncertain_loop(uncertain, blocks)
+    found = covered(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2)
+    upper = float(np.sqrt(found.level))
+    worst = _worst(loop, found, upper, chance)
+    certificate = _tried(loop, upper, count, chance)
+    if loop.dt:
+        certificate["distance of channels"] = loop.channels.distance
+    values, shown, lower = _shown(loop, worst)
+    left_out = _left_out(loop.loop, larger)
+    if left_out is not None:
+        certificate |= left_out.certificate
+    return RobustStability(
+        upper,
+        min(lower, upper),
+        loop.freq(found.omega),
+        values,
+        shown,
+        np.array([loop.freq(one) for one in found.frequencies]),
+        np.sqrt(np.maximum(found.bounds, 0.0)),
+        certificate,
+        left_out,
+    )
+
+
+def _left_out(loop: ClosedLoop, larger: Any) -> SpillOver | None:
+    """Return the check of the nominal loop with the modes left out."""
+    if larger is None:
+        return loop.left_out
+    return ClosedLoop(
+        loop.plant, loop.blocks, loop.controller, loop.idle, larger_plant(loop.plant, larger)
+    ).left_out
+
+
+def _worst(
+    loop: UncertainLoop, found: Any, upper: float, rng: np.random.Generator
+) -> Destabilising | None:
+    """Return the smallest perturbation that destabilises, as far as it was found."""
+    omegas = sought(loop.system, found)
+    if not loop.neglected_w:
+        return destabilising(loop.system, loop.blocks, omegas, upper, rng=rng)
+    where, best = places(loop.blocks), None
+    for omega in omegas:
+        gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
+        for _ in range(_STARTS):
+            start = power_iteration(gain, where, rng, omega)
+            one = smallest_with_block(gain, where, start, 0.99 / upper)
+            if one is not None and (best is None or one[0] < best.size):
+                best = Destabilising(one[0], one[1], omega)
+    return best
+
+
+def _shown(
+    loop: UncertainLoop, worst: Destabilising | None
+) -> tuple[dict[str, float], StandardPlant | None, float]:
+    """Return the Deltas of the worst machine, that machine and one over its size.
+
+    Only what is not stable when closed exactly counts.
+    """
+    if worst is None:
+        return {}, None, 0.0
+    values: dict[str, float] = {}
+    for beyond in (0.0, _BEYOND, 10 * _BEYOND, 50 * _BEYOND):
+        size = worst.size * (1.0 + beyond)
+        values = values_of(loop, worst.found, size)
+        try:
+            made = machine(loop, values, neglected_delta(loop, worst.found, size))
+        except FlexplantError:  # no stiffness left, say: it can only be computed
+            return values, None, 1.0 / worst.size
+        if not ClosedLoop(made, loop.loop.blocks, loop.loop.controller, loop.loop.idle).is_stable:
+            return values, made, 1.0 / size
+    return values, None, 0.0
+
+
+def _tried(
+    loop: UncertainLoop, upper: float, count: int, rng: np.random.Generator
+) -> dict[str, float]:
+    """Return how stable machines at corners are, each closed exactly.
+
+    Raises
+    ------
+    CertificateError
+        When one is unstable within the size that is proven.
+    """
+    names = [block.name for block in loop.blocks if not isinstance(block, FullBlock)]
+    size = min(1.0, 0.999 / upper)
+    worst = -np.inf
+    for _ in range(count):
+        corner = dict(
+            zip(names, (size * rng.choice([-1.0, 1.0], len(names))).tolist(), strict=True)
+        )
+        made = loop.uncertain.lft(corner)
+        poles = close_loop_poles(loop, made)
+        worst = max(worst, float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real)))
+    if not worst < (1.0 if loop.dt else 0.0):
+        raise CertificateError(
+            f"a machine with Deltas of {size:.3g} is unstable ({worst:.9g}), but mu <= "
+            f"{upper:.4g} was found: the loop is too badly conditioned. Report it."
+        )
+    if not count:
+        return {}
+    kind = "largest spectral radius" if loop.dt else "largest real part"
+    return {f"{kind} of {count} machines": worst}
+
+
+def close_loop_poles(loop: UncertainLoop, plant: StandardPlant) -> Any:
+    """Return the poles of the controller's loop around another machine."""
+    nominal = loop.loop
+    return ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle).monitored.poles()

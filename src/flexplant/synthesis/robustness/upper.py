@@ -1,0 +1,287 @@
+"""The upper bound of the structured singular value of one matrix: scalings D and G by centres."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ...values import ComplexArray, FloatArray, IntArray
+from .blocks import Place, Scalings, osborne
+
+#: Newton decrement at which a centre is left; steps for one
+_CENTRED, _STEPS = 0.3, 40
+#: growth of the weight of a skewed level from one centre to the next
+_GROWTH = 10.0
+#: part of the way from the level that scalings reach back to the level they were centred at
+_BACK = 0.15
+#: levels; relative distance of a level to what its centre reaches, at which it is the smallest
+_LEVELS, _SETTLED = 200, 2e-3
+#: a level this far below the size of M is zero
+_ZERO = 1e-10
+
+
+class Certified(NamedTuple):
+    """Scalings x and the smallest level for which they hold."""
+
+    level: float
+    x: FloatArray
+
+
+def upper_level(
+    M: ComplexArray,
+    scalings: Scalings,
+    start: FloatArray | None = None,
+    *,
+    enough: float = 0.0,
+) -> Certified:
+    """Return the smallest level that scalings D, G reach: mu^2 (of a skewed problem, gain^2).
+
+    Generalised eigenvalue minimisation by the method of centres (Boyd, El Ghaoui 1993): at a
+    level, Newton steps to the maximum of ``log det F + sum log det D`` with the trace of D fixed;
+    the next level lies between it and what those scalings reach.
+
+    Parameters
+    ----------
+    M : (z, w) array
+        At one frequency.
+    scalings : Scalings
+        Their structure.
+    start : array, optional
+        Scalings of a frequency nearby.
+    enough : float
+        A level below which it need not go.
+
+    Returns
+    -------
+    Certified
+        An infinite level when a skewed problem has none: the Deltas of level 1 are too large.
+    """
+    W = np.vstack([np.eye(scalings.w), M])
+    size = float(np.linalg.norm(M)) ** 2
+    if not size:
+        return Certified(0.0, scalings.start)
+    x = scalings.scaled(scalings.start, osborne(M, scalings.places))
+    reached = reached_level(W, scalings, x)
+    if start is not None:
+        other = reached_level(W, scalings, start)
+        if other < reached:
+            x, reached = start, other
+    if not np.isfinite(reached):
+        found = _admissible(M, scalings, x)
+        if found is None:
+            return Certified(np.inf, x)
+        x, reached = found, reached_level(W, scalings, found)
+    if scalings.skewed:
+        return _skewed(W, scalings, x, reached, enough)
+    x = x / np.sum(scalings.start * x)
+    best = Certified(max(reached, 0.0), x)
+    level = 1.5 * max(reached, _ZERO * size)
+    for _ in range(_LEVELS):
+        if best.level <= enough:
+            return best
+        x = centred(W, scalings, x, level)
+        reached = reached_level(W, scalings, x)
+        if reached <= _ZERO * size:
+            return Certified(_ZERO * size, x)
+        if reached < best.level:
+            best = Certified(reached, x)
+        if level - reached <= _SETTLED * level:
+            break
+        level = reached + _BACK * (level - reached)
+    return best
+
+
+def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArray | None:
+    """Return scalings of a skewed problem for which some level is finite, None without any."""
+    inner = [p for p, lev in zip(scalings.places, _levels(scalings), strict=True) if not lev]
+    plain = Scalings([p.block for p in inner])
+    rows = np.concatenate([np.arange(p.z.start, p.z.stop) for p in inner])
+    columns = np.concatenate([np.arange(p.w.start, p.w.stop) for p in inner])
+    part = M[np.ix_(rows, columns)]
+    found = upper_level(part, plain, enough=0.98)
+    if found.level >= 1.0:
+        return None
+    # D of the leveled blocks as small as they need to be beside those of the others
+    own = centred(np.vstack([np.eye(plain.w), part]), plain, found.x, 1.0, steps=20)
+    x = np.array(x)
+    ends = [own_range.start for own_range, _ in scalings.d_ranges[1:]] + [scalings.count]
+    inner_ends = [own_range.start for own_range, _ in plain.d_ranges[1:]] + [plain.count]
+    i = 0
+    for (own_range, _), end, lev in zip(scalings.d_ranges, ends, _levels(scalings), strict=True):
+        if not lev:
+            x[own_range.start : end] = own[plain.d_ranges[i][0].start : inner_ends[i]]
+            i += 1
+    for factor in 10.0 ** np.arange(0, -13, -1.0):
+        sizes = np.where(_levels(scalings), factor, 1.0)
+        tried = scalings.scaled(x, sizes)
+        if np.isfinite(reached_level(np.vstack([np.eye(scalings.w), M]), scalings, tried)):
+            return tried
+    return None
+
+
+def _levels(scalings: Scalings) -> list[bool]:
+    """Return which blocks are leveled."""
+    return [bool(np.any(scalings.leveled[scalings.owner == own.start]))
+            for own, _ in scalings.d_ranges]  # fmt: skip
+
+
+def reached_level(W: ComplexArray, scalings: Scalings, x: FloatArray) -> float:
+    """Return the smallest level for which F(x) >= 0: infinite where there is none."""
+    S0, S1 = scalings.matrix(x, 0.0), scalings.matrix(x, 1.0)
+    fixed = _half(W.conj().T @ S0 @ W)
+    grows = _half((S1 - S0)[: scalings.w, : scalings.w])
+    if not scalings.skewed:
+        return float(la.eigh(-fixed, grows, eigvals_only=True)[-1])
+    moving = np.flatnonzero(np.abs(grows).sum(axis=0) > 0)
+    still = np.setdiff1d(np.arange(scalings.w), moving)
+    try:
+        root = la.cho_factor(fixed[np.ix_(still, still)])
+    except la.LinAlgError:
+        return float("inf")
+    across = fixed[np.ix_(still, moving)]
+    schur = _half(across.conj().T @ la.cho_solve(root, across) - fixed[np.ix_(moving, moving)])
+    return float(la.eigh(schur, grows[np.ix_(moving, moving)], eigvals_only=True)[-1])
+
+
+def centred(
+    W: ComplexArray, scalings: Scalings, x: FloatArray, level: float, *, steps: int = _STEPS
+) -> FloatArray:
+    """Return scalings after Newton steps to the analytic centre of ``F > 0, D > 0`` at a level."""
+    coefficients = scalings.coefficients(level)
+    trace = scalings.start
+    value = _barrier(W, scalings, x, level)
+    if not np.isfinite(value):
+        return x
+    for _ in range(steps):
+        F = _half(W.conj().T @ scalings.matrix(x, level) @ W)
+        P = W @ np.linalg.solve(F, W.conj().T)
+        # tr(P S_p) and tr(P S_p P S_q), S_p of a few entries each
+        gradient, hessian = _derivatives(
+            P, scalings.row, scalings.column, coefficients, scalings.first
+        )
+        _add_of_D(scalings, x, gradient, hessian)
+        step, decrement = _newton(hessian, gradient, trace)
+        if not decrement > 1e-6:
+            break
+        t = 1.0 / (1.0 + decrement) if decrement > _CENTRED else 1.0
+        while t > 1e-8:
+            moved = x + t * step
+            new = _barrier(W, scalings, moved, level)
+            if new < value:
+                x, value = moved, new
+                break
+            t *= 0.5
+        else:
+            break
+        if decrement < _CENTRED:
+            break
+    return x
+
+
+def _derivatives(
+    P: ComplexArray, row: IntArray, column: IntArray, value: ComplexArray, first: IntArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return -tr(P S_p) and tr(P S_p P S_q) for S_p of a few entries, each from `first` on."""
+    gradient = -np.add.reduceat(np.real(value * P[column, row]), first)
+    pair = value[:, None] * P[np.ix_(column, row)]
+    curve = pair.real * pair.real.T - pair.imag * pair.imag.T
+    return gradient, np.add.reduceat(np.add.reduceat(curve, first, axis=0), first, axis=1)
+
+
+def _add_of_D(scalings: Scalings, x: FloatArray, gradient: FloatArray, hessian: FloatArray) -> None:
+    """Add the derivatives of ``-sum log det D``."""
+    for (own, basis), D in zip(scalings.d_ranges, scalings.D(x), strict=True):
+        turned = np.linalg.inv(D) @ basis
+        gradient[own] -= np.einsum("pii->p", turned).real
+        hessian[own, own] += np.einsum("pij,qji->pq", turned, turned).real
+
+
+def _skewed(
+    W: ComplexArray, scalings: Scalings, x: FloatArray, reached: float, enough: float
+) -> Certified:
+    """Return the smallest level of a skewed problem: linear in it once D of its block is one.
+
+    Path following: Newton steps on ``t level - log det F - sum log det D`` for growing t.
+    """
+    fixed = int(scalings.owner[np.flatnonzero(scalings.leveled)[0]])
+    x = x / x[fixed]
+    # the level takes the place of the parameter that is fixed at one
+    moves = (scalings.owner != fixed) | scalings.leveled
+    row, column, value = scalings.row[moves], scalings.column[moves], scalings.value[moves]
+    first = np.searchsorted(scalings.owner[moves], np.arange(scalings.count))
+    level, best = 1.5 * max(reached, 1e-300), Certified(reached, x)
+    barriers = scalings.w + sum(basis.shape[1] for _, basis in scalings.d_ranges) - 1
+    t = barriers / level
+    for _ in range(_LEVELS):
+        merit = _barrier(W, scalings, x, level) + t * level
+        for _ in range(_STEPS):
+            F = _half(W.conj().T @ scalings.matrix(x, level) @ W)
+            P = W @ np.linalg.solve(F, W.conj().T)
+            gradient, hessian = _derivatives(P, row, column, value, first)
+            level_gradient, level_curve = gradient[fixed], hessian[fixed, fixed]
+            _add_of_D(scalings, x, gradient, hessian)
+            gradient[fixed], hessian[fixed, fixed] = level_gradient + t, level_curve
+            step, decrement = _newton(hessian, gradient)
+            size = 1.0 if decrement < _CENTRED else 1.0 / (1.0 + decrement)
+            while size > 1e-10:
+                moved = x + size * step
+                there = level + size * step[fixed]
+                moved[fixed] = 1.0
+                new = _barrier(W, scalings, moved, there) + t * there
+                if new < merit:
+                    x, level, merit = moved, there, new
+                    break
+                size *= 0.5
+            if size <= 1e-10 or decrement < _CENTRED:
+                break
+        reached = reached_level(W, scalings, x)
+        if reached < best.level:
+            best = Certified(reached, x)
+        if best.level <= enough or barriers / t <= _SETTLED * max(level, 1e-300):
+            break
+        t *= _GROWTH
+    return Certified(max(best.level, 0.0), best.x)
+
+
+def _newton(
+    hessian: FloatArray, gradient: FloatArray, trace: FloatArray | None = None
+) -> tuple[FloatArray, float]:
+    """Return the Newton step, one that keeps a trace where there is one, and its decrement."""
+    size = 1.0 / np.sqrt(np.maximum(hessian.diagonal(), 1e-300))
+    scaled = hessian * size * size[:, None]
+    scaled[np.diag_indices_from(scaled)] += 1e-13
+    right = gradient[:, None] if trace is None else np.column_stack([gradient, trace])
+    try:
+        both = size[:, None] * la.cho_solve(la.cho_factor(scaled), size[:, None] * right)
+    except la.LinAlgError:
+        return np.zeros_like(gradient), 0.0
+    step = -both[:, 0]
+    if trace is not None:
+        step = step + (trace @ both[:, 0]) / (trace @ both[:, 1]) * both[:, 1]
+    return step, float(np.sqrt(max(-float(gradient @ step), 0.0)))
+
+
+def _barrier(W: ComplexArray, scalings: Scalings, x: FloatArray, level: float) -> float:
+    """Return ``-log det F - sum log det D``, infinite outside."""
+    total = 0.0
+    for matrix in (_half(W.conj().T @ scalings.matrix(x, level) @ W), *scalings.D(x)):
+        try:
+            total -= 2.0 * float(np.sum(np.log(np.linalg.cholesky(matrix).diagonal().real)))
+        except np.linalg.LinAlgError:
+            return float("inf")
+    return total if np.isfinite(total) else float("inf")
+
+
+def _half(M: ComplexArray) -> ComplexArray:
+    return np.asarray(0.5 * (M + M.conj().T))
+
+
+def simple_bound(M: ComplexArray, where: Sequence[Place]) -> float:
+    """Return sigma_max of the evened M: a bound without optimisation, reals taken as complex."""
+    d = np.sqrt(osborne(M, where))
+    left = np.concatenate([np.full(p.block.z, s) for p, s in zip(where, d, strict=True)])
+    right = np.concatenate([np.full(p.block.w, s) for p, s in zip(where, d, strict=True)])
+    return float(np.linalg.norm(left[:, None] * M / right, 2))

@@ -1,0 +1,147 @@
+"""Robust stability and worst-case gain of loops, against the machines themselves."""
+
+import itertools
+from functools import cache
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import AssumptionError, LabelError, ModelError
+from flexplant.lti import StateSpace, tustin
+from flexplant.synthesis import robust_stability, worst_case_gain
+
+RATE = 400.0
+pytestmark = pytest.mark.slow
+
+
+@cache
+def plant(sampled=False):
+    """Three masses on soft ground: 0.9, 8 and 14 Hz; force on the first, sensor on the last."""
+    model = fx.chain(
+        masses=[1.0, 1.0, 1.0], stiffnesses=[2500.0, 2500.0], ground=[30.0, 30.0, 30.0]
+    )
+    modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
+    ports = fx.Ports(
+        w=[fx.Disturbance("d", at="2:x", asd=1e-3)],
+        u=[fx.Actuator("f", at="1:x")],
+        z=[fx.Poi("tip", at="3:x", axes=("x",))],
+        y=[fx.Sensor("s", at="3:x", asd=1e-6)],
+    )
+    found = fx.assemble_plant(modes, ports)
+    return found.discretized(RATE, delay=1) if sampled else found
+
+
+@cache
+def uncertain(sampled=False, std=0.04, modes=(2, 3)):
+    """Poles known to some part of their frequencies and a tenth of their damping."""
+    poles = np.array([complex(*_upper(plant().modal_blocks[k - 1])) for k in modes])
+    spread = np.concatenate([0.1 * np.abs(poles.real), std * poles.imag])
+    measured = fx.MeasuredModes(poles, modes=modes, covariance=np.diag(spread**2))
+    return plant(sampled).uncertain(measured, deviations=1.0)
+
+
+def _upper(pair):
+    pole = max(np.linalg.eigvals(pair), key=lambda value: value.imag)
+    return pole.real, pole.imag
+
+
+@cache
+def lead(sampled=False, gain=60.0):
+    """A lead filter around 1.5 Hz that spills over into the modes above."""
+    a, b = 2 * np.pi * 0.7, 2 * np.pi * 6.0
+    one = StateSpace([[-b]], [[1.0]], [[gain * b / a * (b - a)]], [[-gain * b / a]],
+                     inputs=["s"], outputs=["f"])  # fmt: skip
+    roll = StateSpace([[-2 * np.pi * 9.0]], [[2 * np.pi * 9.0]], [[1.0]], [[0.0]])
+    found = (one * roll).replace(inputs=["s"], outputs=["f"])
+    return tustin(found, RATE) if sampled else found
+
+
+def stable(machine, controller):
+    return fx.close_loop(machine, controller).is_stable
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_the_bounds_against_every_corner(sampled):
+    """No corner inside the upper bound is unstable, and the machine shown is."""
+    deltas, controller = uncertain(sampled), lead(sampled, 25.0)
+    found = robust_stability(deltas, controller)
+    assert found.lower <= found.upper <= 1.25 * found.lower
+    names = [delta.name for delta in deltas.deltas]
+    size = 0.99 / found.upper
+    for corner in itertools.product([-size, 0.0, size], repeat=len(names)):
+        machine = deltas.lft(dict(zip(names, corner, strict=True)))
+        assert stable(machine, controller)
+    assert found.machine.dt == (1 / RATE if sampled else 0.0)
+    with pytest.warns(fx.FlexplantWarning, match="unstable"):
+        assert not stable(found.machine, controller)
+    assert max(map(abs, found.values.values())) == pytest.approx(1 / found.lower, rel=1e-2, abs=0)
+    assert "machines" in " ".join(found.certificate)
+    assert f"{found.upper:.4g}" in repr(found)
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_the_worst_case_gain_is_that_of_a_machine(sampled):
+    deltas, controller = uncertain(sampled, std=0.01), lead(sampled, 15.0)
+    found = worst_case_gain(deltas, controller, w=["d"], z=["tip:x"])
+    assert found.nominal <= found.lower <= found.upper <= 1.1 * found.lower
+    loop = fx.close_loop(found.machine, controller)
+    assert fx.hinf_norm(loop.system["tip:x", "d"]) == pytest.approx(found.lower, rel=1e-6, abs=0)
+    names = [delta.name for delta in deltas.deltas]
+    gains = []
+    for corner in itertools.product([-1.0, 1.0], repeat=len(names)):
+        machine = deltas.lft(dict(zip(names, corner, strict=True)))
+        closed = fx.close_loop(machine, controller).system["tip:x", "d"]
+        gains.append(fx.hinf_norm(closed))
+    assert max(gains) * (1 - 1e-6) <= found.upper
+    assert found.lower >= 0.98 * max(gains)
+    # a weight multiplies the bound
+    twice = worst_case_gain(deltas, controller, w=["d"], z={"tip:x": 2.0})
+    assert twice.upper == pytest.approx(2 * found.upper, rel=0.02, abs=0)
+
+
+def test_it_can_be_simulated():
+    found = worst_case_gain(uncertain(True, std=0.01), lead(True, 15.0), w=["d"], z=["tip:x"])
+    run = fx.simulate(fx.close_loop(found.machine, lead(True, 15.0)), duration=5.0, rng=1)
+    assert run.rms("tip:x") > 0
+
+
+@pytest.mark.parametrize("sampled", [False, True])
+def test_neglected_modes_are_one_full_block(sampled):
+    """The third mode left out: its bound decides, and the loop with it in is stable when proven."""
+    whole = plant().model
+    few = fx.assemble_plant(whole.select([0, 1]), plant().assembled.ports)
+    given = few.discretized(RATE, delay=1) if sampled else few
+    poles = np.array([complex(*_upper(few.modal_blocks[1]))])
+    spread = np.array([0.1 * abs(poles[0].real), 0.01 * poles[0].imag])
+    measured = fx.MeasuredModes(poles, modes=(2,), covariance=np.diag(spread**2))
+    deltas = given.uncertain(measured, deviations=1.0, neglected=plant())
+    controller = lead(sampled, 25.0)
+    found = robust_stability(deltas, controller, larger=plant())
+    assert found.lower <= found.upper <= 1.3 * found.lower
+    assert found.left_out.is_stable  # the machine with the third mode
+    assert found.is_robust
+    if found.machine is not None:
+        with pytest.warns(fx.FlexplantWarning, match="unstable"):
+            assert not stable(found.machine, controller)
+    # the larger machine is one of those covered
+    worst = worst_case_gain(deltas, controller, w=["d"], z=["tip:x"])
+    closed = fx.close_loop(plant(sampled), controller).system["tip:x", "d"]
+    assert fx.hinf_norm(closed) <= worst.upper
+    assert worst.nominal <= worst.lower * (1 + 1e-9)
+
+
+def test_refusals():
+    with (
+        pytest.raises(AssumptionError, match="without any uncertainty"),
+        pytest.warns(fx.FlexplantWarning),
+    ):
+        robust_stability(uncertain(), lead(gain=400.0))
+    with pytest.raises(AssumptionError, match="may be unstable"):
+        worst_case_gain(uncertain(std=0.3), lead(gain=60.0), w=["d"], z=["tip:x"])
+    with pytest.raises(ModelError, match=r"plant\.uncertain"):
+        robust_stability(plant(), lead())
+    with pytest.raises(LabelError, match="no output 'x'"):
+        worst_case_gain(uncertain(), lead(gain=15.0), w=["d"], z=["x"])
+    with pytest.raises(ModelError, match="name them"):
+        worst_case_gain(uncertain(), lead(gain=15.0), w=[], z=["tip:x"])
