@@ -1,5 +1,6 @@
 """All pictures: functions that take values and `ax=`, and return the axes they drew on."""
 
+from .bode import bode as bode
 from .budget import budget as budget
 from .error_map import error_map as error_map
 from .estimation import estimate as estimate
@@ -9,8 +10,11 @@ from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
+from .nyquist import nyquist as nyquist
 from .placement import sensor_map as sensor_map
+from .pole_map import pole_map as pole_map
 from .response import response as response
+from .singular_values import singular_values as singular_values
 from .structure import layout as layout
 from .structure import mode_shape as mode_shape
 from .update_summary import update as update

@@ -1,0 +1,86 @@
+"""Nyquist diagrams: how near a loop gain comes to -1."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.patches import Circle
+
+from ..errors import ModelError, unknown_label
+from ..values import FloatArray, positive
+from ._axes import MARK, axes, finish, legend
+from .gains import curves
+
+
+def nyquist(
+    loop_gains: Any,
+    *,
+    channel: tuple[str, str] | None = None,
+    freq: FloatArray | None = None,
+    modulus: float = 2.0,
+    reach: float = 2.5,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw loop gains L in the complex plane, with -1 and the circle in which ``|S| > modulus``.
+
+    ``S = 1 / (1 + L)``: its size is the inverse of the distance from -1. Frequencies are positive;
+    the mirror image is not drawn.
+
+    Parameters
+    ----------
+    loop_gains : StateSpace, Frf, or mapping {label: one of these}
+        L of one channel each, the sign being that of ``1 + L``.
+    channel : (output, input), optional
+        Of systems with several.
+    freq : (n_freq,) array [Hz], optional
+        Where systems are evaluated; a grid of each, refined at resonances, when not given.
+    modulus : float
+        Of the circle about -1, of radius 1 / modulus; 2 is 6 dB.
+    reach : float
+        The picture shows real and imaginary parts up to it.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ModelError
+        When there is nothing to draw, or one of several channels is not chosen.
+    LabelError
+        When the channel is unknown.
+    """
+    given, ax = ax is not None, axes(ax, figsize=(9.0, 5.0))
+    for curve in curves(loop_gains, freq):
+        known = list(curve.response)
+        if channel is None and len(known) > 1:
+            raise ModelError(
+                f"the loop gain {curve.label or 'given'!r} has {len(known)} channels: choose one, "
+                f"channel={known[0]!r}."
+            )
+        chosen = known[0] if channel is None else channel
+        if chosen not in known:
+            raise unknown_label("channel", str(chosen), [str(one) for one in known])
+        values = curve.response[chosen]
+        nearest = int(np.argmin(np.abs(1.0 + values)))
+        size = -20.0 * np.log10(abs(1.0 + values[nearest]))
+        text = f"|S| up to {size:.1f} dB, at {curve.response.freq[nearest]:.4g} Hz"
+        label = f"{curve.label}: {text}" if curve.label else text
+        ax.plot(values.real, values.imag, label=label, **curve.line)
+        ax.plot(*_point(values[nearest]), "o", color=curve.line["color"], markersize=5)
+    level = 20.0 * np.log10(positive(modulus, "modulus"))
+    ax.add_patch(Circle((-1, 0), 1.0 / modulus, fill=True, alpha=0.15, color=MARK, linewidth=0))
+    ax.add_patch(Circle((0, 0), 1.0, fill=False, color="0.6", linestyle=":", linewidth=0.9))
+    ax.plot(-1, 0, "+", color=MARK, markersize=10, label=f"-1, with |S| = {level:.1f} dB about it")
+    limit = positive(reach, "reach")
+    ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
+    legend(ax, given=given)
+    return finish(ax, x="real part of L", y="imaginary part of L")
+
+
+def _point(value: complex) -> tuple[float, float]:
+    return float(value.real), float(value.imag)

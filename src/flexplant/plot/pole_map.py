@@ -1,0 +1,79 @@
+"""Poles and zeros in the complex plane."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..lti.responses import continuous_poles
+from ..lti.statespace import StateSpace, as_statespace
+from ..values import ComplexArray, FloatArray
+from ._axes import CYCLE, MARK, axes, finish, legend
+
+#: damping ratios of the lines
+_RATIOS = (1e-3, 1e-2, 0.1, 0.3, 0.7)
+
+
+def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Axes:
+    """Draw poles (and zeros) by frequency and damping ratio, those right of the axis in red.
+
+    Lightly damped poles of a machine lie on the imaginary axis for the eye: |s| in Hz over the
+    damping ratio ``-Re s / |s|`` separates them. Poles of sampled systems are taken to ``log(z)
+    / dt``. Poles at zero frequency are named in the legend.
+
+    Parameters
+    ----------
+    systems : StateSpace, or mapping {label: StateSpace}
+        Whose poles are drawn as crosses.
+    zeros : bool
+        Whether invariant zeros are drawn too, as circles.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        Damping ratio over frequency [Hz], negative where unstable.
+
+    Raises
+    ------
+    ModelError
+        When one is no system.
+    """
+    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
+    named = dict(systems) if isinstance(systems, Mapping) else {"": systems}
+    for i, (label, one) in enumerate(named.items()):
+        g = as_statespace(one)
+        color = CYCLE[i % len(CYCLE)]
+        _draw(ax, continuous_poles(g), "x", color, f"{label} poles".strip())
+        if zeros:
+            _draw(ax, _continuous(g.zeros(), g), "o", color, f"{label} zeros".strip())
+    ax.set_xscale("log")
+    ax.set_yscale("symlog", linthresh=1e-4)
+    ax.axhline(0.0, color="0.3", linewidth=0.9)
+    for ratio in _RATIOS:
+        ax.axhline(ratio, color="0.7", linewidth=0.6, linestyle=":")
+    legend(ax, given=given)
+    return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio")
+
+
+def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:
+    if not g.dt:
+        return roots
+    kept = roots[np.abs(roots) > 0]
+    return np.asarray(np.log(kept) / g.dt)
+
+
+def _draw(ax: Axes, roots: ComplexArray, marker: str, color: str, label: str) -> None:
+    upper = roots[roots.imag >= -1e-9 * np.abs(roots)]
+    size = np.abs(upper)
+    still = size < 1e-6 * size.max(initial=0.0)
+    if still.any():
+        label = f"{label}, {int(still.sum())} more at 0 Hz"
+    freq: FloatArray = size[~still] / (2 * np.pi)
+    ratio = -upper[~still].real / size[~still]
+    ax.plot(freq, ratio, marker, color=color, label=label, markersize=6, fillstyle="none")
+    ax.plot(freq[ratio < 0], ratio[ratio < 0], marker, color=MARK, markersize=7, fillstyle="none")

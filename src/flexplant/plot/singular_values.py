@@ -1,0 +1,55 @@
+"""Singular values of a response over frequency."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from ..values import FloatArray
+from ._axes import axes, finish, legend
+from .gains import curves, decibel, readable
+
+
+def singular_values(
+    systems: Any, *, freq: FloatArray | None = None, ax: Axes | None = None
+) -> Axes:
+    """Draw the singular values of responses: the largest as a line, the area down to the smallest.
+
+    The largest one is the gain of the worst direction of the inputs at each frequency; its peak is
+    the H-infinity norm of a stable system. Channels should have one unit, or be weighted.
+
+    Parameters
+    ----------
+    systems : StateSpace, Frf, or mapping {label: one of these}
+        What to draw.
+    freq : (n_freq,) array [Hz], optional
+        Where systems are evaluated; a grid of each, refined at resonances, when not given.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ModelError
+        When there is nothing to draw.
+    """
+    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
+    drawn = curves(systems, freq)
+    for curve in drawn:
+        values = np.linalg.svd(np.moveaxis(curve.response.data, 2, 0), compute_uv=False)
+        largest, smallest = (decibel(np.asarray(values[:, k])) for k in (0, -1))
+        ax.semilogx(curve.response.freq, largest, label=curve.label or None, **curve.line)
+        if values.shape[1] > 1:
+            ax.semilogx(curve.response.freq, smallest, **{**curve.line, "linewidth": 0.6})
+            ax.fill_between(
+                curve.response.freq, smallest, largest, color=curve.line["color"], alpha=0.12
+            )
+    readable(ax)
+    if any(curve.label for curve in drawn):
+        legend(ax, given=given)
+    return finish(ax, x="frequency [Hz]", y="singular values [dB]")

@@ -1,0 +1,112 @@
+"""Bode, Nyquist, singular values, poles: what is drawn is what was given."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from scipy import signal
+
+import flexplant as fx
+from flexplant.errors import LabelError, ModelError
+from flexplant.lti import tf
+from systems_lti import machine, system
+
+LAG = tf([1.0], [1.0, 1.0, 4.0])
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
+
+
+def test_bode_is_that_of_scipy():
+    freq = np.geomspace(0.01, 10.0, 50)
+    ax = fx.plot.bode(LAG, freq=freq)
+    _, size, phase = signal.bode(([1.0], [1.0, 1.0, 4.0]), 2 * np.pi * freq)
+    first, second = ax.figure.axes
+    np.testing.assert_allclose(first.get_lines()[0].get_ydata(), size, rtol=1e-9)
+    np.testing.assert_allclose(second.get_lines()[0].get_ydata(), phase, atol=1e-9)
+    assert (second.get_xlabel(), second.get_ylabel()) == ("frequency [Hz]", "phase [deg]")
+
+
+def test_measured_phases_follow_the_model_by_whole_turns():
+    delayed = fx.lti.series(LAG, fx.lti.pade(0.3, order=6))
+    found = fx.frequency_response(delayed, np.geomspace(0.1, 3.0, 40))
+    measured = found.replace(variance=np.full(found.data.shape, 1e-6))
+    ax = fx.plot.bode({"measured": measured, "model": delayed})
+    phase = ax.figure.axes[1]
+    model, points = phase.get_lines()
+    assert points.get_linestyle() == "None"
+    wanted = np.interp(found.freq, model.get_xdata(), model.get_ydata())
+    assert np.abs(points.get_ydata() - wanted).max() < 2.0
+    assert np.asarray(points.get_ydata()).min() < -360.0
+
+
+def test_a_grid_of_channels_and_its_refusals():
+    g = system()
+    ax = fx.plot.bode({"one": g, "two": 2 * g}, outputs=["out1", "out0"], inputs="in2")
+    panels = ax.figure.axes
+    assert [p.get_ylabel() for p in panels[::2]] == [
+        f"|out{i} / in2| [dB, 0 dB = 1]" for i in (1, 0)
+    ]
+    one, two = panels[2].get_lines()
+    assert np.interp(1.0, two.get_xdata(), two.get_ydata()) == pytest.approx(
+        np.interp(1.0, one.get_xdata(), one.get_ydata()) + 20 * np.log10(2), abs=1e-6
+    )
+    with pytest.raises(LabelError, match="in9"):
+        fx.plot.bode(g, inputs=["in9"])
+    with pytest.raises(ModelError, match=r"more than can be read"):
+        fx.plot.bode(machine(2, 2, m=7, p=7))
+    with pytest.raises(ModelError, match="one channel; got 2 axes and 6 channels"):
+        fx.plot.bode(g, ax=plt.subplots(2)[1])
+    with pytest.raises(ModelError, match="need a system"):
+        fx.plot.bode("servo")
+    with pytest.raises(ModelError, match="nothing to draw"):
+        fx.plot.bode({})
+
+
+def test_a_zero_at_half_the_rate_does_not_draw_the_axis_down():
+    ax = fx.plot.bode(fx.lti.tustin(LAG, 50.0), freq=np.r_[np.geomspace(0.1, 24.0, 50), 25.0])
+    assert min(ax.get_lines()[0].get_ydata()) < -180
+    low, high = ax.get_ylim()
+    assert high - low < 200
+
+
+def test_nyquist_names_the_distance_from_minus_one():
+    L = 20.0 * tf([1.0, 1.0], [1.0, 0.0, 0.0]) * tf([1.0], [0.02, 1.0])
+    ax = fx.plot.nyquist({"servo": L})
+    freq = np.geomspace(1e-2, 1e3, 20001)
+    worst = max(-20 * np.log10(abs(1 + L(2j * np.pi * f))) for f in freq)
+    assert ax.get_legend().get_texts()[0].get_text().startswith(f"servo: |S| up to {worst:.1f} dB")
+    (circle, unit) = ax.patches
+    assert (circle.center, circle.radius, unit.radius) == ((-1, 0), 0.5, 1.0)
+    assert ax.get_aspect() == 1.0
+    with pytest.raises(ModelError, match=r"has 6 channels: choose one"):
+        fx.plot.nyquist(system())
+    with pytest.raises(LabelError):
+        fx.plot.nyquist(L, channel=("x", "y"))
+
+
+def test_singular_values():
+    g = system()
+    freq = np.geomspace(0.1, 10.0, 20)
+    high, low = fx.plot.singular_values(g, freq=freq).get_lines()
+    sizes = np.array([np.linalg.svd(g(2j * np.pi * f), compute_uv=False) for f in freq])
+    np.testing.assert_allclose(high.get_ydata(), 20 * np.log10(sizes[:, 0]), rtol=1e-9)
+    np.testing.assert_allclose(low.get_ydata(), 20 * np.log10(sizes[:, 1]), rtol=1e-9)
+
+
+@pytest.mark.parametrize("rate", [0.0, 1e4])
+def test_poles_by_frequency_and_damping(rate):
+    g = machine(n_rigid=1, n_elastic=4, m=1, p=1)
+    ax = fx.plot.pole_map({"stage": fx.discretized(g, rate) if rate else g}, zeros=True)
+    poles, wrong = ax.get_lines()[:2]
+    np.testing.assert_allclose(np.sort(poles.get_xdata()), np.linspace(245.0, 3700.0, 4), rtol=1e-6)
+    np.testing.assert_allclose(poles.get_ydata(), 1e-3, rtol=1e-5)
+    assert not len(wrong.get_xdata())
+    labels = [text.get_text() for text in ax.get_legend().get_texts()]
+    assert labels[0] == "stage poles, 2 more at 0 Hz"
+    unstable = tf([1.0], [1.0, -2.0, 100.0])
+    assert np.asarray(fx.plot.pole_map(unstable).get_lines()[1].get_ydata()) == pytest.approx(
+        [-0.1]
+    )
