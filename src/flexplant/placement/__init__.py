@@ -25,6 +25,8 @@ from .kinetic_energy import KineticEnergy as KineticEnergy
 from .modal_indices import ActuatorIndices as ActuatorIndices
 from .modal_indices import SensorIndices as SensorIndices
 from .mode_information import ModeInformation as ModeInformation
+from .pareto import ParetoCurve as ParetoCurve
+from .pareto import pareto_curve as pareto_curve
 from .penalised import LeftOutModes as LeftOutModes
 from .penalised import Penalised as Penalised
 from .placement import Placement as Placement
@@ -38,8 +40,11 @@ from .robust import OverMachines as OverMachines
 from .scores import Scores as Scores
 from .scores import score_actuators as score_actuators
 from .scores import score_sensors as score_sensors
+from .screened import Screened as Screened
 from .search import place_actuators as place_actuators
 from .search import place_both as place_both
 from .search import place_sensors as place_sensors
 from .sensor_map import SensorMap as SensorMap
 from .sensor_map import sensor_map as sensor_map
+from .worth import DeviceWorth as DeviceWorth
+from .worth import device_worth as device_worth

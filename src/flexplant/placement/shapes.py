@@ -56,7 +56,7 @@ def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
     zeta = -np.trace(pairs, axis1=1, axis2=2) / 2.0 / np.where(omega > 0, omega, 1.0)
     full = real.inputs[:, 1 : 2 * m : 2]
     rows = [p.row(real) if isinstance(p, SensorPort) else p.push(real) for p in ports]
-    stacked = np.array(rows).reshape(len(ports), -1)
+    stacked = np.array(rows).reshape(len(ports), full.shape[0])
     asd = np.array([(p.asd or 1.0) if isinstance(p, SensorPort) else 1.0 for p in ports])
     return Shapes(stacked @ full, omega, zeta, stacked, full, asd)
 

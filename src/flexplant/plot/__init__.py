@@ -11,6 +11,8 @@ from .frequency import sensitivity as sensitivity
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
 from .nyquist import nyquist as nyquist
+from .placement import pareto_curve as pareto_curve
+from .placement import placed as placed
 from .placement import sensor_map as sensor_map
 from .pole_map import pole_map as pole_map
 from .response import response as response

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -9,11 +10,14 @@ from matplotlib.axes import Axes
 from matplotlib.patches import Circle, Patch
 from matplotlib.patches import Rectangle as Box
 
-from ..placement import SensorMap
-from ..plant import Ports
-from ..structure import Disc, Rectangle
-from ..values import FloatArray, instance
-from ._axes import MARK, MEASURED, axes, finish
+from ..errors import ModelError
+from ..placement import ParetoCurve, SensorMap
+from ..placement.places import Zone, places_of
+from ..placement.shapes import shapes_of
+from ..plant import Ports, StandardPlant
+from ..structure import Disc
+from ..values import FloatArray, instance, scale, whole
+from ._axes import MARK, MEASURED, NOMINAL, UPDATED, axes, finish
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
@@ -24,7 +28,7 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     found : SensorMap
         From `flexplant.sensor_map`.
     ports : Ports, optional
-        Sensors that are there already, where their places are points.
+        Sensors and actuators that are there already and POIs, where their places are points.
     ax : Axes, optional
         Where to draw.
 
@@ -50,17 +54,147 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
         style = {"facecolor": "white", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
         label = "no sensor possible" if i == 0 else None
         ax.add_patch(_patch(zone, label=label, **style))
-    there = [port.at for port in ports.y if isinstance(port.at, tuple)] if ports else []
-    if there:
-        points: FloatArray = np.array(there, dtype=np.float64)
-        ax.plot(points[:, 0], points[:, 1], "P", color=MEASURED, label="sensors", clip_on=False)
+    if ports is not None:
+        _devices(ax, ports.y, ports.u)
+        _pois(ax, [np.asarray(poi.at) for poi in ports.z if isinstance(poi.at, tuple)])
     ax.plot(*found.best[:2], "*", color=MARK, markersize=14, label="best place", clip_on=False)
     ax.set_aspect("equal")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
     return finish(ax, x="x [m]", y="y [m]")
 
 
-def _patch(zone: Rectangle | Disc, **style: Any) -> Patch:
+def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
+    """Draw what each further device buys, and the bound below which no choice can be.
+
+    Parameters
+    ----------
+    found : ParetoCurve
+        From `flexplant.placement.pareto_curve`.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+        The root of a mean square in nm, urad and so on; other criteria as they are.
+
+    Raises
+    ------
+    ModelError
+        When `found` is no ParetoCurve.
+    """
+    instance(found, ParetoCurve, "found", "Pass what pareto_curve returned.")
+    ax = axes(ax, figsize=(7.0, 4.2))
+    values, bounds, label = found.values, found.bounds, found.placements[0].criterion
+    if found.unit:
+        values, bounds = np.sqrt(values), np.sqrt(np.maximum(bounds, 0.0))
+        size, prefix = scale(float(np.max(values)))
+        values, bounds, label = values / size, bounds / size, f"rms [{prefix}{found.unit}]"
+    low = np.isfinite(bounds)
+    ax.plot(found.amounts, values, "o-", color=UPDATED, label="best found")
+    if np.any(low):
+        ax.plot(
+            found.amounts[low], bounds[low], "--", color=NOMINAL, label="no choice is below this"
+        )
+        ax.fill_between(found.amounts[low], bounds[low], values[low], color=UPDATED, alpha=0.15)
+    if not found.by_cost:
+        ax.set_xticks(found.amounts)
+    ax.set_ylim(bottom=0.0 if found.unit else None)
+    finish(ax, x="cost" if found.by_cost else "number of devices", y=label)
+    ax.legend(frameon=False)
+    return ax
+
+
+def placed(
+    plant: StandardPlant,
+    *,
+    mode: int | None = None,
+    zones: Sequence[Zone] = (),
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw the sensors, actuators and POIs of a plant on its structure, seen from above.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Assembled from a structure, such as `placement.on(plant)`.
+    mode : int, optional
+        Number of a mode from 1, rigid-body modes included: its motion in z is drawn as contours,
+        and its nodal line.
+    zones : sequence of Rectangle or Disc
+        Where nothing may be, hatched.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ModelError
+        When the plant has no structure, the mode does not exist, or there are no z-DOFs to draw.
+    """
+    own = instance(plant, StandardPlant, "plant", "Pass placement.on(plant).").assembled
+    ax = axes(ax, figsize=(6.4, 5.4))
+    model: Any = own.realisation.model
+    dofs = model.dofs
+    rows = np.flatnonzero(np.array(dofs.directions) == "z")
+    if rows.size < 3:
+        raise ModelError("a picture from above needs at least three DOFs in z: the model has less.")
+    x, y = dofs.xyz[rows, 0], dofs.xyz[rows, 1]
+    ax.plot(x, y, ".", color="0.8", markersize=2)
+    title = ""
+    if mode is not None:
+        shapes = shapes_of(plant, ())
+        whole(mode, "mode", maximum=shapes.omega.size)
+        shape = shapes.full[rows, mode - 1]
+        size = float(np.max(np.abs(shape)))
+        levels = np.linspace(-1.0, 1.0, 21)
+        filled = ax.tricontourf(x, y, shape / size, levels=levels, cmap="RdBu_r", alpha=0.8)
+        ax.figure.colorbar(filled, ax=ax, label="z, scaled to 1")
+        if shape.min() < 0.0 < shape.max():
+            ax.tricontour(x, y, shape / size, levels=[0.0], colors="black", linewidths=0.8)
+        title = f"mode {mode}, {shapes.omega[mode - 1] / 2 / np.pi:.4g} Hz"
+    for zone in zones:
+        ax.add_patch(_patch(zone, facecolor="none", edgecolor="0.3", hatch="///", zorder=2.5))
+    where = places_of(plant, (*own.ports.y, *own.ports.u))
+    _devices(ax, own.ports.y, own.ports.u, where.points)
+    _pois(ax, [points.mean(axis=0) for points in where.pois])
+    ax.set_aspect("equal")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
+    return finish(ax, x="x [m]", y="y [m]", title=title)
+
+
+def _devices(
+    ax: Axes, sensors: Sequence[Any], actuators: Sequence[Any], points: Sequence[FloatArray] = ()
+) -> None:
+    """Mark sensors and actuators; those whose place is no point only where points are given."""
+    listed = points or [
+        np.array([port.at] if isinstance(port.at, tuple) else np.zeros((0, 3)))
+        for port in (*sensors, *actuators)
+    ]
+    kinds = (
+        ("sensors", listed[: len(sensors)], "P", MEASURED),
+        ("actuators", listed[len(sensors) :], "^", MARK),
+    )
+    for label, parts, marker, color in kinds:
+        if parts and len(found := np.vstack(parts)):
+            style: dict[str, Any] = {"color": color, "markeredgecolor": "white", "zorder": 4}
+            ax.plot(
+                found[:, 0], found[:, 1], marker, label=label, markersize=11, clip_on=False, **style
+            )
+
+
+def _pois(ax: Axes, points: Sequence[FloatArray]) -> None:
+    """Mark POIs."""
+    if points:
+        at = np.array(points)
+        style: dict[str, Any] = {"fillstyle": "none", "markersize": 12, "zorder": 4}
+        ax.plot(at[:, 0], at[:, 1], "o", color=MARK, label="POI", **style)
+
+
+def _patch(zone: Zone, **style: Any) -> Patch:
     """Return the outline of a zone."""
     if isinstance(zone, Disc):
         return Circle((zone.centre[0], zone.centre[1]), zone.radius, **style)

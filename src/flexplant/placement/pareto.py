@@ -1,0 +1,174 @@
+"""What one more device buys: the best value for each count or budget, with its bound."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import InfeasibleError, ModelError
+from ..plant import Actuator, StandardPlant
+from ..values import FloatArray, Rng, Value, positive, real_array, short
+from .candidates import checked_plant
+from .constraints import Budget, Constraint
+from .criterion import Criterion, in_words
+from .placement import Placement
+from .problem import Search
+from .search import place_actuators, place_sensors
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ParetoCurve(Value):
+    """The best choice for each count, or for each budget; prints as a table.
+
+    Parameters
+    ----------
+    amounts : (n,) array
+        Counts or budgets, ascending.
+    placements : sequence of Placement
+        The best that was found for each.
+    bounds : (n,) array
+        No choice of that count (within that budget) is better.
+    by_cost : bool
+        Whether amounts are budgets.
+    """
+
+    amounts: FloatArray
+    placements: Sequence[Placement]
+    bounds: FloatArray
+    by_cost: bool = False
+
+    def __post_init__(self) -> None:
+        self._set(
+            amounts=real_array(self.amounts, "amounts", (None,)),
+            placements=tuple(self.placements),
+            bounds=np.asarray(self.bounds, dtype=np.float64),
+        )
+
+    def __repr__(self) -> str:
+        what = "cost" if self.by_cost else "count"
+        lines = [f"<ParetoCurve by {what}, {self.placements[0].criterion}>"]
+        for amount, best, bound in zip(
+            self.amounts[:6], self.placements[:6], self.bounds[:6], strict=True
+        ):
+            low = f", none below {in_words(bound, self.unit)}" if np.isfinite(bound) else ""
+            lines.append(
+                f"  {amount:<6g} {in_words(best.value, self.unit)}{low}: "
+                f"{' '.join(best.chosen):.60}"
+            )
+        return "\n".join(lines)
+
+    @property
+    def values(self) -> FloatArray:
+        """The criterion (n,) of each."""
+        return np.array([one.value for one in self.placements])
+
+    @property
+    def unit(self) -> str:
+        """Unit of the root of a value, where it is a mean square of a motion."""
+        return self.placements[0].unit
+
+
+def pareto_curve(
+    plant: StandardPlant,
+    candidates: Sequence[Any],
+    amounts: Sequence[float],
+    criterion: Criterion | Callable[[StandardPlant], float] | None = None,
+    *,
+    costs: Mapping[str, float] | None = None,
+    required: Sequence[str] = (),
+    constraints: Sequence[Constraint] = (),
+    method: Search | None = None,
+    executor: Executor | None = None,
+    progress: bool | None = None,
+    rng: Rng = None,
+) -> ParetoCurve:
+    """Return the best choice for each of several counts, or of several budgets.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Sampled.
+    candidates : sequence of Sensor or of Actuator
+        As for `place_sensors` or `place_actuators`.
+    amounts : sequence of int or float
+        Counts; budgets where there are costs. Those without any possible choice are left out.
+    criterion : Criterion or callable, optional
+        As for `place_sensors` or `place_actuators`.
+    costs : mapping {str: float}, optional
+        Cost of candidates by name, 1 of others: for each budget every count that fits is tried.
+    required : sequence of str
+        Candidates that any choice includes.
+    constraints : sequence of Constraint, optional
+        What every choice satisfies.
+    method : Search, optional
+        As for `place_sensors`.
+    executor : concurrent.futures.Executor, optional
+        As for `place_sensors`.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
+    rng : int, SeedSequence or Generator, optional
+        For random starts.
+
+    Returns
+    -------
+    ParetoCurve
+        `fx.plot.pareto_curve` draws it.
+
+    Raises
+    ------
+    ModelError
+        When the plant, a candidate, an amount or the method is not what is needed.
+    LabelError
+        When a name or a place is unknown or doubled.
+    AssumptionError
+        When even all candidates miss a rigid-body mode, or the criterion has no meaning here.
+    InfeasibleError
+        When there is no choice for any amount.
+    CertificateError
+        When a score is not confirmed by the other route.
+    """
+    plant = checked_plant(plant)
+    if not isinstance(amounts, Sequence | np.ndarray | range) or isinstance(amounts, str):
+        raise ModelError(f"amounts are counts or budgets, got {short(amounts)}. Type range(3, 8).")
+    given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
+    side = "u" if any(isinstance(c, Actuator) or c in plant.u for c in candidates) else "y"
+    place = place_actuators if side == "u" else place_sensors
+
+    def best(count: int, extra: tuple[Constraint, ...]) -> Placement | None:
+        try:
+            return place(
+                plant, candidates, count, criterion, required=required, executor=executor,
+                constraints=(*given, *extra), method=method, progress=progress, rng=rng,
+            )  # fmt: skip
+        except InfeasibleError:
+            return None
+
+    rows: list[tuple[float, Placement, float]] = []
+    for amount in sorted(amounts):
+        if costs is None:
+            listed = [best(amount, ())]  # type: ignore[arg-type]
+        else:
+            limit = Budget(positive(amount, "a budget"), dict(costs))
+            names = [c if isinstance(c, str) else c.name for c in candidates]
+            prices = np.cumsum(sorted(limit.costs.get(name, limit.default) for name in names))
+            most = int(np.searchsorted(prices, limit.total, side="right"))
+            listed = [best(count, (limit,)) for count in range(max(len(required), 1), most + 1)]
+        found = [one for one in listed if one is not None]
+        if found:
+            low = min(one.bound for one in found)
+            rows.append((float(amount), min(found, key=lambda one: one.value), low))
+    if not rows:
+        raise InfeasibleError(
+            f"there is no choice for any of the amounts {short(list(amounts))}. Give larger ones, "
+            "or relax a constraint."
+        )
+    return ParetoCurve(
+        np.array([row[0] for row in rows]),
+        tuple(row[1] for row in rows),
+        np.array([row[2] for row in rows]),
+        costs is not None,
+    )

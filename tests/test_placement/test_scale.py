@@ -1,0 +1,157 @@
+"""The same answer on any executor, after being killed, and with a worker that dies."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import pytest
+
+import flexplant.parallel
+from flexplant.errors import ModelError, SolverError
+from flexplant.parallel import mapped
+from flexplant.placement import BranchAndBound, Exchange, Exhaustive, PoiVariance, place_sensors
+
+METHODS = (Exchange(starts=4), Exhaustive(), BranchAndBound(starts=2))
+
+
+def same(one, other):
+    assert one._fields() | {"ports": 0} == other._fields() | {"ports": 0}
+
+
+@pytest.mark.slow
+def test_serial_process_pool_and_dask_agree_to_the_bit(make, send_everything):
+    distributed = pytest.importorskip("distributed")
+    plant, sensors, _ = make(12)
+    serial = [place_sensors(plant, sensors, 4, method=method, rng=5) for method in METHODS]
+    with (
+        ProcessPoolExecutor(2, mp_context=get_context("spawn")) as pool,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as own,
+        distributed.Client(own) as client,
+    ):
+        for executor in (pool, client.get_executor()):
+            for method, expected in zip(METHODS, serial, strict=True):
+                found = place_sensors(plant, sensors, 4, method=method, rng=5, executor=executor)
+                same(found, expected)
+
+
+class Slow:
+    """A criterion that notes each call in a file: what is in the checkpoint is not called again."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __repr__(self):
+        return "Slow"
+
+    def __call__(self, plant):
+        with open(Path(self.folder) / "calls", "a") as file:
+            file.write(".")
+        time.sleep(0.003)
+        return float(sum(sensor.at[0] ** 2 for sensor in plant.assembled.ports.y))
+
+
+SCRIPT = """
+import sys
+sys.path[:0] = {paths!r}
+from test_scale import Slow
+from conftest import machine
+from flexplant.placement import Exhaustive, place_sensors
+plant, sensors, _ = machine(12, count=11)
+place_sensors(plant, sensors, 4, Slow({folder!r}), method=Exhaustive(), checkpoint={path!r})
+"""
+
+
+@pytest.mark.slow
+def test_killed_and_resumed_nothing_is_lost_or_done_twice(make, tmp_path):
+    path, calls = tmp_path / "search.jsonl", tmp_path / "calls"
+    here = Path(__file__).parent
+    code = SCRIPT.format(paths=[str(here), str(here.parent)], folder=str(tmp_path), path=str(path))
+    process = subprocess.Popen([sys.executable, "-c", code])
+    while not path.exists() or path.read_bytes().count(b"\n") < 3:
+        assert process.poll() is None
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    before = calls.stat().st_size
+    with path.open("ab") as file:  # as a power cut would leave it
+        file.write(b"[9, [0.1")
+    plant, sensors, _ = make(12, count=11)
+    criterion, method = Slow(str(tmp_path)), Exhaustive()
+    found = place_sensors(plant, sensors, 4, criterion, method=method, checkpoint=path)
+    assert found.evaluations == 330
+    seen = calls.stat().st_size
+    assert before >= 2 * 60  # two blocks of 64, without sets that miss a rigid-body mode
+    assert seen <= 330 + 64  # the block that was under way when it was killed
+    same(place_sensors(plant, sensors, 4, criterion, method=method, checkpoint=path), found)
+    assert calls.stat().st_size == seen
+    lowest = sorted(sensors, key=lambda sensor: sensor.at[0] ** 2)[:4]
+    assert set(found.chosen) == {sensor.name for sensor in lowest}
+
+
+@pytest.mark.parametrize("method", METHODS, ids=lambda method: type(method).__name__)
+def test_a_file_that_was_cut_gives_the_same_answer(make, tmp_path, method):
+    plant, sensors, _ = make(12)
+    path = tmp_path / "search.jsonl"
+    found = place_sensors(plant, sensors, 4, method=method, checkpoint=path)
+    lines = path.read_bytes().splitlines(keepends=True)
+    assert len(lines) > 2
+    for kept in (1 + len(lines) // 2, len(lines)):
+        path.write_bytes(b"".join(lines[:kept]))
+        same(place_sensors(plant, sensors, 4, method=method, checkpoint=path), found)
+    with pytest.raises(ModelError, match="checkpoint of another search"):
+        place_sensors(plant, sensors, 5, method=method, checkpoint=path)
+
+
+def ends_once(item):
+    """End the process at item 7, the first time only."""
+    folder, number = item
+    mark = Path(folder) / "died"
+    if number == 7 and not mark.exists():
+        mark.touch()
+        os._exit(1)
+    return number**2
+
+
+def ends(number):
+    if number == 7:
+        os._exit(1)
+    return number
+
+
+def test_a_worker_that_dies_is_survived_once(tmp_path, monkeypatch):
+    monkeypatch.setattr(flexplant.parallel, "PROBE", 0.0)
+    monkeypatch.setattr(flexplant.parallel, "CHUNK", 1e-7)
+    with ProcessPoolExecutor(2) as pool:
+        found = mapped(ends_once, [(str(tmp_path), i) for i in range(12)], executor=pool)
+    assert found == [i**2 for i in range(12)]
+    with ProcessPoolExecutor(2) as pool, pytest.raises(SolverError, match="worker died, twice"):
+        mapped(ends, range(12), executor=pool)
+
+
+def test_a_criterion_whose_worker_dies_leaves_the_search_as_it_was(make, tmp_path, send_everything):
+    plant, sensors, _ = make(12)
+    method = Exhaustive()
+    plain = place_sensors(plant, sensors, 4, PoiVariance("die"), method=method)
+    criterion = Fragile(str(tmp_path), os.getpid())
+    with ProcessPoolExecutor(2) as pool:
+        found = place_sensors(plant, sensors, 4, criterion, method=method, executor=pool)
+    assert (tmp_path / "died").exists()
+    assert found.chosen == plain.chosen
+
+
+class Fragile:
+    """The variance at the POI; the first worker that computes it dies."""
+
+    def __init__(self, folder, home):
+        self.mark, self.home = Path(folder) / "died", home
+
+    def __call__(self, plant):
+        if os.getpid() != self.home and not self.mark.exists():
+            self.mark.touch()
+            os._exit(1)
+        return PoiVariance("die")(plant)
