@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from math import isfinite
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -61,23 +62,7 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = Non
     ModelError
         When entries are no numbers, complex, NaN or infinite.
     """
-    try:
-        array = np.asarray(value)
-    except (TypeError, ValueError) as error:  # rows of different lengths
-        raise ModelError(
-            f"{name} must be an array of numbers, got {short(value)}: its rows have different "
-            "lengths. Give every row the same number of entries."
-        ) from error
-    if np.iscomplexobj(array):
-        raise ModelError(
-            f"{name} must be real, got complex entries. Pass its real part if that is meant."
-        )
-    if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and _holds_none(array)):
-        raise _no_numbers(value, name, shape)
-    try:
-        array = np.array(array, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise _no_numbers(value, name, shape) from error
+    array = _floats(value, name, shape)
     if shape is not None and (
         array.ndim != len(shape)
         or any(
@@ -98,6 +83,29 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = Non
             "no result could be trusted. Remove it at its source."
         )
     return array
+
+
+def _floats(value: Any, name: str, shape: tuple[int | None, ...] | None) -> FloatArray:
+    """Return a float64 copy, of any shape and finite or not."""
+    if type(value) is np.ndarray and value.dtype == np.float64:
+        return np.array(value)
+    try:
+        array = np.asarray(value)
+    except (TypeError, ValueError) as error:  # rows of different lengths
+        raise ModelError(
+            f"{name} must be an array of numbers, got {short(value)}: its rows have different "
+            "lengths. Give every row the same number of entries."
+        ) from error
+    if np.iscomplexobj(array):
+        raise ModelError(
+            f"{name} must be real, got complex entries. Pass its real part if that is meant."
+        )
+    if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and _holds_none(array)):
+        raise _no_numbers(value, name, shape)
+    try:
+        return np.array(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise _no_numbers(value, name, shape) from error
 
 
 def _holds_none(array: npt.NDArray[Any]) -> bool:
@@ -148,7 +156,9 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
     """
     if isinstance(value, bool | np.bool_):
         raise ModelError(f"{name} must be one number, got {value}. Pass the number that is meant.")
-    number = float(real_array(value, name, ()))
+    number = (
+        value if type(value) is float and isfinite(value) else float(real_array(value, name, ()))
+    )
     if number < 0 or (number == 0 and not zero):
         raise ModelError(
             f"{name} must be {'zero or ' if zero else ''}positive, got {number:g}. "

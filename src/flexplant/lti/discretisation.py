@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ..errors import ModelError
 from ..values import FloatArray, IntArray, positive
+from .joining import Matrices
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -227,20 +228,20 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
             raise ModelError(f"prewarp must lie between 0 and {0.5 * rate:g} Hz, got {prewarp:g}.")
         w = 2.0 * np.pi * prewarp
         a = w / np.tan(w / a)
-    n = g.n_states
-    left = a * np.eye(n) - g.A
-    if n and np.linalg.cond(left) > 1e14:
+    if g.n_states and np.linalg.cond(a * np.eye(g.n_states) - g.A) > 1e14:
         raise ModelError(f"{g!r} has a pole at {a:g} rad/s, which Tustin maps to infinity.")
-    inverse = np.linalg.inv(left)
+    A, B, C, D = trapezoidal((g.A, g.B, g.C, g.D), a)
+    return g.replace(A=A, B=B, C=C, D=D, dt=1.0 / rate)
+
+
+def trapezoidal(matrices: Matrices, a: float) -> Matrices:
+    """Return A, B, C, D with ``s = a (z - 1) / (z + 1)``; no pole lies at a."""
+    A, B, C, D = matrices
+    inverse = np.linalg.inv(a * np.eye(len(A)) - A)
     # x is replaced by the trapezoidal state, scaled so that B and C keep their sizes
     root = np.sqrt(2.0 * a)
-    return g.replace(
-        A=(a * np.eye(n) + g.A) @ inverse,
-        B=root * inverse @ g.B,
-        C=root * g.C @ inverse,
-        D=g.D + g.C @ inverse @ g.B,
-        dt=1.0 / rate,
-    )
+    plus = a * np.eye(len(A)) + A
+    return plus @ inverse, root * inverse @ B, root * C @ inverse, D + C @ inverse @ B
 
 
 def bilinear(sys: System, rate: float) -> StateSpace:

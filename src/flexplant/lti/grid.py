@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import ModelError
-from ..values import ComplexArray, FloatArray, positive
+from ..values import ComplexArray, FloatArray, IntArray, positive
 from .responses import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
@@ -19,6 +19,8 @@ FLOOR = 1e-6
 UNDAMPED = 1e-12
 #: relative width of the narrowest interval that is halved
 NARROWEST = 1e-8
+#: local maxima that are climbed at most, and the part of the highest that each has at least
+_PEAKS, _HIGH = 6, 0.5
 #: around a resonance, in units of its half-power half-width
 _AROUND = np.array([0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0])
 
@@ -163,11 +165,16 @@ def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 600) -> Floa
     return np.asarray(grid[(grid >= low) & (grid <= high)])
 
 
-def refined(grid: FloatArray, values: FloatArray, *, peaks: int = 6, parts: int = 8) -> FloatArray:
-    """Return new frequencies between the neighbours of the highest local maxima."""
+def _tops(values: FloatArray) -> IntArray:
+    """Return where the highest local maxima are, the highest first."""
     padded = np.concatenate([[-np.inf], values, [-np.inf]])
-    tops = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]))
-    tops = tops[np.argsort(values[tops])[::-1][:peaks]]
+    high = values >= _HIGH * values.max(initial=0.0)
+    tops = np.flatnonzero((values >= padded[:-2]) & (values >= padded[2:]) & high)
+    return np.asarray(tops[np.argsort(values[tops])[::-1][:_PEAKS]])
+
+
+def _between(grid: FloatArray, tops: IntArray, parts: int = 8) -> FloatArray:
+    """Return new frequencies between the neighbours of some points."""
     left, right = grid[np.maximum(tops - 1, 0)], grid[np.minimum(tops + 1, grid.size - 1)]
     share = np.arange(1, 2 * parts) / (2 * parts)
     return np.setdiff1d((left[:, None] + (right - left)[:, None] * share).ravel(), grid)
@@ -176,7 +183,7 @@ def refined(grid: FloatArray, values: FloatArray, *, peaks: int = 6, parts: int 
 def climbed(
     find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies and values of a function of them, refined some times where it is highest.
+    """Return frequencies and values of a function of them, refined where it is highest.
 
     Parameters
     ----------
@@ -185,11 +192,11 @@ def climbed(
     grid : (n_freq,) array [Hz]
         Where it begins.
     rounds : int
-        How often `refined` adds frequencies.
+        How often frequencies are added between the neighbours of the highest local maxima.
     """
     values = find(grid)
     for _ in range(rounds):
-        fresh = refined(grid, values)
+        fresh = _between(grid, _tops(values))
         both = np.concatenate([grid, fresh])
         order = np.argsort(both)
         grid, values = both[order], np.concatenate([values, find(fresh)])[order]

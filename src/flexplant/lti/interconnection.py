@@ -9,7 +9,7 @@ from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import FloatArray
-from .joining import common_dt, common_fields, joined_units, stacked, state_names
+from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
 
@@ -105,17 +105,14 @@ def lft(P: System, K: System) -> StateSpace:
     D22, DK = plant.D[np.ix_(y, u)], controller.D
     B1, B2, C1, C2 = plant.B[:, w], plant.B[:, u], plant.C[z], plant.C[y]
     D11, D12, D21 = plant.D[np.ix_(z, w)], plant.D[np.ix_(z, u)], plant.D[np.ix_(y, w)]
-    # u = R (DK C2 x + CK xk + DK D21 w) with R = (I - DK D22)^-1; y = S (C2 x + D22 CK xk + D21 w)
+    # u = u_x x + u_k xk + R DK D21 w with R = (I - DK D22)^-1; y = S (C2 x + D22 CK xk + D21 w)
     R, S = _well_posed(DK @ D22), _well_posed(D22 @ DK)
-    u_x, u_k, u_w = R @ DK @ C2, R @ controller.C, R @ DK @ D21
-    y_x, y_k, y_w = S @ C2, S @ D22 @ controller.C, S @ D21
+    A, u_x, u_k = _looped(
+        (plant.A, B2, C2, D22), (controller.A, controller.B, controller.C, DK), R, S
+    )
+    u_w, y_w = R @ DK @ D21, S @ D21
     return StateSpace(
-        np.block(
-            [
-                [plant.A + B2 @ u_x, B2 @ u_k],
-                [controller.B @ y_x, controller.A + controller.B @ y_k],
-            ]
-        ),
+        A,
         np.vstack([B1 + B2 @ u_w, controller.B @ y_w]),
         np.hstack([C1 + D12 @ u_x, D12 @ u_k]),
         D11 + D12 @ u_w,
@@ -126,6 +123,27 @@ def lft(P: System, K: System) -> StateSpace:
         name=plant.name,
         units=plant.units,
     )
+
+
+def loop_matrix(P: Matrices, K: Matrices) -> FloatArray:
+    """Return A of the loop of P and ``u = K y``, states of P first.
+
+    Raises
+    ------
+    ModelError
+        When the loop is ill-posed.
+    """
+    D, DK = P[3], K[3]
+    return _looped(P, K, _well_posed(DK @ D), _well_posed(D @ DK))[0]
+
+
+def _looped(
+    P: Matrices, K: Matrices, R: FloatArray, S: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return A of the loop and ``u = u_x x + u_k xk``; R, S: (I - DK D)^-1, (I - D DK)^-1."""
+    (A, B, C, D), (AK, BK, CK, DK) = P, K
+    u_x, u_k, y_x, y_k = R @ DK @ C, R @ CK, S @ C, S @ D @ CK
+    return np.block([[A + B @ u_x, B @ u_k], [BK @ y_x, AK + BK @ y_k]]), u_x, u_k
 
 
 def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> StateSpace:

@@ -7,13 +7,16 @@ Systems are anything with A, B, C, D, dt, inputs, outputs, states and blocks: th
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
 from ..values import ComplexArray, FloatArray
+
+#: A, B, C, D
+Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def in_series(g1: Any, g2: Any) -> dict[str, Any]:
@@ -32,19 +35,28 @@ def in_series(g1: Any, g2: Any) -> dict[str, Any]:
             f"{len(g1.outputs)} ({short_list(g1.outputs)}) and {len(g2.inputs)} "
             f"({short_list(g2.inputs)})."
         )
-    # the second system's states first: A stays block upper triangular
-    n1, n2 = g1.A.shape[0], g2.A.shape[0]
+    A, B, C, D = cascaded((g1.A, g1.B, g1.C, g1.D), (g2.A, g2.B, g2.C, g2.D))
     return {
-        "A": np.block([[g2.A, g2.B @ g1.C], [np.zeros((n1, n2)), g1.A]]),
-        "B": np.vstack([g2.B @ g1.D, g1.B]),
-        "C": np.hstack([g2.C, g2.D @ g1.C]),
-        "D": g2.D @ g1.D,
+        "A": A,
+        "B": B,
+        "C": C,
+        "D": D,
         "inputs": g1.inputs,
         "outputs": g2.outputs,
         **common_fields([g2, g1]),
         "units": {name: g2.units[name] for name in g2.outputs if name in g2.units}
         | {name: g1.units[name] for name in g1.inputs if name in g1.units},
     }
+
+
+def cascaded(first: Matrices, second: Matrices) -> Matrices:
+    """Return A, B, C, D in series: the second's states first, so that A stays upper triangular."""
+    A1, B1, C1, D1 = first
+    A2, B2, C2, D2 = second
+    n1, n2 = len(A1), len(A2)
+    A = np.zeros((n2 + n1, n2 + n1))
+    A[:n2, :n2], A[:n2, n2:], A[n2:, n2:] = A2, B2 @ C1, A1
+    return A, np.vstack([B2 @ D1, B1]), np.hstack([C2, D2 @ C1]), D2 @ D1
 
 
 def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:

@@ -9,10 +9,12 @@ from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, SolverError
 from ..loop import ClosedLoop, close_loop
-from ..lti.interconnection import lft
+from ..lti.interconnection import loop_matrix
+from ..lti.joining import Matrices
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant
 from ..plant.rigid.rigid_motion import RigidModes, gain_of, rigid_modes_of
@@ -117,8 +119,9 @@ class ServoTask:
 
     def is_stable(self, axis: Axis) -> bool:
         """Return whether the loop is stable with the modes that the plant has."""
-        hats = self._estimates.outputs
-        return lft(self._estimates, self.controller(axis).select(inputs=hats)).is_stable
+        K, hats = self.controller(axis), slice(-len(self.poi.axes), None)
+        feedback = (K.A, K.B[:, hats], K.C, K.D[:, hats])
+        return _radius(self._estimates, feedback) < 1.0
 
     def closed(self, axis: Axis) -> ClosedLoop:
         """Return the loop that will run, without a warning of its own."""
@@ -149,7 +152,8 @@ class ServoTask:
         SolverError
             When it is unstable.
         """
-        radius = max(np.abs(lft(body, axis.system).poles()).max() for body in self._bodies)
+        K = axis.system
+        radius = max(_radius(body, (K.A, K.B, K.C, K.D)) for body in self._bodies)
         if not radius < 1.0:
             raise SolverError(
                 f"the rigid-body loop at {axis.bandwidth:g} Hz is unstable (spectral radius "
@@ -159,7 +163,7 @@ class ServoTask:
             )
         margin = 1.0 / max(rigid_peak(body, axis) for body in self._bodies)
         return {
-            "rigid-body spectral radius": float(radius),
+            "rigid-body spectral radius": radius,
             "rigid-body modulus margin": margin,
         }
 
@@ -267,6 +271,11 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
             f"such as poi={ports.z[0].name!r}."
         )
     return ports.poi(name if name is not None else ports.z[0].name)
+
+
+def _radius(g: StateSpace, K: Matrices) -> float:
+    """Return the spectral radius of the loop of g and K, channels in the same order."""
+    return float(np.abs(la.eigvals(loop_matrix((g.A, g.B, g.C, g.D), K))).max())
 
 
 def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:
