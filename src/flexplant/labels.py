@@ -16,7 +16,7 @@ from .errors import LabelError, ShapeError, unknown_label
 from .places import DIRECTIONS as DIRECTIONS
 from .places import Interpolation as Interpolation
 from .places import Place as Place
-from .values import FloatArray, IntArray, Value, real_array
+from .values import FloatArray, IntArray, Value, instance, real_array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,11 +72,13 @@ class DofSet(Value):
         self._set(
             nodes=nodes, directions=directions, xyz=real_array(self.xyz, "xyz", (nodes.size, 3))
         )
-        if not isinstance(self.interpolation, Interpolation | None):
-            raise LabelError(
-                f"interpolation must be an Interpolation, got {type(self.interpolation).__name__}: "
-                "flexplant.interpolated(dofs) makes one, or leave it out."
-            )
+        instance(
+            self.interpolation,
+            Interpolation | None,
+            "interpolation",
+            "Leave it out, or use flexplant.interpolated.",
+            LabelError,
+        )
         index = self._index
         doubled = np.flatnonzero(np.diff(index.keys) == 0)
         if doubled.size:

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from .errors import LabelError, ModelError, ShapeError
+from .errors import FlexplantError, LabelError, ModelError, ShapeError
 from .store import Value as Value
 from .store import frozen as frozen
 from .store import rebuild as rebuild
@@ -146,6 +146,11 @@ def with_unit(value: float, unit: str | None) -> str:
     return f"{value / factor:.3g} {prefix}{unit}"
 
 
+def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str]) -> str:
+    """Return sizes of channels in words: `die:z 0.527 nm, die:rx 3.1 nrad`."""
+    return ", ".join(f"{name} {with_unit(size, units.get(name))}" for name, size in sizes.items())
+
+
 def positive(value: Any, name: str, *, zero: bool = False) -> float:
     """Return `value` as a positive (or, with `zero`, non-negative) float.
 
@@ -211,29 +216,33 @@ def flag(value: Any, name: str) -> bool:
     return bool(value)
 
 
-def instance(value: Any, kind: type[T], name: str, hint: str) -> T:
-    """Return `value`, which must be of a class.
+def instance(
+    value: Any, kind: Any, name: str, hint: str, error: type[FlexplantError] = ModelError
+) -> Any:
+    """Return `value`, which must be of a class, or of one of several.
 
     Parameters
     ----------
     value : object
         What was given.
-    kind : type
-        The class.
+    kind : type or union of types
+        The class or classes.
     name : str
         What the caller calls it.
     hint : str
         How to make one, a sentence.
+    error : type of FlexplantError
+        What is raised.
 
     Raises
     ------
-    ModelError
+    FlexplantError
         When it is of another class.
     """
     if not isinstance(value, kind):
-        raise ModelError(
-            f"{name} must be of type {kind.__name__}, got {type(value).__name__}. {hint}"
-        )
+        listed = [one.__name__ for one in getattr(kind, "__args__", (kind,))]
+        kinds = " or ".join(name for name in listed if name != "NoneType")
+        raise error(f"{name} must be of type {kinds}, got {type(value).__name__}. {hint}")
     return value
 
 

@@ -1,10 +1,9 @@
 """A record through the stationary filter: ours beside filterpy, python-control and SciPy."""
 
-import time
-
 import numpy as np
 import pytest
 import scipy.signal
+from timing import best
 
 import flexplant as fx
 from stages import L, ports
@@ -25,16 +24,6 @@ def observer():
     return fx.design_kalman(plant, plant)
 
 
-def best(call, repeats=30):
-    """Return what a call gave, and its shortest time [s]."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = call()
-        times.append(time.perf_counter() - start)
-    return result, min(times)
-
-
 @pytest.mark.benchmark
 def test_a_record_through_the_stationary_filter():
     kalman = observer()
@@ -45,7 +34,7 @@ def test_a_record_through_the_stationary_filter():
     u = 1e-2 * rng.standard_normal((COUNT, len(kalman.plant.u)))
     records = dict(zip((*kalman.sensors, *kalman.plant.u), np.hstack([y, u]).T, strict=True))
     at_rest = np.zeros(g.n_states)
-    ours, seconds = best(lambda: kalman.estimate(records, start=at_rest))
+    ours, seconds = best(lambda: kalman.estimate(records, start=at_rest), 30)
     _, smooth = best(lambda: kalman.estimate(records, fx.Smoother(), start=at_rest), 2)
     rows = [("estimate", seconds), ("estimate, Smoother()", smooth)]
     both = np.hstack([y, u])

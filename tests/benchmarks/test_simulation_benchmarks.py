@@ -1,10 +1,9 @@
 """A linear loop over 100 000 samples: ours beside python-control and SciPy."""
 
-import time
-
 import numpy as np
 import pytest
 import scipy.signal
+from timing import best
 
 import flexplant as fx
 from flexplant.loop.noise import white_noise
@@ -25,16 +24,6 @@ def stage_loop():
     modes = fx.solve_modes(plate, count=48, damping=fx.ModalDamping(0.01))
     plant = fx.assemble_plant(modes, ports()).discretized(1e4, delay=1)
     return fx.close_loop(plant, fx.design_kalman(plant), fx.design_servo(plant, bandwidth=50.0))
-
-
-def best(call, repeats=3):
-    """Return what a call gave, and its shortest time [s]."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = call()
-        times.append(time.perf_counter() - start)
-    return result, min(times)
 
 
 @pytest.mark.benchmark

@@ -90,6 +90,7 @@ def test_no_pair_of_gains_has_a_smaller_peak(a):
 def test_hinf_on_the_plate():
     """0.1 % damping, 1e-12 m/sqrt(Hz): the peak is that of a dense sweep, below Kalman's."""
     found = design_hinf_filter(plate())
+    assert "m, die:rx " in repr(found) and "rad" in repr(found)
     own, observer = truth(plate()), as_dict(found, plate())
     own["C1"] = own["C1"] / found.sizes[:, None]
     observer |= {name: observer[name] / found.sizes[:, None] for name in "CD"}

@@ -436,7 +436,7 @@ def test_covariance_of_shapes_is_that_of_many_measurements():
         ({"upper": 1.5}, ModelError, "upper"),
         ({"max_iterations": 0}, ModelError, "max_iterations"),
         ({"hold": 100.0}, ModelError, "hold"),
-        ({"dofs": ["y1"]}, LabelError, "mapping"),
+        ({"dofs": ["y1"]}, LabelError, "dofs must be of type Mapping"),
         ({"dofs": {"y9": "1:z"}}, LabelError, "y9"),
         ({"start": [1.0]}, ModelError, "PoleSelection"),
         ({"start": PoleSelection([-1 + 300j], [[1.0]])}, ShapeError, "references"),

@@ -8,7 +8,7 @@ import scipy.linalg as la
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, frequency_response, tustin
 from flexplant.lti.discretisation import discretized, pair_expm, pair_exponential
 from oracles_plant import delayed_run, hold
@@ -215,3 +215,21 @@ def test_heavy_overdamping_neither_overflows_nor_loses_the_slow_pole(omega, rate
     np.testing.assert_allclose(
         omega * integral[0, 1], wanted[0] - [1.0, 0.0], rtol=1e-9, atol=1e-15
     )
+
+
+@pytest.mark.parametrize(
+    ("rate", "delay", "said"),
+    [
+        (1e-4, 0.0, "0.0001 s as a sampling period is rate=10000"),
+        (10.0, 0.0, "10 kHz is rate=10000"),
+        (1e4, 1e-4, "delay=1 at 10000 Hz"),
+    ],
+)
+def test_a_period_for_a_rate_and_seconds_for_samples_are_refused(rate, delay, said):
+    mode = StateSpace([[0, 1], [-(3e3**2), -60]], [[0], [1]], [[1, 0]], [[0]])
+    with pytest.raises(ModelError, match=said):
+        discretized(mode, rate, delay=delay)
+    with pytest.warns(FlexplantWarning, match=r"477\.5 Hz and above, lie above half"):
+        discretized(mode, 500.0)
+    slow = StateSpace([[-3e3]], [[3e3]], [[1]], [[0]])  # a filter: sampled at any rate
+    assert discretized(slow, 10.0).dt == 0.1

@@ -111,6 +111,11 @@ def test_names_static_gain_and_empty_grid():
     assert frequency_response(machine(), np.zeros(0)).data.shape == (5, 4, 0)
 
 
+def test_an_input_that_moves_nothing():
+    still = StateSpace([[0, 1], [-4, -0.1]], [[0], [0]], [[1, 0]], [[0]], blocks=[2])
+    np.testing.assert_array_equal(frequency_response(still, [1.0, 2.0]).data, 0.0)
+
+
 def test_takes_a_control_system():
     import control
 

@@ -168,4 +168,4 @@ def test_refusals(plate):
         solve_modes(plate, count=24, compliance_at=[(0.3, 0.7, 0)])
     modes = solve_modes(plate, count=24)
     with pytest.raises(ModelError, match="already hold all"):
-        attachment_vectors(plate, modes.omega, modes.phi, [{Z8: 0.0}])
+        attachment_vectors(plate, modes.phi, [{Z8: 0.0}])

@@ -154,7 +154,7 @@ def test_motions_that_are_not_known():
     one = DofSet([1], ["z"], [[0, 0, 0]])
     with pytest.raises(LabelError, match="one node"):
         interpolated(one).row((0, 0, 0), "z")
-    with pytest.raises(ModelError, match="FEModel or a DofSet"):
+    with pytest.raises(ModelError, match="dofs must be of type DofSet"):
         interpolated("dofs")
     with pytest.raises(ModelError, match="margin"):
         interpolated(imported(), margin=-1.0)

@@ -4,8 +4,19 @@ import numpy as np
 import pytest
 
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
-from flexplant.plant import Actuator, Disturbance, Poi, Ports, Reference, Sensor
+from flexplant.plant import (
+    Actuator,
+    Disturbance,
+    Poi,
+    Ports,
+    RandomWalk,
+    Reference,
+    RigidForce,
+    Sensor,
+    assemble_plant,
+)  # fmt: skip
 from flexplant.store import load
+from flexplant.structure import chain
 from stages import ports
 
 P = (0.1, 0.2, 0.0)
@@ -152,7 +163,14 @@ def test_names_of_derived_channels_are_reserved(kind, ending):
         (lambda: Actuator("u", at=P, direction=2), "no direction of 'u' 2"),
         (lambda: Sensor("y", at=P, direction=["z"]), "no direction of 'y'"),
         (lambda: Poi("p", at=P, axes=3), r"axes of POI 'p' are names.*got 3"),
-        (lambda: Reference(Poi("p", at=P)), r"a Reference names a POI.*Reference\('die'\)"),
+        (
+            lambda: Reference(Poi("p", at=P)),
+            r"of type str, got Poi.*Reference\('die'\)",
+        ),
+        (
+            lambda: RigidForce("f", shape=RandomWalk(1.0)),
+            r"is a filter, got RandomWalk, wh",
+        ),
         (lambda: Ports(u=5), r"Ports.u must be a sequence of Actuators, got 5.*u=\["),
         (lambda: Ports(u=[Sensor("y", at=P)]), r"got Sensor. It belongs in y"),
         (lambda: Sensor("y", at=P, asd=True), "asd of 'y' must be one number"),
@@ -162,3 +180,10 @@ def test_names_of_derived_channels_are_reserved(kind, ending):
 def test_other_kinds_are_refused_at_the_door(make, words):
     with pytest.raises(FlexplantError, match=words):
         make()
+
+
+def test_the_axes_of_a_poi_replace_the_direction_of_its_label():
+    two = chain(masses=[1.0, 1.0], stiffnesses=[1e3])
+    poi = Poi("die", at="2:x")
+    with pytest.raises(LabelError, match=r"at '2:x' with the axes \('z',\), .* no DOF '2:z'"):
+        assemble_plant(two, Ports(w=[Disturbance("d", at="1:x")], z=[poi]))

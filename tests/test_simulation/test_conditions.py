@@ -103,7 +103,7 @@ def test_a_moving_poi_is_at_each_sample_that_of_its_place(loop):
     ("options", "error", "message"),
     [
         ({"finer": 0}, ModelError, "finer must be a whole number"),
-        ({"moving": 3}, ModelError, "moving must be a mapping"),
+        ({"moving": 3}, ModelError, "moving must be of type Mapping"),
         ({"moving": {"wafer": np.zeros((20, 3))}}, LabelError, "no POI to move 'wafer'"),
         ({"moving": {"die": lambda t: np.full((t.size, 3), 2 * L)}}, LabelError, "off the plate"),
     ],

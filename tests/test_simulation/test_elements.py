@@ -145,7 +145,7 @@ def test_anti_windup_returns_the_integrator():
         ({"elements": {"u7": Saturation(1.0)}}, LabelError, "no channel for an element 'u7'"),
         ({"elements": {"u": 3.0}}, ModelError, "must be a Saturation or a Quantiser, got 3.0"),
         ({"elements": {"u": [Saturation(1.0)] * 2}}, ModelError, "two elements of one kind"),
-        ({"elements": Saturation(1.0)}, ModelError, "elements must be a mapping"),
+        ({"elements": Saturation(1.0)}, ModelError, "elements must be of type Mapping"),
         ({"anti_windup": -1.0}, ModelError, "anti_windup must be positive"),
     ],
 )

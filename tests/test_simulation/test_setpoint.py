@@ -109,7 +109,7 @@ def test_a_step_and_scan_chain_exposes_what_it_should():
     assert "order 4" in repr(chain) and "3 exposures, on a grid of 0.0001 s" in repr(chain)
     with pytest.raises(ModelError, match="one order and one grid"):
         forth.then(setpoint(1e-3, velocity=1.0, acceleration=1.0))
-    with pytest.raises(ModelError, match="need a SetPoint"):
+    with pytest.raises(ModelError, match="of type SetPoint"):
         forth.then(1.0)
 
 

@@ -72,7 +72,7 @@ def test_what_is_no_specification(loop, run):
         fx.Specification(ma=1.0, effort=1.0).check(loop)
     with pytest.raises(LabelError, match="driven actuator"):
         fx.Specification(effort={"u9": 1.0}).check(loop, run)
-    with pytest.raises(ModelError, match="need a ClosedLoop"):
+    with pytest.raises(ModelError, match="loop must be of type ClosedLoop"):
         fx.Specification(ma=1.0).check(run)
 
 

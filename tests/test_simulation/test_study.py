@@ -157,7 +157,7 @@ def test_the_checkpoint_of_another_study_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("result", "message"),
     [
-        (3.0, "must return a mapping"),
+        (3.0, "pipeline returns must be of type Mapping"),
         ({"a": np.zeros(3)}, "column 'a' holds"),
         ({"failed": 1.0}, "cannot be the name of a column"),
     ],

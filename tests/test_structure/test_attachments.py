@@ -238,7 +238,7 @@ def test_units():
         (lambda: Spring("1:z", np.nan), ModelError, "stiffness of a spring"),
         (lambda: Spring((0, 0, 0), 1, direction="up"), LabelError, "direction"),
         (lambda: Damper("1:z", -1), ModelError, "rate of a damper"),
-        (lambda: make_plate().with_parts([3]), ModelError, "as parts"),
+        (lambda: make_plate().with_parts([3]), ModelError, "a part must be of type PointMass"),
         (lambda: make_plate().with_parts(3), ModelError, "parts must be"),
         (lambda: make_plate().with_parts(Spring("99:z", 1)), LabelError, "99:z"),
         (lambda: make_plate().with_parts(Spring("9:z", 1, to="9:z")), ModelError, "both ends"),

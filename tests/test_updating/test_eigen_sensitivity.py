@@ -119,7 +119,7 @@ def test_answer_names_modes_and_parameters(plate):
 def test_bad_input_is_refused(plate, make):
     rom = plate.reduced(0.01, False)
     mass = AddedMass(plate.z8)
-    with pytest.raises(ModelError, match="list of AddedMass"):
+    with pytest.raises(ModelError, match=r"must be of type Parameter.*AddedMass"):
         eigenvalue_sensitivities(rom, ["mass"])
     with pytest.raises(ModelError, match="empty"):
         eigenvalue_sensitivities(rom, [])

@@ -642,7 +642,7 @@ def test_bad_input_is_refused(chain):
         fit.interval(1.0)
     with pytest.raises(ModelError, match="count"):
         fit.sample(0)
-    with pytest.raises(ModelError, match="residuals must be a list"):
+    with pytest.raises(ModelError, match="a residual must be of type Residual"):
         identifiability(chain, MASS, [3])
     with pytest.warns(FlexplantWarning, match="did not converge"):
         update(

@@ -482,7 +482,7 @@ def test_bad_input_is_refused(plate):
         update(np.eye(3), mass, data)
     with pytest.raises(ModelError, match="parameters is empty"):
         update(rom, [], data)
-    with pytest.raises(ModelError, match="list of AddedMass"):
+    with pytest.raises(ModelError, match=r"must be of type Parameter.*AddedMass"):
         update(rom, [plate.z8], data)
     with pytest.raises(LabelError, match="more than once"):
         update(rom, mass * 2, data)
@@ -490,7 +490,7 @@ def test_bad_input_is_refused(plate):
         update(rom, [AddedMass("999:z")], data)
     with pytest.raises(ModelError, match="residuals is empty"):
         update(rom, mass, [])
-    with pytest.raises(ModelError, match="list of Eigenvalues"):
+    with pytest.raises(ModelError, match="a residual must be of type Residual, got MeasuredModes"):
         update(rom, mass, [data[0].measured])
     with pytest.raises(LabelError, match="rigid-body mode"):
         update(rom, mass, [Eigenvalues(MeasuredModes([-1 + 10j], modes=[2]))])

@@ -12,7 +12,7 @@ from ..errors import ModelError, ShapeError
 from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, positive, real_array, short
+from ..values import FloatArray, Value, instance, positive, real_array, short
 from .channels import poi_channels, row_of
 from .estimate import Estimate
 from .estimator import KalmanEstimator
@@ -301,10 +301,7 @@ def _nees(
     """Return the mean normalised squared errors with their confidence intervals."""
     if truth is None:
         return {}
-    if not isinstance(truth, Mapping):
-        raise ModelError(
-            f"truth must be a mapping {{channel: array}}, got {short(truth)}. Pass it."
-        )
+    instance(truth, Mapping, "truth", "Pass {channel: array}.")
     channels, found = poi_channels(observer.plant), {}
     wanted = [n for n in truth if n in channels] if hasattr(truth, "dt") else list(truth)
     for name in wanted:

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, unknown_label
 from ..lti.lyapunov import scale_of
 from ..parallel import one_thread
-from ..values import FloatArray, Value, known_units, real_array, short
+from ..values import FloatArray, Value, instance, known_units, real_array, sizes_of
 from .channels import estimates
 from .filter_model import FilterModel
 from .lags import Filter, FixedLag, Lag, Predictor, Smoother
@@ -89,9 +89,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
     def __repr__(self) -> str:
         missing = int(np.count_nonzero(np.isnan(self.innovations)))
         gaps = f", {missing} of {self.innovations.size} innovations missing" if missing else ""
-        last = ", ".join(
-            f"{name} {value:.3g}" for name, value in zip(self.names, self._typical(), strict=True)
-        )
+        last = sizes_of(dict(zip(self.names, self._typical(), strict=True)), self.units)
         return (
             f"<Estimate by {self.lag!r}: {self.time.size} samples{gaps};\n"
             f"  median deviation {last}>"
@@ -163,11 +161,9 @@ def estimated(
 
     `place` gives the rows of POIs that move, for a number of samples.
     """
-    if not isinstance(lag, Predictor | Filter | FixedLag | Smoother):
-        raise ModelError(
-            f"lag must say when an estimate is known, got {short(lag)}. Pass Predictor(), "
-            "Filter(), FixedLag(samples) or Smoother()."
-        )
+    instance(
+        lag, Predictor | Filter | FixedLag | Smoother, "lag", "Say when: Filter() or Smoother()."
+    )
     record = recorded(records, model)
     steady, sight, d, s = in_unit_states(model, P)
     if place is not None:

@@ -14,7 +14,7 @@ from ..errors import ModelError, ShapeError
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, real_array, with_unit
+from ..values import FloatArray, Value, real_array, sizes_of
 from .certificate import KalmanCertificate
 from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
@@ -73,10 +73,7 @@ class KalmanEstimator(Value):
 
     def __repr__(self) -> str:
         channels = poi_channels(self.plant)
-        units = self.plant.units
-        rms = ", ".join(
-            f"{name} {with_unit(self.rms(name), units.get(name))}" for name in channels[:4]
-        )
+        rms = sizes_of({name: self.rms(name) for name in channels[:4]}, self.plant.units)
         count = self.certificate.left_out
         counted = (
             "modes left out are not known: truncation is not in these numbers"

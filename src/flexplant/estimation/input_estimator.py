@@ -8,7 +8,7 @@ import numpy as np
 
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, sizes_of
 from .channels import poi_channels, row_of
 from .invertibility import Invertibility
 
@@ -72,7 +72,7 @@ class InputEstimator(Value):
 
     def __repr__(self) -> str:
         names = [*poi_channels(self.plant), *self.inputs]
-        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in names[:6])
+        rms = sizes_of({name: self.rms(name) for name in names[:6]}, self.plant.units)
         late = "in their own sample" if not self.delay else f"{self.delay} sample late"
         return (
             f"<InputEstimator: {self.system.n_states} states, inputs {late}, spectral radius "

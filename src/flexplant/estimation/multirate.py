@@ -14,7 +14,7 @@ from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, real_array, short, whole
+from ..values import FloatArray, Value, instance, real_array, short, sizes_of, whole
 from .certificate import AGREEMENT
 from .channels import checked_plant, estimates, poi_channels, row_of, sensors
 from .filter_model import FilterModel, check_noises, filter_model
@@ -79,7 +79,8 @@ class PeriodicEstimator(Value):
         self._set(**{name: getattr(self, name) for name in names})
 
     def __repr__(self) -> str:
-        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in poi_channels(self.plant)[:4])
+        names = poi_channels(self.plant)[:4]
+        rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
         return (
             f"<PeriodicEstimator: {self.gains.shape[1]} states, {len(self.sensors)} sensors, "
             f"period {self.period} samples;\n  rms error {rms}>"
@@ -266,11 +267,7 @@ def design_multirate(
 
 def _measured(names: tuple[str, ...], every: Any) -> FloatArray:
     """Return which sensors are read in which sample of the common period (T, ny)."""
-    if not isinstance(every, Mapping):
-        raise ModelError(
-            f"every must be a mapping {{sensor: samples}}, got {short(every)}. Pass such as "
-            "{'y3': 10}."
-        )
+    instance(every, Mapping, "every", "Pass {sensor: samples}, such as {'y3': 10}.")
     intervals, offsets = dict.fromkeys(names, 1), dict.fromkeys(names, 0)
     for name, given in every.items():
         if name not in names:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, sizes_of
 from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
 
@@ -105,7 +105,7 @@ class RobustFilter(Value):
 
     def __repr__(self) -> str:
         names = poi_channels(self.plant)[:4]
-        rms = ", ".join(f"{name} {self.rms(name):.3g}" for name in names)
+        rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
         return (
             f"<RobustFilter: {self.system.n_states} states, {len(sensors(self.plant))} sensors;\n"
             f"  rms error on its own plant {rms};\n  {self.certificate!r}>"

@@ -15,7 +15,7 @@ from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, positive, short
+from ..values import FloatArray, Value, instance, positive
 from .certificate import AGREEMENT
 from .channels import checked_plant, estimates
 from .filter_model import FilterModel, check_noises, filter_model
@@ -127,10 +127,7 @@ def design_input_estimator(
     systems, Automatica 43, 2007, 111-116; ... with direct feedthrough, 934-937. Kitanidis, Unbiased
     minimum-variance linear state estimation, Automatica 23, 1987.
     """
-    if not isinstance(method, Unbiased | Augmented):
-        raise ModelError(
-            f"method must be Unbiased() or Augmented(drift), got {short(method)}. Pass one of them."
-        )
+    instance(method, Unbiased | Augmented, "method", "Pass Unbiased() or Augmented(drift).")
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)
     quiet = _without(plant, names)

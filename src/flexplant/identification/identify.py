@@ -195,12 +195,7 @@ def _identified(
     labels = checked_channels(dofs, frf)
     listed = _checked_orders(orders)
     if start is not None:
-        instance(
-            start,
-            PoleSelection,
-            "start",
-            "Pass diagram.select(freq=[...]).",
-        )
+        instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
     diagram = None
@@ -280,8 +275,7 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     """Return {channel: DOF label}, checked."""
     if dofs is None:
         return {}
-    if not isinstance(dofs, Mapping):
-        raise LabelError(f"dofs is a mapping from channels to DOF labels, got {dofs!r:.60}.")
+    instance(dofs, Mapping, "dofs", "Pass {channel: DOF label}.", LabelError)
     known = {*frf.inputs, *frf.outputs}
     for name in dofs:
         if name not in known:

@@ -75,11 +75,7 @@ def numbered(
 
     instance(measured, MeasuredModes, "measured", "Pass identify_modes(frf).")
     modes = model.modes() if hasattr(model, "modes") and not isinstance(model, Modes) else model
-    if not isinstance(modes, Modes):
-        raise ModelError(
-            f"numbered compares with Modes or a model that has .modes(), got "
-            f"{type(model).__name__}. Solve it first: solve_modes(model, count=...)."
-        )
+    instance(modes, Modes, "model", "Solve it first: solve_modes(model, count=...).")
     width = positive(tolerance, "tolerance")
     if not 0 <= positive(least_mac, "least_mac", zero=True) < 1:
         raise ModelError(f"least_mac must be below 1, got {least_mac:g}.")

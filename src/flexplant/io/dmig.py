@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,11 @@ from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .formats import Format
 from .nastran import Nodes, nastran_float, read_nodes
+from .nastran_names import named_matrices
 from .numbers import fixed_numbers, printed_digits
-from .paths import file_path
+from .paths import damaged, file_path
 
-_STIFFNESS = ("KAAX", "KAA", "KGG", "K2GG", "K2PP", "K")
-_MASS = ("MAAX", "MAA", "MGG", "M2GG", "M2PP", "M")
-_DAMPING = ("BAAX", "BAA", "BGG", "B2GG", "B2PP", "B")
+_ENDINGS = ("AAX", "AA", "GG", "2GG", "2PP", "")
 
 
 def read_dmig(
@@ -86,19 +84,10 @@ def read_dmig(
             f"{str(path)!r} has no DMIG cards. Request them in the run: PARAM,EXTOUT,DMIGPCH or "
             "EXTSEOUT(DMIGPCH)."
         )
-    K, M, D = (
-        _chosen(given, usual, what, blocks, str(path))
-        for given, usual, what in (
-            (stiffness, _STIFFNESS, "stiffness"),
-            (mass, _MASS, "mass"),
-            (damping, _DAMPING, "damping"),
-        )
-    )
-    if K is None:
-        raise ModelError(
-            f"{str(path)!r} holds {sorted(blocks)}, none of which has a usual name of a stiffness "
-            f"matrix ({', '.join(_STIFFNESS)}). Say which it is: stiffness='...'."
-        )
+    wanted = {"stiffness": stiffness, "mass": mass, "damping": damping}
+    names = named_matrices(blocks, wanted, _ENDINGS, str(path))
+    K, M, D = (None if name is None else blocks[name] for name in names)
+    assert K is not None  # noqa: S101 - its name is known
     given = [part for part in (K, M, D) if part is not None]
     # a DOF as one number: 16 node + component
     codes = [code for part in given for code in (part.rows, part.columns)]
@@ -178,22 +167,6 @@ class _Block:
         off = i != j
         mirrored = sp.coo_array((self.values[off], (j[off], i[off])), shape=(n, n))
         return sp.csc_array(half + mirrored)
-
-
-def _chosen(
-    given: str | None, usual: Sequence[str], what: str, blocks: dict[str, _Block], path: str
-) -> _Block | None:
-    if given is not None:
-        if given not in blocks:
-            raise unknown_label("matrix", given, blocks, repr(path))
-        return blocks[given]
-    there = [name for name in usual if name in blocks]
-    if len(there) > 1:
-        raise ModelError(
-            f"{path!r} holds {there}, any of which may be the {what}. Say which: "
-            f"{what}={there[0]!r}."
-        )
-    return blocks[there[0]] if there else None
 
 
 def _blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
@@ -347,10 +320,8 @@ def _code(node: bytes, component: bytes) -> int:
 
 def _codes(nodes: IntArray, components: IntArray, path: str) -> IntArray:
     if np.any(components > 6):
-        raise FlexplantError(
-            f"{path!r}: component {int(components.max())} of node "
-            f"{int(nodes[np.argmax(components)])}: components are 0 to 6. The file is damaged."
-        )
+        node = int(nodes[np.argmax(components)])
+        raise damaged(path, f"component {components.max()} of node {node}: components are 0 to 6")
     return np.asarray(16 * nodes + components, dtype=np.int64)
 
 

@@ -2,27 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, ModelError, unknown_label
+from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices
 from ..values import name_list
 from .formats import Format
+from .nastran_names import check_held, named_matrices
 from .op4_binary import binary_matrices
 from .op4_text import text_matrices
 from .paths import file_path
 
 #: a matrix of the file: dense where the file holds it dense, real or complex
 Op4Matrix: TypeAlias = Any
-_STIFFNESS = ("KAA", "KAAX", "KGG", "KXX", "KFF", "KLL", "K2GG", "KTT", "K")
-_MASS = ("MAA", "MAAX", "MGG", "MXX", "MFF", "MLL", "M2GG", "MTT", "M")
-_DAMPING = ("BAA", "BAAX", "BGG", "BXX", "BFF", "BLL", "B2GG", "BTT", "B")
+_ENDINGS = ("AA", "AAX", "GG", "XX", "FF", "LL", "2GG", "TT", "")
 
 
 def read_op4(
@@ -69,19 +68,11 @@ def read_op4(
     (symmetric) with one triangle only are completed.
     """
     found = _read(path, None)
-    chosen = {
-        "stiffness": _chosen(stiffness, _STIFFNESS, "stiffness", found, path),
-        "mass": _chosen(mass, _MASS, "mass", found, path),
-        "damping": _chosen(damping, _DAMPING, "damping", found, path),
-    }
-    if chosen["stiffness"] is None:
-        raise ModelError(
-            f"{str(path)!r} holds {sorted(found)}, none of which has a usual name of a stiffness "
-            f"matrix ({', '.join(_STIFFNESS)}). Say which it is: stiffness='...'."
-        )
-    K, M, D = (_real(found, name, path) for name in chosen.values())
+    given = {"stiffness": stiffness, "mass": mass, "damping": damping}
+    chosen = named_matrices(found, given, _ENDINGS, str(path))
+    K, M, D = (_real(found, name, path) for name in chosen)
     assert K is not None  # noqa: S101 - its name is known
-    digits = found[chosen["stiffness"]][2]
+    digits = found[str(chosen[0])][2]
     return FEMatrices(K, M, D, dofs=dofs, digits=digits, source=str(path))
 
 
@@ -113,22 +104,6 @@ def read_op4_matrices(
     """
     found = _read(path, None if names is None else name_list(names, "matrices"))
     return {name: matrix for name, (matrix, _, _) in found.items()}
-
-
-def _chosen(
-    given: str | None, usual: Sequence[str], what: str, found: dict[str, Any], path: str | Path
-) -> str | None:
-    if given is not None:
-        if given not in found:
-            raise unknown_label("matrix", given, found, repr(str(path)))
-        return given
-    there = [name for name in usual if name in found]
-    if len(there) > 1:
-        raise ModelError(
-            f"{str(path)!r} holds {there}, any of which may be the {what}. Say which: "
-            f"{what}={there[0]!r}."
-        )
-    return there[0] if there else None
 
 
 def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
@@ -181,9 +156,7 @@ def _read(
         found[key] = (matrix, form, digits)
     if names is None:
         return found
-    for name in names:
-        if name not in found:
-            raise unknown_label("matrix", name, found, repr(str(path)))
+    check_held(names, found, str(path))
     return {name: found[name] for name in names}
 
 

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError
 from ..structure.precision import digits_of
+from .paths import damaged
 
 
 @dataclass(frozen=True)
@@ -59,10 +60,8 @@ class _Words:
                 f"the file ({self.size} bytes): it is cut off or damaged. Write or copy it again."
             )
         if self.content[at : at + marker] != self.content[stop : stop + marker]:
-            raise FlexplantError(
-                f"{self.path!r}, byte {stop}: the record of {length} bytes does not end with its "
-                "length again: the file is damaged. Write or copy it again, in binary mode."
-            )
+            what = f"byte {stop}: the record of {length} bytes does not end with its length again"
+            raise damaged(self.path, what, "Write or copy it again, in binary mode.")
         return start, stop
 
     def integers(self, at: int, count: int) -> list[int]:
@@ -91,36 +90,27 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
     while at < words.size:
         start, stop = words.record(at)
         if stop - start != 6 * size:
-            raise FlexplantError(
-                f"{path!r}, byte {at}: a matrix begins with a record of {6 * size} bytes, got "
-                f"{stop - start}: the file is damaged. Write it again."
-            )
+            due = f"a matrix begins with a record of {6 * size} bytes, got {stop - start}"
+            raise damaged(path, f"byte {at}: {due}")
         columns, rows, form, kind = words.integers(start, 4)
         name = content[start + 4 * size : stop].decode("latin-1").replace("\0", "").strip()
         if columns < 1 or not rows or kind not in (1, 2, 3, 4) or not name.isprintable():
-            raise FlexplantError(
-                f"{path!r}, byte {start}: no header of a matrix: {columns} columns, {rows} rows, "
-                f"type {kind}, name {name!r}. The file is damaged. Write it again."
-            )
+            got = f"{columns} columns, {rows} rows, type {kind}, name {name!r}"
+            raise damaged(path, f"byte {start}: no header of a matrix: {got}")
         at = stop + marker
         starts: list[int] = []
         stops: list[int] = []
         while True:
             start, stop = words.record(at)
             if stop - start < 3 * size:
-                raise FlexplantError(
-                    f"{path!r}, byte {at}: a column of {name} has {stop - start} bytes, too few "
-                    "for its header: the file is damaged. Write it again."
-                )
+                few = f"a column of {name} has {stop - start} bytes, too few for its header"
+                raise damaged(path, f"byte {at}: {few}")
             column = words.integers(start, 1)[0]
             at = stop + marker
             if column > columns:
                 break
             if column < 1:
-                raise FlexplantError(
-                    f"{path!r}, byte {start}: column {column} of {name}: the file is damaged. "
-                    "Write it again."
-                )
+                raise damaged(path, f"byte {start}: column {column} of {name}")
             starts.append(start)
             stops.append(stop)
         matrix = _matrix(words, name, (abs(rows), columns), rows < 0, kind, starts, stops)
@@ -226,14 +216,9 @@ def _gather(content: bytes, at: Any, width: int) -> Any:
 
 
 def _outside(path: str, at: int, name: str, row: int, shape: tuple[int, int]) -> FlexplantError:
-    return FlexplantError(
-        f"{path!r}, byte {at}: a string of {name} reaches row {row} of {shape[0]}: the file is "
-        "damaged. Write it again."
-    )
+    return damaged(path, f"byte {at}: a string of {name} reaches row {row} of {shape[0]}")
 
 
 def _broken(path: str, at: int, name: str) -> FlexplantError:
-    return FlexplantError(
-        f"{path!r}, byte {at}: a string of {name} has an impossible length: the file is damaged. "
-        "Write it again (above 65535 rows with BIGMAT=YES)."
-    )
+    what = f"byte {at}: a string of {name} has an impossible length"
+    return damaged(path, what, "Write it again (above 65535 rows with BIGMAT=YES).")

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError
 from .numbers import fixed_numbers
+from .paths import damaged
 
 #: digits of single precision (types 1 and 3), however many are printed
 _SINGLE = 7
@@ -174,10 +175,8 @@ class _Reader:
         inside = np.arange(int(count.sum())) - np.repeat(np.cumsum(count) - count, count)
         rows = np.repeat(row - 1, count) + inside
         if rows.size and rows.max() >= shape[0]:
-            raise FlexplantError(
-                f"{self.path!r}, before line {self.at + 1}: matrix {name} reaches row "
-                f"{int(rows.max()) + 1} of {shape[0]}: the file is damaged. Write it again."
-            )
+            reached = f"matrix {name} reaches row {int(rows.max()) + 1} of {shape[0]}"
+            raise damaged(self.path, f"before line {self.at + 1}: {reached}")
         columns = np.repeat(column - 1, count)
         if sparse:
             return sp.csc_array(sp.coo_array((numbers, (rows, columns)), shape=shape))

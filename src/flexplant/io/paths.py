@@ -1,4 +1,4 @@
-"""What names a file."""
+"""What names a file, and what is said of a damaged one."""
 
 from __future__ import annotations
 
@@ -25,3 +25,8 @@ def file_path(path: Any, name: str = "path") -> Path:
     if Path(path).is_dir():
         raise FlexplantError(f"{str(path)!r} is a folder. Name the file in it.")
     return Path(path)
+
+
+def damaged(path: object, what: object, do: str = "Write it again.") -> FlexplantError:
+    """Return the error of a file that is not what its format says; `what` is cut to 200 letters."""
+    return FlexplantError(f"{str(path)!r}, {what!s:.200}: the file is damaged. {do}")

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import AssumptionError, LabelError, ModelError
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, IntArray, short
+from ..values import FloatArray, IntArray, instance
 
 #: relative: the noise factors of single disturbances add up to the one that the plant has
 _ADDS_UP = 1e-6
@@ -156,8 +156,7 @@ def row_of(monitored: StateSpace, channel: str) -> int:
         When it has no such output.
     """
     given: object = channel
-    if not isinstance(given, str):
-        raise LabelError(f"a channel is named by a str, got {short(given)}. Pass 'die:error'.")
+    instance(given, str, "a channel", "Pass its name: 'die:error'.", LabelError)
     return int(monitored.output_index([channel])[0])
 
 

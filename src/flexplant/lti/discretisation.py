@@ -11,6 +11,7 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..values import FloatArray, IntArray, positive
 from .joining import Matrices
+from .rate_check import check_rate, light_modes
 from .statespace import StateSpace, System, as_statespace
 
 
@@ -46,9 +47,15 @@ def discretized(
     Raises
     ------
     ModelError
-        When `sys` is sampled already, or rate or delay is not positive.
+        When `sys` is sampled already, rate or delay is not positive, or plausible in another unit
+        only: the slowest mode lies far above half the rate, or a delay is next to nothing.
     LabelError
         When `delayed` names an unknown input.
+
+    Warns
+    -----
+    FlexplantWarning
+        When all modes lie above half the rate.
     """
     g = as_statespace(sys)
     if g.dt and g.n_states:
@@ -56,6 +63,14 @@ def discretized(
             f"{g!r} is sampled already: a rate cannot be changed exactly without the continuous "
             "model. Discretise that one."
         )
+    check_rate(light_modes(g.poles()), rate, delay, stacklevel=2)
+    return held_exactly(g, rate, delay=delay, delayed=delayed)
+
+
+def held_exactly(
+    g: StateSpace, rate: float, *, delay: float = 0.0, delayed: Iterable[str] | None = None
+) -> StateSpace:
+    """Return the zero-order-hold equivalent of a continuous system; see `discretized`."""
     h = 1.0 / positive(rate, "rate")
     late = g.input_index(g.inputs if delayed is None else delayed)
     whole, fraction = divmod(positive(delay, "delay", zero=True), 1.0)

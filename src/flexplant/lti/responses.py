@@ -189,7 +189,7 @@ def _modal(g: StateSpace) -> Modal | None:
                 functions[n_moving:n_both, :, 0] = real_part[fixed]
                 functions[n_moving:n_both, :, 1] = imag_part[fixed]
                 functions[n_both:] = (1.0, 0.0)
-                flat = functions.reshape(residues.shape[1], -1)
+                flat = functions.reshape(residues.shape[1], 2 * part.size)
                 tame = tame and -ceiling < flat.min(initial=0.0) and flat.max(initial=0.0) < ceiling
                 np.matmul(residues, flat, out=out[:, 2 * start : 2 * (start + part.size)])
         return data, tame

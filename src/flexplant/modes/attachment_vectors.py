@@ -64,7 +64,7 @@ def named(place: Place) -> str:
 
 
 def attachment_vectors(
-    model: FEModel, omega: FloatArray, phi: FloatArray, at: Sequence[Place]
+    model: FEModel, phi: FloatArray, at: Sequence[Place]
 ) -> tuple[FloatArray, FloatArray]:
     """Return residual attachment vectors (n, m) and their frequencies (m,) [rad/s].
 

@@ -125,7 +125,7 @@ def solve_modes(
         return _complex_modes(model, kept, top, names)
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
     if at:
-        vectors, vector_omega = attachment_vectors(model, omega, phi, at)
+        vectors, vector_omega = attachment_vectors(model, phi, at)
     del factored
     r = model.rigid_body.shape[1]
     if damping is None:

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
-from ..lti.discretisation import discretized
+from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, Disturbance, StandardPlant
 from ..values import FloatArray, positive
@@ -153,7 +153,7 @@ def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArra
     B = np.array([real.force(port.push(real)) for port in candidates]).T
     D = np.zeros((0, len(candidates)))
     slow = StateSpace(real.A, B, np.zeros((0, n)), D, blocks=real.blocks)
-    return discretized(slow, 1.0 / plant.dt).B
+    return held_exactly(slow, 1.0 / plant.dt).B
 
 
 def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:

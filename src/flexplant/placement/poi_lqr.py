@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import CertificateError, SolverError
-from ..lti.discretisation import discretized
+from ..lti.discretisation import held_exactly
 from ..lti.lyapunov import solve_stein
 from ..lti.riccati import control_dare
 from ..lti.statespace import StateSpace
@@ -178,5 +178,5 @@ def _late(
         B = np.array([real.force(c.push(real)) for c in candidates]).T
         D = np.zeros((len(rows), len(candidates)))
         slow = StateSpace(real.A, B, rows, D, blocks=real.blocks)
-        late = discretized(slow, 1.0 / plant.dt, delay=fraction)
+        late = held_exactly(slow, 1.0 / plant.dt, delay=fraction)
     return n + np.arange(late.n_states - n).reshape(len(candidates), -1), late

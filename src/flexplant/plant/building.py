@@ -7,18 +7,18 @@ from typing import Any, TypeVar
 import numpy as np
 
 from ..errors import ModelError
-from ..lti.discretisation import diagonal_pairs, discretized
+from ..lti.discretisation import diagonal_pairs, held_exactly
 from ..lti.noise import noise_factor
+from ..lti.rate_check import check_latency, check_rate, light_modes
 from ..lti.statespace import StateSpace
 from ..modes import Modes
 from ..reduction import ReducedModel
 from ..structure import FEModel
-from ..values import FloatArray, instance, positive, short
+from ..values import FloatArray, instance, positive
 from .dynamics import structure_system, with_filters
 from .origin import Assembled, Foreign
 from .partition import Partition
 from .ports import Ports
-from .rate_check import check_rate
 from .realisation import ModalRealisation
 from .residual import modes_of
 from .sampling import sampled_physical
@@ -101,9 +101,11 @@ def sampled(plant: P, rate: float, delay: float) -> P:
             f"the plant is {plant.alteration}: sample plant.unweighted, then do so again with "
             "sampled weights and blocks (continuous ones would be distorted by the hold)."
         )
-    check_rate(plant, rate, delay)
+    check_rate(_elastic(plant), rate, delay, stacklevel=3)
+    for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
+        check_latency(name, late, rate)
     if not plant.is_assembled:
-        system = discretized(plant.system, rate, delay=delay, delayed=plant.u)
+        system = held_exactly(plant.system, rate, delay=delay, delayed=plant.u)
         return plant.replace(system=system, origin=Foreign(None, float(delay), plant))
     origin = plant.assembled
     held = plant.held
@@ -113,7 +115,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
     if origin.ports.latencies or diagonal_pairs(origin.physical) is None:
         physical, factor = _with_own_delays(origin, rate, delay, asd)
     else:
-        physical = discretized(origin.physical, rate, delay=delay, delayed=plant.u)
+        physical = held_exactly(origin.physical, rate, delay=delay, delayed=plant.u)
         white = noise_factor(origin.physical, asd, physical.dt)
         lines = physical.n_states - origin.physical.n_states
         factor = np.vstack([white, np.zeros((lines, white.shape[1]))])
@@ -125,6 +127,14 @@ def sampled(plant: P, rate: float, delay: float) -> P:
             physical=physical, noise_factor=factor, delay=float(delay), continuous=plant
         ),
     )
+
+
+def _elastic(plant: Partition) -> FloatArray:
+    """Return the frequencies [Hz] of the elastic modes of a plant."""
+    if not plant.is_assembled:
+        return light_modes(plant.system.poles())
+    size = np.sqrt(np.maximum(np.linalg.det(plant.modal_blocks), 0.0))
+    return np.asarray(size[size > 0] / (2.0 * np.pi))
 
 
 def _with_own_delays(
@@ -183,12 +193,8 @@ def with_modes_of(plant: P, larger: object) -> P:
     ModelError
         When it is no structure, or the plant has no ports to assemble it with.
     """
-    if not isinstance(larger, FEModel | Modes | ReducedModel):
-        raise ModelError(
-            f"larger must be a structure or a plant with more modes, got {short(larger)}. Pass "
-            "Modes, an FEModel, a ReducedModel or a StandardPlant, or leave it out."
-        )
-    whole = larger.completed() if isinstance(larger, ReducedModel) else larger
+    given = instance(larger, FEModel | Modes | ReducedModel, "larger", "Pass one, or a plant.")
+    whole = given.completed() if isinstance(given, ReducedModel) else given
     return rebuilt(plant, realisation=modes_of(whole))
 
 

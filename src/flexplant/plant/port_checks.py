@@ -112,6 +112,12 @@ def checked_filter(name: str, what: str, given: Any) -> StateSpace | None:
     """
     if given is None:
         return None
+    if hasattr(given, "shape") and hasattr(given, "asd"):
+        kind = type(given).__name__
+        raise ModelError(
+            f"the {what} of {name!r} is a filter, got {kind}, which is a spectrum: noise and its "
+            f"filter. It makes the port itself: {kind}(...).force(name, at), .rigid or .floor."
+        )
     sys = as_statespace(given)
     if len(sys.inputs) != 1 or len(sys.outputs) != 1:
         raise ModelError(

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.interconnection import series
 from ..lti.weights import pade
-from ..values import Value, check_names, short
+from ..values import Value, check_names, instance, short
 from .forces import Actuator as Actuator
 from .forces import Disturbance as Disturbance
 from .port import QUANTITIES as QUANTITIES
@@ -40,10 +40,7 @@ class Reference(Value):
 
     def __post_init__(self) -> None:
         poi: object = self.poi
-        if not isinstance(poi, str):
-            raise LabelError(
-                f"a Reference names a POI, got {short(poi)}. Pass its name: Reference('die')."
-            )
+        instance(poi, str, "the POI of a Reference", "Pass its name: Reference('die').", LabelError)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -148,7 +148,15 @@ class Poi(Value):
 
     def row(self, realisation: ModalRealisation, axis: str) -> FloatArray:
         """Return the row (n,) over the model's DOFs of one axis."""
-        return realisation.row(self._at(axis), axis)
+        try:
+            return realisation.row(self._at(axis), axis)
+        except LabelError as error:
+            if not isinstance(self.at, str) or self.at == self._at(axis):
+                raise
+            raise LabelError(
+                f"POI {self.name!r} is at {self.at!r} with the axes {self.axes}, which replace the "
+                f"label's direction: {error} Name those that are there, axes=(...)."
+            ) from error
 
     def see(self, realisation: ModalRealisation, axis: str) -> Seen:
         """Return what an axis shows of the states, and of forces at once."""

@@ -11,7 +11,7 @@ from ..errors import ModelError, unknown_label
 from ..lti.discretisation import tustin
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import short
+from ..values import instance
 from .building import P
 from .origin import Weighted
 from .partition import Partition
@@ -48,11 +48,9 @@ def weighted(plant: P, z: Any, w: Any) -> P:
 def _mapping(weights: Any, side: str) -> dict[str, Any]:
     if weights is None:
         return {}
-    if not isinstance(weights, Mapping):
-        raise ModelError(
-            f"weights of {side} are a mapping {{channel: weight}}, got {short(weights)}. "
-            f"Such as {side}={{'die:error': inverse_sensitivity(30.0)}}."
-        )
+    instance(
+        weights, Mapping, f"weights of {side}", "{'die:error': inverse_sensitivity(30.0)}, say."
+    )
     return dict(weights)
 
 

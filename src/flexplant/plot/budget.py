@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..errors import ModelError
 from ..loop import ErrorBudget
-from ..values import scale, short
+from ..values import instance, scale
 from ._axes import CYCLE, axes, finish
 
 
@@ -35,8 +34,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     ModelError
         When it is no ErrorBudget.
     """
-    if not isinstance(found, ErrorBudget):
-        raise ModelError(f"need an ErrorBudget, got {short(found)}. Pass loop.budget(channel).")
+    instance(found, ErrorBudget, "found", "Pass loop.budget(channel).")
     ax = axes(ax, figsize=(7.0, 4.0))
     order = [int(i) for i in np.argsort(-found.variances, kind="stable")]
     shown, rest = order[: max(most, 1)], order[max(most, 1) :]

@@ -6,7 +6,7 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError
 from ..simulation import ErrorMap
-from ..values import scale, short
+from ..values import instance, scale, short
 from ._axes import MARK, axes, finish
 
 
@@ -32,8 +32,7 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     ModelError
         When `found` is no ErrorMap, has fewer than three points, or `what` is neither.
     """
-    if not isinstance(found, ErrorMap):
-        raise ModelError(f"need an ErrorMap, got {short(found)}. Pass what error_map returned.")
+    instance(found, ErrorMap, "found", "Pass what error_map returned.")
     if what not in ("ma", "msd"):
         raise ModelError(f"what must be 'ma' or 'msd', got {short(what)}. Pass one of them.")
     if len(found.points) < 3:

@@ -14,7 +14,7 @@ from ..estimation import Estimate, LagReport
 from ..estimation.channels import row_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
-from ..values import FloatArray, name_list, positive, real_array, scale, short
+from ..values import FloatArray, instance, name_list, positive, real_array, scale, short
 from ._axes import CYCLE, MEASURED, NOMINAL, UPDATED, axes, finish
 
 
@@ -106,8 +106,7 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     LabelError
         When it has no such channel.
     """
-    if not isinstance(report, LagReport):
-        raise ModelError(f"need a LagReport, got {short(report)}. Pass observer.report().")
+    instance(report, LagReport, "report", "Pass observer.report().")
     row = row_of(report.channels, report.channels[0] if channel is None else channel)
     name = report.channels[row]
     unit = report.units.get(name, "")
@@ -167,10 +166,7 @@ def estimate(
     LabelError
         When there is no such channel.
     """
-    if not isinstance(result, Estimate):
-        raise ModelError(
-            f"need an Estimate, got {short(result)}. Pass what observer.estimate returned."
-        )
+    instance(result, Estimate, "result", "Pass what observer.estimate returned.")
     name = result.names[0] if channel is None else channel
     signal, spread = result[name], positive(deviations, "deviations") * result.deviation(name)
     middle = np.zeros_like(signal) if name.endswith(":innovation") else signal

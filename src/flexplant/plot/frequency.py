@@ -11,7 +11,7 @@ from ..errors import ModelError, unknown_label
 from ..loop import ClosedLoop
 from ..loop.comparison import error_sensitivity
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, short
+from ..values import ComplexArray, FloatArray, instance, short
 from ._axes import CYCLE, axes, finish, legend
 
 
@@ -121,11 +121,7 @@ def sensitivity(
     ModelError
         When there is no such mapping.
     """
-    if not isinstance(curves, Mapping):
-        raise ModelError(
-            f"need a mapping of labels to (freq, size), got {short(curves)}. Type "
-            "{'model': (freq, size)}."
-        )
+    instance(curves, Mapping, "curves", "Type {'model': (freq, size)}.")
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     for i, (label, curve) in enumerate(curves.items()):
         freq, size = error_sensitivity(curve) if isinstance(curve, ClosedLoop) else curve

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
 from ..simulation import Response
-from ..values import name_list, real_array, scale, short
+from ..values import instance, name_list, real_array, scale
 from ._axes import CYCLE, finish, legend, panel_axes
 
 #: what a unit measures
@@ -67,8 +67,7 @@ def response(
         When `run` is no Response, nothing of it is within `span`, or channels of several units
         shall go into one axes.
     """
-    if not isinstance(run, Response):
-        raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+    instance(run, Response, "run", "Pass what simulate returned.")
     run = run if span is None else _part(run, span)
     chosen = None if channels is None else name_list(channels, "channels")
     names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])

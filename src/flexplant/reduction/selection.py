@@ -99,12 +99,7 @@ def select_dofs(
     """
     instance(modes, Modes, "modes", "Pass solve_modes(model, count=24).")
     rule = PivotedQr() if criterion is None else criterion
-    instance(
-        rule,
-        SelectionCriterion,
-        "criterion",
-        "Pass PivotedQr() or Greedy().",
-    )
+    instance(rule, SelectionCriterion, "criterion", "Pass PivotedQr() or Greedy().")
     basis = modes.basis
     kept = list(name_list(required, "required DOFs"))
     if len(set(kept)) != len(kept):

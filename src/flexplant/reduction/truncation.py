@@ -122,7 +122,7 @@ class ModalTruncation(ReductionMethod):
             n_rigid=solved.n_rigid,
         )
         if static:
-            vectors, omega = attachment_vectors(model, kept.omega, np.real(kept.phi), static)
+            vectors, omega = attachment_vectors(model, np.real(kept.phi), static)
             zeta = np.zeros(omega.size)
             if law is not None:
                 zeta = law.zeta(omega)

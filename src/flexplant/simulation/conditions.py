@@ -11,7 +11,7 @@ from ..errors import ModelError, unknown_label
 from ..loop import ClosedLoop
 from ..loop.known import with_known
 from ..plant import StandardPlant
-from ..values import FloatArray, positive, real_array, short, whole
+from ..values import FloatArray, instance, positive, real_array, whole
 from .elements import Element, split_elements
 
 
@@ -75,11 +75,7 @@ def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
 def _paths(plant: StandardPlant, moving: Any, time: FloatArray) -> dict[str, FloatArray]:
     if moving is None:
         return {}
-    if not isinstance(moving, Mapping):
-        raise ModelError(
-            f"moving must be a mapping, got {short(moving)}: name the POI, "
-            "moving={'die': (n_time, 3) points or a function of the times}."
-        )
+    instance(moving, Mapping, "moving", "Name the POI: {'die': (n_time, 3) points}.")
     pois = [poi.name for poi in plant.assembled.ports.z]
     found = {}
     for name, path in moving.items():

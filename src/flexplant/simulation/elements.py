@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..errors import ModelError, unknown_label
-from ..values import FloatArray, Value, positive, short
+from ..values import FloatArray, Value, instance, positive, short
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,11 +134,7 @@ def split_elements(
     """
     if elements is None:
         return {}, {}
-    if not isinstance(elements, Mapping):
-        raise ModelError(
-            f"elements must be a mapping, got {short(elements)}: name the channel that each acts "
-            "on, elements={'u1': Saturation(10.0), 'y1': Quantiser(1e-9)}."
-        )
+    instance(elements, Mapping, "elements", "Name the channel: {'u1': Saturation(10.0)}.")
     for name, element in elements.items():
         if name not in sensors and name not in driven:
             raise unknown_label("channel for an element", name, [*sensors, *driven])

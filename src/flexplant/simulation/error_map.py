@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError
+from ..errors import LabelError
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi
-from ..values import FloatArray, Value, real_array, short
+from ..values import FloatArray, Value, instance, real_array
 from .exposure import exposure_errors
 from .simulate import Signal, simulate
 
@@ -105,8 +105,7 @@ def error_map(
         `exposure_errors`.
     """
     given: object = loop
-    if not isinstance(given, ClosedLoop):
-        raise ModelError(f"need a ClosedLoop, got {short(given)}. Use close_loop(plant, ...).")
+    instance(given, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     places = real_array(points, "points", (None, 3))
     ports = loop.plant.assembled.ports
     names = [f"map|{i}" for i in range(1, len(places) + 1)]

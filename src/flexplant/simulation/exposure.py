@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ModelError, ShapeError, unknown_label
-from ..values import FloatArray, Value, name_list, positive, real_array, short
+from ..values import FloatArray, Value, instance, name_list, positive, real_array
 from .moments import moving_moments, unit_of
 from .response import Numbers, Response
 
@@ -206,8 +206,7 @@ def error_channels(run: Response) -> tuple[str, ...]:
 
 
 def _check_run(run: object) -> None:
-    if not isinstance(run, Response):
-        raise ModelError(f"need a Response, got {short(run)}. Pass what simulate returned.")
+    instance(run, Response, "run", "Pass what simulate returned.")
 
 
 def _parts(run: Response, start: Any, exposures: Any) -> list[slice]:

@@ -14,7 +14,7 @@ from ..loop import ClosedLoop, close_loop
 from ..loop.known import DERIVATIVES, force_name
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, decouple, standard_plant
-from ..values import ComplexArray, FloatArray, Value, name_list, real_array, short, whole
+from ..values import ComplexArray, FloatArray, Value, instance, name_list, real_array, short, whole
 from .motion import SetPoint
 
 #: points on a circle of Cauchy's integrals; its largest radius [rad/s], and how often it is halved
@@ -366,8 +366,7 @@ def term_numbers(terms: Any) -> list[int]:
 
 
 def _check_order(move: Any, gains: FloatArray) -> None:
-    if not isinstance(move, SetPoint):
-        raise ModelError(f"need a SetPoint, got {short(move)}. Use setpoint(...) or scan(...).")
+    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")
     highest = max((m for m in range(5) if np.any(gains[:, :, m])), default=0)
     if move.order < highest:
         raise ModelError(

@@ -11,7 +11,7 @@ from ..loop import ClosedLoop, close_loop
 from ..loop.known import force_name
 from ..lti.responses import responder
 from ..plant import decouple
-from ..values import FloatArray, positive, short
+from ..values import FloatArray, instance, positive
 from .feedforward import design_feedforward, force_axes, known_forces, tracked
 from .motion import SetPoint
 from .simulate import simulate
@@ -73,12 +73,10 @@ def inverse_forces(
     Van Zundert, Oomen, On inversion-based approaches for feedforward and ILC, Mechatronics 50,
     2018.
     """
-    if not isinstance(loop, ClosedLoop):
-        raise ModelError(f"need a ClosedLoop, got {short(loop)}. Use close_loop(plant, ...).")
+    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     plant, poi, name = tracked(loop.plant, reference)
     given: object = move
-    if not isinstance(given, SetPoint):
-        raise ModelError(f"need a SetPoint, got {short(move)}. Use setpoint(...) or scan(...).")
+    instance(given, SetPoint, "move", "Use setpoint(...) or scan(...).")
     if not plant.dt:
         raise ModelError("the inverse is of a sampled loop: use plant.discretized(rate, delay=).")
     steps = round(positive(duration, "duration") / plant.dt)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import ModelError
 from ..loop import ClosedLoop, close_loop
 from ..loop.known import force_name
-from ..values import FloatArray, Value, positive, short, whole
+from ..values import FloatArray, Value, instance, positive, short, whole
 from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPoint
 from .response import Response
@@ -175,7 +175,5 @@ def _check(start: object, loop: object, move: object) -> None:
             f"need a Feedforward with one set of gains, got {short(start)}. Use "
             "design_feedforward(plant)."
         )
-    if not isinstance(loop, ClosedLoop):
-        raise ModelError(f"need a ClosedLoop, got {short(loop)}. Use close_loop(plant, ...).")
-    if not isinstance(move, SetPoint):
-        raise ModelError(f"need a SetPoint, got {short(move)}. Use setpoint(...) or scan(...).")
+    instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
+    instance(move, SetPoint, "move", "Use setpoint(...) or scan(...).")

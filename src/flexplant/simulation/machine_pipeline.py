@@ -22,7 +22,7 @@ from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..synthesis import design_hinf
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
-from ..values import Value, generator, positive, short, whole
+from ..values import Value, generator, instance, positive, short, whole
 from .machine_report import MachineReport
 from .simulate import simulate
 from .specification import Specification
@@ -123,8 +123,7 @@ class MachinePipeline(Value):
 
     def __post_init__(self) -> None:
         for name, kind in (("model", ReducedModel), ("full", FEModel), ("ports", Ports)):
-            if not isinstance(getattr(self, name), kind):
-                raise ModelError(f"{name} must be of type {kind.__name__}. Give one of that type.")
+            instance(getattr(self, name), kind, name, "Give one of that type.")
         if not self.ports.references:
             raise ModelError("the ports need a reference for the POI: references=[Reference(...)].")
         self._set(

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ModelError
-from ..values import FloatArray, Value, real_array, short
+from ..values import FloatArray, Value, instance, real_array
 from .profile import moved
 
 #: [samples] a time this close to the grid is on it
@@ -155,9 +155,7 @@ class SetPoint(Value):
         ModelError
             When it is no SetPoint, or order or grid differ.
         """
-        other: object = following
-        if not isinstance(other, SetPoint):
-            raise ModelError(f"need a SetPoint to follow, got {short(other)}. Use setpoint(...).")
+        other: SetPoint = instance(following, SetPoint, "following", "Use setpoint(...).")
         if (other.order, other.tick, other.gridded) != (self.order, self.tick, self.gridded):
             raise ModelError(
                 f"{other!r} cannot follow {self!r}: a chain has one order and one grid. Give both "

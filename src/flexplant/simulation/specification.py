@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import AssumptionError, ModelError, unknown_label
 from ..loop import ClosedLoop, bandwidth
-from ..values import FloatArray, Value, positive, short
+from ..values import FloatArray, Value, instance, positive, short
 from .exposure import exposure_errors, settling_time
 from .response import Response
 
@@ -182,8 +182,7 @@ class Specification(Value):
             When the channel or an actuator is unknown.
         """
         given: object = loop
-        if not isinstance(given, ClosedLoop):
-            raise ModelError(f"need a ClosedLoop, got {short(given)}. Use close_loop(plant, ...).")
+        instance(given, ClosedLoop, "loop", "Use close_loop(plant, ...).")
         needed = [name for name in _OF_RUNS if getattr(self, name) is not None]
         if needed and not isinstance(run, Response):
             raise ModelError(

@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import ModelError, unknown_label
-from ..values import Value, short
+from ..values import Value, instance, short
 
 #: reasons that the repr lists
 _SHOWN = 3
@@ -100,11 +100,7 @@ def checked_row(row: Any) -> dict[str, Any]:
     ModelError
         When it is no mapping of names to these.
     """
-    if not isinstance(row, Mapping):
-        raise ModelError(
-            f"the pipeline must return a mapping {{column: number, truth or text}}, got "
-            f"{short(row)}. Return a dict."
-        )
+    instance(row, Mapping, "what the pipeline returns", "Return {column: number, truth or text}.")
     plain: dict[str, Any] = {}
     for name, value in row.items():
         if not isinstance(name, str) or name == "failed":

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, DofSet, Interpolation, Place
-from ..values import FloatArray, IntArray, Matrix, Value, positive, real_array
+from ..values import FloatArray, IntArray, Matrix, Value, instance, positive, real_array
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,11 +202,7 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
     rows: dict[str, list[sp.csc_array]] = {}
     signs: dict[str, list[float]] = {}
     for part in listed:
-        if not isinstance(part, Part):
-            raise ModelError(
-                f"a structure takes PointMass, Spring and Damper as parts, got "
-                f"{type(part).__name__}. Add matrices of your own by model.replace(K=...)."
-            )
+        instance(part, Part, "a part", "Add matrices of your own by model.replace(K=...).")
         for name, row, weight in part.added(dofs):
             if weight:
                 scaled = np.sqrt(abs(weight)) * row
@@ -220,12 +216,8 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
 
 
 def _iterated(parts: Any) -> Iterable[Any]:
-    if not isinstance(parts, Iterable):
-        raise ModelError(
-            f"parts must be a list of PointMass, Spring and Damper, got {type(parts).__name__}. "
-            "Pass them in [...]."
-        )
-    return parts
+    given: Iterable[Any] = instance(parts, Iterable, "parts", "Pass PointMass(...) in [...].")
+    return given
 
 
 def sum_of(matrix: Matrix | None, added: sp.csc_array | None) -> Matrix | None:

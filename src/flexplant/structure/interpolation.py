@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import LabelError, ModelError
+from ..errors import LabelError
 from ..labels import DIRECTIONS, DofSet, Interpolation
-from ..values import FloatArray, IntArray, positive, real_array
+from ..values import FloatArray, IntArray, instance, positive, real_array
 from .model import FEModel
 
 #: up to this many nodes one smooth interpolant serves everywhere; beyond, the nearest nodes do
@@ -60,11 +60,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     nodes, and may step by the error of interpolation where these change.
     """
     dofs = item.dofs if isinstance(item, FEModel) else item
-    if not isinstance(dofs, DofSet):
-        raise ModelError(
-            f"interpolated needs an FEModel or a DofSet, got {type(item).__name__}. "
-            "A reduced model interpolates with the shapes of the model it comes from."
-        )
+    instance(dofs, DofSet, "dofs", "Pass an FEModel or its dofs.")
     shape = ScatteredShape(dofs.xyz, dofs.directions, positive(margin, "margin", zero=True))
     between = dofs.replace(interpolation=shape)
     if isinstance(item, FEModel):

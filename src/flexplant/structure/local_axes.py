@@ -10,7 +10,7 @@ import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError
 from ..labels import DofSet
-from ..values import real_array, short
+from ..values import instance, real_array
 
 
 def cosines(dofs: DofSet, rotations: Any) -> Any:
@@ -24,11 +24,7 @@ def cosines(dofs: DofSet, rotations: Any) -> Any:
         When cosines are not orthogonal, or a node has only some of its three directions.
     """
     rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
-    if not isinstance(rotations, Mapping):
-        raise LabelError(
-            f"rotations must be {{node: (3, 3) direction cosines}}, got {short(rotations)}. Give "
-            "matrices whose row i holds the global components of local axis i."
-        )
+    instance(rotations, Mapping, "rotations", "Pass {node: (3, 3) cosines}.", LabelError)
     for node, given in rotations.items():
         matrix = real_array(given, f"rotations[{node}]", (3, 3))
         if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
-import numpy as np
-import scipy.linalg as la
-
-from ..errors import FlexplantError, InfeasibleError, ModelError, SolverError
+from ..errors import FlexplantError, InfeasibleError, SolverError
 from ..lti.preparation import Prepared
-from ..values import Value, positive, whole
+from ..values import Value
+from .lmi_method import LOOSER, Candidate, check_cost, check_size, checked_settings, first_verified
 from .lmi_plant import Plant, lqg_states, same_states
 from .lmi_programs import Optimum, moderate_controller, smallest_gamma
-from .lmi_solution import verified
 from .method import SolvedController
 
 #: gap between value and lower bound at which no other coordinates are tried
@@ -22,10 +20,6 @@ _GAP = 5e-4
 _COARSER = 10.0
 #: programs from one choice of states
 _ROUNDS = 4
-#: gamma, relative to the plant's size, that is taken for zero
-_NOTHING = 1e-7
-#: multiples of the back-off that are tried in turn
-_LOOSER = np.array([1.0, 2.0, 4.0, 8.0])
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,12 +61,7 @@ class Lmi(Value):
     time_limit: float = 60.0
 
     def __post_init__(self) -> None:
-        self._set(
-            back_off=positive(self.back_off, "back_off"),
-            tolerance=positive(self.tolerance, "tolerance"),
-            max_states=whole(self.max_states, "max_states"),
-            time_limit=positive(self.time_limit, "time_limit"),
-        )
+        self._set(**checked_settings(self))
 
     def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.
@@ -89,27 +78,18 @@ class Lmi(Value):
         SolverError
             When the solver stops early, or no controller keeps what the LMIs promise.
         """
-        n = problem.A.shape[0]
-        if not 0 < n <= self.max_states:
-            raise ModelError(
-                f"Lmi takes plants of 1 to {self.max_states} states, got {n}: time grows as n^6. "
-                "Reduce the order first, use Riccati(), or raise Lmi(max_states=...)."
-            )
+        check_size(self, problem)
         found = self._smallest(Plant.of(problem))
-        failures = []
-        for back_off in self.back_off * _LOOSER:
-            try:
-                K = moderate_controller(found.plant, 1.0 + back_off, self._settings(self.tolerance))
-                norm = verified(problem, K, found.value * (1.0 + back_off))
-            except (FlexplantError, la.LinAlgError) as error:
-                failures.append(f"{100 * back_off:.3g} % above it: {error}")
-                continue
-            return SolvedController(*K, norm, min(found.lower, norm))
-        raise SolverError(
-            f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
-            + " ".join(failures)
-            + " Loosen weights, add a little noise to each sensor, or raise Lmi(back_off=...)."
-        )
+        settings = self._settings(self.tolerance)
+        candidates = [
+            Candidate(
+                f"{100 * part:.3g} % above it",
+                found.value * (1.0 + part),
+                partial(moderate_controller, found.plant, 1.0 + part, settings),
+            )
+            for part in self.back_off * LOOSER
+        ]
+        return first_verified(problem, found.value, found.lower, candidates)
 
     def _settings(self, tolerance: float) -> dict[str, float]:
         return {
@@ -145,12 +125,7 @@ class Lmi(Value):
             # a proof of infeasibility says more than a solver that stopped
             raise next((e for e in failures if isinstance(e, InfeasibleError)), failures[-1])
         best = _tightest(found)
-        if best.value < _NOTHING * guess:
-            raise InfeasibleError(
-                f"there is no smallest gamma: {best.value:.3g} is reached, where the plant's own "
-                f"size is {guess:.3g}. u cancels w in z, at no cost. Weight the efforts in z, or "
-                "give the sensors noise in w."
-            )
+        check_cost(best.value, guess)
         return best._replace(lower=min(max(one.lower for one in found), best.value))
 
     @staticmethod

@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..lti.discretisation import discretized
+from ..lti.discretisation import held_exactly
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray
@@ -94,7 +94,7 @@ def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
         outputs=["error"],
         blocks=[2],
     )
-    return discretized(body, rate, delay=delay)
+    return held_exactly(body, rate, delay=delay)
 
 
 def rigid_peak(body: StateSpace, axis: Axis) -> float:

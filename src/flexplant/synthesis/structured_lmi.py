@@ -4,18 +4,28 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantError, InfeasibleError, ModelError, SolverError
+from ..errors import FlexplantError, SolverError
 from ..lti.preparation import Prepared
 from ..parallel import Progress
-from ..values import FloatArray, Value, positive, whole
+from ..values import FloatArray, Value
 from .interior_point import STEPS, Iterate, clock, smallest
+from .lmi_method import (
+    LOOSER,
+    NOTHING,
+    Candidate,
+    check_cost,
+    check_size,
+    checked_settings,
+    first_verified,
+)
 from .lmi_plant import Plant, half, lqg_states, same_states
-from .lmi_solution import Matrices, dual_bound, reconstructed, verified
+from .lmi_solution import Matrices, dual_bound, reconstructed
 from .method import SolvedController
 from .projected_lmis import ProjectedLmis
 
@@ -26,10 +36,8 @@ LARGER = 10.0
 #: gamma, beside the scale it is sought in, that is sought again in its own scale, unless the
 #: relative gap to the lower bound is settled
 _ROUGH, _SETTLED = (0.1, 10.0), 1e-3
-#: relative to the plant's size: a gamma that is taken for zero
-_NOTHING = 1e-7
-#: multiples of the back-off that are tried in turn, and points tried for each
-_LOOSER, _POINTS = np.array([1.0, 2.0, 4.0, 8.0]), 3
+#: points tried for each back-off
+_POINTS = 3
 #: steps of the search for a weight of an eliminated variable, each by this factor
 _WEIGHTS, _FACTOR = 60, 4.0
 
@@ -80,12 +88,7 @@ class StructuredLmi(Value):
     progress: bool | None = None
 
     def __post_init__(self) -> None:
-        self._set(
-            back_off=positive(self.back_off, "back_off"),
-            tolerance=positive(self.tolerance, "tolerance"),
-            max_states=whole(self.max_states, "max_states"),
-            time_limit=positive(self.time_limit, "time_limit"),
-        )
+        self._set(**checked_settings(self))
 
     def solve(self, problem: Prepared) -> SolvedController:
         """Return the controller of a prepared problem.
@@ -113,23 +116,13 @@ class StructuredLmi(Value):
         SolverError
             When no controller keeps what the LMIs promise.
         """
-        failures = []
-        for back_off in self.back_off * _LOOSER:
-            for point in found.points_below(1.0 + back_off)[:_POINTS]:
-                target = found.scale * float(point.y[-1])
-                try:
-                    K = _controller(found.plant, *found.program.matrices(point.y))
-                    norm = verified(problem, K, target)
-                except (FlexplantError, la.LinAlgError) as error:
-                    failures.append(f"{target:.6g}: {error}")
-                    continue
-                return SolvedController(*K, norm, min(found.lower, norm), {}, found.notes)
-        raise SolverError(
-            f"the LMIs give gamma = {found.value:.6g} as smallest, but no controller. "
-            + " ".join(failures[-3:])
-            + " Loosen weights, raise back_off, or use Riccati(), which adds a little noise and "
-            "effort where sensors and actuators have none."
-        )
+        candidates = [
+            Candidate(f"{target:.6g}", target, partial(_controller_at, found, point))
+            for part in self.back_off * LOOSER
+            for point in found.points_below(1.0 + part)[:_POINTS]
+            for target in [found.scale * float(point.y[-1])]
+        ]
+        return first_verified(problem, found.value, found.lower, candidates, found.notes)
 
     def smallest(self, problem: Prepared) -> SmallestGamma:
         """Return the smallest gamma of the LMIs with its lower bound, without a controller.
@@ -139,14 +132,7 @@ class StructuredLmi(Value):
         ModelError, InfeasibleError, SolverError
             As for `solve`.
         """
-        n = problem.A.shape[0]
-        if not n:
-            raise ModelError("StructuredLmi needs states, got a static plant. Use Riccati().")
-        if n > self.max_states:
-            raise ModelError(
-                f"StructuredLmi takes plants of 1 to {self.max_states} states, got {n}: time "
-                "grows as n^6. Reduce the order first, use Riccati(), or raise max_states."
-            )
+        check_size(self, problem)
         left = clock(self.time_limit)
         plant = Plant.of(problem)
         guess = scale = plant.size()
@@ -160,7 +146,7 @@ class StructuredLmi(Value):
                     settled = found.value - found.lower <= _SETTLED * found.value
                     if settled or low < found.value / scale < high:
                         break
-                    if found.value < _NOTHING * guess:
+                    if found.value < NOTHING * guess:
                         break
                     scale = found.value
                 break
@@ -168,12 +154,7 @@ class StructuredLmi(Value):
                 failures.append(SolverError(str(error)))
         else:
             raise failures[0]
-        if found.value < _NOTHING * guess:
-            raise InfeasibleError(
-                f"there is no smallest gamma: the infimum is 0. {found.value:.3g} is reached, "
-                f"where the plant's own size is {guess:.3g}. u cancels w in z, at no cost. Weight "
-                "the efforts in z, or give the sensors noise in w."
-            )
+        check_cost(found.value, guess)
         return found
 
     def _solved(self, plant: Plant, scale: float, left: Callable[[], float]) -> SmallestGamma:
@@ -247,6 +228,10 @@ def _bound(
     """Return the lower bound on gamma that multipliers give."""
     U, V = (side.onto @ part @ side.onto.T for side, part in zip(program.sides, X, strict=False))
     return dual_bound(plant, U, V, LARGER * S, LARGER * R)
+
+
+def _controller_at(found: SmallestGamma, point: Iterate) -> Matrices:
+    return _controller(found.plant, *found.program.matrices(point.y))
 
 
 def _controller(plant: Plant, R: FloatArray, S: FloatArray, gamma: float) -> Matrices:

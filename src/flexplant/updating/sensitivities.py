@@ -10,7 +10,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
-from ..values import ComplexArray, FloatArray, Value, real_array, short
+from ..values import ComplexArray, FloatArray, Value, instance, real_array, short
 from .family import Eigen, Family, repeated_groups
 from .parameters.added import Parameter
 
@@ -169,11 +169,7 @@ def checked_parameters(parameters: Any) -> tuple[Parameter, ...]:
     """Return the parameters as a tuple, checked."""
     listed = tuple(parameters) if isinstance(parameters, Sequence) else (parameters,)
     for parameter in listed:
-        if not isinstance(parameter, Parameter):
-            raise ModelError(
-                f"parameters must be a list of AddedMass, AddedDamping, AddedStiffness, got "
-                f"{short(parameter)}. Pass [AddedMass('41:z')], say."
-            )
+        instance(parameter, Parameter, "a parameter", "Pass [AddedMass('41:z')], say.")
     if not listed:
         raise ModelError("parameters is empty: there is nothing to update.")
     names = [parameter.name for parameter in listed]

@@ -138,12 +138,7 @@ def update(
     listed = checked_parameters(parameters)
     given = checked_residuals(residuals)
     if method is not None:
-        instance(
-            method,
-            UpdateMethod,
-            "method",
-            "Pass GaussNewton() or TrustRegion().",
-        )
+        instance(method, UpdateMethod, "method", "Pass GaussNewton() or TrustRegion().")
     if max_iterations is not None:
         _checked_count(max_iterations)
     enough = positive(tolerance, "tolerance")

@@ -93,7 +93,7 @@ def facts(given: FEMatrices) -> Facts:
     there = np.flatnonzero(~absent)
     mass_definite, negative, weak = _mass_state(given, M, no_mass)
     rounding = _rounding(K, M, given)
-    lowest, scaled, failure = _lowest(K, M, there, bool(mass_definite), no_mass, rounding)
+    lowest, scaled, failure = _lowest(K, M, there, bool(mass_definite), rounding)
     motions, mechanisms = None, np.zeros((n, 0))
     if lowest is not None:
         zero = lowest.shapes[:, : lowest.n_zero]
@@ -129,7 +129,7 @@ def facts(given: FEMatrices) -> Facts:
         body=body,
         piece=pieces(K, M, given.dofs),
         loss=None if lowest is None or given.digits is None else loss(lowest, given.digits),
-        damping={} if D is None else _damping(D, M, motions),
+        damping={} if D is None else _damping(D, motions),
     )
 
 
@@ -194,7 +194,7 @@ def _held(lowest: Lowest, suspended: int) -> Lowest:
 
 
 def _lowest(
-    K: Any, M: Any, there: IntArray, mass_definite: bool, no_mass: Any, rounding: float
+    K: Any, M: Any, there: IntArray, mass_definite: bool, rounding: float
 ) -> tuple[Lowest | None, bool, str]:
     """Return the lowest modes, whether M made them, and why there are none."""
     if not there.size or not K.nnz:
@@ -218,7 +218,7 @@ def _lowest(
     )
 
 
-def _damping(D: Any, M: Any, motions: ZeroEnergy | None) -> dict[str, Any]:
+def _damping(D: Any, motions: ZeroEnergy | None) -> dict[str, Any]:
     kept = np.flatnonzero(~_empty(D))
     definite = not kept.size or is_positive_definite(D[kept][:, kept], 1e-9)
     drag = 0.0

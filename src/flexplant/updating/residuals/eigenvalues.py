@@ -54,10 +54,7 @@ class Eigenvalues(Residual):
 
     def __post_init__(self) -> None:
         instance(
-            self.measured,
-            MeasuredModes,
-            "measured",
-            "Pass MeasuredModes(poles, modes=[...]).",
+            self.measured, MeasuredModes, "measured", "Pass MeasuredModes(poles, modes=[...])."
         )
         if self.measured.modes is None:
             raise LabelError(

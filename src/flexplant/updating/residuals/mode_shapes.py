@@ -75,10 +75,7 @@ class ModeShapes(Residual):
     def __post_init__(self) -> None:
         name = type(self).__name__
         instance(
-            self.measured,
-            MeasuredModes,
-            "measured",
-            "Pass MeasuredModes(poles, modes=[...]).",
+            self.measured, MeasuredModes, "measured", "Pass MeasuredModes(poles, modes=[...])."
         )
         if self.measured.modes is None:
             raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
@@ -317,11 +314,7 @@ def _rows(residual: ModeShapes, name: str) -> tuple[list[Place], Any]:
 def _listed(at: Any, direction: str) -> list[Place]:
     if isinstance(at, str):
         return [at]
-    if not isinstance(at, Sequence | np.ndarray):
-        raise ShapeError(
-            f"at must be a list of places, got {short(at)}. Give DOF labels or points, one for "
-            "each row of the shapes."
-        )
+    instance(at, Sequence | np.ndarray, "at", "Give a place for each row.", ShapeError)
     return [checked_place(place, direction)[0] for place in at]
 
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import ModelError
-from ...values import ComplexArray, FloatArray
+from ...values import ComplexArray, FloatArray, instance
 from ..family import Family
 from ..parameters.added import Parameter
 from ..point_model import Point, first_point
@@ -206,12 +206,7 @@ def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
     """Return the residuals as a tuple, checked."""
     listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
     for residual in listed:
-        if not isinstance(residual, Residual):
-            raise ModelError(
-                "residuals must be a list of Eigenvalues, ModeShapes, FrfResidual, Antiresonances "
-                f"or StaticCompliance, got {type(residual).__name__}. Pass the measurement "
-                "wrapped, [Eigenvalues(measured)]."
-            )
+        instance(residual, Residual, "a residual", "Wrap the measurement: [Eigenvalues(measured)].")
     if not listed:
         raise ModelError("residuals is empty: nothing was measured to update from.")
     return listed

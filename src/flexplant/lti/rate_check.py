@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
 
 import numpy as np
 
 from ..errors import FlexplantWarning, ModelError
-from ..lti.joining import block_eigenvalues
-from ..values import FloatArray, positive
+from ..values import ComplexArray, FloatArray, positive
 
 #: times half the rate: where even the lowest mode lies above this, the rate is in another unit
 _HOPELESS = 10.0
@@ -17,23 +15,23 @@ _HOPELESS = 10.0
 _NO_DELAY = 0.01
 #: samples: a delay beyond this is in another unit, of a loop, an actuator or a sensor
 _LONGEST = 1000.0
-#: damping ratio up to which a pole of a plant made elsewhere is a mode, not a filter
+#: damping ratio up to which a pole is a mode, not a filter
 _LIGHT = 0.3
 
 
-def check_rate(plant: Any, rate: float, delay: float) -> None:
-    """Judge a sampling rate [Hz] by the modes of a plant, delays and latencies by the rate.
+def check_rate(modes: FloatArray, rate: float, delay: float, stacklevel: int) -> None:
+    """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate.
 
     Raises
     ------
     ModelError
-        When the lowest elastic mode lies far above half the rate; when a delay is a negligible part
-        of a sample; when it, or the latency of an actuator or sensor, is more than 1000 samples.
+        When the lowest mode lies far above half the rate; when a delay is a negligible part of a
+        sample, or more than 1000 samples.
 
     Warns
     -----
     FlexplantWarning
-        When all elastic modes lie above half the rate.
+        When all modes lie above half the rate; `stacklevel` as for `warnings.warn`.
     """
     rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
     if 0 < delay < _NO_DELAY:
@@ -47,25 +45,17 @@ def check_rate(plant: Any, rate: float, delay: float) -> None:
             f"that late. If {delay:g} us are meant, it is delay={1e-6 * delay * rate:.4g} at "
             f"{rate:g} Hz."
         )
-    for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
-        if late * rate > _LONGEST:
-            raise ModelError(
-                f"the latency of {name!r} is {late:g} s, {late * rate:.4g} samples at {rate:g} Hz: "
-                f"latencies are in seconds. If {late:g} samples are meant, it is "
-                f"latency={late / rate:.4g}."
-            )
-    modes = _elastic(plant)
     if not modes.size or modes.min() <= 0.5 * rate:
         return
     said = (
-        f"all {modes.size} elastic modes of the plant, {modes.min():.4g} Hz and above, lie above "
+        f"all {modes.size} elastic modes, {modes.min():.4g} Hz and above, lie above "
         f"half the sampling rate ({0.5 * rate:g} Hz): in its samples they look like slow ones. The "
         "rate is in Hz"
     )
     if modes.min() > 0.5 * _HOPELESS * rate:
         raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
     said = f"{said}, the model in SI units: are both?"
-    warnings.warn(said, FlexplantWarning, stacklevel=4)
+    warnings.warn(said, FlexplantWarning, stacklevel=stacklevel + 1)
 
 
 def _meant(rate: float, lowest: float) -> str:
@@ -77,13 +67,17 @@ def _meant(rate: float, lowest: float) -> str:
     return ""
 
 
-def _elastic(plant: Any) -> FloatArray:
-    """Return the frequencies [Hz] of the elastic modes of a plant."""
-    if plant.is_assembled:
-        held = plant.modal_blocks[np.linalg.det(plant.modal_blocks) >= 0]
-        poles = [block_eigenvalues(block, (2,)) for block in held]
-        size = np.array([float(np.sqrt(np.abs(p[0] * p[1]))) for p in poles])
-    else:
-        found = plant.system.poles()
-        size = np.abs(found[(found.imag > 0) & (-found.real < _LIGHT * np.abs(found))])
-    return np.asarray(size[size > 0] / (2 * np.pi), dtype=np.float64)
+def check_latency(name: str, latency: float, rate: float) -> None:
+    """Raise ModelError when the latency [s] of a port is more than 1000 samples."""
+    if latency * rate > _LONGEST:
+        raise ModelError(
+            f"the latency of {name!r} is {latency:g} s, {latency * rate:.4g} samples at {rate:g} "
+            f"Hz: latencies are in seconds. If {latency:g} samples are meant, it is "
+            f"latency={latency / rate:.4g}."
+        )
+
+
+def light_modes(poles: ComplexArray) -> FloatArray:
+    """Return the frequencies [Hz] of the lightly damped pairs among continuous poles [rad/s]."""
+    size = np.abs(poles)
+    return np.asarray(size[(poles.imag > 0) & (-poles.real < _LIGHT * size)] / (2.0 * np.pi))

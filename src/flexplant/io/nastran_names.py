@@ -1,0 +1,62 @@
+"""Which matrices of a Nastran file are K, M and D: by the usual names, or those that are given."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+from ..errors import ModelError, unknown_label
+
+_LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
+
+
+def named_matrices(
+    found: Mapping[str, Any],
+    given: Mapping[str, str | None],
+    endings: Sequence[str],
+    path: str,
+) -> list[str | None]:
+    """Return the names of stiffness, mass and damping; of the latter two None where not there.
+
+    Parameters
+    ----------
+    found : mapping {name: matrix}
+        What the file holds.
+    given : mapping {"stiffness", "mass", "damping": name or None}
+        What the caller says; None takes the one that has a usual name.
+    endings : sequence of str
+        Of usual names, after the letter K, M or B.
+    path : str
+        The file, for messages.
+
+    Raises
+    ------
+    LabelError
+        When a name that is given is not there.
+    ModelError
+        When several may be meant, or there is no stiffness.
+    """
+    names: list[str | None] = []
+    for what, name in given.items():
+        check_held(() if name is None else (name,), found, path)
+        usual = [_LETTERS[what] + ending for ending in endings]
+        there = [one for one in usual if one in found] if name is None else [name]
+        if len(there) > 1:
+            raise ModelError(
+                f"{path!r} holds {there}, any of which may be the {what}. Say which: "
+                f"{what}={there[0]!r}."
+            )
+        if not there and what == "stiffness":
+            raise ModelError(
+                f"{path!r} holds {sorted(found)}, none of which has a usual name of a stiffness "
+                f"matrix ({', '.join(usual)}). Say which it is: stiffness='...'."
+            )
+        names.append(there[0] if there else None)
+    return names
+
+
+def check_held(names: Iterable[str], found: Iterable[str], path: str) -> None:
+    """Raise LabelError unless the file holds all these matrices."""
+    for name in names:
+        if name not in found:
+            raise unknown_label("matrix", name, found, repr(path))
