@@ -24,6 +24,7 @@ from flexplant.simulation import (
     learn_feedforward,
     settling_time,
 )
+from flexplant.synthesis import FixedOrder, design_structured
 from flexplant.testbeds import wafer_stage
 from stages import RATE, ports, sampled, some_modes
 
@@ -162,6 +163,14 @@ CALLS = [
     ("in_axes", lambda x: fx.loop.in_axes(x), ()),
     ("report_loops", lambda x: fx.loop.report_loops(x), ()),
     ("report_loops rigid", lambda x: fx.loop.report_loops(loop(), rigid=x), ()),
+    ("design_structured", lambda x: design_structured(x, FixedOrder(0)), ()),
+    ("design_structured structure", lambda x: design_structured(plant(), x), ()),
+    ("design_structured starts", lambda x: design_structured(plant(), FixedOrder(0), starts=x), ()),
+    ("FixedOrder", lambda x: FixedOrder(x), ()),
+    ("FixedOrder pattern", lambda x: FixedOrder(pattern=x), ("none",)),
+    ("TunedLaws", lambda x: design_structured(plant(), fx.synthesis.TunedLaws(x)), ()),
+    ("TunedLaws free", lambda x: fx.synthesis.TunedLaws(fx.Pid(1.0), free=x), ("dict",)),
+    ("Parametrised", lambda x: fx.synthesis.Parametrised(x, [1.0]), ()),
     ("ncf_margin", lambda x: fx.ncf_margin(plant(), x), ()),
     ("design_hinf", lambda x: fx.design_hinf(x), ()),
     ("design_hinf method", lambda x: fx.design_hinf(plant(), x), ("none",)),

@@ -24,5 +24,11 @@ from .robustness.stability import RobustStability as RobustStability
 from .robustness.stability import robust_stability as robust_stability
 from .servo import design_servo as design_servo
 from .servo import servo_bandwidth as servo_bandwidth
+from .structured import StructuredController as StructuredController
+from .structured import design_structured as design_structured
 from .structured_lmi import StructuredLmi as StructuredLmi
+from .structures import FixedOrder as FixedOrder
+from .structures import ObserverGains as ObserverGains
+from .structures import Parametrised as Parametrised
 from .tune import tune_loops as tune_loops
+from .tuned_laws import TunedLaws as TunedLaws

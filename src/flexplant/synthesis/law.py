@@ -50,17 +50,25 @@ class Section(NamedTuple):
         return np.asarray(((b2 * p + b1) * p + b0) / ((a2 * p + a1) * p + a0))
 
     @property
-    def system(self) -> StateSpace:
-        """The section as a continuous system."""
+    def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """A, B, C and D of the continuous section."""
         (b2, b1, b0), (a2, a1, a0), w = self.b, self.a, self.omega
         if not a2:
             b1, b0, a0 = b1 / a1, b0 / a1, a0 / a1
-            g = StateSpace([[-a0 * w]], [[w]], [[b0 - b1 * a0]], [[b1]])
-        else:
-            b2, b1, b0, a1, a0 = b2 / a2, b1 / a2, b0 / a2, a1 / a2, a0 / a2
-            A = [[0.0, w], [-a0 * w, -a1 * w]]
-            g = StateSpace(A, [[0.0], [w]], [[b0 - b2 * a0, b1 - b2 * a1]], [[b2]])
-        return g.replace(inputs=["error"], outputs=["command"])
+            one = np.array([[-a0 * w]]), np.array([[w]]), np.array([[b0 - b1 * a0]])
+            return *one, np.array([[b1]])
+        b2, b1, b0, a1, a0 = b2 / a2, b1 / a2, b0 / a2, a1 / a2, a0 / a2
+        return (
+            np.array([[0.0, w], [-a0 * w, -a1 * w]]),
+            np.array([[0.0], [w]]),
+            np.array([[b0 - b2 * a0, b1 - b2 * a1]]),
+            np.array([[b2]]),
+        )
+
+    @property
+    def system(self) -> StateSpace:
+        """The section as a continuous system."""
+        return StateSpace(*self.matrices, inputs=["error"], outputs=["command"])
 
 
 class Element(Value):

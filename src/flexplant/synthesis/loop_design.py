@@ -107,6 +107,9 @@ def axes_of(
         if before is None and after is None and given.is_assembled:
             axes = decouple(given)
             before, after = axes.accelerations, axes.to_motions
+            errors = [f"{name}:error" for name in after.inputs]
+            if set(errors) <= set(given.y):  # seen as reference minus measurement
+                after = (-after).replace(inputs=errors)
         plant = given.Gyu
     if isinstance(plant, Frf):
         inside: Any = in_axes(plant, before=before, after=after, rate=rate, delay=delay, hold=hold)
@@ -207,7 +210,7 @@ def design_loops(
         When the loop is unstable, or is with the modes left out.
     """
     axes = axes_of(plant, before, after, rate, delay, hold)
-    found = made(axes, _checked(axes, laws), rigid, unstable, references, larger)
+    found = made(axes, checked_laws(axes, laws), rigid, unstable, references, larger)
     if found.report.is_stable is False:
         closest = min(found.report.loops, key=lambda loop: loop.modulus_margin)
         warnings.warn(
@@ -253,7 +256,7 @@ def made(
     )
 
 
-def _checked(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law]:
+def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law]:
     """Return a law for each axis, at the rate of the plant.
 
     Raises

@@ -1,0 +1,329 @@
+"""Structures of a controller with parameters: static gain, low order, laws, observer gains."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ..errors import FlexplantError, ModelError, ShapeError
+from ..lti.balancing import balanced
+from ..lti.discretisation import bilinear, tustin
+from ..lti.preparation import Prepared
+from ..lti.riccati import control_care, solve_care
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, instance, real_array, whole
+from .hinf import design_hinf
+from .structured_loop import Matrices
+
+#: step of a derivative by differences, and the steps and weights of fourth order
+_STEP = 1e-3
+DIFFERENCES = tuple(
+    (k * _STEP, w / (12.0 * _STEP)) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0))
+)
+
+
+class Family(Protocol):
+    """A structure made ready for a plant: from parameters of size 1 to a controller.
+
+    Parameters
+    ----------
+    order : int
+        States of the controller.
+    first : (n,) array
+        Where the first start is.
+    spread : float
+        Standard deviation of the others around it.
+    """
+
+    order: int
+    first: FloatArray
+    spread: float
+
+    def matrices(self, theta: FloatArray) -> Matrices:
+        """Return the controller y -> u; of a sampled plant in the s of Tustin's rule."""
+
+    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
+        """Return the gradient by the parameters from that by the matrices."""
+
+    def structure(self, theta: FloatArray) -> Any:
+        """Return the structure with these parameters as its own."""
+
+
+class Structure(Protocol):
+    """What `design_structured` takes: a value that makes itself ready for a plant."""
+
+    def family(self, plant: StandardPlant, prepared: Prepared) -> Family:
+        """Return the structure made ready for a plant."""
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class FixedOrder(Value):
+    """A controller of given order, all entries of A, B, C and D free.
+
+    Parameters
+    ----------
+    order : int
+        States; 0 is a static gain.
+    pattern : (nu, ny) array of bool, optional
+        Of a static gain: which entries are free, the others are zero (decentralised feedback).
+    start : StateSpace, optional
+        A controller y -> u to begin with, of this order; of an earlier design.
+    """
+
+    order: int = 0
+    pattern: npt.NDArray[np.bool_] | None = None
+    start: StateSpace | None = None
+
+    def __post_init__(self) -> None:
+        order = whole(self.order, "order", minimum=0)
+        pattern = self.pattern
+        if pattern is not None:
+            if order:
+                raise ModelError("a pattern is that of a static gain: leave order out, or it.")
+            pattern = real_array(pattern, "pattern", (None, None)) != 0
+        self._set(order=order, pattern=pattern)
+
+    def __repr__(self) -> str:
+        free = "" if self.pattern is None else f", {int(self.pattern.sum())} entries free"
+        return f"FixedOrder({self.order}{free})"
+
+    def family(self, plant: StandardPlant, prepared: Prepared) -> _Entries:
+        """Return the structure made ready for a plant.
+
+        Raises
+        ------
+        ShapeError, ModelError
+            When pattern or start do not fit the plant.
+        """
+        nu, ny = len(plant.u), len(plant.y)
+        pattern = np.ones((nu, ny), dtype=bool) if self.pattern is None else self.pattern
+        if pattern.shape != (nu, ny):
+            raise ShapeError(
+                f"pattern must have shape ({nu}, {ny}) of (u, y), got {pattern.shape}."
+            )
+        entries = _Entries(self.order, pattern, prepared, np.zeros(0))
+        known = self.start if self.start is not None else _reduced(plant, self.order)
+        if known is None:
+            rest = Matrices(
+                -prepared.speed * np.eye(self.order),
+                np.zeros((self.order, ny)),
+                np.zeros((nu, self.order)),
+                np.zeros((nu, ny)),
+            )
+            return entries.starting(rest)
+        if known.n_states != self.order or known.D.shape != (nu, ny):
+            raise ModelError(f"start is {known!r}: pass {self.order} states, {ny} y and {nu} u.")
+        g = bilinear(known, 1.0 / plant.dt) if plant.dt else known
+        return entries.starting(Matrices(g.A, g.B, g.C, g.D))
+
+
+def _reduced(plant: StandardPlant, order: int) -> StateSpace | None:
+    """Return the controller of full order, reduced; None where that is not possible."""
+    if not order:
+        return None
+    try:
+        full = design_hinf(plant).system
+        return balanced(full, order=order).system if full.n_states > order else None
+    except FlexplantError:
+        return None
+
+
+class _Entries:
+    """Entries in units of the plant's speed and of its u and y."""
+
+    spread = 1.0
+
+    def __init__(
+        self, order: int, pattern: npt.NDArray[np.bool_], p: Prepared, first: FloatArray
+    ) -> None:
+        self.order, self.first, self.pattern, self.dt = order, first, pattern, p.dt
+        self.names = (p.y, p.u)
+        root = np.full(order, np.sqrt(p.speed))
+        rows = np.concatenate([root, np.linalg.norm(p.u_scale, axis=1)])
+        columns = np.concatenate([root, np.linalg.norm(p.y_scale, axis=0)])
+        free = np.ones((rows.size, columns.size), dtype=bool)
+        free[order:, order:] = pattern
+        self.scale, self.free = np.outer(rows, columns), free
+
+    def starting(self, K: Matrices) -> _Entries:
+        """Return itself with the parameters of a controller as its first ones."""
+        self.first = (_joined(K) / self.scale)[self.free]
+        return self
+
+    def matrices(self, theta: FloatArray) -> Matrices:
+        entries = np.zeros(self.scale.shape)
+        entries[self.free] = theta
+        return _cut(entries * self.scale, self.order)
+
+    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
+        return np.asarray((_joined(by) * self.scale)[self.free])
+
+    def structure(self, theta: FloatArray) -> FixedOrder:
+        return FixedOrder(
+            self.order,
+            None if self.order else self.pattern,
+            as_system(self.matrices(theta), self.names, self.dt),
+        )
+
+
+def _joined(K: Matrices) -> FloatArray:
+    return np.asarray(np.block([[K.A, K.B], [K.C, K.D]]))
+
+
+def _cut(all_: FloatArray, k: int) -> Matrices:
+    return Matrices(all_[:k, :k], all_[:k, k:], all_[k:, :k], all_[k:, k:])
+
+
+def as_system(K: Matrices, names: tuple[Sequence[str], Sequence[str]], dt: float) -> StateSpace:
+    """Return a controller as a system, sampled by Tustin's rule where dt is not 0."""
+    g = StateSpace(*K, inputs=names[0], outputs=names[1])
+    return tustin(g, 1.0 / dt) if dt else g
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ObserverGains(Value):
+    """An observer of the plant's states with state feedback: the gains L and F are free.
+
+    ``dx/dt = A x + B2 u - L (y - C2 x - D22 u), u = F x``, with the A, B2, C2 of the (weighted)
+    plant; the first gains are those of LQG. A sampled plant's observer is that of its bilinear
+    equivalent.
+    """
+
+    def __repr__(self) -> str:
+        return "ObserverGains()"
+
+    def family(self, plant: StandardPlant, prepared: Prepared) -> _Gains:
+        """Return the structure made ready for a plant.
+
+        Raises
+        ------
+        AssumptionError, SolverError
+            When LQG has no stabilising gains: a mode is not reached or seen.
+        """
+        return _Gains(prepared, self)
+
+
+class _Gains:
+    spread = 0.1
+
+    def __init__(self, p: Prepared, structure: ObserverGains) -> None:
+        self.p, self.order, self._structure = p, p.A.shape[0], structure
+        n = self.order
+        F = -control_care(p.A, p.B2, Q=np.eye(n), R=np.eye(len(p.u))).gain
+        L = -solve_care(p.A, p.C2, Q=np.eye(n), R=np.eye(len(p.y))).gain
+        self.first = np.concatenate([F.ravel(), L.ravel()])
+
+    def _parts(self, theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        split = len(self.p.u) * self.order
+        return theta[:split].reshape(-1, self.order), theta[split:].reshape(self.order, -1)
+
+    def matrices(self, theta: FloatArray) -> Matrices:
+        p, root = self.p, np.sqrt(self.p.speed)
+        F, L = self._parts(theta)
+        return Matrices(
+            p.speed * (p.A + p.B2 @ F + L @ (p.C2 + p.D22 @ F)),
+            -root * L @ p.y_scale,
+            root * p.u_scale @ F,
+            np.zeros((F.shape[0], L.shape[1])),
+        )
+
+    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
+        p, root = self.p, np.sqrt(self.p.speed)
+        F, L = self._parts(theta)
+        A = p.speed * by.A
+        on_F = p.B2.T @ A + p.D22.T @ L.T @ A + root * p.u_scale.T @ by.C
+        on_L = A @ (p.C2 + p.D22 @ F).T - root * by.B @ p.y_scale.T
+        return np.concatenate([on_F.ravel(), on_L.ravel()])
+
+    def structure(self, theta: FloatArray) -> ObserverGains:
+        return self._structure
+
+
+class Parametrised:
+    """Any structure: a function of parameters that gives a controller.
+
+    Parameters
+    ----------
+    make : function
+        Of an (n,) array; returns a StateSpace y -> u, always of the same order, sampled as the
+        plant is, and smooth in the parameters.
+    start : (n,) array
+        Where the search begins; steps are taken in multiples of each entry (of 1 where it is 0).
+    spread : float
+        Relative size of the differences between starts.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When make is no function, or start no array.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[FloatArray], StateSpace],
+        start: npt.ArrayLike,
+        *,
+        spread: float = 0.3,
+    ) -> None:
+        if not callable(make):
+            raise ModelError("make must be a function of the parameters. Pass one.")
+        self.make, self.start = make, real_array(start, "start", (None,))
+        self.spread = float(real_array(spread, "spread", ()))
+
+    def __repr__(self) -> str:
+        return f"Parametrised({self.start.size} parameters)"
+
+    def family(self, plant: StandardPlant, prepared: Prepared) -> Differenced:
+        """Return the structure made ready for a plant.
+
+        Raises
+        ------
+        ModelError, LabelError
+            When what it makes does not fit the plant.
+        """
+        unit = np.where(self.start != 0, np.abs(self.start), 1.0)
+
+        def matrices(theta: FloatArray) -> Matrices:
+            made = instance(self.make(unit * theta), StateSpace, "what make returns", "Return one.")
+            g = made.select(plant.u, plant.y)
+            g = bilinear(g, 1.0 / plant.dt) if plant.dt and g.n_states else g
+            return Matrices(g.A, g.B, g.C, g.D)
+
+        return Differenced(
+            matrices,
+            self.start / unit,
+            self.spread,
+            lambda theta: Parametrised(self.make, unit * theta, spread=self.spread),
+        )
+
+
+class Differenced:
+    """A family whose matrices are differentiated by differences, exact for polynomials up to 4."""
+
+    def __init__(
+        self,
+        matrices: Callable[[FloatArray], Matrices],
+        first: FloatArray,
+        spread: float,
+        structure: Callable[[FloatArray], Any],
+    ) -> None:
+        self.matrices, self.first, self.spread = matrices, first, spread
+        self.structure = structure
+        self.order = matrices(first).A.shape[0]
+
+    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
+        """Return the gradient by the parameters from that by the matrices."""
+
+        def along(i: int, step: float) -> float:
+            moved = theta.copy()
+            moved[i] += step
+            return float(sum(np.sum(g * m) for g, m in zip(by, self.matrices(moved), strict=True)))
+
+        return np.array(
+            [sum(w * along(i, step) for step, w in DIFFERENCES) for i in range(theta.size)]
+        )

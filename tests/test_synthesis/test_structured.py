@@ -1,0 +1,266 @@
+"""Structured H-infinity: exact gradients, optima known by other theory, several plants, laws."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+from test_spill_over import many, small
+
+import oracles_synthesis as oracle
+from flexplant.errors import InfeasibleError, LabelError, ModelError, ShapeError
+from flexplant.lti import StateSpace, discretized
+from flexplant.lti.preparation import prepared
+from flexplant.plant import StandardPlant, reference_errors, stage_weights
+from flexplant.synthesis import (
+    FixedOrder,
+    Lead,
+    LowPass,
+    Notch,
+    ObserverGains,
+    Parametrised,
+    Pid,
+    TunedLaws,
+    design_loops,
+    design_structured,
+)
+from flexplant.synthesis.nonsmooth import bfgs, sampled_minimum, smallest_combination
+from flexplant.synthesis.structured_loop import ScaledLoop
+from stages import ports, sampled
+
+
+def named(A, B, C, D, nu, ny, dt=0.0):
+    u, y = [f"u{i}" for i in range(nu)], [f"y{i}" for i in range(ny)]
+    w = [f"w{i}" for i in range(B.shape[1] - nu)]
+    z = [f"z{i}" for i in range(C.shape[0] - ny)]
+    P = StateSpace(A, B, C, D, dt, inputs=[*w, *u], outputs=[*z, *y])
+    return StandardPlant.from_statespace(P, u=u, y=y)
+
+
+def coprime(A, B, C):
+    """The problem of the normalised coprime factors, and its least gamma of any order."""
+    parts, best = oracle.coprime_problem(A, B, C)
+    return named(*parts, B.shape[1], C.shape[0]), best
+
+
+def machine(freq=30.0, rate=500.0, stiff=0.0):
+    """A mass with a mode in a tracking problem: z = [w1 (r - y), w2 u], sampled and late."""
+    w = 2 * np.pi * freq
+    A = la.block_diag([[0, 1], [-stiff, 0]], [[0, 1], [-(w**2), -0.02 * w]])
+    B, C = np.array([[0.0], [1], [0], [1]]), np.array([[1.0, 0, 0.4, 0]])
+    G = StateSpace(A, B, C, [[0.0]])
+    G = discretized(G, rate, delay=1) if rate else G
+    n, k = G.n_states, 2 * np.pi * 3.0
+    # integrator weight on the error, gain on the effort
+    lag = np.exp(-0.02 * k / rate) if rate else -0.02 * k
+    drive = 0.5 * k / rate if rate else 0.5 * k
+    A = np.block([[G.A, np.zeros((n, 1))], [-drive * G.C, np.array([[lag]])]])
+    B = np.block([[np.zeros((n, 1)), G.B], [np.array([[drive]]), np.zeros((1, 1))]])
+    C = np.block(
+        [
+            [np.zeros((1, n)), np.ones((1, 1))],
+            [np.zeros((1, n + 1))],
+            [-0.5 * G.C, np.zeros((1, 1))],
+            [G.C, np.zeros((1, 1))],
+        ]
+    )
+    D = np.array([[0.0, 0], [0, 1e-4], [0.5, 0], [-1.0, 0]])
+    return named(A, B, C, D, 1, 1, G.dt)
+
+
+def law(freq=30.0):
+    pid = Pid.corners((2 * np.pi * 3.0) ** 2 / 3, integrator=0.3, zero=1.0, pole=9.0)
+    return pid * LowPass(25.0) * Notch(freq, 0.1)
+
+
+def judged(plant, found):
+    """The norm of the loop by dense matrices and a sweep; the loop is stable."""
+    g, K = plant.system, found.system
+    parts = oracle.split(g.A, g.B, g.C, g.D, len(plant.u), len(plant.y))
+    loop = oracle.closed_loop(parts, K.A, K.B, K.C, K.D)
+    assert oracle.stability(loop[0], g.dt) < 0
+    return oracle.brute_norm(*loop, g.dt)
+
+
+def scaled(theta):
+    """A law in parameters as any user would write it: continuous, then by hand to rate 500."""
+    return design_loops(machine(), float(theta[0]) * law()).system
+
+
+STRUCTURES = {
+    "static": (lambda: machine(rate=0.0, stiff=90.0), FixedOrder(0)),
+    "order 2, sampled": (machine, FixedOrder(2)),
+    "laws, sampled": (machine, TunedLaws(law(), free=("p", "i", "d", "pole", "freq", "depth"))),
+    "a gain and a lead": (machine, TunedLaws(150.0 * Lead(3.0, 12.0) * LowPass(60.0))),
+    "observer, sampled": (machine, ObserverGains()),
+    "parametrised": (machine, Parametrised(scaled, [1.0])),
+}
+
+
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_gradients_are_exact(name):
+    """Of the norm at its peak and of the least stable pole, in parameters, by differences."""
+    make, structure = STRUCTURES[name]
+    plant = make()
+    p = prepared(plant.system, plant.u, plant.y)
+    family = structure.family(plant, p)
+    loop = ScaledLoop(p, family.order)
+    rng = np.random.default_rng(2)
+    theta = family.first + 0.05 * rng.standard_normal(family.first.size)
+
+    def pole(t):
+        return loop.stability(family.matrices(t))[0]
+
+    def log_norm(t):
+        return np.log(loop.norm(family.matrices(t))[0])
+
+    if not np.isfinite(log_norm(theta)):  # any stabilising parameters
+
+        def both(t):
+            value, by, _ = loop.stability(family.matrices(t))
+            return value, family.slope(t, by)
+
+        theta, _ = bfgs(both, theta, enough=-1e-4, steps=200, out_of_time=lambda: False)
+    value, by, _ = loop.norm(family.matrices(theta))
+    _, pole_by, _ = loop.stability(family.matrices(theta))
+    for function, slope in (
+        (log_norm, family.slope(theta, by) / value),
+        (pole, family.slope(theta, pole_by)),
+    ):
+        size = np.linalg.norm(slope)
+        for _ in range(3):
+            step = rng.standard_normal(theta.size)
+            step *= 1e-5 / np.linalg.norm(step)
+            change = (function(theta + step) - function(theta - step)) / 2
+            assert change == pytest.approx(slope @ step, rel=2e-4, abs=2e-6 * size * 1e-5 + 1e-13)
+
+
+def test_the_static_gain_at_a_kink():
+    """(1 + k^2) max(1, 1/k^2) is least at k = -1: gamma sqrt(2), where no gradient is small."""
+    plant, best = coprime(np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1)))
+    assert best == pytest.approx(np.sqrt(2.0), rel=1e-12)
+    found = design_structured(plant, FixedOrder(0))
+    assert found.gamma == pytest.approx(best, rel=1e-4)
+    assert found.system.D[0, 0] == pytest.approx(-1.0, rel=1e-3)
+    assert found.certificate["decrease left"] < 1e-5
+    assert judged(plant, found) == pytest.approx(found.gamma, rel=1e-3)
+
+
+def test_order_n_minus_1_reaches_the_optimum_of_any_order():
+    """The double integrator: one state is enough for (4 + 2 sqrt(2))^(1/2)."""
+    plant, best = coprime(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), np.eye(2)[:1])
+    found = design_structured(plant, FixedOrder(1), starts=2)
+    assert found.system.n_states == 1
+    assert best * (1 - 1e-6) <= found.gamma <= 1.005 * best
+    assert judged(plant, found) == pytest.approx(found.gamma, rel=1e-3)
+
+
+def test_a_pattern_keeps_its_zeros_and_an_earlier_design_is_a_start():
+    A = np.array([[0.0, 1, 0, 0], [-2, -0.1, 1, 0], [0, 0, 0, 1], [1, 0, -2, -0.1]])
+    B, C = np.eye(4)[:, [1, 3]], np.eye(4)[[1, 3]]
+    plant, _ = coprime(A, B, C)
+    each = design_structured(plant, FixedOrder(pattern=np.eye(2)), starts=2)
+    assert each.system.D[0, 1] == each.system.D[1, 0] == 0.0
+    every = design_structured(plant, FixedOrder(start=each.system), starts=1)
+    assert every.gamma <= each.gamma * (1 + 1e-6)
+    again = design_structured(plant, every.structure, starts=1)
+    assert again.gamma == pytest.approx(every.gamma, rel=1e-3)
+    with pytest.raises(ShapeError, match=r"shape \(2, 2\) of \(u, y\)"):
+        design_structured(plant, FixedOrder(pattern=np.ones((1, 2))))
+
+
+@pytest.mark.slow
+def test_laws_are_tuned_to_a_local_minimum():
+    """PID with roll-off and notch, sampled and late: every draw nearby is worse."""
+    plant = machine()
+    first = design_loops(plant, law())
+    found = design_structured(plant, TunedLaws(law()), starts=2, time_limit=10.0)
+    assert found.gamma < 0.75 * judged(plant, first)
+    assert judged(plant, found) == pytest.approx(found.gamma, rel=2e-3)
+    (tuned,) = found.structure.family(plant, prepared(plant.system, plant.u, plant.y))._each
+    same = design_loops(plant, tuned).system
+    z = np.exp(0.3j)
+    assert same.evaluated(z) == pytest.approx(found.system.evaluated(z), rel=1e-6)
+    rng = np.random.default_rng(0)
+    radius, slope = found.certificate["radius"], found.certificate["slope"]
+    family = TunedLaws(law()).family(plant, prepared(plant.system, plant.u, plant.y))
+    loop = ScaledLoop(prepared(plant.system, plant.u, plant.y), family.order)
+    for _ in range(40):
+        step = rng.standard_normal(found.parameters.size)
+        step *= radius / np.linalg.norm(step)
+        near = loop.norm(family.matrices(found.parameters + step))[0]
+        assert near >= found.gamma * (1 - 1e-6) - 2.0 * slope * radius
+
+
+@pytest.mark.slow
+def test_one_controller_for_several_machines():
+    """Modes at 26 and 36 Hz: one law holds both, a law for one is worse on the other."""
+    plants = [machine(26.0), machine(36.0)]
+    one = design_structured(plants, TunedLaws(law(30.0)), starts=1, time_limit=8.0)
+    norms = [judged(plant, one) for plant in plants]
+    assert one.gamma == pytest.approx(max(norms), rel=2e-3)
+    assert one.certificate["norm of plant 1"] == pytest.approx(norms[0], rel=2e-3)
+    alone = design_structured(plants[0], TunedLaws(law(26.0)), starts=1, time_limit=8.0)
+    assert alone.gamma <= one.gamma * (1 + 1e-2)
+    g, K = plants[1].system, alone.system
+    other = oracle.closed_loop(oracle.split(g.A, g.B, g.C, g.D, 1, 1), K.A, K.B, K.C, K.D)
+    unstable = oracle.stability(other[0], g.dt) >= 0
+    assert unstable or oracle.brute_norm(*other, g.dt) > 1.05 * one.gamma
+    with pytest.raises(ModelError, match="plant 2 has other u, y or rate"):
+        design_structured([plants[0], machine(26.0, rate=400.0)], TunedLaws(law()))
+
+
+@pytest.mark.slow
+def test_the_stage_with_decoupled_laws_and_the_modes_left_out():
+    """Weights of a stage, SI units, one law for each rigid-body axis of errors."""
+    P = sampled(small(), ports())
+    errors, weights = reference_errors(P), stage_weights(P, 20.0)
+    weighted = P.through(errors).weighted(z=weights.z, w=weights.w)
+    w = (2 * np.pi * 20.0) ** 2
+    start = Pid.corners(w / 4, integrator=2.0, zero=5.0, pole=80.0) * LowPass(160.0)
+    found = design_structured(
+        weighted, TunedLaws(start, free=("p", "i", "d", "freq")), starts=1, time_limit=6.0,
+        larger=many(),
+    )  # fmt: skip
+    assert found.gamma == pytest.approx(judged(weighted, found), rel=2e-3)
+    assert found.left_out is not None and found.left_out.is_stable
+    assert set(found.structure.laws) == {"cog:z", "cog:rx", "cog:ry"}
+
+
+def test_what_cannot_be_stabilised_says_which_pole():
+    """A free mass is not held by position feedback alone; the time limit holds too."""
+    plant, _ = coprime(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), np.eye(2)[:1])
+    with pytest.raises(InfeasibleError, match=r"best leaves a pole at .* Hz .*a higher order"):
+        design_structured(plant, FixedOrder(0), starts=2)
+    with pytest.raises(InfeasibleError, match="of 1 starts"):
+        design_structured(plant, FixedOrder(0), time_limit=1e-3)
+    with pytest.raises(LabelError, match="no number of an element 'gain'"):
+        TunedLaws(law(), free=("gain",))
+    with pytest.raises(ModelError, match="no number of the laws is free"):
+        design_structured(machine(), TunedLaws(LowPass(3.0), free=("ratio",)))
+
+
+def test_a_nonsmooth_minimum_and_its_report():
+    """max(|x1|, 3 |x2 - 1|) + |x1 + x2|: from anywhere to (-0.6, 0.8) or so, value by LP."""
+
+    def function(x):
+        parts = np.array([x[0], -x[0], 3 * (x[1] - 1), 3 * (1 - x[1])])
+        slopes = np.array([[1.0, 0], [-1, 0], [0, 3], [0, -3]])
+        i, sign = int(np.argmax(parts)), np.sign(x[0] + x[1]) or 1.0
+        return parts[i] + abs(x[0] + x[1]), slopes[i] + sign
+
+    x, value = bfgs(function, np.array([3.0, -2.0]), enough=0.0, steps=200, out_of_time=lambda: 0)
+    rng = np.random.default_rng(0)
+    found = sampled_minimum(function, x, value, rng=rng, out_of_time=lambda: False)
+    from scipy.optimize import linprog
+
+    rows = [[1, 0, -1, 0], [-1, 0, -1, 0], [0, 3, -1, 0], [0, -3, -1, 0], [1, 1, 0, -1]]
+    bounds = [0, 0, 3, -3, 0, 0]
+    exact = linprog(
+        [0, 0, 1, 1], A_ub=[*rows, [-1, -1, 0, -1]], b_ub=bounds, bounds=[(None, None)] * 4
+    )
+    assert found.value == pytest.approx(exact.fun, rel=1e-4)
+    assert found.decrease < 1e-5
+    triangle = np.array([[1.0, 1.0], [3.0, 1.0], [2.0, 4.0]])
+    np.testing.assert_allclose(smallest_combination(triangle), [1.0, 1.0], atol=1e-10)
+    np.testing.assert_allclose(
+        smallest_combination(np.array([[2.0, -1.0], [2.0, 3.0]])), [2.0, 0.0], atol=1e-10
+    )
