@@ -22,7 +22,7 @@ from .controller import Controller
 from .nonsmooth import Minimum, bfgs, sampled_minimum
 from .spill_over import spill_over, unchecked
 from .structured_loop import DECAY, Matrices, ScaledLoop
-from .structures import Family, Structure, as_system
+from .structures import ControllerFamily, ControllerStructure, as_system
 
 #: steps of BFGS for stability and for the norm
 _STEPS = 300
@@ -59,7 +59,7 @@ class StructuredController(Controller):
 @one_thread()
 def design_structured(
     plant: StandardPlant | System | Sequence[StandardPlant],
-    structure: Structure,
+    structure: ControllerStructure,
     *,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
@@ -131,7 +131,7 @@ def design_structured(
     limit, begun = positive(time_limit, "time_limit"), time.perf_counter()
     problems = [prepared(one.system, one.u, one.y) for one in plants]
     family = structure.family(plants[0], problems[0])
-    search = _Search(
+    search = _StructureSearch(
         family, [ScaledLoop(p, family.order) for p in problems], problems, begun + _SHARE * limit
     )
     x, value = search.best(starts, random)
@@ -200,11 +200,15 @@ def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> lis
     return plants
 
 
-class _Search:
+class _StructureSearch:
     """The functions of the parameters, and the search through starts."""
 
     def __init__(
-        self, family: Family, loops: list[ScaledLoop], problems: list[Prepared], end: float
+        self,
+        family: ControllerFamily,
+        loops: list[ScaledLoop],
+        problems: list[Prepared],
+        end: float,
     ) -> None:
         self.family, self.loops, self.problems, self.end = family, loops, problems, end
         self.notes: tuple[str, ...] = ()

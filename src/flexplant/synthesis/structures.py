@@ -27,7 +27,7 @@ DIFFERENCES = tuple(
 )
 
 
-class Family(Protocol):
+class ControllerFamily(Protocol):
     """A structure made ready for a plant: from parameters of size 1 to a controller.
 
     Parameters
@@ -54,10 +54,10 @@ class Family(Protocol):
         """Return the structure with these parameters as its own."""
 
 
-class Structure(Protocol):
+class ControllerStructure(Protocol):
     """What `design_structured` takes: a value that makes itself ready for a plant."""
 
-    def family(self, plant: StandardPlant, prepared: Prepared) -> Family:
+    def family(self, plant: StandardPlant, prepared: Prepared) -> ControllerFamily:
         """Return the structure made ready for a plant."""
 
 
