@@ -73,7 +73,7 @@ def design_structured(
     From several starts the spectral abscissa of the closed loop is lowered until it is stable, then
     the norm, the largest over all plants, by BFGS with its gradient at the peak frequency
     (``d|T| = Re u* dT v``, u and v the singular vectors there). The best is finished by gradient
-    sampling, which goes on at kinks, where several peaks are equally high, and determines how far from
+    sampling, which goes on at kinks, where several peaks are equally high, and reports how far from
     a local minimum it ends. The problem is not convex: another start may do better.
 
     Parameters
