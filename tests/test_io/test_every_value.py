@@ -110,7 +110,6 @@ def made():
     yield from (static, servo, loop, point, response)
     law = fx.Pid(1e3, 1.0, 20.0, 200.0) * fx.Lead(30.0) * fx.Notch(300.0) * fx.LowPass(400.0)
     yield from (synthesis.TunedLaws(law), synthesis.FixedOrder(1), synthesis.ObserverGains())
-    yield synthesis.StructuredController(law.system, "by hand", parameters=np.ones(2))
     yield from (*law.factors, law, fx.design_loops(sampled, law))
     zero, one = np.zeros(1), {"mode6:freq": 1.0}
     yield synthesis.RobustStability(0.5, 0.4, 10.0, one, plant, zero, zero, {"machines": 1.0})

@@ -34,6 +34,8 @@ class Controller(Value):
         How the loop stands on the plant with the modes left out, where these are known.
     notes : sequence of str
         What the certificate does not cover, and what else is worth knowing.
+    structure : FixedOrder, TunedLaws or ObserverGains, optional
+        Of `design_structured`: what it was given, with the numbers that it found.
     """
 
     system: StateSpace
@@ -44,6 +46,7 @@ class Controller(Value):
     reached: Mapping[str, float] | None = None
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
+    structure: Value | None = None
 
     def __post_init__(self) -> None:
         self._set(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -34,28 +33,6 @@ _SHARE = 0.7
 _AGREEMENT = 1e-3
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class StructuredController(Controller):
-    """A controller of given structure, with the structure at its parameters.
-
-    Parameters
-    ----------
-    structure : structure, optional
-        What `design_structured` was given, with the parameters that it found: of `TunedLaws` the
-        laws. A further design begins there.
-    parameters : (n,) array
-        In the units of the structure.
-    """
-
-    structure: Any = None
-    parameters: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        if self.parameters is not None:
-            self._set(parameters=self.parameters)
-
-
 @one_thread()
 def design_structured(
     plant: StandardPlant | System | Sequence[StandardPlant],
@@ -67,7 +44,7 @@ def design_structured(
     rng: Rng = 0,
     time_limit: float = 60.0,
     larger: Any = None,
-) -> StructuredController:
+) -> Controller:
     """Return the controller of a structure with the least H-infinity norm found from w to z.
 
     From several starts the spectral abscissa of the closed loop is lowered until it is stable, then
@@ -96,11 +73,12 @@ def design_structured(
 
     Returns
     -------
-    StructuredController
-        `gamma` is the largest verified norm; the certificate holds those of each plant, and of
-        the local minimum the gradient left (`slope`, the smallest convex combination of gradients
-        within `radius` of the parameters) and what a step of that radius would still lower gamma
-        by, relative to it (`decrease left`).
+    Controller
+        `structure` is the one given with the numbers found, of `TunedLaws` the laws; a further
+        design can begin there. `gamma` is the largest verified norm. The certificate holds the norm
+        of each plant, and of the local minimum `slope`, the norm of the smallest convex combination
+        of gradients within `radius` of the parameters, and `decrease left`, what a step of that
+        radius would still lower gamma by to first order, relative to it.
 
     Raises
     ------
@@ -156,7 +134,7 @@ def design_structured(
     if len(plants) > 1:
         certificate |= {f"norm of plant {i}": one["norm"] for i, one in enumerate(each, 1)}
     left_out = spill_over(plants[0], [K], larger)
-    return StructuredController(
+    return Controller(
         K,
         f"H-infinity of structure {structure!r}",
         gamma=each[worst]["norm"],
@@ -165,7 +143,6 @@ def design_structured(
         left_out=left_out,
         notes=(*search.notes, *(() if left_out is not None else unchecked(plants[0]))),
         structure=family.structure(found.x),
-        parameters=found.x,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -50,8 +50,8 @@ class ControllerFamily(Protocol):
     def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
         """Return the gradient by the parameters from that by the matrices."""
 
-    def structure(self, theta: FloatArray) -> Any:
-        """Return the structure with these parameters as its own."""
+    def structure(self, theta: FloatArray) -> Value | None:
+        """Return the structure with these parameters as its own, where it is a value."""
 
 
 class ControllerStructure(Protocol):
@@ -294,12 +294,7 @@ class Parametrised:
             g = bilinear(g, 1.0 / plant.dt) if plant.dt and g.n_states else g
             return Matrices(g.A, g.B, g.C, g.D)
 
-        return Differenced(
-            matrices,
-            self.start / unit,
-            self.spread,
-            lambda theta: Parametrised(self.make, unit * theta, spread=self.spread),
-        )
+        return Differenced(matrices, self.start / unit, self.spread)
 
 
 class Differenced:
@@ -310,10 +305,8 @@ class Differenced:
         matrices: Callable[[FloatArray], Matrices],
         first: FloatArray,
         spread: float,
-        structure: Callable[[FloatArray], Any],
     ) -> None:
         self.matrices, self.first, self.spread = matrices, first, spread
-        self.structure = structure
         self.order = matrices(first).A.shape[0]
 
     def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
@@ -327,3 +320,6 @@ class Differenced:
         return np.array(
             [sum(w * along(i, step) for step, w in DIFFERENCES) for i in range(theta.size)]
         )
+
+    def structure(self, theta: FloatArray) -> None:
+        """Return None: a function is no value that could be kept in a file."""
