@@ -1,5 +1,10 @@
 """Controllers: the servo on the estimated point of interest, H2 and H-infinity."""
 
+from .aftercare.c_code import write_c as write_c
+from .aftercare.order import reduce_controller as reduce_controller
+from .aftercare.sampling import discretise_controller as discretise_controller
+from .aftercare.sections import second_order_sections as second_order_sections
+from .aftercare.windup import anti_windup_form as anti_windup_form
 from .controller import Controller as Controller
 from .elements import Lead as Lead
 from .elements import LowPass as LowPass

@@ -1,0 +1,1 @@
+"""Controllers after their design: fewer states, samples, limits, sections and C."""

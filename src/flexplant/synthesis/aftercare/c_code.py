@@ -1,0 +1,196 @@
+"""write_c: a sampled controller as one C99 file with its header, without allocation."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...errors import LabelError, ModelError
+from ...lti.statespace import StateSpace, as_statespace
+from ...values import FloatArray, short
+
+_HEADER = """\
+/* {title}
+ * Sampling time {dt:.17g} s, {n} states. Inputs, in order: {inputs}.
+ * Outputs, in order: {outputs}. SI units; u = K y, the sign of the feedback is in it.
+ * Call {name}_reset once, then in every sample {name}_step; or {name}_output as soon as the inputs
+ * are there and {name}_update after the outputs have been applied.
+ */
+#ifndef {guard}_H
+#define {guard}_H
+
+#define {guard}_STATES {n}
+#define {guard}_INPUTS {m}
+#define {guard}_OUTPUTS {p}
+
+typedef struct {{
+    double x[{room}];
+}} {name}_t;
+
+void {name}_reset({name}_t *self);
+void {name}_output(const {name}_t *self, const double in[{m}], double out[{p}]);
+void {name}_update({name}_t *self, const double in[{m}]);
+void {name}_step({name}_t *self, const double in[{m}], double out[{p}]);
+
+#endif
+"""
+
+_SOURCE = """\
+/* {title}: x[k+1] = A x[k] + B in[k], out[k] = C x[k] + D in[k]. */
+#include "{name}.h"
+
+{tables}
+void {name}_reset({name}_t *self)
+{{
+    int i;
+    for (i = 0; i < {room}; ++i) {{
+        self->x[i] = 0.0;
+    }}
+}}
+
+void {name}_output(const {name}_t *self, const double in[{m}], double out[{p}])
+{{
+    int i;
+    (void)self;
+    for (i = 0; i < {p}; ++i) {{
+        out[i] = 0.0;
+    }}
+{output}}}
+
+void {name}_update({name}_t *self, const double in[{m}])
+{{
+    double next[{room}] = {{0.0}};
+    int i;
+    (void)in;
+{update}    for (i = 0; i < {room}; ++i) {{
+        self->x[i] = next[i];
+    }}
+}}
+
+void {name}_step({name}_t *self, const double in[{m}], double out[{p}])
+{{
+    {name}_output(self, in, out);
+    {name}_update(self, in);
+}}
+"""
+
+#: words that C takes for itself
+_RESERVED = frozenset(
+    """auto break case char const continue default do double else enum extern float for goto if
+    inline int long register restrict return short signed sizeof static struct switch typedef
+    union unsigned void volatile while main""".split()  # noqa: SIM905 - words, not data
+)
+
+
+def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Path, Path]:
+    """Write a sampled controller as C99: one source file and its header, no allocation.
+
+    Entries of the matrices that are zero are not stored: modal forms cost what their blocks cost.
+    Numbers are written with 17 digits, which is exact.
+
+    Parameters
+    ----------
+    controller : StateSpace or Controller
+        Sampled; from `anti_windup_form` its inputs hold the applied commands: call `_output`,
+        apply and limit, then `_update`.
+    path : path
+        Of the source; the header stands beside it.
+    name : str, optional
+        Prefix of the functions; the file's own when not given.
+
+    Returns
+    -------
+    (Path, Path)
+        The source and the header.
+
+    Raises
+    ------
+    LabelError
+        When the name is no C identifier.
+    ModelError
+        When the controller is continuous, or the path no `.c` file.
+    """
+    K = as_statespace(controller)
+    if not K.dt and K.n_states:
+        raise ModelError(
+            "a computer runs a sampled controller: discretise_controller(plant, controller) first."
+        )
+    try:
+        source = Path(path)
+    except TypeError as error:
+        raise ModelError(
+            f"path must be a file name, got {short(path)}. Such as 'stage.c'."
+        ) from error
+    if source.suffix != ".c":
+        raise ModelError(f"path must end in .c, got {short(str(path))}. The header goes beside it.")
+    prefix = source.stem if name is None else name
+    valid = isinstance(prefix, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix)
+    if not valid or prefix in _RESERVED:
+        raise LabelError(
+            f"{short(prefix)} is no name that C allows for functions. Pass name= with letters, "
+            "digits and underscores."
+        )
+    if source.with_suffix(".c").stem != prefix:
+        source = source.with_name(f"{prefix}.c")
+    header = source.with_suffix(".h")
+    fields = _fields(K, prefix)
+    header.write_text(_HEADER.format(**fields), encoding="ascii")
+    source.write_text(_SOURCE.format(**fields), encoding="ascii")
+    return source, header
+
+
+def _fields(K: StateSpace, name: str) -> dict[str, Any]:
+    """Return what the templates are filled with."""
+    tables, calls = [], {}
+    for key, matrix in (("A", K.A), ("B", K.B), ("C", K.C), ("D", K.D)):
+        table, loop = _table(key, matrix)
+        tables.append(table)
+        calls[key] = loop
+    return {
+        "title": _ascii(K.name or name),
+        "name": name,
+        "guard": name.upper(),
+        "dt": K.dt,
+        "n": K.n_states,
+        "room": max(K.n_states, 1),
+        "m": len(K.inputs),
+        "p": len(K.outputs),
+        "inputs": _ascii(", ".join(K.inputs)),
+        "outputs": _ascii(", ".join(K.outputs)),
+        "tables": "".join(tables),
+        "output": calls["C"].format(to="out", of="self->x") + calls["D"].format(to="out", of="in"),
+        "update": calls["A"].format(to="next", of="self->x")
+        + calls["B"].format(to="next", of="in"),
+    }
+
+
+def _table(key: str, matrix: FloatArray) -> tuple[str, str]:
+    """Return the entries of a matrix that are not zero, and the loop that applies them."""
+    rows, columns = np.nonzero(matrix)
+    count = rows.size
+    if not count:
+        return "", ""
+    values = _wrapped([f"{value:.17g}" for value in matrix[rows, columns]])
+    text = f"static const double {key}_value[{count}] = {{\n{values}\n}};\n"
+    for part, numbers in (("row", rows), ("column", columns)):
+        listed = _wrapped([str(i) for i in numbers.tolist()])
+        text += f"static const int {key}_{part}[{count}] = {{\n{listed}\n}};\n"
+    loop = (
+        f"    for (i = 0; i < {count}; ++i) {{{{\n"
+        f"        {{to}}[{key}_row[i]] += {key}_value[i] * {{of}}[{key}_column[i]];\n"
+        "    }}\n"
+    )
+    return text, loop
+
+
+def _wrapped(parts: list[str]) -> str:
+    lines = [", ".join(parts[i : i + 4]) for i in range(0, len(parts), 4)]
+    return ",\n".join(f"    {line}" for line in lines)
+
+
+def _ascii(text: str) -> str:
+    """Return text that cannot end a comment."""
+    return text.encode("ascii", "replace").decode().replace("*/", "* /").replace("\n", " ")

@@ -1,0 +1,258 @@
+"""reduce_controller: fewer states, as the closed loop sees them."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import CertificateError, FlexplantError, ModelError
+from ...lti.balancing import balanced
+from ...lti.frequency import frequency_response
+from ...lti.grid import resonance_grid
+from ...lti.interconnection import feedback, series
+from ...lti.norms import peak_gain
+from ...lti.riccati import control_care, control_dare
+from ...lti.splitting import split_stable
+from ...lti.statespace import StateSpace, System, as_statespace
+from ...parallel import one_thread
+from ...plant import StandardPlant, standard_plant
+from ...values import FloatArray, positive, whole
+from ..controller import Controller
+from ..spill_over import spill_over, unchecked
+from .loop_check import LoopFacts, kept, loop_facts, required, stable_before
+
+
+class _Problem(NamedTuple):
+    """A controller, what is kept of it as it is, and the factors of the rest with their weight."""
+
+    K: StateSpace
+    #: poles on the edge of stability and beyond: integrators
+    kept: StateSpace
+    factors: StateSpace
+    weight: StateSpace
+    size: float
+
+    @classmethod
+    def of(cls, plant: StandardPlant, K: StateSpace) -> _Problem:
+        size = _size(plant, K)
+        split = split_stable(K)
+        scaled = split.stable.replace(C=split.stable.C / size, D=split.stable.D / size, blocks=None)
+        factors, F = _factors(scaled)
+        rows = [name for name in K.outputs if name in plant.u]
+        P = plant.system.select(K.inputs, rows)
+        if split.rest.n_states:  # the plant with what is kept around it
+            P = feedback(P, split.rest.select(rows), sign=1)
+        return cls(K, split.rest, factors, _weight(P, scaled, rows, F, size), size)
+
+    def truncated(self, order: int) -> tuple[StateSpace, float]:
+        """Return the controller of truncated factors, and the weighted error."""
+        K, size, p = self.K, self.size, len(self.K.outputs)
+        wanted = order - self.kept.n_states
+        found = balanced(self.factors, order=wanted, output_weight=self.weight).system
+        # K_r = N_r M_r^-1
+        Cn, Cm, Dn = found.C[:p], found.C[p:], found.D[:p]
+        inverse = np.linalg.inv(found.D[p:])
+        reduced = StateSpace(
+            found.A - found.B @ inverse @ Cm,
+            found.B @ inverse,
+            size * (Cn - Dn @ inverse @ Cm),
+            size * Dn @ inverse,
+            K.dt,
+            inputs=K.inputs,
+            outputs=K.outputs,
+            units=K.units,
+            name=K.name,
+        )
+        same = found.replace(inputs=self.factors.inputs, outputs=self.factors.outputs)
+        error = peak_gain(series(self.factors - same, self.weight))[0]
+        if self.kept.n_states:
+            kept = self.kept.replace(units=K.units, name=K.name)
+            reduced = reduced + kept.replace(D=np.zeros_like(kept.D))
+        names = [f"x{i}" for i in range(1, reduced.n_states + 1)]
+        return reduced.replace(states=names, name=K.name), error
+
+
+@one_thread()
+def reduce_controller(
+    plant: StandardPlant | System,
+    controller: Any,
+    *,
+    order: int | None = None,
+    loss: float = 0.1,
+    larger: Any = None,
+) -> Controller:
+    """Return a controller of fewer states that keeps the closed loop, or none at all.
+
+    With a normalised right coprime factorisation ``K = N M^-1``, ``[N; M]`` is truncated in states
+    balanced with the weight through which its error enters the loop::
+
+        W [dN; dM],   W = (M - P N)^-1 [P, -I]
+
+    Where that weighted error is below one the reduced loop is stable (small gain); in any case it
+    is closed again, on the plant as given, and refused when it is unstable or loses margin (of a
+    weighted plant: gamma) beyond `loss`.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        What the controller was designed for, continuous or sampled like it; weighted ones keep
+        gamma.
+    controller : StateSpace or Controller
+        From y to u; its integrators and unstable poles stay as they are.
+    order : int, optional
+        States of the result; the fewest that keep the loop when not given.
+    loss : float
+        Relative loss of the modulus margin, or growth of gamma, that is allowed.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`: the reduced loop is
+        checked there too.
+
+    Returns
+    -------
+    Controller
+        The certificate holds margin, gamma and stability before and after, and the weighted error.
+
+    Raises
+    ------
+    CertificateError
+        When the controller as given is not stable in its loop, or that of the order degrades it.
+    ModelError
+        When an order is not below that of the controller.
+    SolverError
+        When the factors cannot be computed.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+
+    References
+    ----------
+    Zhou, Doyle, Glover, Robust and Optimal Control, 1996, section 19.2. Anderson, Liu, Controller
+    reduction: concepts and approaches, IEEE Trans. Autom. Control 34, 1989.
+    """
+    given = standard_plant(plant)
+    K = as_statespace(controller)
+    allowed = positive(loss, "loss", zero=True)
+    before = stable_before(given, K)
+    if K.n_states < 1:
+        raise ModelError("the controller is a static gain: it has no states to leave out.")
+    problem = _Problem.of(given, K)
+    if order is not None:
+        least = problem.kept.n_states
+        chosen = whole(order, "order", minimum=least, maximum=max(K.n_states - 1, least))
+        found, error = problem.truncated(chosen)
+        after = loop_facts(given, found)
+        required(before, after, allowed, "Choose a higher order, leave order out, or raise loss.")
+    else:
+        found, error, after = _smallest(given, problem, before, allowed)
+    left_out = spill_over(given, [found], larger)
+    was = {f"{name} before": value for name, value in before.certificate.items()}
+    gamma = None if np.isnan(after.gamma) else after.gamma
+    return Controller(
+        found,
+        f"reduced from {K.n_states} states, coprime factors weighted by the loop",
+        gamma=gamma,
+        certificate=after.certificate
+        | was
+        | {"weighted error": error}
+        | (left_out.certificate if left_out is not None else {}),
+        left_out=left_out,
+        notes=() if left_out is not None else unchecked(given),
+    )
+
+
+def _smallest(
+    plant: StandardPlant, problem: _Problem, before: LoopFacts, loss: float
+) -> tuple[StateSpace, float, LoopFacts]:
+    """Return the reduced controller of the fewest states that keeps the loop, from halvings."""
+    best: tuple[StateSpace, float, LoopFacts] | None = None
+    lost = ""
+
+    def tried(order: int) -> bool:
+        nonlocal best, lost
+        try:
+            found, error = problem.truncated(order)
+        except FlexplantError as failure:
+            lost = str(failure)
+            return False
+        after = loop_facts(plant, found)
+        lost = kept(before, after, loss)
+        if not lost and (best is None or found.n_states < best[0].n_states):
+            best = found, error, after
+        return not lost
+
+    full = problem.K.n_states
+    low, high = problem.kept.n_states - 1, full
+    while high - low > 1:
+        middle = (low + high) // 2
+        if tried(middle):
+            high = middle
+        else:
+            low = middle
+    if best is None:  # an odd order may keep what the halves lose
+        for order in range(full - 1, full // 2, -1):
+            if tried(order):
+                break
+    if best is None:
+        raise CertificateError(
+            f"no controller of fewer states than {full} keeps the loop: with "
+            f"{full - 1}, {lost or 'none is left out'}. Raise loss, or keep the controller."
+        )
+    return best
+
+
+def _size(plant: StandardPlant, K: StateSpace) -> float:
+    """Return the gain of the controller where the loop works, the unit of u in those of y."""
+    loop = plant.system.select(plant.y, plant.u)
+    grid = resonance_grid(np.concatenate([loop.poles(), K.poles()]), K.dt, points=60)
+    grid = grid[grid < 0.49 / K.dt] if K.dt else grid
+    rows = [name for name in K.outputs if name in plant.u]
+    gain = np.abs(frequency_response(K.select(rows), grid).data).max(axis=(0, 1))
+    through = np.abs(frequency_response(plant.system.select(K.inputs, rows), grid).data).max(
+        axis=(0, 1)
+    )
+    acts = gain * through > 0.1
+    return float(np.median(gain[acts])) if acts.any() else float(gain.max())
+
+
+def _factors(K: StateSpace) -> tuple[StateSpace, FloatArray]:
+    """Return [N; M] of the normalised right coprime factorisation, and its feedback F."""
+    m = len(K.inputs)
+    R = np.eye(m) + K.D.T @ K.D
+    solve = control_dare if K.dt else control_care
+    found = solve(K.A, K.B, Q=K.C.T @ K.C, R=R, S=K.C.T @ K.D)
+    F = -found.gain
+    factors = StateSpace(
+        K.A + K.B @ F, K.B, np.vstack([K.C + K.D @ F, F]), np.vstack([K.D, np.eye(m)]), K.dt,
+        inputs=[f"v:{name}" for name in K.inputs],
+        outputs=[*K.outputs, *(f"m:{name}" for name in K.inputs)],
+    )  # fmt: skip
+    return factors, F
+
+
+def _weight(
+    P: StateSpace, K: StateSpace, rows: list[str], F: FloatArray, size: float
+) -> StateSpace:
+    """Return W: from errors of u = N v and of y = M v to v, the loop of P and K closed."""
+    own = K.select(rows)
+    n, k, m = P.n_states, K.n_states, len(K.inputs)
+    B2, D22 = size * P.B, size * P.D
+    back = np.linalg.inv(np.eye(m) - D22 @ own.D)  # y = back (C x + D22 (C_K x_K + a) - b)
+    y_x, y_k, y_a, y_b = back @ P.C, back @ D22 @ own.C, back @ D22, -back
+    u_x, u_k, u_a, u_b = own.D @ y_x, own.C + own.D @ y_k, own.D @ y_a, own.D @ y_b
+    A = np.block([
+        [P.A + B2 @ u_x, B2 @ u_k],
+        [K.B @ y_x, K.A + K.B @ y_k],
+    ])  # fmt: skip
+    B = np.block([[B2 @ (np.eye(len(rows)) + u_a), B2 @ u_b], [K.B @ y_a, K.B @ y_b]])
+    C = np.hstack([y_x, y_k - F])
+    D = np.hstack([y_a, y_b])
+    # monitored outputs of the controller do not act on the loop
+    into = np.zeros((B.shape[1], len(K.outputs) + m))
+    for i, name in enumerate(rows):
+        into[i, K.outputs.index(name)] = 1.0
+    into[len(rows) :, len(K.outputs) :] = np.eye(m)
+    assert A.shape == (n + k, n + k)  # noqa: S101 - the blocks were laid out so
+    return StateSpace(A, B @ into, C, D @ into, K.dt)
