@@ -8,6 +8,7 @@ from timing import best
 import flexplant as fx
 from flexplant.loop.noise import white_noise
 from flexplant.parallel import one_thread
+from flexplant.simulation.drawn import Drawn
 from flexplant.simulation.runs import SampleBySample
 from flexplant.simulation.stepping import machine
 from stages import L, ports
@@ -39,7 +40,7 @@ def test_a_linear_loop():
     given[:, loop.plant.w.index("die:ref")] = 1e-6
 
     def plain():
-        single = SampleBySample(loop, machine(loop), white_noise(loop.plant.replace(asd={})))
+        single = SampleBySample(loop, machine(loop), Drawn(white_noise(loop.plant.replace(asd={}))))
         single.begin(np.zeros(g.n_states), [np.random.default_rng(0)])
         data = np.zeros((1, len(g.outputs), COUNT))
         with one_thread():

@@ -12,6 +12,7 @@ from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Recursion, cheapest
 from ..values import FloatArray
 from .anti_windup import split_law
 from .conditions import Conditions, Moving
+from .drawn import Drawn
 from .elements import Acting
 from .stepping import Buffers, Machine, machine, step_through
 
@@ -23,8 +24,6 @@ _TYPICAL = 10_000
 #: part of a channel's peak by which blocks may differ from single samples, beside this many times
 #: the rounding of single samples: a channel that symmetry keeps at zero is nothing but rounding
 _AGREE, _ROUNDING = 1e-10, 100.0
-#: part of a state's largest noise that is rounding
-_NO_NOISE = 1e-13
 
 
 class Runner(Protocol):
@@ -59,20 +58,21 @@ def make_runner(
     single samples is seen by running them with inputs three times as large. An unstable loop goes
     sample by sample, and so does one with elements that are not linear.
     """
+    drawn = Drawn(noise)
     if met is not None and met.any:
-        return _under(loop, noise, met)
-    single = SampleBySample(loop, machine(loop), noise)
+        return _under(loop, drawn, met)
+    single = SampleBySample(loop, machine(loop), drawn)
     n = loop.plant.system.n_states + loop.controller.n_states
     shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
-    m = given.shape[1] + noise.factor.shape[1]
+    m = given.shape[1] + drawn.factor.shape[1]
     if not grows and n and cheapest(n, shown, m, _TYPICAL)[1] < single.cost:
-        blocks = InBlocks(loop, noise, given)
+        blocks = InBlocks(loop, drawn, given)
         if blocks.agrees(single, given):
             return blocks
     return single
 
 
-def _under(loop: ClosedLoop, noise: WhiteNoise, met: Conditions) -> SampleBySample:
+def _under(loop: ClosedLoop, noise: Drawn, met: Conditions) -> SampleBySample:
     """Return the way through a loop under conditions that are not linear, or change with time."""
     plant, parts, applied = loop.plant, machine(loop), None
     dt = met.finer * plant.dt
@@ -94,7 +94,7 @@ class SampleBySample:
         self,
         loop: ClosedLoop,
         parts: Machine,
-        noise: WhiteNoise,
+        noise: Drawn,
         sensed: Acting | None = None,
         applied: Acting | None = None,
         moving: Moving | None = None,
@@ -107,7 +107,8 @@ class SampleBySample:
         self.read = np.array([n.removesuffix(":noise") in plant.y for n in names], dtype=bool)
         # a sample that is read has the noise of the controller's rate
         self.level = np.where(self.read, 1.0 / np.sqrt(hold), 1.0)
-        self.parts, self.noise, self.n, self.ny = parts, noise, plant.system.n_states, len(plant.y)
+        self.parts, self.n, self.ny = parts, plant.system.n_states, len(plant.y)
+        self.noise = noise
         u = np.array([plant.u.index(name) for name in loop.driven], dtype=np.int64)
         self.u, self.n_u = u, len(plant.u)
         self.B1, self.D21 = plant.B1, plant.D21
@@ -116,8 +117,9 @@ class SampleBySample:
     @property
     def cost(self) -> float:
         """Operations for a sample: about twelve calls, and products with single vectors."""
-        m, noise = self.parts, 2 * self.noise.factor.size
-        return 12 * CALL + 2 * ONE_VECTOR * (m.sense.size + m.law.size + m.inflow.size) + noise
+        m = self.parts
+        products = 2 * ONE_VECTOR * (m.sense.size + m.law.size + m.inflow.size)
+        return 12 * CALL + products + self.noise.cost
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put all runs at a state of plant and controller; each draws from its generator."""
@@ -141,7 +143,7 @@ class SampleBySample:
         k = given.shape[0]
         self.w[:, :k], self.w[:, k:] = given, 0.0
         for r, generator in enumerate(self.generators):
-            white, single = _drawn(generator, self.stretch, self.noise)
+            white, single = self.noise.draw(generator, self.stretch)
             if self.hold > 1:
                 single = single * self.level
                 between = np.arange(self.stretch) % self.hold > 0
@@ -181,12 +183,12 @@ class InBlocks:
 
     stretch, abreast = PIECE, 1
 
-    def __init__(self, loop: ClosedLoop, noise: WhiteNoise, given: FloatArray) -> None:
+    def __init__(self, loop: ClosedLoop, noise: Drawn, given: FloatArray) -> None:
         g, self.noise, self.n = loop.monitored, noise, loop.plant.system.n_states
         named = np.any(given != 0.0, axis=0)
         named[noise.columns] = True
         self.columns = np.flatnonzero(named)
-        factor, self.mixed = _thin(noise.factor)
+        factor = self.noise.factor
         rest = np.zeros((g.n_states - self.n, factor.shape[1]))
         none = np.zeros((g.D.shape[0], factor.shape[1]))
         self.system = Recursion(
@@ -195,6 +197,8 @@ class InBlocks:
             g.C,
             np.hstack([g.D[:, self.columns], none]),
         )
+        self.w = np.zeros((PIECE, given.shape[1]))
+        self.v = np.empty((PIECE, self.system.G.shape[1]))
         self.blocks = self.system.in_blocks(self.system.best_size(_TYPICAL))
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
@@ -203,16 +207,12 @@ class InBlocks:
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
-        k = given.shape[0]
-        white, single = _drawn(self.generator, PIECE, self.noise)
-        w = np.zeros((PIECE, given.shape[1]))
-        w[:k] = given
-        w[:, self.noise.columns] += single
-        known = self.columns.size
-        v = np.empty((PIECE, known + self.mixed.shape[1]))
-        v[:, :known] = w[:, self.columns]
-        np.matmul(white, self.mixed, out=v[:, known:])
-        out, self.x = self.blocks.run(v, self.x)
+        k, known = given.shape[0], self.columns.size
+        white, single = self.noise.draw(self.generator, PIECE)
+        self.w[:k], self.w[k:] = given, 0.0
+        self.w[:, self.noise.columns] += single
+        self.v[:, :known], self.v[:, known:] = self.w[:, self.columns], white
+        out, self.x = self.blocks.run(self.v, self.x)
         data[0] = out[:k].T
         return bool(np.all(np.isfinite(self.x)))
 
@@ -221,9 +221,9 @@ class InBlocks:
         k, rng = min(2 * self.blocks.size, STRETCH), np.random.default_rng(0)
         size = np.abs(given).max(axis=0, initial=0.0)
         w = size * rng.standard_normal((k, size.size))
-        white, extra = _drawn(rng, k, self.noise)
+        white, extra = self.noise.draw(rng, k)
         w[:, self.noise.columns] += extra
-        v = np.hstack([w[:, self.columns], white @ self.mixed])
+        v = np.hstack([w[:, self.columns], white])
         start = np.zeros(self.system.F.shape[0])
         expected = np.zeros((2, self.system.H.shape[0], k))
         single.begin(start, [rng, rng])
@@ -237,27 +237,3 @@ class InBlocks:
         wrong = np.abs(self.blocks.run(v, start)[0].T - expected[0]).max(axis=1)
         allowed = _AGREE * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
         return bool(np.all(wrong <= allowed))
-
-
-def _drawn(
-    generator: np.random.Generator, samples: int, noise: WhiteNoise
-) -> tuple[FloatArray, FloatArray]:
-    """Return white samples for the factor of the states, and noise for the columns of w.
-
-    Always for a whole stretch: a longer run begins with the shorter one, bit by bit.
-    """
-    rank = noise.factor.shape[1]
-    white = generator.standard_normal((samples, rank + noise.columns.size))
-    return white[:, :rank], white[:, rank:] * noise.deviation
-
-
-def _thin(factor: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return L (n, r) and V (m, r) with ``factor = L V'`` to rounding, r as small as that allows.
-
-    Few forces through many modes make a factor whose singular values fall fast.
-    """
-    size = np.linalg.norm(factor, axis=1)
-    unit = factor / np.where(size > 0, size, 1.0)[:, None]
-    U, s, V = np.linalg.svd(unit, full_matrices=False)
-    kept = int(np.count_nonzero(s > _NO_NOISE * s.max(initial=0.0)))
-    return size[:, None] * U[:, :kept] * s[:kept], np.ascontiguousarray(V[:kept].T)
