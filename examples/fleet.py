@@ -30,7 +30,8 @@ CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
 PLACES = [(L / 2, L / 4, 0.0), (L / 8, L / 2, 0.0), (3 * L / 8, 7 * L / 8, 0.0)]
 MEASURED = range(4, 13)  # numbers of the modes whose poles are measured
-OWN, TRIED = (80.0, 60.0, 40.0), (10.0, 15.0, 20.0, 30.0, 40.0, 50.0, 60.0, 80.0)  # Hz
+OWN, TRIED = (80.0, 60.0, 40.0), (10.0, 15.0, 20.0, 25.0, 30.0, 40.0, 60.0, 80.0)  # Hz
+MARGIN, MA = 0.4, 10e-9  # modulus margin, m: the specification
 TRAINING = 12  # machines that the controller for all is chosen on
 
 PORTS = fx.Ports(
@@ -99,13 +100,13 @@ def pipeline(blocks: Any = None) -> fx.simulation.MachinePipeline:
         starts=3,
         bandwidth=OWN,
         blocks=blocks,
-        specification=fx.Specification(ma=10e-9, modulus_margin=0.4, start=0.3),
+        specification=fx.Specification(ma=MA, modulus_margin=MARGIN, start=0.3),
         reference=fx.setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05),
         duration=0.6,
     )
 
 
-# %% One controller for all: the fastest that is with 6 dB on a sample of the machines
+# %% One controller for all: the fastest that has the margin on a sample of the machines
 def for_all(machines: list[fx.testbeds.WaferStage]) -> tuple[float, Any]:
     """Return bandwidth and blocks of the fastest design on the mean machine that holds on all."""
     model = reduced((0.5, 0.5, 0.5))  # the mean machine
@@ -117,7 +118,7 @@ def for_all(machines: list[fx.testbeds.WaferStage]) -> tuple[float, Any]:
         blocks = errors, fx.design_hinf(weighted)
         with warnings.catch_warnings(action="ignore"):  # that one is unstable is what is asked
             loops = [one.loop(PORTS, *blocks) for one in machines]
-            if not all(loop.is_stable and loop.modulus_margin > 0.5 for loop in loops):
+            if not all(loop.is_stable and loop.modulus_margin >= MARGIN for loop in loops):
                 break
         best = asked, blocks
     return best
@@ -142,24 +143,35 @@ def main(count: int = 200, folder: Path = OUT, workers: int | None = None) -> di
     return {"asked": asked, "tables": tables}
 
 
+def failures(one: fx.simulation.StudyTable) -> str:
+    """Return how many machines failed, and why: no result, unstable, not to specification."""
+    ran = one["failed"] == ""
+    counts = {reason: int(np.sum(one["failed"] == reason)) for reason in sorted({*one["failed"]})}
+    counts.pop("", None)
+    counts["unstable"] = int(np.sum(ran & ~one["stable"]))
+    counts[f"modulus margin below {MARGIN:g}"] = int(np.sum(one["modulus margin"] < MARGIN))
+    counts[f"MA above {1e9 * MA:g} nm"] = int(np.sum(one["MA"] > MA))
+    return ", ".join(f"{reason}: {count}" for reason, count in counts.items())
+
+
 def table(result: dict[str, Any]) -> str:
-    """Return the distributions as text."""
+    """Return the distributions as text; the worst bandwidth is the lowest one."""
     tried, own = (", ".join(f"{one:g}" for one in some) for some in (TRIED, OWN))
     heads = ("bandwidth [Hz]", "error rms [nm]", "MA [nm]")
     lines = [
         f"One controller for all is designed for {result['asked']:g} Hz, the fastest of {tried} Hz",
-        f"that leaves {TRAINING} other machines a modulus margin of 0.5. One for each is designed",
-        f"for the first of {own} Hz that has 0.4 on its own model.",
-        f"{'':14s}{'stable':>12s}{'margin >= 0.4':>18s} " + "".join(f"{h:>24s}" for h in heads),
-        f"{'':45s}" + f"{'5 %':>8s}{'median':>8s}{'95 %':>8s}" * 3,
+        f"that leaves {TRAINING} other machines a modulus margin of {MARGIN:g}. One for each is",
+        f"designed for the first of {own} Hz that has it on its own model.",
+        f"{'':14s}{'machines':>10s}" + "".join(f"{h:>26s}" for h in heads),
+        f"{'':24s}" + f"{'median':>10s}{'95 %':>8s}{'worst':>8s}" * 3,
     ]
     for name, one in result["tables"].items():
-        count, holds = one["stable"].size, one["modulus margin"] >= 0.4
-        row = f"{name:14s}{one['stable'].sum():6d} of {count:<3d}{holds.sum():11d} of {count:<3d} "
-        for column, scale in (("bandwidth", 1.0), ("error rms", 1e9), ("MA", 1e9)):
+        row = f"{name:14s}{one['stable'].size:10d}"
+        for column, scale in (("bandwidth", -1.0), ("error rms", 1e9), ("MA", 1e9)):
             values = scale * one[column][one["stable"]]
-            row += "".join(f"{q:8.3g}" for q in np.quantile(values, (0.05, 0.5, 0.95)))
+            row += "  " + "".join(f"{abs(q):8.3g}" for q in np.quantile(values, (0.5, 0.95, 1.0)))
         lines.append(row)
+    lines += [f"{name}, failed: {failures(one)}" for name, one in result["tables"].items()]
     lines.append("error rms: of die:error from 0.3 to 0.6 s; MA: largest mean of it over 5 ms")
     return "\n".join(lines)
 

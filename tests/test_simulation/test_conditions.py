@@ -8,8 +8,11 @@ import oracles_loop as oracle
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import design_kalman
 from flexplant.loop import close_loop
+from flexplant.loop.noise import white_noise
 from flexplant.plant import assemble_plant
 from flexplant.simulation import Quantiser, Saturation, simulate
+from flexplant.simulation.conditions import Conditions
+from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
 from flexplant.synthesis import design_servo
 from machines import block, matrices, observer, servo, stage
 from stages import L, ports, some_modes
@@ -97,6 +100,26 @@ def test_a_moving_poi_is_at_each_sample_that_of_its_place(loop):
             np.testing.assert_allclose(run[name][k], still[name][k], rtol=0, atol=1e-9 * scale)
     plain = simulate(loop, disturbance={"amp1": np.sin(np.arange(100))}, **options)
     assert np.abs(run["die:ry"] - plain["die:ry"]).max() > 0.01 * plain.peak("die:ry")
+
+
+def test_a_moving_poi_in_blocks_is_that_of_single_samples(loop):
+    """Under noise, over more than one piece; the tests of single places hold for both then."""
+    steps = 5000
+    place = np.linspace(0.1, 0.5, steps)
+    met = Conditions(paths={"die": np.stack([place, 0.3 + 0 * place, 0 * place], axis=1)})
+    given, noise = np.full((steps, len(loop.plant.w)), 1e-7), white_noise(loop.plant)
+    found = []
+    for grows, kind in ((False, InBlocks), (True, SampleBySample)):
+        runner = make_runner(loop, noise, given, grows=grows, met=met)
+        assert type(runner) is kind
+        data = np.zeros((1, len(loop.monitored.outputs), steps))
+        runner.begin(np.zeros(loop.monitored.n_states), [np.random.default_rng(1)])
+        for first in range(0, steps, runner.stretch):
+            part = slice(first, min(first + runner.stretch, steps))
+            assert runner.fill(given[part], data[:, :, part])
+        found.append(data[0])
+    wrong = np.abs(found[0] - found[1]).max(axis=1)
+    assert np.all(wrong <= 1e-10 * np.abs(found[1]).max(axis=1))
 
 
 @pytest.mark.parametrize(

@@ -118,6 +118,23 @@ def test_functions_of_the_centre_and_arrays_are_the_same():
     assert repr(three.dofs.interpolation) == "<PlateShape 0.8 x 0.5 m, 4 x 3 elements, 2 missing>"
 
 
+@pytest.mark.parametrize("direction", ["z", "rx", "ry"])
+def test_many_points_at_once_are_the_points_one_by_one(direction):
+    """Inside, on all edges and beside a hole; one point in the hole is refused."""
+    plate = make_plate(elements=(4, 4), holes=Rectangle((0.3, 0.3), (0.45, 0.45)))
+    x, y = np.meshgrid(np.linspace(0.0, 0.6, 9), np.linspace(0.0, 0.6, 13))
+    points = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, 0.01)])
+    inside = (points[:, :2] > 0.3 + 1e-9) & (points[:, :2] < 0.45 - 1e-9)
+    points = points[~np.all(inside, axis=1)]
+    found = plate.dofs.rows(points, direction)
+    expected = [plate.dofs.row(point, direction) for point in points]
+    np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    with pytest.raises(LabelError, match="in a hole"):
+        plate.dofs.rows([*points[:3], (0.4, 0.4, 0.0)], direction)
+    with pytest.raises(LabelError, match="off the plate"):
+        plate.dofs.rows([*points[:3], (0.7, 0.1, 0.0)], direction)
+
+
 def test_interpolation_beside_holes():
     plate = make_plate(elements=(4, 4), holes=Rectangle((0.3, 0.3), (0.45, 0.45)))
     q = np.column_stack(

@@ -28,9 +28,9 @@ class Conditions(NamedTuple):
     paths: Mapping[str, FloatArray] = {}
 
     @property
-    def any(self) -> bool:
-        """Whether there are any."""
-        return bool(self.on_y or self.on_u or self.paths or self.finer > 1)
+    def one_by_one(self) -> bool:
+        """Whether samples differ in more than in what is shown of them."""
+        return bool(self.on_y or self.on_u or self.finer > 1)
 
 
 def conditions(

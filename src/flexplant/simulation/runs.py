@@ -55,20 +55,24 @@ def make_runner(
     Blocks of samples cost less unless a plant in modal blocks is so large that its O(n) operations
     for a sample are fewer. They are taken when a block agrees with the same samples one by one to
     1e-10 of each channel's peak, for white inputs as large as those of the run; the rounding of
-    single samples is seen by running them with inputs three times as large. An unstable loop goes
-    sample by sample, and so does one with elements that are not linear.
+    single samples is seen by running them with inputs three times as large. POIs that move are
+    shown from the plant's states, which come in blocks too. An unstable loop goes sample by sample,
+    and so does one with elements that are not linear, or finer samples.
     """
-    drawn = Drawn(noise)
-    if met is not None and met.any:
+    drawn, met = Drawn(noise), met or Conditions()
+    if met.one_by_one:
         return _under(loop, drawn, met)
+    moving = Moving(loop.plant, met.paths) if met.paths else None
     single = SampleBySample(loop, machine(loop), drawn)
     n = loop.plant.system.n_states + loop.controller.n_states
     shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
+    shown += loop.plant.system.n_states if moving else 0
     m = given.shape[1] + drawn.factor.shape[1]
     if not grows and n and cheapest(n, shown, m, _TYPICAL)[1] < single.cost:
-        blocks = InBlocks(loop, drawn, given)
+        blocks = InBlocks(loop, drawn, given, moving)
         if blocks.agrees(single, given):
             return blocks
+    single.moving = moving
     return single
 
 
@@ -183,19 +187,24 @@ class InBlocks:
 
     stretch, abreast = PIECE, 1
 
-    def __init__(self, loop: ClosedLoop, noise: Drawn, given: FloatArray) -> None:
+    def __init__(
+        self, loop: ClosedLoop, noise: Drawn, given: FloatArray, moving: Moving | None = None
+    ) -> None:
         g, self.noise, self.n = loop.monitored, noise, loop.plant.system.n_states
+        self.moving, self.n_shown, self.plant = moving, len(g.outputs), loop.plant
+        self.driven = [g.outputs.index(name) for name in loop.driven]
+        self.u = [len(loop.plant.w) + loop.plant.u.index(name) for name in loop.driven]
         named = np.any(given != 0.0, axis=0)
         named[noise.columns] = True
         self.columns = np.flatnonzero(named)
         factor = self.noise.factor
         rest = np.zeros((g.n_states - self.n, factor.shape[1]))
-        none = np.zeros((g.D.shape[0], factor.shape[1]))
+        states = np.eye(self.n if moving else 0, g.n_states)
+        seen = np.vstack([g.C, states])
+        direct = np.zeros((seen.shape[0], self.columns.size + factor.shape[1]))
+        direct[: self.n_shown, : self.columns.size] = g.D[:, self.columns]
         self.system = Recursion(
-            g.A,
-            np.hstack([g.B[:, self.columns], np.vstack([factor, rest])]),
-            g.C,
-            np.hstack([g.D[:, self.columns], none]),
+            g.A, np.hstack([g.B[:, self.columns], np.vstack([factor, rest])]), seen, direct
         )
         self.w = np.zeros((PIECE, given.shape[1]))
         self.v = np.empty((PIECE, self.system.G.shape[1]))
@@ -203,7 +212,7 @@ class InBlocks:
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put the run at a state of plant and controller; it draws from its generator."""
-        self.x, (self.generator,) = start, generators
+        self.x, (self.generator,), self.first = start, generators, 0
 
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
@@ -213,8 +222,22 @@ class InBlocks:
         self.w[:, self.noise.columns] += single
         self.v[:, :known], self.v[:, known:] = self.w[:, self.columns], white
         out, self.x = self.blocks.run(self.v, self.x)
-        data[0] = out[:k].T
+        if self.moving is not None:
+            self._move(self.moving, out[:k])
+        data[0] = out[:k, : self.n_shown].T
+        self.first += k
         return bool(np.all(np.isfinite(self.x)))
+
+    def _move(self, moving: Moving, out: FloatArray) -> None:
+        """Put what POIs along their paths do into out (k, channels, then states)."""
+        inputs = np.zeros((out.shape[0], len(self.plant.w) + len(self.plant.u)))
+        inputs[:, : len(self.plant.w)] = self.w[: out.shape[0]]
+        inputs[:, self.u] = out[:, self.driven]
+        for start in range(0, out.shape[0], STRETCH):
+            part = slice(start, min(start + STRETCH, out.shape[0]))
+            z, states = out[part, : len(self.plant.z)], out[part, self.n_shown :]
+            for rows in moving.rows(self.first + start, part.stop - start):
+                rows.show(z, states, inputs[part])
 
     def agrees(self, single: SampleBySample, given: FloatArray) -> bool:
         """Return whether two blocks (or 128 samples) are the same samples one by one."""
@@ -225,7 +248,7 @@ class InBlocks:
         w[:, self.noise.columns] += extra
         v = np.hstack([w[:, self.columns], white])
         start = np.zeros(self.system.F.shape[0])
-        expected = np.zeros((2, self.system.H.shape[0], k))
+        expected = np.zeros((2, self.n_shown, k))
         single.begin(start, [rng, rng])
         states, y, _ = single.buffers
         for r, times in enumerate((1.0, 3.0)):
@@ -234,6 +257,7 @@ class InBlocks:
             y[:k, r] = times * (w @ single.D21.T)
         single.advance(k, expected)
         rounding = np.abs(expected[1] / 3.0 - expected[0]).max(axis=1)
-        wrong = np.abs(self.blocks.run(v, start)[0].T - expected[0]).max(axis=1)
+        found = self.blocks.run(v, start)[0][:, : self.n_shown].T
+        wrong = np.abs(found - expected[0]).max(axis=1)
         allowed = _AGREE * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
         return bool(np.all(wrong <= allowed))

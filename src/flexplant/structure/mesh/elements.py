@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 from itertools import product
+from typing import Any
 
 import numpy as np
 
@@ -66,16 +67,19 @@ def hermite(s: float, length: float, order: int = 0) -> FloatArray:
     return np.array([-bow / length, 1 - 4 * s + 3 * s**2, bow / length, 3 * s**2 - 2 * s])
 
 
-def plate_terms(s: float, t: float, dp: int, dq: int) -> FloatArray:
-    """Return the d^dp/ds^dp d^dq/dt^dq derivatives (12,) of the terms s^p t^q."""
+def plate_terms(s: Any, t: Any, dp: int, dq: int) -> FloatArray:
+    """Return the d^dp/ds^dp d^dq/dt^dq derivatives (..., 12) of the terms s^p t^q."""
     return _derived(_P, s, dp) * _derived(_Q, t, dq)
 
 
-def _derived(power: IntArray, x: float, order: int) -> FloatArray:
+def _derived(power: IntArray, x: Any, order: int) -> FloatArray:
     factor = np.ones(power.size)
     for k in range(order):
         factor *= power - k
-    return np.asarray(factor * np.power(float(x), np.maximum(power - order, 0)), dtype=np.float64)
+    return np.asarray(
+        factor * np.power(np.asarray(x, float)[..., None], np.maximum(power - order, 0)),
+        dtype=np.float64,
+    )
 
 
 @cache
