@@ -26,7 +26,16 @@ from flexplant.placement import (
     place_sensors,
     score_sensors,
 )
-from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, StandardPlant, assemble_plant
+from flexplant.plant import (
+    Actuator,
+    Disturbance,
+    Poi,
+    Ports,
+    Reference,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+)
 from flexplant.store import load
 from flexplant.structure import FEModel, ModalDamping
 from flexplant.synthesis import design_h2
@@ -58,6 +67,9 @@ def test_the_cost_is_the_h2_norm_of_the_best_controller(make):
     system = lqg_plant(plant, COST)
     found = design_h2(system, u=list(plant.u), y=list(plant.y)).gamma
     assert COST(plant) == pytest.approx(found**2, rel=1e-5, abs=0.0)
+    # a reference is in y, and no sensor
+    led = plant.with_ports(plant.assembled.ports.replace(references=[Reference("die")]))
+    assert COST(led) == pytest.approx(COST(plant), rel=1e-9, abs=0.0)
 
 
 @pytest.mark.parametrize("delay", [0.0, 1.0, 2.0])

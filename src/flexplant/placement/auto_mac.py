@@ -49,7 +49,8 @@ class AutoMac(ByShapes):
     """Largest off-diagonal entry of the MAC between the elastic mode shapes at the sensors.
 
     ``(phi_i' phi_j)^2 / (phi_i' phi_i phi_j' phi_j)``, 0 where all shapes differ, 1 where two look
-    alike. It does not count how large the motions are that the sensors see.
+    alike. It does not count how large the motions are that the sensors see, and of a POI it says
+    next to nothing, as `ModeInformation`.
     """
 
     def of(self, plant: StandardPlant, shapes: Shapes) -> LargestMac:

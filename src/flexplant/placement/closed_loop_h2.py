@@ -24,6 +24,7 @@ from .poi_axes import (
     plain,
     poi_rows,
     pushed_columns,
+    sensor_rows,
     shown,
     structure_part,
     unit_of,
@@ -94,24 +95,25 @@ class ClosedLoopH2(Criterion):
         self.check(plant, ())
         plant.check().require(("stabilisable", "detectable"), "a stationary controller")
         rows = poi_rows(plant, self._factors(plant))
-        A, B, C, W = plant.system.A, plant.B2, plant.C2, plant.process_noise
+        A, B, W = plant.system.A, plant.B2, plant.process_noise
         R = self.effort**2 * np.eye(B.shape[1])
         control = control_dare(A, B, Q=rows.T @ rows, R=R)
         S, F = control.P, control.gain
         estimator = design_kalman(plant, larger=plant)
         P, K = estimator.covariance, estimator.gain
+        read = sensor_rows(plant)  # without references
+        C, noise = plant.C2[read], plant.sensor_noise[np.ix_(read, read)]
         V = F.T @ (R + B.T @ S @ B) @ F
         cost = float(np.sum(S * W) + np.sum(V * P))
         # states and the errors of their prediction: u = -F (x - (I - K C) e) + F K noise
         n, seen = A.shape[0], np.eye(A.shape[0]) - K @ C
         loop = np.block([[A - B @ F, B @ F @ seen], [np.zeros((n, n)), A @ seen]])
         push = np.vstack([-B @ F @ K, -A @ K])
-        both = np.block([[W, W], [W, W]]) + push @ plant.sensor_noise @ push.T
+        both = np.block([[W, W], [W, W]]) + push @ noise @ push.T
         X = solve_stein(loop, both)
         out = np.block([[rows, np.zeros_like(rows)], [-self.effort * F, self.effort * F @ seen]])
-        noise = self.effort * F @ K
         found = float(np.einsum("ij,jk,ik->", out, X, out))
-        found += float(np.einsum("ij,jk,ik->", noise, plant.sensor_noise, noise))
+        found += float(np.sum((self.effort * F @ K) @ noise * (self.effort * F @ K)))
         if not abs(found - cost) <= 1e-6 * abs(cost):
             raise CertificateError(
                 f"the loop costs {found:.9g}, its Riccati equations say {cost:.9g}: the problem is "
@@ -144,7 +146,7 @@ class ClosedLoopH2(Criterion):
         given = {side: [p for p in candidates if side_of(p) == side] for side in "yu"}
         fixed = {
             side: list(getattr(own, side)) if own else [PlantChannel(n, side) for n in names]
-            for side, names in (("y", plant.y), ("u", plant.u))
+            for side, names in (("y", [plant.y[i] for i in sensor_rows(plant)]), ("u", plant.u))
         }
         problem = Separation(
             A,

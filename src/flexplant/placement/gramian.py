@@ -24,7 +24,7 @@ class ModalGramian(Criterion):
     ``W_ij = -conj(c_i) c_j / (conj(lambda_i) + lambda_j)`` for the eigenvectors: modes of one
     frequency that are alike count as one, which the diagonal alone takes for two. Rigid-body modes,
     whose Gramian is infinite, are left out; filters and delays do not count. It is the sum of the
-    Gramians of single devices.
+    Gramians of single devices. Of a POI it says next to nothing, as `ModeInformation`.
 
     Parameters
     ----------

@@ -22,8 +22,7 @@ class KineticEnergy(ByShapes):
 
     ``sum_i sum_k (r_i phi_k) (r_i M phi_k)``, 1 for each mode over all DOFs: places that move much,
     and are heavy. Each place counts by itself, so that neighbours that see the same are both
-    chosen; layouts ranked by it had a Spearman correlation of 0 to 0.56 with the exact variance at
-    the POI.
+    chosen. Of a POI it says next to nothing, as `ModeInformation`.
 
     Parameters
     ----------

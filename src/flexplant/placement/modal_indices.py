@@ -22,9 +22,8 @@ class SensorIndices(ByShapes):
 
         H2:  g / (2 sqrt(zeta) omega^(3/2)),   Hinf:  g / (2 zeta omega^2),   Hankel: half of it
 
-    over that of the largest. Each device counts by itself: two at one place count twice. Layouts
-    ranked by classical criteria had a Spearman correlation of 0 to 0.56 with the exact variance at
-    the POI.
+    over that of the largest. Each device counts by itself: two at one place count twice. Of a POI
+    it says next to nothing, as `ModeInformation`.
 
     Parameters
     ----------

@@ -39,9 +39,10 @@ class ModeInformation(ByShapes):
 
     One snapshot of the sensors, no dynamics, no disturbances: choices that distinguish the shapes
     best. `ByRows` searches for it by effective independence or pivoted QR, and it has a bound.
-    Fewer sensors than modes have none. On the stages of this package's tests its ranking of layouts
-    had a Spearman correlation of 0 to 0.56 with that by the exact variance at the POI: where the
-    POI matters, use `PoiVariance`.
+    Fewer sensors than modes have none. It says next to nothing of a POI: rankings of layouts by
+    classical criteria (this one, Gramians, indices, energy, MAC) had a Spearman correlation of
+    -0.45 to 0.56 with that by the exact variance, on plates. Where the POI matters, use
+    `PoiVariance`.
 
     Parameters
     ----------

@@ -8,6 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
+from ..estimation.channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, Disturbance, StandardPlant
@@ -142,6 +143,11 @@ def measured_rows(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray
             row = port.see(plant.assembled.realisation).row
             rows.append(row / np.sqrt(0.5 * port.asd**2 / plant.dt))
     return np.array(rows, dtype=np.float64).reshape(-1, n)
+
+
+def sensor_rows(plant: StandardPlant) -> list[int]:
+    """Return which channels of y are sensors, not references."""
+    return [plant.y.index(name) for name in sensors(plant)]
 
 
 def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:

@@ -83,7 +83,7 @@ class Quadratic(Value, Convex):
             keep[self.owned.ravel()] = False
             keep[self.owned[rows].ravel()] = True
         inner = np.ix_(keep, keep)
-        g = self.items[rows][:, keep]
+        g = _compressed(self.items[rows][:, keep])
         return g, solved(self.A[inner], self.H[inner], g), self.S[:, keep]
 
     @property
@@ -98,7 +98,7 @@ class Quadratic(Value, Convex):
         equation ``Y = M' Y M + S' S`` the gradient is ``-g_i' X+ Y X+ g_i``.
         """
         cost, _, _, adjoint, seen = self._stationary(weights)
-        return cost, -np.einsum("ij,jk,ik->i", seen, adjoint, seen)
+        return cost, -np.sum((seen @ adjoint) * seen, axis=1)
 
     def tangent(self, weights: FloatArray) -> Tangent:
         """Return the tangent of the information ``(X+)^-1`` at weights (N,).
@@ -120,7 +120,7 @@ class Quadratic(Value, Convex):
         lost = (self.S @ axes[:, ~kept]) ** 2 @ np.abs(sizes[~kept])
         root = axes[:, kept] * np.sqrt(sizes[kept])
         face, into = root.T @ self.S.T, (root / sizes[kept]).T
-        gradient = np.einsum("ij,jk,ik->i", seen, adjoint, seen)
+        gradient = np.sum((seen @ adjoint) * seen, axis=1)
         most = float(np.max(gradient))
         for slopes in _slopes(closed, seen, into):
             found = np.einsum("ik,nij,jk->n", face, slopes, face, optimize=True)
@@ -139,7 +139,7 @@ class Quadratic(Value, Convex):
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return J, X+, M, the adjoint Y and the rows ``g_i' X+`` at weights."""
         used = weights > 0
-        g = np.sqrt(weights[used])[:, None] * self.items[used]
+        g = _compressed(np.sqrt(weights[used])[:, None] * self.items[used])
         X = solved(self.A, self.H, g)
         gain = _gain(X, g)
         left = np.eye(X.shape[0]) - gain @ g
@@ -220,6 +220,11 @@ def _doubled(A: FloatArray, G: FloatArray, H: FloatArray) -> FloatArray | None:
         if growth < CONVERGED:
             return H
     return None
+
+
+def _compressed(g: FloatArray) -> FloatArray:
+    """Return as few rows as there are states with the same ``g' g``."""
+    return g if g.shape[0] <= g.shape[1] else np.asarray(np.linalg.qr(g, mode="r"))
 
 
 def _slopes(closed: FloatArray, seen: FloatArray, into: FloatArray) -> Iterator[FloatArray]:

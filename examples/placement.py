@@ -1,0 +1,164 @@
+"""Where to put sensors and actuators: choices with a proof of how good they are.
+
+Run it: ``python examples/placement.py``. The stage of ``wafer_stage.py`` carries 0.5 kg that no
+drawing shows; its model is updated from a measurement, with the uncertainty of what was found. The
+error at the die, which no sensor sees, decides where four sensors go: on a grid of 48 places
+without the die itself, in picometres, with a bound below which no choice can be.
+"""
+
+# %% Names and numbers
+import os
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # the matrices are small: threads would only wait
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import flexplant as fx
+from flexplant.placement import (
+    AfterLoss,
+    BranchAndBound,
+    ByRows,
+    ClosedLoopH2,
+    Exchange,
+    Excluded,
+    MinimumDistance,
+    ModeInformation,
+    OverMachines,
+    Screened,
+    device_worth,
+    pareto_curve,
+)
+from wafer_stage import DELAY, RATE, L, ports, reduced, updated
+
+OUT = Path(__file__).parent / "out"
+ENCODER = 5e-12  # m/sqrt(Hz)
+GRID = [(x, y, 0.0) for x in np.linspace(0.0, L, 7) for y in np.linspace(0.0, L, 7)]
+SENSORS = [fx.Sensor(f"s{i}", at=place, asd=ENCODER) for i, place in enumerate(GRID)]
+PLACES = [(x, y, 0.0) for x in np.linspace(0.1, L - 0.1, 4) for y in np.linspace(0.1, L - 0.1, 4)]
+ACTUATORS = [fx.Actuator(f"a{i}", at=place) for i, place in enumerate(PLACES)]
+#: nobody can measure on the die, nor near its edge
+DIE = fx.Disc((L / 2, L / 2), radius=0.05)
+#: nor here, where a cable is
+CABLE = fx.Rectangle((-0.01, 0.15), (0.25, 0.45))
+#: z at the die, and its rotations at the edge of a field, 13 mm away
+AXES = {"z": 1.0, "rx": 0.013, "ry": 0.013}
+
+
+# %% The machine: updated, and as uncertain as its measurement
+def machine(rng: int = 1) -> tuple[fx.StandardPlant, list[fx.StandardPlant]]:
+    """Return the sampled plant of the updated model, and three machines that it could be too."""
+    hidden = fx.testbeds.wafer_stage(damping=0.01, rate=RATE, delay=DELAY)
+    exact = hidden.poles([6, 7])
+    measured = fx.MeasuredModes(
+        poles=exact.poles, modes=[6, 7], covariance=np.diag(np.repeat((2.0, 0.5), 2) ** 2)
+    )
+    fit = updated(reduced(0.01), measured)
+    small = fx.assemble_plant(fit.model, ports()).discretized(RATE, delay=DELAY)
+    return small, small.uncertain(fit).sample(rng, 3)
+
+
+# %% Sensors
+def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[str, fx.Placement]:
+    """Return four sensors by several criteria and constraints."""
+    # modes that the reduced model has left out do not count here, they would undo the bound
+    goal = fx.PoiVariance("die", AXES, own_modes=True)
+    off = Excluded(DIE)
+    search = Exchange(starts=1)
+
+    def best(criterion: Any, count: int = 4, method: Any = search, **options: Any) -> fx.Placement:
+        given = (off, *options.pop("constraints", ()))
+        return fx.place_sensors(
+            plant, SENSORS, count, criterion, constraints=given, method=method, rng=0, **options
+        )
+
+    spread = fx.place_sensors(
+        plant, SENSORS, 25, ModeInformation(), constraints=[off], method=ByRows()
+    )
+    return {
+        "the die's error": best(goal),
+        "within 12 %, proven": best(
+            goal, method=BranchAndBound(gap=0.12, time_limit=10.0, starts=1)
+        ),
+        "0.25 m apart": best(goal, constraints=[MinimumDistance(0.25)]),
+        "none at the cable": best(goal, constraints=[Excluded(CABLE)]),
+        "worst machine of three": best(OverMachines(goal, machines)),
+        "one may fail": best(AfterLoss(goal), method=Screened(goal, starts=1)),
+        "25 for the shapes": spread,
+    }
+
+
+# %% Actuators, both, and what more devices buy
+def both(plant: fx.StandardPlant) -> dict[str, Any]:
+    """Return actuators and sensors for the closed loop, the curve over counts, and their worth."""
+    cost = ClosedLoopH2("die", AXES, effort=1e-9)
+    few = [sensor for sensor in SENSORS[::3] if not DIE.holds(np.array([sensor.at[:2]]))[0]]
+    search = Exchange(starts=1)
+    pair = fx.place_both(plant, few, ACTUATORS, (4, 4), cost, method=search, rng=0)
+    goal = fx.PoiVariance("die", AXES, own_modes=True)
+    curve = pareto_curve(
+        plant, few, range(3, 7), goal, constraints=[Excluded(DIE)], method=search, rng=0
+    )
+    return {"pair": pair, "curve": curve, "worth": device_worth(plant, pair, cost)}
+
+
+def main() -> dict[str, Any]:
+    """Return everything that was found."""
+    plant, machines = machine()
+    result = {"plant": plant, "machines": machines, "sensors": sensors(plant, machines)}
+    grid = [place for place in GRID if not DIE.holds(np.array([place[:2]]))[0]]
+    corners = plant.assembled.ports.y[:3]
+    three = plant.with_ports(plant.assembled.ports.replace(y=corners))
+    goal = fx.PoiVariance("die", AXES, own_modes=True)
+    found = fx.sensor_map(three, grid, goal, asd=ENCODER, constraints=[Excluded(DIE)])
+    return result | both(plant) | {"map": found, "three": three}
+
+
+# %% The table
+def table(result: dict[str, Any]) -> str:
+    """Return choices with their values and bounds as text."""
+    plant = result["plant"]
+    goal = fx.PoiVariance("die", AXES, own_modes=True)
+    lines = [f"{'sensors':24s}{'at the die':>12s}{'their goal':>12s}{'at best':>12s}   chosen"]
+    for name, found in result["sensors"].items():
+        error = f"{1e12 * np.sqrt(goal(found.on(plant))):.1f} pm"
+        value, low = (
+            f"{1e12 * np.sqrt(number):.1f} pm" if found.unit else "-"
+            for number in (found.value, max(found.bound, 0.0))
+        )
+        lines.append(f"{name:24s}{error:>12s}{value:>12s}{low:>12s}   {' '.join(found.chosen):.24}")
+    pair = result["pair"]
+    lines += ["", f"the closed loop: {pair!r}", f"{result['worth']!r}", "", f"{result['curve']!r}"]
+    return "\n".join(lines)
+
+
+# %% The pictures
+def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
+    """Draw the score over the plate, the curve with its bound, and devices on a mode shape."""
+    import matplotlib.pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    drawn = []
+
+    def keep(name: str) -> None:
+        drawn.append(folder / f"{name}.png")
+        plt.savefig(drawn[-1], dpi=110)
+        plt.close("all")
+
+    fx.plot.sensor_map(result["map"], ports=result["three"].assembled.ports)
+    keep("placement_map")
+    fx.plot.pareto_curve(result["curve"])
+    keep("placement_curve")
+    fx.plot.placed(result["pair"].on(result["plant"]), mode=6, zones=[DIE])
+    keep("placement_mode")
+    return drawn
+
+
+# %% Run it
+if __name__ == "__main__":
+    everything = main()
+    print(table(everything))
+    for path in pictures(everything):
+        print(path)
