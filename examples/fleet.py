@@ -1,12 +1,24 @@
 """A fleet of wafer stages: one robust controller for all against one for each machine.
 
-Run it: ``python examples/fleet.py [machines]`` (200 unless given: some 6 minutes on two cores).
+Run it: ``python examples/fleet.py [machines]`` (200 unless given: some 9 minutes of one core).
 Each machine carries unknown masses at three places, its plate is a little stiffer or softer than
 the drawing and its damping differs. All are measured (poles of nine modes), updated and controlled
 twice: by one controller for all, as fast as a sample of the machines allows, and by one that is
 designed on the machine's own updated model. The paper's thesis is that the second can be faster,
 since it need not be robust against what has been measured. The study can be stopped at any time:
 what is done is in a file.
+
+The thesis holds on these 200 machines, which are all stable with a modulus margin of 0.4 or more
+both ways (the worst bandwidth is the lowest)::
+
+                       bandwidth [Hz]            error rms [nm]                   MA [nm]
+                   median    95 %   worst    median    95 %   worst    median    95 %   worst
+    one for all      29.7    28.6      28      13.3    16.2    17.3      32.8    42.8    49.7
+    one for each     81.6    81.2    65.4      3.93    4.72     6.1      5.73    7.33    9.71
+
+No machine was without a result. The specification of 10 nm MA after a move is missed by all 200
+machines with one controller for all, by none with its own. Poles are exact here and the parameters
+are those that really differ: what a measurement leaves unknown would cost some of the difference.
 """
 
 # %% Names and numbers

@@ -60,7 +60,7 @@ def test_each_machine_with_its_own_model_is_faster_and_more_accurate(fleet, tmp_
         assert f"stiffness = {value:.4g}"[:16] in text
         assert "specification: passed" in text
     shown = fleet.table({"asked": 20.0, "tables": tables})
-    assert "one for each       2 of 2" in shown
+    assert "one for each, failed: unstable: 0" in shown
     assert max(map(len, shown.splitlines())) <= 120
     assert fleet.picture({"asked": 20.0, "tables": tables}, tmp_path).stat().st_size > 10_000
 

@@ -80,3 +80,10 @@ def test_the_code_runs(tmp_path, monkeypatch):
     P = scipy.linalg.solve_discrete_lyapunov(g.A, g.B @ g.B.T)
     by_scipy = np.sqrt(np.trace(g.C @ P @ g.C.T) + np.sum(g.D**2))
     assert h2_norm(g) == pytest.approx(by_scipy, rel=1e-8)
+    laptop = names["laptop"]
+    assert laptop["failed"].tolist() == ["", ""] and laptop["passed"].all()
+    np.testing.assert_allclose(next(iter(laptop.values())), [0.3, 0.6], rtol=2e-3)
+    for other in ("pool", "cluster"):
+        for column, values in names[other].items():
+            np.testing.assert_array_equal(values, laptop[column])
+    assert sorted(laptop["report"]) == sorted(path.name for path in tmp_path.glob("reports/*"))
