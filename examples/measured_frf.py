@@ -76,8 +76,7 @@ def poles(frf: fx.Frf) -> tuple[fx.identification.IdentifiedModes, fx.MeasuredMo
 def response(frf: fx.Frf, lines: Any, outputs: list[str]) -> fx.FrfResidual:
     """Return what compares lines of the sampled machine with a model behind the same hold."""
     used, where = frf.select(outputs=outputs), {name: SENSORS[name] for name in outputs}
-    noise = used.variance * (RUNS - 1) / (RUNS - 2)  # the mean of sigma^2 / s^2 of few runs
-    return fx.FrfResidual(used, lines=lines, places=where | ACTUATORS, hold=RATE, variance=noise)
+    return fx.FrfResidual(used, lines=lines, places=where | ACTUATORS, hold=RATE)
 
 
 def located(frf: fx.Frf, eigenvalues: fx.Eigenvalues) -> tuple[Localisation, Localisation]:

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.signal as ss
 
-from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import (
     H1Estimator,
     H2Estimator,
@@ -15,6 +15,7 @@ from flexplant.identification import (
     multisine,
 )
 from flexplant.lti import Frf
+from flexplant.updating import FrfResidual
 from oracles_identification import Loop
 
 RATE = 1000.0
@@ -287,3 +288,25 @@ def test_drift_between_periods_is_not_taken_for_more_noise_than_it_makes(periods
     error, said = np.mean(score, axis=0)
     high = slice(20, None)
     assert np.mean(error[high] / np.mean(said[high])) == pytest.approx(1.0, abs=0.35)
+
+
+@pytest.mark.parametrize(
+    ("runs", "outputs", "inputs", "shared"), [(6, 2, 4, True), (6, 2, 4, False), (4, 3, 1, False)]
+)
+def test_how_well_the_variance_of_a_few_runs_is_known(runs, outputs, inputs, shared):
+    """Noise alone: ``|mean|^2 / variance`` is nu / (nu - 1) in the mean, and a fit counts it."""
+    rng = np.random.default_rng(5)
+    freq, size = np.arange(1.0, 3001.0), (runs, outputs, inputs, 3000)
+    own = rng.normal(size=size) + 1j * rng.normal(size=size)
+    noise = own[:, :1] * np.arange(1, outputs + 1)[:, None, None] + 1e-6 * own if shared else own
+    places = {"inputs": [f"{i}:z" for i in range(1, inputs + 1)]}
+    places["outputs"] = [f"{i}:z" for i in range(1, outputs + 1)]
+    frf = average_frfs([Frf(freq, each, **places) for each in noise])
+    ratio = np.mean(np.abs(frf.data) ** 2 / frf.variance)
+    assert frf.freedom / (frf.freedom - 1) == pytest.approx(ratio, rel=0.04)
+    assert frf.select(outputs=["1:z"]).freedom == frf.freedom
+    fair = FrfResidual(frf, lines=[0, 1]).variance
+    np.testing.assert_allclose(fair, frf.variance * frf.freedom / (frf.freedom - 1), rtol=1e-12)
+    if runs == 4:
+        with pytest.warns(FlexplantWarning, match="1.2 degrees of freedom"):
+            FrfResidual(frf.replace(freedom=1.2), lines=[0, 1])

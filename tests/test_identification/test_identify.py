@@ -352,7 +352,7 @@ def test_slopes_against_central_differences():
             moved[place] += x[6 + k] + 1j * x[9 + k]
         return _Projected(lines, poles + x[:3] + 1j * x[3:6], moved, pivots).cost
 
-    g = _Projected(lines, poles, part, pivots).normal[1]
+    g = _Projected(lines, poles, part, pivots).gradient()[1]
     step = np.array([1e-4] * 6 + [1e-5] * 6)
     for k in range(12):
         e = np.zeros(12)

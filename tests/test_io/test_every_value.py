@@ -220,6 +220,7 @@ def of_updates(rom, unknowns, residual, fit):
     force = fx.assemble_plant(rom, ports()).Gyu.select([f"y{i}" for i in range(1, 5)])
     frf = fx.frequency_response(force, np.linspace(200, 800, 200))
     yield from (fx.MatrixParameter("spring", dK=np.eye(25)), fx.updating.ModeDamping(6))
+    yield fx.updating.PolynomialParameter("thickness", dK=[np.eye(25), None, np.eye(25)], unit="m")
     yield from (fx.FrfResidual(frf, variance=np.ones(frf.data.shape), lines=[0, 1]),)
     yield from (fx.ModeShapes(poles, seen, rom.dofs.labels[:5]),)
     yield from (fx.updating.ShapeCorrelation(poles, seen, rom.dofs.labels[:5]),)

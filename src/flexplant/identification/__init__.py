@@ -14,3 +14,4 @@ from .periodic import multisine as multisine
 from .spectra import H1Estimator as H1Estimator
 from .spectra import H2Estimator as H2Estimator
 from .spectra import HvEstimator as HvEstimator
+from .structural import structural_modes as structural_modes

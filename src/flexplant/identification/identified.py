@@ -30,6 +30,8 @@ class IdentifiedModes(MeasuredModes):
         l_k, of the inputs.
     inputs, outputs : sequences of str
         Names of the channels.
+    input_dofs : sequence of n_in str
+        Labels of the inputs' DOFs, or their names where no DOF is known.
     terms : (n_out, n_in, lower + upper) array
         E(s), coefficients of powers of s scaled by the largest frequency.
     lower : int
@@ -56,6 +58,7 @@ class IdentifiedModes(MeasuredModes):
     participation: ComplexArray = field(kw_only=True)
     inputs: tuple[str, ...] = field(kw_only=True)
     outputs: tuple[str, ...] = field(kw_only=True)
+    input_dofs: tuple[str, ...] = field(default=(), kw_only=True)
     terms: FloatArray = field(kw_only=True)
     lower: int = field(kw_only=True)
     top: float = field(kw_only=True)
@@ -71,6 +74,7 @@ class IdentifiedModes(MeasuredModes):
         if self.shapes is None:
             raise ModelError("identified modes have shapes at their outputs.")
         self._set(
+            input_dofs=tuple(self.input_dofs) or tuple(self.inputs),
             participation=self.participation,
             terms=self.terms,
             shape_covariance=self.shape_covariance,

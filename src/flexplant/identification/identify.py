@@ -245,8 +245,7 @@ def _identified(
         if not ready.known:
             share = 1.0 - freedom(lines, poles.size) / (2 * fit.model.size)
             ready = ready.from_residuals(ready.data - fit.model, share)
-    if not fit.settled:
-        fit = refined(lines, fit.poles, fit.participation, steps=max_iterations)
+    fit = refined(lines, fit.poles, fit.participation, steps=max_iterations, fine=True)
     warned(left)
     found = answer(frf, ready, lines, fit, (low, high), labels, diagram)
     leakage_warned(frf, found.poles)

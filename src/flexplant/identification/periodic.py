@@ -144,6 +144,7 @@ def frf_of_periods(
         coherence=_coherence(y, left, periods, n_in) if variance is not None else None,
         variance=variance,
         correlation=correlation,
+        freedom=None if variance is None else float(freedom),
         resolution=resolution,
     )
 

@@ -9,13 +9,15 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..values import ComplexArray
-from .pole_test import CHANCE, freedom, price
+from .pole_test import CHANCE, corroborated, freedom, price
 from .refine import Fit, Lines, projected_cost, refined
 
 #: half the distance at which a pole is taken apart, in parts of its damping
 APART = 0.5
 #: numbers of residual terms tried where 9 leave more than noise
 MORE = (25, 17, 13)
+#: what a weak pole must lower the cost by elsewhere
+GAIN = 0.1
 #: a pole is weak whose cost is less than so many times the least that is required of one
 WEAK = 4.0
 
@@ -42,10 +44,10 @@ def separated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
 
 def least_of(lines: Lines, places: int) -> float:
     """Return by how much a second pole must lower the cost at one of some places."""
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     n_out, n_in, _ = lines.data.shape
-    return float(chi2.isf(CHANCE / places, 2 * (n_out + n_in)))
+    return float(chdtri(2 * (n_out + n_in), CHANCE / places))
 
 
 def _apart(lines: Lines, fit: Fit, steps: int) -> Fit | None:
@@ -60,10 +62,11 @@ def _apart(lines: Lines, fit: Fit, steps: int) -> Fit | None:
         if gain < least / 3:
             break
         try:
-            more = refined(lines, poles, part, steps=steps)
+            more = refined(lines, poles, part, steps=steps, below=fit.cost - least)
         except SolverError:
             continue
-        if fit.cost - more.cost > least and _narrow(more, fit):
+        enough = fit.cost - more.cost > least and _narrow(more, fit)
+        if enough and corroborated(lines, fit.model, more.model):
             return more
     return None
 
@@ -112,10 +115,10 @@ def relocated(lines: Lines, fit: Fit, *, steps: int) -> Fit:
             if abs(poles[k] - pole) < 1.0 * abs(pole.real):
                 continue
             try:
-                more = refined(lines, poles, fit.participation, steps=steps)
+                more = refined(lines, poles, fit.participation, steps=steps, below=fit.cost - GAIN)
             except SolverError:
                 continue
-            if more.cost < fit.cost and _narrow(more, fit):
+            if more.cost < fit.cost - GAIN and _narrow(more, fit):
                 fit = more
     return fit
 
@@ -128,7 +131,7 @@ def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
     leave is too little to be seen and enough to bias, and in a wide band they cost next to
     nothing: so as many as the lines afford.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     channels = lines.data.shape[0] * lines.data.shape[1]
     unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
@@ -137,6 +140,6 @@ def backed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Lines, Fit]:
             continue
         more = replace(lines, upper=upper)
         gain = fit.cost - projected_cost(more, fit.poles, fit.participation)
-        if gain > unit * chi2.isf(CHANCE, channels * (upper - lines.upper)):
+        if gain > unit * chdtri(channels * (upper - lines.upper), CHANCE):
             return more, refined(more, fit.poles, fit.participation, steps=steps, strict=False)
     return lines, fit

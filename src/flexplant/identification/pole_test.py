@@ -6,7 +6,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..values import ComplexArray
-from .refine import Lines, projected_normal
+from .refine import Lines, projected_model, projected_normal
 
 #: probability that noise anywhere in the band passes for a pole
 CHANCE = 1e-3
@@ -25,7 +25,37 @@ def supported(
         if min(losses) > least * unit:
             break
         kept.pop(int(np.argmin(losses)))
+    kept = [k for k in kept if len(kept) == 1 or _seen(lines, poles, part, kept, k)]
     return poles[kept], part[:, kept]
+
+
+def _seen(lines: Lines, poles: ComplexArray, part: ComplexArray, kept: list[int], k: int) -> bool:
+    """Return whether a pole narrower than the lines are apart is seen at more than two of them."""
+    spacing = 2 * np.pi * float(np.median(np.diff(lines.freq)))
+    if -poles[k].real > spacing:
+        return True
+    rest = [other for other in kept if other != k]
+    less, more = (projected_model(lines, poles[some], part[:, some]) for some in (rest, kept))
+    return corroborated(lines, less, more)
+
+
+def corroborated(lines: Lines, less: ComplexArray, more: ComplexArray) -> bool:
+    """Return whether other lines than the two that gain most bear a pole out.
+
+    A disturbance of one frequency, or a variance that came out too small at one line, makes an
+    outlier. A pole of next to no damping, there or between two lines, explains it and changes
+    other lines by chance only: those lower the cost by a chi-square of four degrees, of the pole
+    and its size.
+    """
+    from scipy.special import chdtri
+
+    before, after = (
+        np.sum(np.abs((lines.data - model) * lines.weight) ** 2, axis=(0, 1))
+        for model in (less, more)
+    )
+    gain = before - after
+    unit = max(1.0, float(np.sum(after)) / (2 * lines.data.size))
+    return float(np.sum(np.sort(gain)[:-2])) > unit * lines.inflation * float(chdtri(4, CHANCE))
 
 
 def price(lines: Lines) -> float:
@@ -37,10 +67,10 @@ def price(lines: Lines) -> float:
     `inflation` times the power of independent errors. A pole kept in vain costs little; one left
     out biases its neighbours by up to the root of this amount.
     """
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     n_out, n_in, n_freq = lines.data.shape
-    return lines.inflation * float(chi2.isf(CHANCE / n_freq, 2 * (n_out + n_in)))
+    return lines.inflation * float(chdtri(2 * (n_out + n_in), CHANCE / n_freq))
 
 
 class _Costs:

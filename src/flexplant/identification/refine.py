@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,10 @@ from .basis import axis, pole_terms, residual_terms
 
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0
+#: squares of the standard deviations by which a full step may still move a fit that has settled
+FINE, COARSE = 1e-5, 1e-2
+#: steps after which a fit may be given up, and how often the gain of a full step is waited for
+PATIENCE, HOPE = 4, 20.0
 #: least damping ratio of a pole
 LEAST = 1e-7
 
@@ -32,6 +38,31 @@ class Lines:
     #: variance of a mean over many lines, relative to independent ones
     inflation: float = 1.0
 
+    @cached_property
+    def smooth(self) -> ComplexArray:
+        """The residual terms (n_terms, n_freq)."""
+        top = 2 * np.pi * float(self.freq[-1])
+        return residual_terms(
+            axis(self.freq), lower=self.lower, upper=self.upper, hold=self.hold, top=top
+        )
+
+    @cached_property
+    def smooth_bases(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Per output Q (n_in, 2 n_freq, n_terms) and R of the weighted residual terms."""
+        found = []
+        for w in self.weight:
+            pairs = [_qr(_real(self.smooth * row).T) for row in w]
+            found.append((np.array([Q for Q, _ in pairs]), np.array([R for _, R in pairs])))
+        return found
+
+    @cached_property
+    def goals(self) -> list[FloatArray]:
+        """Per output the weighted data (n_in 2 n_freq,) that no residual term explains."""
+        found = []
+        for (Q, _), data, w in zip(self.smooth_bases, self.data, self.weight, strict=True):
+            found.append(_off(Q, _real(data * w)[:, :, None]).ravel())
+        return found
+
 
 @dataclass(frozen=True, eq=False)
 class Fit:
@@ -46,7 +77,7 @@ class Fit:
     jacobian: list[ComplexArray]  # per output (n_in, n_freq, n_parameters)
     model: ComplexArray  # the fitted responses
     settled: bool = True
-    shape_maps: tuple[tuple[FloatArray, ComplexArray], ...] = ()  # see _Projected.shape_maps
+    shape_maps: tuple[tuple[FloatArray, ComplexArray], ...] = ()  # see _Projected.normal
 
 
 def refined(
@@ -56,6 +87,8 @@ def refined(
     *,
     steps: int,
     strict: bool = True,
+    fine: bool = False,
+    below: float = np.inf,
 ) -> Fit:
     r"""Return the weighted least-squares fit of
 
@@ -65,7 +98,14 @@ def refined(
     the maximum likelihood one when the weights are those of circular Gaussian errors. Shapes psi
     and residual terms E are linear and eliminated at each step (Golub and Pereyra, Inverse
     Problems 19 (2003) R1; Kaufman's Jacobian); poles and participation l, one entry of each
-    column held at 1, are found by Levenberg-Marquardt.
+    column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
+    to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
+    up: as soon as twenty times what a full step would gain is not enough.
+
+    Raises
+    ------
+    SolverError
+        When the fit does not settle and this is `strict`, or it is given up.
     """  # noqa: D400 - the sentence is the equation
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
@@ -73,8 +113,9 @@ def refined(
     now = _projected(lines, poles, participation, pivots)
     damping, settled, idle = 1e-6, True, 0
     power = float(np.sum(np.abs(lines.data * lines.weight) ** 2))
-    for _ in range(steps):
-        N, g, _ = now.normal
+    enough = FINE if fine else COARSE
+    for number in range(steps):
+        N, g = now.gradient()
         size = np.sqrt(np.maximum(np.diag(N), 1e-300))
         scaled, slope = N / np.outer(size, size), g / size
         # a pole outside the band may come to the axis: it stays there, the others go on
@@ -103,9 +144,11 @@ def refined(
             pivots = np.argmax(np.abs(participation), axis=0)
             participation = participation / participation[pivots, columns]
             now = _projected(lines, poles, participation, pivots)
-        # a step of 3e-3 standard deviations of what is left is none
-        if predicted <= 1e-5 * now.cost / (2 * lines.data.size):
+        # a step of so few standard deviations of what is left is none
+        if predicted <= enough * now.cost / (2 * lines.data.size):
             break
+        if number >= PATIENCE and now.cost - HOPE * predicted > below:
+            raise unsettled(poles.size, number)
         idle = idle + 1 if gained <= 1e-12 * now.cost else 0
         if idle >= 3 or (idle and damping <= 1e-3) or now.cost <= 1e-24 * power:
             break
@@ -113,7 +156,7 @@ def refined(
         settled = False
         if strict:
             raise unsettled(poles.size, steps)
-    N, _, jacobian = now.normal
+    N, jacobian, maps = now.normal()
     return Fit(
         poles,
         participation,
@@ -124,7 +167,7 @@ def refined(
         jacobian,
         now.model,
         settled,
-        tuple(now.shape_maps),
+        maps,
     )
 
 
@@ -147,97 +190,142 @@ class _Projected:
         pivots: Any,
     ) -> None:
         s = axis(lines.freq)
-        n_out, n_in, _ = lines.data.shape
+        n_out = lines.data.shape[0]
         m = poles.size
         self.lines, self.pivots, self.m = lines, pivots, m
         self.participation = participation
         self.plus, self.slope = pole_terms(poles, s, lines.hold)
         self.minus, self.slope_minus = pole_terms(poles.conj(), s, lines.hold)
-        top = 2 * np.pi * float(lines.freq[-1])
-        smooth = residual_terms(s, lower=lines.lower, upper=lines.upper, hold=lines.hold, top=top)
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
-        self.terms = np.zeros((n_out, n_in, smooth.shape[0]))
-        self.model = np.zeros_like(lines.data)
-        #: per output, d[Re psi; Im psi]/d(poles, participation) and, with these held, its rows
-        #: by the weighted data, (n_in, n_freq, 2 m)
-        self.shape_maps: list[tuple[FloatArray, ComplexArray]] = []
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
-        self.bases: list[tuple[list[FloatArray], FloatArray, FloatArray, FloatArray]] = []
-        self.linear: list[tuple[FloatArray, FloatArray, float]] = []
+        #: per output the basis of the shapes' columns, free of residual terms, and the error
+        self.bases: list[tuple[FloatArray, FloatArray]] = []
         self.cost = 0.0
-        for o in range(n_out):
-            smooth_bases, smooth_R, rows, goal = [], [], [], []
-            for i in range(n_in):
-                w = lines.weight[o, i]
-                Q, R = _qr(_real(smooth * w).T)
-                smooth_bases.append(Q)
-                smooth_R.append(R)
-                rows.append(_off(Q, self._columns(i, w)))
-                goal.append(_off(Q, _real(lines.data[o, i] * w)))
-            stacked = np.concatenate(rows)
+        for o, (right, stacked) in enumerate(zip(lines.goals, self._stacked(), strict=True)):
             size = np.maximum(np.linalg.norm(stacked, axis=0), 1e-300)
             Q, R = _qr(stacked / size)
-            right = np.concatenate(goal)
-            self.linear.append((stacked.T @ stacked, stacked.T @ right, float(right @ right)))
             x = la.lstsq(R, Q.T @ right, cond=1e-13)[0] / size
             self.shapes[o] = x[:m] + 1j * x[m:]
             self.triangles.append((R, size))
             error = right - Q @ (Q.T @ right)
             self.cost += float(error @ error)
-            self.bases.append((smooth_bases, Q, error, x))
-            for i in range(n_in):
-                w = lines.weight[o, i]
-                modal = self._modal(i, self.shapes[o])
-                left = _real((lines.data[o, i] - modal) * w)
-                self.terms[o, i] = la.lstsq(smooth_R[i], smooth_bases[i].T @ left)[0]
-                self.model[o, i] = modal + self.terms[o, i] @ smooth
+            self.bases.append((Q, error))
 
-    def _columns(self, i: int, w: FloatArray) -> FloatArray:
-        l = self.participation[i][:, None]  # noqa: E741 - the field's letter
+    def _stacked(self) -> Iterator[FloatArray]:
+        """Yield per output the columns (n_in 2 n_freq, 2 m) of its shapes, free of other terms."""
+        l = self.participation[:, :, None]  # noqa: E741 - the field's letter
         first, second = l * self.plus, l.conj() * self.minus
-        return _real(np.concatenate([first + second, 1j * (first - second)]) * w).T
+        both = np.concatenate([first + second, 1j * (first - second)], axis=1)
+        for (Q, _), w in zip(self.lines.smooth_bases, self.lines.weight, strict=True):
+            columns = _real(both * w[:, None, :]).transpose(0, 2, 1)
+            yield _off(Q, columns).reshape(columns.shape[0] * columns.shape[1], 2 * self.m)
 
-    def _modal(self, i: int, shape: ComplexArray) -> ComplexArray:
-        residue = shape * self.participation[i]
-        return np.asarray(residue @ self.plus + residue.conj() @ self.minus)
+    @cached_property
+    def linear(self) -> list[tuple[FloatArray, FloatArray, float]]:
+        """Per output the normal equations of its shapes, and the power they are to explain."""
+        return [
+            (stacked.T @ stacked, stacked.T @ right, float(right @ right))
+            for right, stacked in zip(self.lines.goals, self._stacked(), strict=True)
+        ]
+
+    @cached_property
+    def modal(self) -> ComplexArray:
+        """The responses (n_out, n_in, n_freq) of the modes alone."""
+        residues = self.shapes[:, None, :] * self.participation
+        return np.asarray(residues @ self.plus + residues.conj() @ self.minus)
+
+    @cached_property
+    def terms(self) -> FloatArray:
+        """The coefficients (n_out, n_in, n_terms) of the residual terms."""
+        left = _real((self.lines.data - self.modal) * self.lines.weight)
+        return np.array(
+            [
+                [la.lstsq(R, Q.T @ row)[0] for Q, R, row in zip(Qs, Rs, rows, strict=True)]
+                for (Qs, Rs), rows in zip(self.lines.smooth_bases, left, strict=True)
+            ]
+        )
 
     @property
-    def normal(self) -> tuple[FloatArray, FloatArray, list[ComplexArray]]:
-        """Return J^T J, J^T e and J of the nonlinear parameters, all outputs together."""
-        n_in, n_freq = self.lines.data.shape[1:]
-        count = 2 * self.m * n_in
-        self.shape_maps = []
-        N, g, kept = np.zeros((count, count)), np.zeros(count), []
-        for o, (smooth_bases, Q, error, _) in enumerate(self.bases):
-            shape = self.shapes[o][:, None]
-            blocks = []
-            for i in range(n_in):
-                w = self.lines.weight[o, i]
-                l = self.participation[i][:, None]  # noqa: E741
-                a, b = shape * l * self.slope, (shape * l).conj() * self.slope_minus
-                parts = np.zeros((2 * n_in, self.m, n_freq), dtype=np.complex128)
-                parts[0], parts[1] = a + b, 1j * (a - b)
-                # the entries of l that are free, in order, the pivot of each column left out
-                c, d = shape * self.plus, shape.conj() * self.minus
-                for k in range(self.m):
-                    if i != self.pivots[k]:
-                        place = 2 + 2 * (i - (i > self.pivots[k]))
-                        parts[place, k] = c[k] + d[k]
-                        parts[place + 1, k] = 1j * (c[k] - d[k])
-                columns = _real(parts.reshape(count, n_freq) * w).T
-                blocks.append(_off(smooth_bases[i], columns))
-            J = np.concatenate(blocks)
-            R, size = self.triangles[o]
-            inverse = la.pinv(R, rtol=1e-13) / size[:, None]
-            common = Q.T @ J
-            rows = (Q @ inverse.T).reshape(n_in, 2, n_freq, 2 * self.m)
-            self.shape_maps.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
-            J -= Q @ common
+    def model(self) -> ComplexArray:
+        """The fitted responses."""
+        return np.asarray(self.modal + self.terms @ self.lines.smooth)
+
+    def _moving(self, o: int) -> FloatArray:
+        """Return how rows (n_in, 2 n_freq, 4 m) of an output move, free of residual terms.
+
+        With Re and Im of the poles, then with those of the participation of the row's own input.
+        """
+        shape = self.shapes[o][:, None]
+        l = self.participation[:, :, None]  # noqa: E741
+        a, b = shape * l * self.slope, (shape * l).conj() * self.slope_minus
+        c, d = shape * self.plus, shape.conj() * self.minus
+        parts = np.concatenate([a + b, 1j * (a - b), np.zeros_like(a), np.zeros_like(a)], axis=1)
+        parts[:, 2 * self.m : 3 * self.m], parts[:, 3 * self.m :] = c + d, 1j * (c - d)
+        columns = _real(parts * self.lines.weight[o][:, None, :]).transpose(0, 2, 1)
+        return _off(self.lines.smooth_bases[o][0], columns)
+
+    @cached_property
+    def _places(self) -> list[tuple[Any, Any]]:
+        """Per input which of the 4 m columns of its rows are parameters, and which ones.
+
+        Parameters are Re and Im of the poles, then those entries of the participation, input by
+        input, that are free: the pivot of each column is not.
+        """
+        m, k = self.m, np.arange(self.m)
+        found = []
+        for i in range(self.participation.shape[0]):
+            free = k[self.pivots != i]
+            place = 2 + 2 * (i - (i > self.pivots[free]))
+            mine = np.concatenate([np.arange(2 * m), 2 * m + free, 3 * m + free])
+            found.append(
+                (mine, np.concatenate([np.arange(2 * m), place * m + free, (place + 1) * m + free]))
+            )
+        return found
+
+    def _jacobian(self, o: int) -> tuple[FloatArray, FloatArray]:
+        """Return J (n_in 2 n_freq, n_parameters) of an output, and what the shapes take of it.
+
+        ``J = D - Q Q^T D`` with how the rows of each input move, D, and the basis Q of the shapes.
+        """
+        n_in = self.participation.shape[0]
+        Q = self.bases[o][0]
+        J = np.zeros((n_in, Q.shape[0] // n_in, 2 * self.m * n_in))
+        for own, D, (mine, at) in zip(J, self._moving(o), self._places, strict=True):
+            own[:, at] = D[:, mine]
+        J = J.reshape(Q.shape[0], -1)
+        common = Q.T @ J
+        J -= Q @ common
+        return J, common
+
+    def gradient(self) -> tuple[FloatArray, FloatArray]:
+        """Return J^T J and J^T e of the nonlinear parameters, all outputs together."""
+        count = 2 * self.participation.size
+        N, g = np.zeros((count, count)), np.zeros(count)
+        for o, (_, error) in enumerate(self.bases):
+            J, _ = self._jacobian(o)
             N += J.T @ J
             g += J.T @ error
+        return N, g
+
+    def normal(self) -> tuple[FloatArray, list[ComplexArray], tuple[Any, ...]]:
+        """Return J^T J, J and the maps of the shapes, of the nonlinear parameters.
+
+        J per output (n_in, n_freq, n_parameters); the maps per output are d[Re psi; Im psi] /
+        d(poles, participation) and, these held, its rows by the weighted data (n_in, n_freq, 2 m).
+        """
+        n_in, n_freq = self.lines.data.shape[1:]
+        count = 2 * self.m * n_in
+        N, kept, maps = np.zeros((count, count)), [], []
+        for o, (Q, _) in enumerate(self.bases):
+            J, common = self._jacobian(o)
+            R, size = self.triangles[o]
+            inverse = la.pinv(R, rtol=1e-13) / size[:, None]
+            rows = (Q @ inverse.T).reshape(n_in, 2, n_freq, 2 * self.m)
+            maps.append((-inverse @ common, rows[:, 0] + 1j * rows[:, 1]))
+            N += J.T @ J
             split = J.reshape(n_in, 2, n_freq, count)
             kept.append(split[:, 0] + 1j * split[:, 1])
-        return N, g, kept
+        return N, kept, tuple(maps)
 
 
 def _projected(lines: Lines, poles: ComplexArray, part: ComplexArray, pivots: Any) -> _Projected:
@@ -274,7 +362,7 @@ def _qr(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _off(Q: FloatArray, rows: FloatArray) -> FloatArray:
-    return np.asarray(rows - Q @ (Q.T @ rows))
+    return np.asarray(rows - Q @ (np.swapaxes(Q, -1, -2) @ rows))
 
 
 def projected_normal(
@@ -287,3 +375,8 @@ def projected_normal(
 def projected_cost(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> float:
     """Return the cost with the best shapes and residual terms."""
     return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).cost
+
+
+def projected_model(lines: Lines, poles: ComplexArray, participation: ComplexArray) -> ComplexArray:
+    """Return the responses with the best shapes and residual terms."""
+    return _Projected(lines, poles, participation, np.zeros(poles.size, dtype=int)).model

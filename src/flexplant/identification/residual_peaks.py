@@ -10,8 +10,8 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import FlexplantWarning, SolverError
-from ..values import ComplexArray
-from .pole_test import freedom, price
+from ..values import ComplexArray, FloatArray
+from .pole_test import corroborated, freedom, price
 from .refine import Fit, Lines, projected_cost, refined
 
 #: lengths [lines] of the stretches that are examined
@@ -26,6 +26,10 @@ ROUNDING = 1e-9
 SHARE = 0.01
 #: poles that may be added, and the damping ratio above which one is no mode
 MOST, BROADEST = 6, 0.2
+
+
+#: lines around a peak, and standard deviations of their sum without the two highest, of a mode
+AROUND, NEARBY = 6, 2.5
 
 
 @dataclass(frozen=True)
@@ -75,13 +79,26 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
             share = total / np.convolve(measured, np.ones(length), mode="valid")
             height = np.where(share > SHARE**2, height, 0.0)
         best = int(np.argmax(height))
-        if height[best] > LIMIT:
+        if height[best] > LIMIT and not _outlier(power, best, length, middle, spread):
             seen = lines.freq[best : best + length]
             weight = power[best : best + length]
             step = float(lines.freq[1] - lines.freq[0])
             middle_freq = float(seen @ weight / weight.sum())
             found.append(Peak(middle_freq, step * length, float(height[best])))
     return sorted(found, key=lambda peak: -peak.height)
+
+
+def _outlier(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
+    """Return whether a peak is one or two lines and nothing around them.
+
+    A disturbance of one frequency, or a variance that came out too small there; a mode is seen at
+    its neighbours too.
+    """
+    aside = max(0, (AROUND - length + 1) // 2)
+    near = np.sort(power[max(0, first - aside) : first + length + aside])[:-2]
+    share = near.size / length
+    rest, wide = middle * share, spread * np.sqrt(share)
+    return bool(3.0 * rest / wide * (np.cbrt(np.sum(near) / rest) - 1.0) < NEARBY)
 
 
 def exact(lines: Lines, model: ComplexArray) -> bool:
@@ -129,7 +146,7 @@ def candidate(
 
 def fewest_terms(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) -> tuple[Lines, Fit]:
     """Return the fit with the fewest residual terms of modes above that the data let pass."""
-    from scipy.stats import chi2
+    from scipy.special import chdtri
 
     unit = max(1.0, fit.cost / freedom(lines, fit.poles.size))
     channels = lines.data.shape[0] * lines.data.shape[1]
@@ -137,7 +154,7 @@ def fewest_terms(lines: Lines, fit: Fit, fewer: Sequence[int], *, steps: int) ->
         less = replace(lines, upper=upper)
         lost = projected_cost(less, fit.poles, fit.participation) - fit.cost
         # a term too many costs next to nothing; one too few a bias: so noise may pass 1 in 10
-        if lost < unit * lines.inflation * chi2.isf(0.1, channels * (lines.upper - upper)):
+        if lost < unit * lines.inflation * chdtri(channels * (lines.upper - upper), 0.1):
             return less, refined(less, fit.poles, fit.participation, steps=steps, strict=False)
     return lines, fit
 
@@ -161,13 +178,14 @@ def _added(lines: Lines, fit: Fit, peak: Peak, steps: int) -> Fit | None:
     if fit.cost - cost < least / 4:
         return None
     try:
-        more = refined(lines, poles, part, steps=steps)
+        more = refined(lines, poles, part, steps=steps, below=fit.cost - least)
     except SolverError:
         return None
     zeta, before = (-each.poles.real / np.abs(each.poles) for each in (more, fit))
     # where a broad pole stands behind the others already, none shall become broader
     broadest = max(BROADEST, 1.1 * before.max())
-    return more if fit.cost - more.cost > least and zeta.max() < broadest else None
+    enough = fit.cost - more.cost > least and corroborated(lines, fit.model, more.model)
+    return more if enough and zeta.max() < broadest else None
 
 
 def unexplained(lines: Lines, fit: Fit) -> list[Peak]:

@@ -63,6 +63,7 @@ def answer(
         dofs=outputs,
         participation=part[:, inside],
         inputs=tuple(frf.inputs),
+        input_dofs=inputs,
         outputs=tuple(frf.outputs),
         terms=terms,
         lower=lines.lower,

@@ -49,6 +49,9 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         Of a measurement, between 0 and 1.
     variance : (n_out, n_in, n_freq) array, optional
         Of a measurement, E|error|^2 of each entry.
+    freedom : float, optional
+        Complex degrees of freedom nu of each variance, where it was estimated from few runs (R
+        runs: R - 1): the mean of |error|^2 / variance is then ``nu / (nu - 1)``.
     correlation : (n_out, n_out, n_freq) complex array, optional
         Of a measurement: of the errors of different outputs under the same input (a disturbance
         reaches all of them), with ones on the diagonal.
@@ -89,6 +92,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
     resolution: float | None = None
     window: str | tuple[Any, ...] | None = None
     overlap: float = 0.0
+    freedom: float | None = None
     units: Mapping[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -137,6 +141,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
             resolution=resolution,
             window=None if window is None else checked_window(window),
             overlap=checked_overlap(self.overlap),
+            freedom=None if self.freedom is None else positive(self.freedom, "freedom"),
         )
 
     def __repr__(self) -> str:
@@ -355,7 +360,7 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
     for array in (freq, data):
         array.flags.writeable = False
     fields = {"freq": freq, "data": data, "inputs": tuple(g.inputs), "outputs": tuple(g.outputs)}
-    known = ("quantity", "coherence", "variance", "correlation", "resolution", "window")
+    known = ("quantity", "coherence", "variance", "correlation", "resolution", "window", "freedom")
     frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0, "units": g.units})
     assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
     return frf

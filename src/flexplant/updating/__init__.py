@@ -20,6 +20,7 @@ from .parameters.added import AddedStiffness as AddedStiffness
 from .parameters.added import Parameter as Parameter
 from .parameters.matrix_parameters import MatrixParameter as MatrixParameter
 from .parameters.matrix_parameters import ModeDamping as ModeDamping
+from .parameters.polynomial import PolynomialParameter as PolynomialParameter
 from .residuals.eigenvalues import Eigenvalues as Eigenvalues
 from .residuals.frf_residual import FrfResidual as FrfResidual
 from .residuals.mode_shapes import ModeShapes as ModeShapes

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -88,36 +89,66 @@ class Family:
         self.parameters = tuple(parameters)
         self.n_rigid = rigid.shape[1]
         self.highest = highest
-        k, q = M.shape[0], len(self.parameters)
-        self.physical = [np.zeros((q, k, k)) for _ in range(3)]
-        for b, parameter in enumerate(self.parameters):
-            for stack, part in zip(self.physical, parameter.matrices(model), strict=True):
+        k = M.shape[0]
+        terms = [(b, part) for b, one in enumerate(self.parameters) for part in one.terms(model)]
+        #: the parameter of each term: M(p) = M + sum_j g_j(p) M_j, one term where it is affine
+        self.owner = [b for b, _ in terms]
+        self.physical = [np.zeros((len(terms), k, k)) for _ in range(3)]
+        for j, (_, parts) in enumerate(terms):
+            for stack, part in zip(self.physical, parts, strict=True):
                 if part is not None:
-                    stack[b] = dense(part)
+                    stack[j] = dense(part)
         self.massive = np.flatnonzero(np.any(M != 0, axis=0))
         if self.massive.size < k:
             self.V, self.rigid = np.eye(k), rigid
             self.M, self.D, self.K = M, D, K
-            self.dM, self.dD, self.dK = self.physical
+            self._terms = self.physical
         else:
             self.massive, self.rigid = np.arange(k), np.eye(k)[:, : self.n_rigid]
             omega, self.V = _modal_basis(M, K, rigid)
             self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
-            self.dM, self.dD, self.dK = (self.V.T @ stack @ self.V for stack in self.physical)
+            self._terms = [self.V.T @ stack @ self.V for stack in self.physical]
         self.condensed = self.massive.size < k
-        self._stacks = [_stacked(stack) for stack in (self.dM, self.dD, self.dK)]
+        self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
 
     def of(self, parameters: Sequence[int]) -> Family:
         """Return the family of some of the parameters, by position; coordinates are shared."""
         part = copy(self)
-        part.parameters = tuple(self.parameters[b] for b in parameters)
-        part.physical = [stack[list(parameters)] for stack in self.physical]
-        part.dM, part.dD, part.dK = (
-            stack[list(parameters)] for stack in (self.dM, self.dD, self.dK)
-        )
-        part._stacks = [_stacked(stack) for stack in (part.dM, part.dD, part.dK)]
+        chosen = list(parameters)
+        part.parameters = tuple(self.parameters[b] for b in chosen)
+        terms = [j for b in chosen for j, owner in enumerate(self.owner) if owner == b]
+        part.owner = [chosen.index(self.owner[j]) for j in terms]
+        part.physical = [stack[terms] for stack in self.physical]
+        part._terms = [stack[terms] for stack in self._terms]
+        part._derive(np.zeros(len(chosen)))
         return part
+
+    def tangent(self, p: FloatArray) -> Family:
+        """Return the family with derivatives at `p`; itself where the parameters are affine."""
+        if len(self.owner) == len(self.parameters):
+            return self
+        part = copy(self)
+        part._derive(p)
+        return part
+
+    def _derive(self, p: FloatArray) -> None:
+        """Set the derivatives dM, dD and dK (q, k, k) to those at `p`."""
+        if len(self.owner) == len(self.parameters):
+            self.dM, self.dD, self.dK = self._terms
+        else:
+            slopes = np.zeros((len(self.parameters), len(self.owner)))
+            slopes[self.owner, range(len(self.owner))] = self._curves(p)[1]
+            self.dM, self.dD, self.dK = (np.tensordot(slopes, part, axes=1) for part in self._terms)
+        self._stacks = [_stacked(stack) for stack in (self.dM, self.dD, self.dK)]
+
+    def _curves(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return g_j and their derivatives at `p`, of all terms."""
+        if len(self.owner) == len(self.parameters):
+            return p, np.ones_like(p)
+        found = [q.curve(v) for q, v in zip(self.parameters, p.tolist(), strict=True)]
+        sizes, slopes = zip(*found, strict=True)
+        return np.concatenate(sizes), np.concatenate(slopes)
 
     def text(self, p: FloatArray) -> str:
         """Return the parameters with values and units."""
@@ -125,12 +156,14 @@ class Family:
 
     def changes(self, p: FloatArray) -> list[FloatArray]:
         """Return what the parameters add to M, D and K of the model itself."""
-        return [np.tensordot(p, stack, axes=1) for stack in self.physical]
+        return [np.tensordot(self._curves(p)[0], stack, axes=1) for stack in self.physical]
 
     def rigid_left(self, p: FloatArray) -> FloatArray:
         """Return the rigid-body modes (r, r') that no spring to the ground holds at `p`."""
         r = self.n_rigid
-        active = [part @ self.rigid / np.abs(part).max() for part in self.dK[p != 0] if part.any()]
+        sizes = self._curves(p)[0]
+        acting = self._terms[2][sizes != 0]
+        active = [part @ self.rigid / np.abs(part).max() for part in acting if part.any()]
         if not r or not active:
             return np.eye(r)
         _, sizes, right = la.svd(np.vstack(active))
@@ -159,16 +192,19 @@ class Family:
 
     def matrices(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return M, D and K at `p` in the coordinates of the family."""
+        sizes = self._curves(p)[0]
         M, D, K = (
-            start if stack is None else start + np.tensordot(p, change, axes=1)
-            for start, stack, change in zip(
-                (self.M, self.D, self.K),
-                self._stacks,
-                (self.dM, self.dD, self.dK),
-                strict=True,
+            start + np.tensordot(sizes, change, axes=1) if used else start
+            for start, used, change in zip(
+                (self.M, self.D, self.K), self._used, self._terms, strict=True
             )
         )
         return M, D, K
+
+    @cached_property
+    def _used(self) -> list[bool]:
+        """Which of M, D and K the parameters change."""
+        return [bool(np.any(part)) for part in self._terms]
 
     def moved(self, X: ComplexArray, factors: Sequence[ComplexArray]) -> ComplexArray:
         """Return ``f0 dM X + f1 dD X + f2 dK X`` (q, k, m), each column with its own factors."""

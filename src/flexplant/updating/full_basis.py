@@ -34,6 +34,8 @@ DEPENDENT = 1e-10
 LARGE, TOO_LARGE = 300, 20_000
 #: DOFs from which few modes (one of so many) are found faster by Lanczos than densely
 SPARSE, FEW = 600, 10
+#: loads above which the second static response of each is left out
+MANY = 30
 #: bases of a large FEModel until its estimate moves no more
 MOST_ROUNDS = 10
 
@@ -114,7 +116,8 @@ class FullBasis:
                 if q.to is not None:
                     loads.append(full.dofs.row(q.to, q.direction))
         try:
-            self.changes = [q.matrices(full) for q in parameters]
+            for q in parameters:
+                q.matrices(full)
         except ShapeError as error:
             raise ShapeError(
                 f"{error} The full model needs the matrices of all its DOFs: give those, they are "
@@ -165,7 +168,9 @@ class FullBasis:
         changed = self._changed(p)
         phi = self._modes(changed)
         static = self._static(changed, self.loads)
-        further = self._static(changed, np.asarray(changed.M @ static))
+        # many candidates: their static responses alone fill the basis
+        few = static.shape[1] <= MANY
+        further = self._static(changed, np.asarray(changed.M @ static)) if few else static[:, :0]
         M: Any = self.full.M
         V = np.array(self.full.rigid_body)
         for part in (phi, static, further):
@@ -193,10 +198,9 @@ class FullBasis:
 
     def _changed(self, p: FloatArray) -> FEModel:
         changes: dict[str, Any] = {"M": self.full.M, "K": self.full.K}
-        for (dM, _, dK), value in zip(self.changes, p.tolist(), strict=True):
-            for name, part in (("M", dM), ("K", dK)):
-                if part is not None and value:
-                    changes[name] = summed(changes[name], value * part)
+        for q, value in zip(self.parameters, p.tolist(), strict=True):
+            dM, _, dK = q.change(self.full, value)
+            changes = {"M": summed(changes["M"], dM), "K": summed(changes["K"], dK)}
         return self.full.replace(**changes, D=None)
 
 

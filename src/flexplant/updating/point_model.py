@@ -30,7 +30,8 @@ class Point:
     """
 
     def __init__(self, family: Family, p: FloatArray, eigen: Eigen, labels: IntArray) -> None:
-        self.family = family
+        #: with the derivatives at p
+        self.family = family.tangent(p)
         self.p = p
         self.eigen = eigen
         self.labels = labels
@@ -43,6 +44,10 @@ class Point:
         """M, D and K in the coordinates of the family."""
         return self.family.matrices(self.p)
 
+    @cached_property
+    def _where(self) -> dict[int, int]:
+        return {int(n): c for c, n in enumerate(self.labels.tolist()) if n}
+
     def columns(self, numbers: Sequence[int]) -> list[int]:
         """Return the columns of modes by number.
 
@@ -51,7 +56,7 @@ class Point:
         ModelError
             When one of them no longer oscillates.
         """
-        where = {int(n): c for c, n in enumerate(self.labels.tolist()) if n}
+        where = self._where
         lost = [n for n in numbers if n not in where]
         if lost:
             raise ModelError(f"modes {lost} cease to oscillate.")

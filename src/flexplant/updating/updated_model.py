@@ -60,9 +60,8 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
 def _changed_structure(model: FEModel, parameters: Sequence[Parameter], p: FloatArray) -> FEModel:
     total: dict[str, Matrix | None] = dict.fromkeys("MDK")
     for parameter, value in zip(parameters, p.tolist(), strict=True):
-        for name, part in zip("MDK", parameter.matrices(model), strict=True):
-            if part is not None and value:
-                total[name] = summed(total[name], value * part)
+        for name, part in zip("MDK", parameter.change(model, value), strict=True):
+            total[name] = summed(total[name], part)
     changes = {name: summed(getattr(model, name), change) for name, change in total.items()}
     try:
         changed: FEModel = _replaced(model, changes, parameters, p)

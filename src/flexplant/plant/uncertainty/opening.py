@@ -85,7 +85,7 @@ def uncertain(
         many,
         weight,
         source if isinstance(source, UpdateResult) else None,
-        tuple(parameters or ()),
+        about_fit(source, parameters or ()) if isinstance(source, UpdateResult) else (),
     )
 
 
@@ -105,6 +105,7 @@ def _by_parameters(
             f"the modes of this plant are coupled by damping ({plant.form}): its Deltas are the "
             "parameters of the fit, which act on all modes. Leave modes out."
         )
+    unknowns = about_fit(fit, unknowns)
     system, deltas = by_parameters(plant.continuous, fit, unknowns, deviations)
     weight = None
     if neglected is not None:
@@ -137,6 +138,11 @@ def _checked_fit(fit: UpdateResult, parameters: Sequence[Parameter]) -> FloatArr
             "another mode, or give MeasuredModes(covariance=...)."
         )
     return fit.covariance
+
+
+def about_fit(fit: UpdateResult, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
+    """Return the parameters counted from their estimates, which the fit's model has already."""
+    return tuple(q.about(v) for q, v in zip(parameters, fit.values.tolist(), strict=True))
 
 
 class _Channels(NamedTuple):
@@ -265,7 +271,7 @@ def _fitted_poles(
     covariance = _checked_fit(fit, tuple(parameters or ()))
     elastic = range(realisation.n_rigid + 1, realisation.n_modes + 1)
     chosen = list(elastic if modes is None else modes)
-    found = eigenvalue_sensitivities(fit.model, list(parameters or ()), modes=chosen)
+    found = eigenvalue_sensitivities(fit.model, about_fit(fit, parameters or ()), modes=chosen)
     J = np.vstack([found.S.real, found.S.imag])
     return found.modes, found.poles, J @ covariance @ J.T
 

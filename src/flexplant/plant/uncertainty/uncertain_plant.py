@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 from ...errors import FlexplantWarning, ModelError, unknown_label
 from ...lti.statespace import StateSpace
+from ...sparse.factor import dense
 from ...structure.rigid import orthonormalised
 from ...updating import UpdateResult
 from ...updating.parameters.added import Parameter
@@ -287,13 +288,12 @@ def _moved(
     """Return the fit's model with parameters changed by some amounts."""
     changed: dict[str, Any] = {name: getattr(model, name) for name in "MDK"}
     for parameter, amount in zip(parameters, change.tolist(), strict=True):
-        for name, part in zip("MDK", parameter.matrices(model), strict=True):
+        for name, part in zip("MDK", parameter.change(model, amount), strict=True):
             if part is None:
                 continue
-            moved: Any = elastic_part(model, realisation, part) if name == "D" else part  # type: ignore[arg-type]
+            moved: Any = elastic_part(model, realisation, dense(part)) if name == "D" else part
             old = changed[name]
             if sp.issparse(old):
-                changed[name] = sp.csc_array(old + amount * sp.csc_array(moved))
-            else:
-                changed[name] = amount * moved if old is None else old + amount * moved
+                moved = sp.csc_array(moved)
+            changed[name] = moved if old is None else old + moved
     return model.replace(**changed)

@@ -9,14 +9,22 @@ from typing import Any
 import numpy as np
 
 from ...errors import FlexplantWarning, ModelError
+from ...structure.model import FEModel
 from ...values import FloatArray
 from ...values import whole as counted
+from ..full_basis import FullBasis
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
 from ..sensitivities import checked_parameters
 from .goodness import is_bad
 from .localisation import Localisation
 from .subsets import Subsets
+
+#: part of what the best candidate explains to first order that makes another worth a fit, and how
+#: many are fitted in any case
+WORTH, FEWEST = 0.25, 10
+#: DOFs of an FEModel above which a basis replaces it
+LARGE = 150
 
 
 def localise(
@@ -47,7 +55,8 @@ def localise(
     Parameters
     ----------
     model : ReducedModel or FEModel
-        Without the change.
+        Without the change. An FEModel of more than 150 DOFs is replaced by a basis of its modes
+        and the static responses to loads at the candidates.
     residuals : sequence of Residual
         Measured with the change.
     candidates : sequence of c Parameter
@@ -57,7 +66,8 @@ def localise(
     most : int
         Largest subset.
     screen : int
-        How many are fitted exactly.
+        How many are fitted exactly, at most: those that explain, to first order, a quarter of what
+        the best one does, and ten in any case.
 
     Returns
     -------
@@ -90,6 +100,8 @@ def localise(
         )
     given = checked_residuals(residuals)
     most, screen = counted(most, "most"), counted(screen, "screen")
+    if isinstance(model, FEModel) and model.n_dof > LARGE:
+        model = FullBasis(model, [*listed, *beside], given).at(np.zeros(len(listed) + len(beside)))
     whole = Objective(model, [*listed, *beside], given, prior=False)
     fits = Subsets(whole, given, len(listed))
     if fits.rows <= len(beside):
@@ -100,6 +112,7 @@ def localise(
     values, score, criterion = _singles(fits, screen)
     ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
     best = fits.best(ranked, most)
+    fits.polish(best)
     fit = fits.fit(best)
     p = np.zeros(0) if fit is None else fit.p
     chi2, dof = fits.chi2(best)
@@ -139,13 +152,16 @@ def _singles(fits: Subsets, screen: int) -> tuple[FloatArray, FloatArray, FloatA
     explained = fits.explained(())
     values, score = np.full(fits.count, np.nan), explained / error
     criterion = np.full(fits.count, np.inf)
-    for i in np.argsort(-explained)[:screen].tolist():
+    order = np.argsort(-explained)
+    worth = int(np.sum(explained >= WORTH * np.max(explained)))
+    tried = order[: min(screen, max(worth, FEWEST))]
+    for i in tried.tolist():
         found = fits.fit((i,))
         score[i] = 0.0
         if found is not None:
             values[i], score[i] = found.p[0], 1 - found.error / error
             criterion[i] = fits.score((i,))
-    for i in np.argsort(-explained)[screen:].tolist():
+    for i in order[tried.size :].tolist():
         # known to first order only: never better than what was fitted exactly
         score[i] = min(score[i], float(np.nanmin(score[np.isfinite(criterion)], initial=1.0)))
     return values, score, criterion

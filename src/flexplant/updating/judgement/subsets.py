@@ -20,6 +20,10 @@ BEAM = 3
 JOIN = 6
 #: rounds of exchanging members
 ROUNDS = 4
+#: relative tolerance of the fits that are compared, and of the one that is chosen
+COMPARED, CHOSEN = 1e-4, 1e-9
+#: parts of the way to a guess at which modes are followed
+WAY = (0.0, 0.25, 0.5, 0.75)
 
 Subset = tuple[int, ...]
 
@@ -54,6 +58,8 @@ class Subsets:
         self.beside = list(range(count, len(whole.parameters)))
         self.start = whole.default_start
         self.done: dict[Subset, SubsetFit | None] = {}
+        #: what each candidate would be alone, to first order
+        self.linear: FloatArray | None = None
         #: the points each fit went through
         self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.beside]]}
         if self.beside:
@@ -73,6 +79,17 @@ class Subsets:
             except (ModelError, SolverError):
                 self.done[subset] = None
         return self.done[subset]
+
+    def polish(self, subset: Subset) -> None:
+        """Fit a subset to all digits, from where its fit ended."""
+        if self.fit(subset) is None or not (subset or self.beside):
+            return
+        objective = self._objective([*subset, *self.beside])
+        objective.path = self.ways[subset][:-1]
+        end = self.ways[subset][-1]
+        found = TrustRegion().search(objective, end, most=50, tolerance=CHOSEN)
+        self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
+        self.done[subset] = _left(objective, found.p, found.p)
 
     def score(self, subset: Subset) -> float:
         """Return the extended BIC, ``chi^2 + k ln n + 2 ln C(c, k)``; infinite without a fit."""
@@ -131,6 +148,8 @@ class Subsets:
             r = self.whole.values(point)
             if not point.turned:
                 J = self.whole.slopes(point)
+                if not subset:
+                    self.linear = _alone(J[:, : self.count], J[:, fixed], r)
                 return _share(J[:, : self.count], J[:, fixed], r)
             # slopes of repeated modes depend on the candidate: each by itself
             return np.array([self._alone(b, subset, r) for b in range(self.count)])
@@ -206,9 +225,43 @@ class Subsets:
     def _fitted(self, subset: Subset) -> SubsetFit:
         picked = [*subset, *self.beside]
         objective = self._objective(picked)
-        found = TrustRegion().search(objective, self.start[picked], most=50, tolerance=1e-8)
+        first, guess = self.start[picked], self._guess(subset)
+        method = TrustRegion()
+        if guess is not None:
+            # modes keep the numbers of the start, and are followed on the way
+            objective.path = [first + part * (guess - first) for part in WAY]
+            try:
+                found = method.search(objective, guess, most=50, tolerance=COMPARED)
+            except (ModelError, SolverError, np.linalg.LinAlgError):
+                found = None
+            if found is not None and found.trail.error[-1] < self._error(()):
+                self.ways[subset] = [*objective.path, *found.trail.p]
+                return _left(objective, found.p, found.p)
+            objective = self._objective(picked)
+        found = method.search(objective, first, most=50, tolerance=COMPARED)
         self.ways[subset] = found.trail.p
         return _left(objective, found.p, found.p)
+
+    def _guess(self, subset: Subset) -> FloatArray | None:
+        """Return values near the fit of a subset: of the best part of it, or to first order.
+
+        From zero a trust region grows by a factor of two a step to where one of these begins.
+        """
+        parts = [tuple(k for k in subset if k != out) for out in subset]
+        parts = [part for part in parts if part and self.done.get(part) is not None]
+        if parts:
+            best = min(parts, key=self._error)
+            fit = self.done[best]
+            assert fit is not None  # noqa: S101 - just selected
+            own = dict(zip([*best, *self.beside], fit.p.tolist(), strict=True))
+            return np.array([own.get(k, 0.0) for k in [*subset, *self.beside]])
+        if len(subset) != 1 or self.linear is None:
+            return None
+        return np.array([self.linear[subset[0]], *self.start[self.beside]])
+
+    def _error(self, subset: Subset) -> float:
+        found = self.done.get(subset)
+        return np.inf if found is None else found.error
 
 
 def _left(objective: Objective, values: FloatArray, p: FloatArray) -> SubsetFit:
@@ -218,6 +271,14 @@ def _left(objective: Objective, values: FloatArray, p: FloatArray) -> SubsetFit:
     fitted = np.full(p.size, bool(values.size))
     chi2, _ = chi_square(objective, point, fitted)
     return SubsetFit(values, float(r @ r), chi2, worst(objective, point))
+
+
+def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
+    """Return what each parameter alone would be to first order, beside others."""
+    Q = np.linalg.qr(beside)[0]
+    J, r = J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
+    length = np.sum(J**2, axis=0)
+    return np.asarray(-(J.T @ r) / np.where(length > 0, length, np.inf))
 
 
 def _share(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:

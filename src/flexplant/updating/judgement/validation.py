@@ -7,17 +7,24 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
 from ...errors import ModelError
+from ...sparse.factor import dense
 from ...values import FloatArray, Rng, Value, generator, positive
 from ..parameters.added import Parameter
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
+from ..search.objective import numbers
 from ..search.update_method import UpdateMethod
 from ..sensitivities import checked_parameters
 from ..update import update
 from ..update_result import UpdateResult
 from .correlation import Correlation, correlate
+from .goodness import chance, is_bad
+
+#: part of the rms of unused data that a helpful update leaves where the noise is not known
+HALF = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -30,7 +37,13 @@ class Validation(Value):
         Of the fitted data.
     fitted, unused : (2,) array
         Rms of the whitened residuals before and after the update, of the data that were fitted and
-        of those that were not. Where the noise is known, 1 is what noise alone would leave.
+        of those that were not. Where the noise is known, 1 is what noise and the uncertainty of
+        the parameters would leave: after the update residuals of unused data are whitened by
+        ``I + J C J^T``, of fitted data counted per degree of freedom.
+    p_value : float or None
+        The probability that these alone leave more of the unused data than the updated model
+        does; None where the noise is not known. Below 1e-4 a change is missing, or in the wrong
+        place.
     before, after : Correlation
         Of the unused data with the model before and after.
     """
@@ -40,20 +53,28 @@ class Validation(Value):
     unused: FloatArray
     before: Correlation
     after: Correlation
+    p_value: float | None = None
 
     def __post_init__(self) -> None:
         self._set(fitted=self.fitted, unused=self.unused)
 
     @property
     def helped(self) -> bool:
-        """Whether the update brought the model nearer to data that were not fitted."""
-        return bool(self.unused[1] < self.unused[0])
+        """Whether the updated model predicts data that were not fitted.
+
+        Nearer than before, and where the noise is known up to that and the uncertainty of the
+        parameters (`p_value` of 1e-4 at least); where it is not, to a half of what was left. A
+        mass in the wrong place comes nearer too, and predicts nothing.
+        """
+        if self.p_value is None:
+            return bool(self.unused[1] < HALF * self.unused[0])
+        return bool(self.unused[1] < self.unused[0]) and not is_bad(self.p_value)
 
     def __repr__(self) -> str:
         a, b = self.fitted.tolist(), self.unused.tolist()
         return (
             f"<Validation: rms residual of fitted data {a[0]:.3g} -> {a[1]:.3g}, of unused data "
-            f"{b[0]:.3g} -> {b[1]:.3g}>"
+            f"{b[0]:.3g} -> {b[1]:.3g}{'' if self.helped else ', NOT PREDICTED'}>"
         )
 
 
@@ -93,9 +114,12 @@ def validate(
     ------
     FlexplantError
         As `update`.
+    ModelError
+        When unused data were fitted.
     """
     listed = checked_parameters(parameters)
     given, kept = checked_residuals(residuals), checked_residuals(unused)
+    _check_apart(given, kept)
     fit = update(
         model,
         listed,
@@ -107,12 +131,16 @@ def validate(
         prior=prior,
     )
     begin = np.asarray(fit.history.parameters[0], dtype=np.float64)
+    before, _ = _misfit(model, listed, given, begin, fit, spread=False)
+    fitted = np.array([before[0], _per_freedom(fit, before)])
+    both, chance_of = _misfit(model, listed, kept, begin, fit, spread=True)
     return Validation(
         fit=fit,
-        fitted=_rms(model, listed, given, begin, fit.values),
-        unused=_rms(model, listed, kept, begin, fit.values),
+        fitted=fitted,
+        unused=both,
         before=correlate(model, kept),
         after=correlate(fit.model, kept),
+        p_value=chance_of,
     )
 
 
@@ -154,17 +182,78 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
     return chosen.select(first.tolist()), chosen.select(rest.tolist())
 
 
-def _rms(
+def _per_freedom(fit: UpdateResult, rms: FloatArray) -> float:
+    """Return the rms of fitted data, per degree of freedom where the noise is known."""
+    known = fit.chi2 is not None and fit.dof > 0
+    return float(np.sqrt((fit.chi2 or 0.0) / fit.dof)) if known else float(rms[1])
+
+
+def _misfit(
     model: Any,
     parameters: Sequence[Parameter],
     residuals: Sequence[Residual],
     start: FloatArray,
-    end: FloatArray,
-) -> FloatArray:
+    fit: UpdateResult,
+    *,
+    spread: bool,
+) -> tuple[FloatArray, float | None]:
+    """Return the rms before and after, and the chance that noise leaves more than after.
+
+    With `spread`, that of the parameters counts as noise: r^T (N + J C J^T)^-1 r / m.
+    """
     objective = Objective(model, parameters, residuals, prior=False)
     before = objective.values(objective.begin(start))
     # in steps, so that modes are followed and not lost
     for part in np.linspace(0.0, 1.0, 6)[1:]:
-        objective.at(start + part * (end - start), refer=True)
-    after = objective.values(objective.at(end))
-    return np.sqrt([np.mean(before**2), np.mean(after**2)])
+        objective.at(start + part * (fit.values - start), refer=True)
+    point = objective.at(fit.values)
+    after = objective.values(point)
+    rms = np.sqrt([np.mean(before**2), np.mean(after**2)])
+    if not spread or not objective.noise_known or fit.covariance is None:
+        return rms, None
+    noise = np.eye(after.size)
+    for bound, rows in objective.rows(point):
+        if bound.noise is not None:
+            noise[rows, rows] = dense(bound.noise)
+    J = objective.slopes(point)
+    chi2 = float(after @ la.solve(noise + J @ fit.covariance @ J.T, after, assume_a="pos"))
+    rms[1] = np.sqrt(chi2 / after.size)
+    return rms, chance(chi2, after.size)
+
+
+def _check_apart(given: Sequence[Residual], kept: Sequence[Residual]) -> None:
+    """Refuse unused data that were fitted: the same modes or lines of one measurement."""
+    for one in given:
+        for other in kept:
+            if type(one) is not type(other):
+                continue
+            parts, twice = _parts(one), _parts(other)
+            common = [part for part in twice if part in parts]
+            if _same_data(one, other) and (common or not parts):
+                raise ModelError(
+                    f"{other!r} is not unused: {_named(common)} of it were fitted, and fitting "
+                    "them says nothing of others. Take a measurement apart with split(residual), "
+                    "or keep another one back."
+                )
+
+
+def _parts(residual: Residual) -> list[int]:
+    """Return the modes or lines of a residual."""
+    lines = getattr(residual, "lines", None)
+    return [int(i) for i in (numbers(residual) if lines is None else lines)]
+
+
+def _named(common: list[int]) -> str:
+    return f"parts {', '.join(map(str, common[:6]))}" if common else "all"
+
+
+def _same_data(one: Any, other: Any) -> bool:
+    """Whether two residuals of one kind are of the same measurement."""
+    if hasattr(one, "lines"):
+        a, b = one.measured, other.measured
+        return a is b or (a.data.shape == b.data.shape and np.array_equal(a.data, b.data))
+    if hasattr(one, "measured"):
+        a, b = one.measured, other.measured
+        shared = [n for n in a.modes or () if n in (b.modes or ())]
+        return any(a.poles[a.modes.index(n)] == b.poles[b.modes.index(n)] for n in shared)
+    return one is other

@@ -6,3 +6,4 @@ from .added import AddedStiffness as AddedStiffness
 from .added import Parameter as Parameter
 from .matrix_parameters import MatrixParameter as MatrixParameter
 from .matrix_parameters import ModeDamping as ModeDamping
+from .polynomial import PolynomialParameter as PolynomialParameter

@@ -11,14 +11,14 @@ import scipy.sparse as sp
 
 from ...errors import LabelError, ModelError, unknown_label
 from ...labels import DIRECTIONS, Place
-from ...values import Matrix, Value, real_array, short
+from ...values import FloatArray, Matrix, Value, real_array, short
 
 #: derivatives of M, D and K to one parameter, None where zero
 Derivatives: TypeAlias = "tuple[Matrix | None, Matrix | None, Matrix | None]"
 
 
 class Parameter(Value):
-    """One unknown p on which M, D and K depend affinely: M(p) = M + p dM, and so on.
+    """One unknown p on which M, D and K depend, affinely (M(p) = M + p dM) unless stated.
 
     A subclass has a unique `name`, a `unit` and its `matrices`; `bounds` (lowest, highest) and
     `prior` (mean, standard deviation) may say what is known of p beforehand.
@@ -38,6 +38,27 @@ class Parameter(Value):
             When the model has no such place.
         """
         raise NotImplementedError
+
+    def terms(self, model: Any) -> list[Derivatives]:
+        """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and of D and K."""
+        return [self.matrices(model)]
+
+    def curve(self, value: float) -> tuple[FloatArray, FloatArray]:
+        """Return the sizes g_j of the terms at a value, and their derivatives."""
+        return np.array([value]), np.ones(1)
+
+    def change(self, model: Any, value: float) -> Derivatives:
+        """Return what the parameter at a value adds to M, D and K of the model."""
+        total: list[Any] = [None, None, None]
+        for size, parts in zip(self.curve(value)[0].tolist(), self.terms(model), strict=True):
+            for i, part in enumerate(parts):
+                if part is not None and size:
+                    total[i] = size * part if total[i] is None else total[i] + size * part
+        return total[0], total[1], total[2]
+
+    def about(self, value: float) -> Parameter:
+        """Return the parameter counted from a value, of a model that has it already."""
+        return self
 
     def text(self, value: float) -> str:
         """Return name, value and unit in one phrase."""

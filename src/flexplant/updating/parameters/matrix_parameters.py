@@ -68,7 +68,7 @@ class MatrixParameter(Parameter):
                 f"a MatrixParameter needs a name, got {short(self.name)}. Pass a text."
             )
         parts = {
-            label: _checked_matrix(getattr(self, label), f"{label} of {self.name}")
+            label: checked_matrix(getattr(self, label), f"{label} of {self.name}")
             for label in ("dM", "dD", "dK")
         }
         if all(part is None for part in parts.values()):
@@ -95,9 +95,9 @@ class MatrixParameter(Parameter):
     ) -> MatrixParameter:
         """Return the parameter p = v - value of a full model `build(v)`, by central differences.
 
-        For anything that changes elements: a thickness, a density, a length. The matrices are
-        taken as affine in p; where they are not (a bending stiffness goes with thickness^3),
-        build the model anew at the answer and update once more.
+        For anything that changes elements affinely: a density, Young's modulus. Where the matrices
+        are not affine (a bending stiffness goes with thickness^3) this holds for small changes
+        only: `PolynomialParameter.from_build` is exact.
 
         Parameters
         ----------
@@ -155,8 +155,7 @@ class MatrixParameter(Parameter):
 
         ``quantity = value (1 + p)`` in the region, by central differences of the full model; its
         matrices are projected through T once, when an update begins. Young's modulus and density
-        are exactly affine. A thickness is not: build anew with `value` at the answer and update
-        once more, which converges in a few rounds.
+        are exactly affine. A thickness is not: `PolynomialParameter.from_build` for each region.
 
         Parameters
         ----------
@@ -234,24 +233,10 @@ class MatrixParameter(Parameter):
             When the matrices belong neither to the model nor to its full structure.
         """
         return (
-            self._projected(self.dM, model),
-            self._projected(self.dD, model),
-            self._projected(self.dK, model),
+            projected(self.dM, model, self.name),
+            projected(self.dD, model, self.name),
+            projected(self.dK, model, self.name),
         )
-
-    def _projected(self, part: Matrix | None, model: Any) -> Matrix | None:
-        if part is None:
-            return None
-        k, n = model.M.shape[0], len(getattr(model, "full_dofs", model.dofs))
-        if part.shape[0] == k:
-            return part
-        if part.shape[0] != n:
-            raise ShapeError(
-                f"{self.name} has matrices of {part.shape[0]} DOFs; the model has {k}, its full "
-                f"structure {n}."
-            )
-        product = np.asarray(model.T.T @ (part @ model.T), dtype=np.float64)
-        return (product + product.T) / 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -330,6 +315,28 @@ class ModeDamping(Parameter):
         return None, 2 * float(omega[-1]) * np.outer(force, force), None
 
 
+def projected(part: Matrix | None, model: Any, name: str) -> Matrix | None:
+    """Return a matrix of a model's own DOFs, ``T^T A T`` of one of its full structure.
+
+    Raises
+    ------
+    ShapeError
+        When it belongs to neither.
+    """
+    if part is None:
+        return None
+    k, n = model.M.shape[0], len(getattr(model, "full_dofs", model.dofs))
+    if part.shape[0] == k:
+        return part
+    if part.shape[0] != n:
+        raise ShapeError(
+            f"{name} has matrices of {part.shape[0]} DOFs; the model has {k}, its full "
+            f"structure {n}."
+        )
+    product = np.asarray(model.T.T @ (part @ model.T), dtype=np.float64)
+    return (product + product.T) / 2
+
+
 def _mask(value: Any, name: Any) -> Any:
     if not isinstance(name, str) or not name:
         raise LabelError(f"a region needs a name, got {short(name)}. Use a text.")
@@ -344,7 +351,8 @@ def _mask(value: Any, name: Any) -> Any:
     return mask
 
 
-def _checked_matrix(value: Any, name: str) -> Matrix | None:
+def checked_matrix(value: Any, name: str) -> Matrix | None:
+    """Return a square, finite, symmetric matrix, None when it is None or zero."""
     if value is None:
         return None
     given: Any = value

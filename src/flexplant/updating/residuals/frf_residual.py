@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import ModelError, ShapeError
+from ...errors import FlexplantWarning, ModelError, ShapeError
 from ...labels import Place
 from ...lti import Frf
 from ...values import ComplexArray, FloatArray, flag, instance, positive, real_array, short
@@ -23,6 +24,8 @@ from .zero_order_hold import Held
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: lines whose response is below so many standard deviations of the noise are left out
 SIGNAL = 3.0
+#: degrees of freedom of a variance below which chi-square is not to be trusted
+LEAST = 1.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,8 +43,9 @@ class FrfResidual(Residual):
         Responses of outputs to inputs [quantity / N]; `measured.quantity` says displacement
         (also when None), velocity or acceleration.
     variance : float or array that spreads to (n_out, n_in, n_freq), optional
-        ``E|noise|^2`` of each entry; that of the Frf when not given; the correlation of lines
-        follows from the Frf's window. Where neither is known,
+        ``E|noise|^2`` of each entry; that of the Frf when not given, times ``nu / (nu - 1)``
+        where it was estimated with `freedom` nu, so that chi-square has its mean; the correlation
+        of lines follows from the Frf's window. Where neither is known,
         entries count by their size, each divided by the rms of its channel pair.
     lines : sequence of int or (n_freq,) bool array, optional
         Frequency lines to use. None: those where the median over the channels of
@@ -91,7 +95,7 @@ class FrfResidual(Residual):
             raise ModelError(f"quantity {frf.quantity!r} is none of {', '.join(ORDERS)}.")
         variance = self.variance
         if variance is None:
-            variance = getattr(frf, "variance", None)
+            variance = _fair(frf)
         if variance is not None:
             given = real_array(variance, "variance")
             try:
@@ -251,6 +255,22 @@ def response_slopes(
     moved = family.moved(flat, (s**2, s, np.ones_like(s))).reshape(q, k, lines, n_in)
     slopes: ComplexArray = -np.matmul(Y.transpose(0, 2, 1), moved.transpose(0, 2, 1, 3))
     return slopes
+
+
+def _fair(frf: Frf) -> FloatArray | None:
+    """Return the variance with which ``|error|^2 / variance`` is 1 in the mean."""
+    if frf.variance is None or frf.freedom is None:
+        return frf.variance
+    if frf.freedom <= LEAST:
+        warnings.warn(
+            f"the variance of this Frf has {frf.freedom:.3g} degrees of freedom: |error|^2 / "
+            "variance has hardly a mean, and chi-square says little. Average more runs or periods, "
+            "or give variance= that is known otherwise.",
+            FlexplantWarning,
+            stacklevel=5,
+        )
+    nu = max(frf.freedom, LEAST)
+    return np.asarray(frf.variance * (nu / (nu - 1)))
 
 
 def _checked_hold(hold: Any, delay: Any, frf: Frf, lines: Any) -> tuple[float | None, float]:

@@ -216,7 +216,8 @@ class _BoundShapes(Bound):
         Phi = white @ (self.rows @ point.eigen.X[:, columns])
         if not np.any(Phi.imag):
             Phi = Phi.real
-        Q = np.linalg.qr(Phi)[0]
+        # of one mode the basis is the shape itself
+        Q = Phi / np.linalg.norm(Phi) if len(group) == 1 else np.linalg.qr(Phi)[0]
         return Phi, Q, white @ self.psi[:, i]
 
     def values(self, point: Point) -> FloatArray:
@@ -235,7 +236,7 @@ class _BoundShapes(Bound):
             for i in group:
                 Phi, Q, psi = self._parts(point, group, i)
                 dPhi = self.white[i] @ (dY if np.iscomplexobj(Phi) else dY.real)
-                plus = np.linalg.pinv(Phi)
+                plus = _inverse(Phi, Q)
                 left = psi - Q @ (Q.conj().T @ psi)
                 inner = dPhi @ (plus @ psi)
                 inner = inner - (inner @ Q.conj()) @ Q.T
@@ -271,13 +272,20 @@ class _BoundMac(_BoundShapes):
             for i in group:
                 Phi, Q, psi = self._parts(point, group, i)
                 dPhi = self.white[i] @ dY
-                plus = np.linalg.pinv(Phi)
+                plus = _inverse(Phi, Q)
                 left = psi - Q @ (Q.conj().T @ psi)
                 # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
                 change = np.real((dPhi @ (plus @ psi)) @ left.conj())
                 inside = float(np.linalg.norm(Q.conj().T @ psi))
                 found.append(-float(np.linalg.norm(psi)) * change / inside**3)
         return np.array(found)
+
+
+def _inverse(Phi: Any, Q: Any) -> Any:
+    """Return the pseudo-inverse of shapes, of one with its unit vector Q at once."""
+    if Phi.shape[1] > 1:
+        return np.linalg.pinv(Phi)
+    return Q.conj().T / np.linalg.norm(Phi)
 
 
 def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:

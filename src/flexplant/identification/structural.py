@@ -1,0 +1,267 @@
+"""Measured modes as the modes of a structure: a plant without a finite-element model."""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import FlexplantWarning, LabelError, ModelError
+from ..labels import DofSet
+from ..modes import Modes
+from ..structure import interpolated
+from ..structure.rigid import rigid_motions
+from ..values import ComplexArray, FloatArray, flag, instance
+from .identified import IdentifiedModes
+
+#: part of the largest eigenvalue of an inertia or a flexibility below which one is noise, and by
+#: which one may be negative
+NOISE, NEGATIVE = 1e-3, 0.05
+#: relative imaginary part of a shape, and part of one that a model's modes do not make, to warn of
+COMPLEX, MISSED = 0.1, 0.1
+#: frequencies of residual vectors that are tried, in parts of the band's end
+NEAREST, FARTHEST = 1.03, 10.0
+
+
+def structural_modes(
+    measured: IdentifiedModes,
+    dofs: DofSet,
+    *,
+    over: Modes | None = None,
+    rigid: bool = True,
+) -> Modes:
+    r"""Return identified modes as those of a structure, for `assemble_plant`.
+
+    From the fit :math:`H = \sum_k \psi_k l_k^T/(s - \lambda_k) + \ldots + E(s)`,
+    mass-normalised at a place where the machine was both driven and measured:
+
+    - shapes :math:`\phi_k = \mathrm{Re}\,\psi_k` at the outputs and
+      :math:`\mathrm{Re}(2 i\,\mathrm{Im}(\lambda_k)\, l_k)` at the inputs, their mean at places
+      that are both;
+    - what is left, nearest to :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band:
+      rigid-body modes :math:`\Phi_r \Phi_r^T = A` in the span of the rigid-body motions of the
+      geometry, and residual vectors :math:`v v^T/\omega_v^2 = G`, completed from the places that
+      are both: :math:`G_{oc} G_{cc}^{-1} G_{co}`.
+
+    Parameters
+    ----------
+    measured : IdentifiedModes
+        Of `identify_modes(frf, dofs={channel: label})`.
+    dofs : DofSet
+        Where the labels are. POIs elsewhere need shapes between these:
+        ``interpolated(DofSet(...))``.
+    over : Modes, optional
+        Of a model of the same structure, not more modes than there are measured places: shapes
+        are expanded over all its DOFs, ``phi = Phi Phi_a^+ psi`` (SEREP), so that POIs may be
+        anywhere on the model.
+    rigid : bool
+        Whether the term in 1/s^2 is rigid-body motion. False for a held structure.
+
+    Returns
+    -------
+    Modes
+        Rigid-body modes first. `certificate` says how large the imaginary parts left out are
+        ("imaginary") and, with `over`, what part of a measured shape the model's modes do not make
+        ("expansion"). ``plant.uncertain(numbered(measured, modes))`` gives the covariance of the
+        poles to the plant.
+
+    Warns
+    -----
+    FlexplantWarning
+        When one of these is above a tenth.
+
+    Raises
+    ------
+    ModelError
+        When the scale of shapes is not known, the term in 1/s^2 is no inertia, or `over` has more
+        modes than places.
+    LabelError
+        When a channel is not one of `dofs`.
+
+    References
+    ----------
+    O'Callahan, Avitabile, Riemer: System equivalent reduction expansion process, IMAC 7, 1989.
+    """
+    instance(measured, IdentifiedModes, "measured", "Pass the answer of identify_modes(frf).")
+    instance(dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz), or model.dofs.")
+    if over is not None:
+        instance(over, Modes, "over", "Pass solve_modes(model, count=...).")
+        dofs = over.dofs
+    if not measured.mass_normalised:
+        raise ModelError(
+            "the scale of these shapes is not known: no input and output are at one DOF. Drive "
+            "and measure one place, and name it in identify_modes(frf, dofs={channel: label})."
+        )
+    free = flag(rigid, "rigid")
+    labels = tuple(dict.fromkeys([*(measured.dofs or ()), *measured.input_dofs]))
+    absent = [label for label in labels if label not in dofs.labels]
+    if absent:
+        raise LabelError(
+            f"{', '.join(absent[:4])} are channels at no DOF of {dofs!r}. Say where they are: "
+            "identify_modes(frf, dofs={channel: label})."
+        )
+    at = _Places(measured, labels)
+    shapes = at.shapes()
+    imaginary = float(np.max(np.linalg.norm(shapes.imag, axis=0) / np.linalg.norm(shapes, axis=0)))
+    rows = dofs.indices(labels)
+    A, G, fast = at.smooth()
+    body = at.rigid(A, dofs, rows) if free else np.zeros((len(labels), 0))
+    vectors = at.residual(G, fast)
+    certificate = {"imaginary": imaginary}
+    columns = [body, shapes.real, vectors]
+    place = dofs
+    if over is not None:
+        columns, certificate["expansion"] = _expanded(over, rows, columns)
+    else:
+        place = dofs.select(labels)
+        if dofs.interpolation is not None:
+            # between the places that were measured only
+            margin = float(getattr(dofs.interpolation, "margin", 0.0))
+            place = interpolated(place, margin=margin)
+    _warn(certificate)
+    body, phi, vectors = columns
+    m = vectors.shape[1]
+    zeta = np.concatenate([np.zeros(body.shape[1]), measured.zeta])
+    return Modes(
+        np.concatenate([np.zeros(body.shape[1]), np.abs(measured.poles)]),
+        zeta,
+        np.hstack([body, phi]),
+        place,
+        n_rigid=body.shape[1],
+        vectors=vectors,
+        vector_omega=np.full(m, fast),
+        vector_zeta=np.full(m, float(np.median(measured.zeta))),
+        vector_dofs=[f"residual {i + 1}" for i in range(m)],
+        certificate=certificate,
+    )
+
+
+class _Places:
+    """The channels of an identification by the places they are at."""
+
+    def __init__(self, measured: IdentifiedModes, labels: tuple[str, ...]) -> None:
+        self.measured, self.count = measured, len(labels)
+        #: positions among the places
+        self.outputs = [labels.index(label) for label in measured.dofs or ()]
+        self.inputs = [labels.index(label) for label in measured.input_dofs]
+        self.top = 2 * np.pi * measured.top
+
+    def shapes(self) -> ComplexArray:
+        """Return the shapes (places, m), the mean of both where there are two."""
+        total = np.zeros((self.count, len(self.measured)), dtype=np.complex128)
+        times = np.zeros((self.count, 1))
+        driven = 2j * self.measured.poles.imag * self.measured.participation
+        for at, part in ((self.outputs, np.asarray(self.measured.shapes)), (self.inputs, driven)):
+            np.add.at(total, at, part)
+            np.add.at(times, at, 1.0)
+        return total / times
+
+    def smooth(self) -> tuple[FloatArray, FloatArray, float]:
+        """Return A, G and w of ``A/s^2 + G w^2/(s^2 + w^2)``, nearest to all but the modes.
+
+        The residual terms, and the poles beside the band, on 200 frequencies of the band, relative
+        to the whole response; w is searched.
+        """
+        measured, top = self.measured, self.top
+        freq = np.geomspace(0.5 * float(measured.freq.min()), measured.top, 200)
+        s2 = -((2 * np.pi * freq) ** 2)
+        whole = measured.replace(hold=None).frf(freq).data
+        s = 2j * np.pi * freq
+        part: ComplexArray = np.asarray(measured.shapes)[:, None, :] * measured.participation
+        modal = part @ (1 / (s - measured.poles[:, None]))
+        modal = modal + part.conj() @ (1 / (s - measured.poles.conj()[:, None]))
+        rest = np.real(whole - modal).reshape(-1, freq.size)
+        weight = 1 / np.sqrt(np.mean(np.abs(whole) ** 2, axis=(0, 1)))
+        best = None
+        for w in top * np.geomspace(NEAREST, FARTHEST, 60):
+            terms = np.array([1 / s2, w**2 / (s2 + w**2)])
+            size = np.abs(terms * weight).max(axis=1, keepdims=True)
+            found = np.linalg.lstsq((terms / size * weight).T, (rest * weight).T)[0] / size
+            left = float(np.sum(((rest - found.T @ terms) * weight) ** 2))
+            if best is None or left < best[0]:
+                best = left, found.reshape(2, len(self.outputs), -1), float(w)
+        assert best is not None  # noqa: S101 - 60 were tried
+        return best[1][0], best[1][1], best[2]
+
+    def rigid(self, A: FloatArray, dofs: DofSet, rows: Any) -> FloatArray:
+        """Return the rigid-body modes (places, r): ``U S U^T`` nearest to A, that of 1/s^2."""
+        centre = dofs.xyz[rows].mean(axis=0)
+        motions = rigid_motions(
+            dofs.select([dofs.labels[i] for i in rows]).replace(xyz=dofs.xyz[rows] - centre)
+        )
+        size = np.linalg.norm(motions, axis=0)
+        U = la.orth(motions / np.where(size > 0, size, 1.0), rcond=1e-9)
+        r = U.shape[1]
+        pairs = [(i, j) for i in range(r) for j in range(i, r)]
+        made = []
+        for i, j in pairs:
+            S = np.zeros((r, r))
+            S[i, j] = S[j, i] = 1.0
+            made.append((U[self.outputs] @ S @ U[self.inputs].T).ravel())
+        found, *_ = np.linalg.lstsq(np.array(made).T, A.ravel())
+        S = np.zeros((r, r))
+        for (i, j), value in zip(pairs, found.tolist(), strict=True):
+            S[i, j] = S[j, i] = value
+        return U @ _root(
+            S,
+            "the term in 1/s^2 of the measurement is no rigid-body motion of positive mass. Pass "
+            "rigid=False for a held structure; begin the band of a free one lower.",
+        )
+
+    def residual(self, G: FloatArray, fast: float) -> FloatArray:
+        """Return residual vectors (places, m), mass-normalised at their frequency [rad/s]."""
+        both = [(self.outputs.index(p), i) for i, p in enumerate(self.inputs) if p in self.outputs]
+        o, i = [pair[0] for pair in both], [pair[1] for pair in both]
+        block = G[np.ix_(o, i)]
+        values, turn = la.eigh((block + block.T) / 2)
+        keep = values > NOISE * np.abs(values).max(initial=0.0)
+        half = turn[:, keep] / np.sqrt(values[keep])
+        vectors = np.zeros((self.count, int(keep.sum())))
+        vectors[self.inputs] = G[o].T @ half
+        vectors[self.outputs] = G[:, i] @ half
+        return vectors * fast
+
+
+def _root(S: FloatArray, trouble: str) -> FloatArray:
+    """Return L with ``S = L L^T`` but for noise."""
+    values, vectors = la.eigh(S)
+    if not values.size or values[-1] <= 0 or values[0] < -NEGATIVE * values[-1]:
+        raise ModelError(trouble)
+    keep = values > NOISE * values[-1]
+    return np.asarray(vectors[:, keep] * np.sqrt(values[keep]))
+
+
+def _expanded(over: Modes, rows: Any, columns: list[FloatArray]) -> tuple[list[FloatArray], float]:
+    """Return shapes over all DOFs of a model, and the part of elastic ones it does not make."""
+    Phi = np.real(over.phi)
+    seen = Phi[rows]
+    count, places = over.n_modes, len(rows)
+    if np.linalg.matrix_rank(seen / np.linalg.norm(Phi, axis=0)) < count:
+        raise ModelError(
+            f"{places} measured places do not determine {count} modes of the model: expand over "
+            "fewer, solve_modes(model, count=...), or measure at more places."
+        )
+    found = [np.linalg.lstsq(seen, part)[0] for part in columns]
+    left = columns[1] - seen @ found[1]
+    part = np.linalg.norm(left, axis=0) / np.linalg.norm(columns[1], axis=0)
+    return [Phi @ one for one in found], float(np.max(part))
+
+
+def _warn(certificate: dict[str, float]) -> None:
+    if certificate["imaginary"] > COMPLEX:
+        warnings.warn(
+            f"a measured shape has an imaginary part of {certificate['imaginary']:.0%}: the modes "
+            "of this structure are real, so that it is left out. Measure longer, or look for two "
+            "modes that were taken for one.",
+            FlexplantWarning,
+            stacklevel=3,
+        )
+    if certificate.get("expansion", 0.0) > MISSED:
+        warnings.warn(
+            f"{certificate['expansion']:.0%} of a measured shape is none of the model's modes: "
+            "the expansion is that far off at least. Give more of its modes, or update it first.",
+            FlexplantWarning,
+            stacklevel=3,
+        )
