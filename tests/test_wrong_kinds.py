@@ -24,7 +24,7 @@ from flexplant.simulation import (
     learn_feedforward,
     settling_time,
 )
-from flexplant.synthesis import FixedOrder, design_structured
+from flexplant.synthesis import FixedOrder, design_structured, shape_loop
 from flexplant.testbeds import wafer_stage
 from stages import RATE, ports, sampled, some_modes
 
@@ -171,6 +171,10 @@ CALLS = [
     ("TunedLaws", lambda x: design_structured(plant(), fx.synthesis.TunedLaws(x)), ()),
     ("TunedLaws free", lambda x: fx.synthesis.TunedLaws(fx.Pid(1.0), free=x), ("dict",)),
     ("Parametrised", lambda x: fx.synthesis.Parametrised(x, [1.0]), ()),
+    ("shape_loop", lambda x: shape_loop(x, bandwidth=50.0), ("bool", "fraction", "negative")),
+    ("shape_loop bandwidth", lambda x: shape_loop(plant(), bandwidth=x), ("fraction",)),
+    ("shape_loop model", lambda x: shape_loop(plant(), bandwidth=50.0, model=x),
+     ("none", "fraction")),
     ("ncf_margin", lambda x: fx.ncf_margin(plant(), x), ()),
     ("design_hinf", lambda x: fx.design_hinf(x), ()),
     ("design_hinf method", lambda x: fx.design_hinf(plant(), x), ("none",)),

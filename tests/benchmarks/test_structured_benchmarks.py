@@ -1,17 +1,29 @@
-"""Fixed-order H-infinity beside published optima; loop shaping beside python-control and slycot.
+"""Fixed order beside published optima; loop shaping and H2 beside python-control with slycot.
 
 Run with ``-m benchmark -s``. Norms are of the loop, by a sweep of dense matrices.
 """
 
+import pickle
+import subprocess
+import sys
 import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 from flexplant.lti import StateSpace
-from flexplant.synthesis import FixedOrder, design_hinf, design_structured
-from oracles_synthesis import brute_norm, closed_loop, split, stability
+from flexplant.synthesis import (
+    FixedOrder,
+    design_h2,
+    design_hinf,
+    design_ncf,
+    design_structured,
+    shape_loop,
+)
+from oracles_synthesis import brute_norm, cart_pole, closed_loop, coprime_problem, split, stability
+from oracles_synthesis import chain as oracle_chain
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
 #: static output feedback: Apkarian, Noll, Nonsmooth H-infinity synthesis, 2006; HIFOO, 2006
@@ -57,4 +69,105 @@ def test_static_output_feedback_beside_published_values(capsys):
         )
     with capsys.disabled():
         print("\nstatic    published       ours  true norm  decrease   [s]  full order")
+        print("\n".join(rows))
+
+
+PEER = """
+import pickle, sys, time
+import control
+name, A, B, C, D, nu, ny = pickle.load(sys.stdin.buffer)
+start = time.perf_counter()
+K = getattr(control, name)(control.ss(A, B, C, D), ny, nu)
+K = K[0] if isinstance(K, tuple) else K
+out = (K.A, K.B, K.C, K.D, time.perf_counter() - start)
+sys.stdout.buffer.write(pickle.dumps(out))
+"""
+
+
+def peer(name, P, nu, ny):
+    """(controller or None, seconds, what happened) of python-control with slycot."""
+    given = pickle.dumps((name, P.A, P.B, P.C, P.D, nu, ny))
+    command = [sys.executable, "-W", "ignore", "-c", PEER]
+    try:
+        done = subprocess.run(command, input=given, capture_output=True, timeout=20, check=False)
+    except subprocess.TimeoutExpired:
+        return None, np.nan, "no answer in 20 s"
+    if done.returncode:
+        return None, np.nan, done.stderr.decode().strip().splitlines()[-1][:60]
+    *K, seconds = pickle.loads(done.stdout)
+    return StateSpace(*K), seconds, ""
+
+
+def h2(P, K, nu, ny):
+    A, B, C, _ = closed_loop(split(P.A, P.B, P.C, P.D, nu, ny), K.A, K.B, K.C, K.D)
+    if stability(A, 0.0) >= 0:
+        return np.inf
+    return np.sqrt(np.trace(C @ la.solve_continuous_lyapunov(A, -B @ B.T) @ C.T))
+
+
+def light():
+    """2 kg with modes at 300 and 900 Hz of 0.1 %, shaped for 50 Hz: SI units."""
+    parts = [np.array([[0.0, 1], [0, 0]])]
+    for freq in (300.0, 900.0):
+        w = 2 * np.pi * freq
+        parts.append(np.array([[0.0, 1], [-(w**2), -2e-3 * w]]))
+    return StateSpace(
+        la.block_diag(*parts),
+        np.array([[0, 0.5, 0, 0.5, 0, 0.5]]).T,
+        [[1, 0, -0.3, 0, 0.2, 0]],
+        [[0]],
+    )
+
+
+@pytest.mark.benchmark
+def test_loop_shaping_beside_hinfsyn(capsys):
+    """The same coprime-factor problem given to the peer's H-infinity synthesis."""
+    chain, cart = coprime_problem(*oracle_chain()), coprime_problem(*cart_pole())
+    shaped = shape_loop(light(), bandwidth=50.0).shaped
+    cases = {
+        "chain": (oracle_chain(), chain),
+        "cart and pole": (cart_pole(), cart),
+        "light, SI": (
+            (shaped.A, shaped.B, shaped.C),
+            coprime_problem(shaped.A, shaped.B, shaped.C),
+        ),
+    }
+    rows = []
+    for name, ((A, B, C), (parts, best)) in cases.items():
+        nu, ny = B.shape[1], C.shape[0]
+        P = StateSpace(*parts)
+        G = StateSpace(A, B, C, np.zeros((ny, nu)))
+        start = time.perf_counter()
+        ours = design_ncf(G, back_off=1e-2)
+        seconds = time.perf_counter() - start
+        norm = true_norm(P, ours.system, nu, ny)
+        K, theirs, note = peer("hinfsyn", P, nu, ny)
+        shown = note or f"{true_norm(P, K, nu, ny):10.4g} {theirs:6.2f}"
+        assert norm <= 1.02 * best
+        rows.append(f"{name:14s} {best:10.4g} {norm:10.4g} {seconds:6.2f}   {shown}")
+    with capsys.disabled():
+        print("\nloop shaping      least       ours    [s]   hinfsyn    [s]")
+        print("\n".join(rows))
+
+
+@pytest.mark.benchmark
+@pytest.mark.skipif(not DATA.exists(), reason="COMPleib is not here")
+def test_h2_beside_h2syn(capsys):
+    """The H2 norm that each controller truly reaches, by SciPy's Lyapunov equation."""
+    rows = []
+    for name in ("AC2", "AC15", "HE1", "DIS1", "NN2", "AGS", "BDT1"):
+        P, u, y = compleib(name)
+        nu, ny = len(u), len(y)
+        if np.any(P.D[:-ny, :-nu]):
+            continue
+        start = time.perf_counter()
+        ours = design_h2(P, u=u, y=y)
+        seconds = time.perf_counter() - start
+        norm = h2(P, ours.system, nu, ny)
+        assert norm == pytest.approx(ours.gamma, rel=1e-4)
+        K, theirs, note = peer("h2syn", P, nu, ny)
+        shown = note or f"{h2(P, K, nu, ny):10.5g} {theirs:6.2f}"
+        rows.append(f"{name:6s} {norm:10.5g} {seconds:6.2f}   {shown}")
+    with capsys.disabled():
+        print("\nH2           ours    [s]     h2syn    [s]")
         print("\n".join(rows))

@@ -109,6 +109,7 @@ def made():
     yield from (*plant.check().assumptions, *plant.check().modes, fx.stage_weights(plant, 50.0))
     yield from (static, servo, loop, point, response)
     law = fx.Pid(1e3, 1.0, 20.0, 200.0) * fx.Lead(30.0) * fx.Notch(300.0) * fx.LowPass(400.0)
+    yield synthesis.shape_loop(fx.StateSpace([[0.0]], [[1.0]], [[1.0]], [[0.0]]), bandwidth=1.0)
     yield from (synthesis.TunedLaws(law), synthesis.FixedOrder(1), synthesis.ObserverGains())
     yield from (*law.factors, law, fx.design_loops(sampled, law))
     zero, one = np.zeros(1), {"mode6:freq": 1.0}

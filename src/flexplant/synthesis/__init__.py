@@ -29,6 +29,8 @@ from .robustness.stability import RobustStability as RobustStability
 from .robustness.stability import robust_stability as robust_stability
 from .servo import design_servo as design_servo
 from .servo import servo_bandwidth as servo_bandwidth
+from .shaping import ShapedLoop as ShapedLoop
+from .shaping import shape_loop as shape_loop
 from .structured import design_structured as design_structured
 from .structured_lmi import StructuredLmi as StructuredLmi
 from .structures import FixedOrder as FixedOrder

@@ -234,26 +234,48 @@ def made(
     """Return the design of laws that were checked; parameters as for `design_loops`."""
     inner = axes_controller(axes, laws)
     report = report_loops((axes.plant, inner), at="y", rigid=rigid, unstable=unstable)
-    followed = dict(references or {})
-    for name in followed:
-        if name not in axes.names:
-            raise unknown_label("axis", name, axes.names, "the laws")
-    shown = np.zeros((len(axes.names), len(followed)))  # the reference is taken from the motion
-    for column, name in enumerate(followed):
-        shown[axes.names.index(name), column] = -1.0
-    after = axes.after.replace(
-        D=np.hstack([axes.after.D, shown]),
-        B=np.zeros((0, shown.shape[1] + len(axes.after.inputs))),
-        inputs=[*axes.after.inputs, *name_list(followed.values(), "references")],
-        dt=inner.dt,
-    )
-    system = series(series(after, inner), axes.before.replace(dt=inner.dt))
-    system = system.replace(name="loops", inputs=after.inputs, outputs=axes.before.outputs)
+    system = connected(axes, inner, references or {}).replace(name="loops")
     left_out = None if axes.given is None else spill_over(axes.given, [system], larger)
     lacking = axes.given is not None and left_out is None
     return LoopDesign(
         system, laws, report, left_out, unchecked(axes.given) if lacking and axes.given else ()
     )
+
+
+def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> StateSpace:
+    """Return [y, references] -> u of a controller in the axes.
+
+    Parameters
+    ----------
+    axes : Axes
+        The plant.
+    inner : StateSpace
+        Motions to commands of the axes, references then being taken from their motions; or
+        references of all axes and motions to commands.
+    references : mapping {axis: name}
+        References to add.
+
+    Raises
+    ------
+    LabelError
+        When an axis is unknown.
+    """
+    for name in references:
+        if name not in axes.names:
+            raise unknown_label("axis", name, axes.names)
+    names = name_list(references.values(), "references")
+    chosen = np.zeros((len(axes.names), len(names)))
+    for column, name in enumerate(references):
+        chosen[axes.names.index(name), column] = 1.0
+    none = np.zeros((len(axes.names), len(axes.after.inputs)))
+    if len(inner.inputs) > len(axes.names):
+        read = np.block([[none, chosen], [axes.after.D, np.zeros(chosen.shape)]])
+    else:
+        read = np.hstack([axes.after.D, -chosen])
+    inputs = [*axes.after.inputs, *names]
+    first = StateSpace([], [], [], read, inner.dt, inputs=inputs)
+    system = series(series(first, inner), axes.before.replace(dt=inner.dt))
+    return system.replace(inputs=inputs, outputs=axes.before.outputs)
 
 
 def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law]:

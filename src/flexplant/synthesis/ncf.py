@@ -97,43 +97,23 @@ def design_ncf(
         )
     shaped = series(series(first, G), last)
     if bandwidth is not None:
-        weight = _integral_action(shaped, positive(bandwidth, "bandwidth"))
+        weight = integral_action(shaped, positive(bandwidth, "bandwidth"))
         first, shaped = series(weight, first), series(weight, shaped)
-    part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
-    K, gamma, least = _robust(part, back_off)
-    margin, stability = _margin(shaped, K)
-    other = _least_by_factors(part)
+    K, least, certificate = verified_controller(shaped, back_off)
     whole = series(series(last, K), first).replace(
         inputs=G.outputs, outputs=G.inputs, name="ncf", units=G.units
     )
-    if not margin or not _margin(G, whole)[0]:
-        raise AssumptionError(
-            "a mode that is undamped, integrating or unstable is not reached by u, not seen in y, "
-            "or hidden by the shaping (a zero of `before` or `after` on its pole, or an integrator "
-            "on a zero of the plant): the loop is not stable. Move that zero, or add an actuator "
-            "or a sensor."
-        )
-    if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
-        raise CertificateError(
-            f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
-            f"claimed, the smallest gamma is {least:.6g} by the Riccati equations and {other:.6g} "
-            "by the Hankel norm of the factors: the shaped plant is too badly conditioned to "
-            "trust. Bring its gains at u and y to size 1, and leave out states that are hardly "
-            "reached or seen."
-        )
+    if not loop_margin(G, whole)[0]:
+        raise hidden_mode()
     left_out = spill_over(plant, [whole], larger) if isinstance(plant, StandardPlant) else None
     lacking = unchecked(plant) if isinstance(plant, StandardPlant) and left_out is None else ()
     return Controller(
         whole,
         "loop shaping by normalised coprime factors",
-        gamma=1.0 / margin,
+        gamma=1.0 / certificate["margin"],
         lower=least,
-        certificate={
-            "margin": margin,
-            "smallest gamma by the Hankel norm": other,
-            "stability": stability,
-            "modulus margin": modulus_margin((G, whole)),
-        }
+        certificate=certificate
+        | {"modulus margin": modulus_margin((G, whole))}
         | (left_out.certificate if left_out is not None else {}),
         left_out=left_out,
         notes=lacking,
@@ -165,10 +145,10 @@ def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -
         When the two do not go together.
     """
     G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
-    return _margin(G, as_statespace(controller))[0]
+    return loop_margin(G, as_statespace(controller))[0]
 
 
-def _margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
+def loop_margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
     """Return 1 / the norm of the loop, 0 when unstable, and its stability."""
     p, m = len(G.outputs), len(G.inputs)
     if (len(K.inputs), len(K.outputs)) != (p, m):
@@ -203,15 +183,60 @@ def _margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
     return 1.0 / peak_gain(loop)[0], stability
 
 
+def verified_controller(
+    shaped: StateSpace, back_off: float
+) -> tuple[StateSpace, float, dict[str, float]]:
+    """Return the controller of a shaped plant, the smallest gamma, and what was verified.
+
+    Raises
+    ------
+    AssumptionError
+        When a mode is hidden: the loop is not stable.
+    CertificateError
+        When the loop does not keep the promise.
+    """
+    part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
+    K, gamma, least = _robust(part, back_off)
+    margin, stability = loop_margin(shaped, K)
+    other = _least_by_factors(part)
+    if not margin:
+        raise hidden_mode()
+    if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
+        raise CertificateError(
+            f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
+            f"claimed, the smallest gamma is {least:.6g} by the Riccati equations and {other:.6g} "
+            "by the Hankel norm of the factors: the shaped plant is too badly conditioned to "
+            "trust. Bring its gains at u and y to size 1, and leave out states that are hardly "
+            "reached or seen."
+        )
+    found = {
+        "margin": margin,
+        "smallest gamma by the Hankel norm": other,
+        "stability": stability,
+    }
+    return K, least, found
+
+
+def hidden_mode() -> AssumptionError:
+    """Return the error for a loop that cannot be stable."""
+    return AssumptionError(
+        "a mode that is undamped, integrating or unstable is not reached by u, not seen in y, "
+        "or hidden by the shaping (a zero of `before` or `after` on its pole, or an integrator "
+        "on a zero of the plant): the loop is not stable. Move that zero, or add an actuator "
+        "or a sensor."
+    )
+
+
 def _names(letter: str, count: int) -> list[str]:
     return [f"{letter}{i}" for i in range(count)]
 
 
-def _continuous(shaped: StateSpace) -> StateSpace:
+def continuous(shaped: StateSpace) -> StateSpace:
+    """Return the shaped plant in continuous time, gains kept."""
     return bilinear(shaped, 1.0 / shaped.dt) if shaped.dt else shaped
 
 
-def _solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
+def riccati_solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
     """Return X and Z of the Riccati equations of control and filtering (the bilinear map's too)."""
     control, estimate = (control_dare, solve_dare) if g.dt else (control_care, solve_care)
     R, S = np.eye(len(g.outputs)) + g.D @ g.D.T, np.eye(len(g.inputs)) + g.D.T @ g.D
@@ -227,8 +252,8 @@ def _solutions(g: StateSpace) -> tuple[FloatArray, FloatArray]:
 
 def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, float]:
     """Return the controller of the shaped plant, its gamma, and the smallest gamma."""
-    X, Z = _solutions(shaped)
-    g = _continuous(shaped)
+    X, Z = riccati_solutions(shaped)
+    g = continuous(shaped)
     least = float(np.sqrt(1.0 + np.max(np.linalg.eigvals(X @ Z).real, initial=0.0)))
     gamma = (1.0 + back_off) * least
     S = np.eye(len(g.inputs)) + g.D.T @ g.D
@@ -239,7 +264,7 @@ def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, flo
     return (tustin(K, 1.0 / shaped.dt) if shaped.dt else K), gamma, least
 
 
-def _integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
+def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
     """Return ``k_i (1 + w / (10 s))`` for each channel, of gain 1 with the plant's at bandwidth.
 
     Raises
@@ -268,8 +293,8 @@ def _integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
 
 def _least_by_factors(shaped: StateSpace) -> float:
     """Return ``(1 - |[N, M]|_H^2)^(-1/2)``, the smallest gamma by a Hankel norm."""
-    _, Z = _solutions(shaped)
-    g = _continuous(shaped)
+    _, Z = riccati_solutions(shaped)
+    g = continuous(shaped)
     R = np.eye(len(g.outputs)) + g.D @ g.D.T
     H = -np.linalg.solve(R, (g.B @ g.D.T + Z @ g.C.T).T).T
     values, vectors = np.linalg.eigh(R)

@@ -1,0 +1,252 @@
+"""shape_loop: from a bandwidth to the shaped plant, its robust controller and the margins."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import CertificateError, ModelError, SolverError
+from ..loop import LoopReport, report_loops
+from ..lti.discretisation import tustin
+from ..lti.frequency import Frf
+from ..lti.interconnection import append, series
+from ..lti.responses import responses
+from ..lti.statespace import StateSpace, System, as_statespace
+from ..lti.weights import lowpass
+from ..parallel import one_thread
+from ..plant import StandardPlant
+from ..values import FloatArray, Value, positive
+from .controller import Controller
+from .loop_design import Axes, axes_of, connected
+from .ncf import integral_action, loop_margin, verified_controller
+from .ncf_following import following
+from .spill_over import spill_over, unchecked
+
+#: how near the crossover comes to the bandwidth, and the steps that it may take
+_NEAR, _STEPS = 0.02, 8
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class ShapedLoop(Value):
+    """A loop shaped to a bandwidth: every step of the recipe.
+
+    Parameters
+    ----------
+    shaped : StateSpace
+        The plant in its axes with the shaping before it.
+    controller : Controller
+        From y (and references) to u; what was verified is in it.
+    report : LoopReport
+        Crossovers and margins of each axis, the others closed.
+    """
+
+    shaped: StateSpace
+    controller: Controller
+    report: LoopReport
+
+    @property
+    def system(self) -> StateSpace:
+        """The controller, for `close_loop`."""
+        return self.controller.system
+
+    def __repr__(self) -> str:
+        first, *rest = repr(self.report).splitlines()
+        return "\n".join([f"<ShapedLoop: {first[1:-1]}>", *rest, repr(self.controller)])
+
+
+@one_thread()
+def shape_loop(
+    plant: StandardPlant | System,
+    *,
+    bandwidth: float,
+    before: System | FloatArray | None = None,
+    after: System | FloatArray | None = None,
+    rolloff: float | None = None,
+    model: float | System | None = None,
+    weight: float = 1.0,
+    references: Mapping[str, str] | None = None,
+    back_off: float = 0.1,
+    larger: Any = None,
+) -> ShapedLoop:
+    """Return the loop shaped to a bandwidth by the recipe of Glover and McFarlane.
+
+    In the decoupled axes the plant gets integral action, a roll-off and a gain (`design_ncf`); the
+    robust controller of the shaped plant moves the crossover, so the gain is set again until the
+    slowest axis crosses 1 at the bandwidth. With a reference model the controller has two degrees
+    of freedom: it reads references too, and the closed loop follows the model.
+
+    Parameters
+    ----------
+    plant : StandardPlant or StateSpace
+        Continuous or sampled, with rigid-body modes and integrators as they are. Of an assembled
+        StandardPlant the rigid-body axes are taken (`decouple`), unless `before` and `after` are
+        given.
+    bandwidth : float [Hz]
+        Where the slowest axis shall cross 1.
+    before, after : StateSpace or array, optional
+        Static transformations, commands of the axes to u and y to motions.
+    rolloff : float [Hz], optional
+        Corner of a second-order low-pass before the plant.
+    model : float [Hz] or StateSpace, optional
+        Reference model: second-order low-passes of this corner, one for each axis, or a
+        continuous stable system from references to motions of the axes.
+    weight : float
+        rho: how much following the model counts beside robustness, 1 to 3.
+    references : mapping {axis: channel of y}, optional
+        Axes that follow a reference, and its name, such as ``{"cog:z": "die:ref"}``; with a model
+        all axes, ``cog:z:ref`` and so on, unless given.
+    back_off : float
+        Relative distance from the smallest gamma, with one degree of freedom.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+
+    Returns
+    -------
+    ShapedLoop
+        Of its controller `gamma` is the verified norm (one degree of freedom: 1 over the margin
+        against errors of the coprime factors; below 4 is robust), `lower` the smallest gamma of the
+        shaped plant. The certificate holds the margin, and of two degrees of freedom the largest
+        error of following the model.
+
+    Raises
+    ------
+    AssumptionError
+        When an undamped or unstable mode is not reached or seen, or hidden by the shaping.
+    SolverError
+        When no gain brings the crossover to the bandwidth.
+    CertificateError
+        When the closed loop does not keep the promise.
+    ModelError, ShapeError, LabelError
+        When plant, transformations, model and names do not go together.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+
+    References
+    ----------
+    McFarlane, Glover, IEEE Trans. Automatic Control 37, 1992; Hoyle, Hyde, Limebeer, IEEE CDC 1991.
+    """
+    target, back_off = positive(bandwidth, "bandwidth"), positive(back_off, "back_off")
+    rho = positive(weight, "weight")
+    if isinstance(plant, Frf) or hasattr(plant, "frdata"):
+        raise ModelError(
+            "the plant is a frequency response: loop shaping needs a model. Identify one, or tune "
+            "laws on the Frf by tune_loops."
+        )
+    axes = axes_of(plant, before, after, None, 0.0, True)
+    T_ref = None if model is None else _model(model, axes)
+    freq = target
+    for _ in range(_STEPS):
+        shaping = _shaping(axes, freq, rolloff)
+        shaped = series(shaping, axes.plant)
+        found = _designed(shaped, T_ref, rho, back_off)
+        K = series(found.K, shaping)
+        inner = K.select(inputs=K.inputs[-len(axes.names) :])
+        inner = inner.replace(inputs=axes.names, outputs=axes.before.inputs)
+        report = report_loops((axes.plant, inner), at="y")
+        reached = [one.crossovers[0] for one in report.loops if one.crossovers]
+        if reached and abs(min(reached) / target - 1.0) <= _NEAR:
+            break
+        freq *= target / min(reached) if reached else 2.0
+    else:
+        raise SolverError(
+            f"the slowest axis crosses 1 at {min(reached, default=np.nan):.4g} Hz, not at "
+            f"{target:g} Hz, whatever the gain: the plant's delay or resonances leave no loop of "
+            "that bandwidth. Lower it, or the roll-off."
+        )
+    if references is None:
+        references = {} if T_ref is None else {axis: f"{axis}:ref" for axis in axes.names}
+    system = connected(axes, K, references).replace(name="shaped loop")
+    if not report.is_stable:
+        raise CertificateError(
+            "the loop of the plant as given is not stable: a mode was hidden by the shaping. "
+            "Move the zeros of `before` and `after`."
+        )
+    left_out = None if axes.given is None else spill_over(axes.given, [system], larger)
+    lacking = axes.given is not None and left_out is None
+    controller = Controller(
+        system,
+        f"loop shaping to {target:g} Hz{'' if T_ref is None else ', two degrees of freedom'}",
+        gamma=found.gamma,
+        lower=found.least,
+        certificate=found.certificate | (left_out.certificate if left_out is not None else {}),
+        left_out=left_out,
+        notes=unchecked(axes.given) if lacking and axes.given else (),
+    )
+    return ShapedLoop(shaped, controller, report)
+
+
+@dataclass(frozen=True)
+class _Designed:
+    """The controller of a shaped plant, y or [references; y] to u, and what was verified."""
+
+    K: StateSpace
+    gamma: float
+    least: float
+    certificate: dict[str, float]
+
+
+def _designed(
+    shaped: StateSpace, model: StateSpace | None, rho: float, back_off: float
+) -> _Designed:
+    """Return the controller with one degree of freedom, or with two where there is a model."""
+    K, least, certificate = verified_controller(shaped, back_off)
+    if model is None:
+        return _Designed(K, 1.0 / certificate["margin"], least, certificate)
+    K, gamma = following(shaped, model, rho)
+    margin, stability = loop_margin(shaped, K.select(inputs=K.inputs[len(shaped.outputs) :]))
+    if not margin >= (1.0 - 1e-3) / gamma:
+        raise CertificateError(
+            f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
+            "claimed: the shaped plant is too badly conditioned to trust. Bring its gains at u "
+            "and y to size 1."
+        )
+    error = _following_error(shaped, model, K)
+    found = certificate | {"margin": margin, "stability": stability, "error of following": error}
+    return _Designed(K, gamma, least, found)
+
+
+def _following_error(shaped: StateSpace, model: StateSpace, K: StateSpace) -> float:
+    """Return the largest singular value of closed loop minus model over a sweep."""
+    poles = np.abs(model.poles()) / (2.0 * np.pi)
+    top = 0.499 / shaped.dt if shaped.dt else 1e3 * float(poles.max(initial=1.0))
+    freq = np.geomspace(1e-3 * float(poles.min(initial=1.0)), top, 400)
+    G, gains, T = (np.moveaxis(responses(s, freq), 2, 0) for s in (shaped, K, model))
+    p = T.shape[1]
+    closed = np.linalg.solve(np.eye(p) - G @ gains[:, :, p:], G @ gains[:, :, :p])
+    return float(np.linalg.norm(closed - T, 2, axis=(1, 2)).max())
+
+
+def _model(given: float | System, axes: Axes) -> StateSpace:
+    """Return the reference model: as it is given, or low-passes."""
+    if not isinstance(given, int | float | np.number):
+        return as_statespace(given)
+    one = lowpass(positive(given, "model"), order=2)
+    names = [f"{name}:ref" for name in axes.names]
+    return append(
+        *(
+            one.replace(inputs=[r], outputs=[n], states=[f"{n}|{s}" for s in one.states])
+            for r, n in zip(names, axes.names, strict=True)
+        )
+    )
+
+
+def _shaping(axes: Axes, freq: float, rolloff: float | None) -> StateSpace:
+    """Return integral action and roll-off of each axis, of gain 1 with the plant at a frequency."""
+    if rolloff is None:
+        return integral_action(axes.plant, freq)
+    names = axes.before.inputs
+    one = lowpass(positive(rolloff, "rolloff"), order=2)
+    filters = append(
+        *(
+            one.replace(inputs=[f"{n}|in"], outputs=[n], states=[f"{n}|{s}" for s in one.states])
+            for n in names
+        )
+    )
+    filters = tustin(filters, axes.rate) if axes.rate else filters
+    return series(integral_action(series(filters, axes.plant), freq), filters)
