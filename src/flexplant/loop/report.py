@@ -162,7 +162,7 @@ def report_loops(
                 there = inverted(parts.gain(np.array([freq]), at))
                 return complex(1.0 - 1.0 / there[0, i, i])
 
-        return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact)
+        return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
 
     margin = 0.0 if count.unstable else 1.0 / parts.worst[0]
     loops = tuple(one(i) for i in range(len(names)))
@@ -198,6 +198,8 @@ def loop_margins(
     freq: FloatArray,
     L: ComplexArray,
     exact: Callable[[float], complex] | None = None,
+    *,
+    sampled: bool = False,
 ) -> LoopMargins:
     """Return the margins of one loop gain (n_freq,); the critical point is +1.
 
@@ -211,6 +213,8 @@ def loop_margins(
         The loop gain.
     exact : function of frequency [Hz], optional
         The loop gain between the lines; interpolated unless given.
+    sampled : bool
+        Whether the loop gain ends on the real axis, at half the rate.
     """
 
     def between(f: float) -> complex:
@@ -221,10 +225,11 @@ def loop_margins(
     phases = [abs(np.degrees(np.angle(find(f)))) for f in crossovers]
     # L is real where the imaginary part changes sign; positive: towards the critical point
     reals = [find(f).real for f in _roots(freq, L.imag, lambda f: find(f).imag)]
-    # and at both ends, zero frequency and half the rate, where it comes to lie on the real axis
-    reals += [end.real for end in (L[0], L[-1]) if abs(end.imag) < _REAL * abs(end.real)]
-    below = [x for x in reals if 0.0 < x < 1.0]
-    above = [x for x in reals if x > 1.0]
+    # and at its ends, zero frequency and half the rate, where it comes to lie on the real axis
+    ends = L[[0, -1]] if sampled else L[:1]
+    reals += [end.real for end in ends if abs(end.imag) < _REAL * abs(end.real)]
+    below = [float(x) for x in reals if 0.0 < x < 1.0]
+    above = [float(x) for x in reals if x > 1.0]
     size = np.abs(1.0 - L)
     least = int(np.argmin(size))
     return LoopMargins(
