@@ -183,7 +183,14 @@ def test_the_stationary_filter_in_blocks_is_the_plain_loop():
     )
 
 
-@pytest.mark.parametrize("method", [Predictor(), Filter(), FixedLag(7), FixedLag(60), Smoother()])
+@pytest.mark.parametrize(
+    "method",
+    [
+        Filter(),
+        FixedLag(60),
+        *(pytest.param(m, marks=pytest.mark.slow) for m in (Predictor(), FixedLag(7), Smoother())),
+    ],
+)
 def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatch):
     kalman = observer()
     model = kalman.model
@@ -343,7 +350,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
         report["smooth"]
 
 
-@pytest.mark.parametrize("truncated", [False, True])
+@pytest.mark.parametrize("truncated", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", [Predictor(), Filter(), FixedLag(4), Smoother()])
 def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):
     """Start, a gap, blocks, compliance and noise of modes left out: row by row the fixed POI's."""

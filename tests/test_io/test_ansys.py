@@ -32,6 +32,7 @@ class TestSample:
             fx.solve_modes(model, count=4).freq, [1283.200, 1283.200, 5781.975, 6919.399], atol=5e-4
         )
 
+    @pytest.mark.slow
     def test_coordinates_from_the_result_file_of_the_same_model(self):
         examples = pytest.importorskip("ansys.mapdl.reader.examples")
         found = fx.read_matrices(FULL, nodes=examples.rstfile)

@@ -167,7 +167,9 @@ def test_the_error_follows_the_first_axis():
 
 
 @pytest.mark.parametrize("delay", [0.0, 0.3, 1.0, 1.6, 2.0])
-@pytest.mark.parametrize("model", ["reduced", "full with a mass"])
+@pytest.mark.parametrize(
+    "model", ["reduced", pytest.param("full with a mass", marks=pytest.mark.slow)]
+)
 def test_sampling_is_the_dense_matrix_exponential(delay, model):
     """Impulse responses of the sampled plant against scipy.linalg.expm of [0 I; -K/M -D/M].
 

@@ -39,7 +39,7 @@ def close(found, wanted, tolerance):
     return bool(np.all(np.abs(found - wanted) <= tolerance * (np.abs(wanted) + 1e-3 * size)))
 
 
-@pytest.mark.parametrize("changes", [{}, {"mass": 0.5}, {"mass": 0.5, "damper": 200.0}])
+@pytest.mark.parametrize("changes", [{}, {"mass": 0.5, "damper": 200.0}])
 def test_a_full_model_is_the_dense_receptance(changes):
     # oracle: dense solves; with mass or damper the damping is not proportional (complex modes)
     for zeta in (0.001, 0.01):

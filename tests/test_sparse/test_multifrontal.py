@@ -122,6 +122,7 @@ def test_a_count_with_unstable_pivots_raises(tiny):
         multifrontal_inertia(A, dissection)
 
 
+@pytest.mark.slow
 def test_definiteness_of_large_mass_matrices():
     mesh = meshes.plate(64)
     M = mesh[0]

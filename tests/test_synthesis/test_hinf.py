@@ -236,6 +236,7 @@ def test_rigid_motions_that_no_sensor_sees_are_named():
         design_hinf(sampled(updated(), blind))
 
 
+@pytest.mark.slow
 def test_a_plant_without_weights_is_solved_in_any_units():
     """Metres beside newtons: the Riccati equations are in units of their own."""
     plant = sampled(updated())

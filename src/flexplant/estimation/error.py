@@ -1,4 +1,4 @@
-"""The error of an observer on any sampled plant, in closed form: no model of the observer's own."""
+"""The error of an observer on any sampled plant, in closed form; its design model is not used."""
 
 from __future__ import annotations
 

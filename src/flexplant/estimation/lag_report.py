@@ -1,4 +1,4 @@
-"""What waiting brings: the predicted error at the POIs by lag, beside the static relation."""
+"""How a lag reduces the predicted error at the POIs, beside the static relation."""
 
 from __future__ import annotations
 

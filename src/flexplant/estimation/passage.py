@@ -1,4 +1,4 @@
-"""The filter's way through a record: sample by sample while its gain changes, then in blocks."""
+"""A filter applied to a record: sample by sample while its gain changes, then in blocks."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def passed(
 
 
 class _Walk:
-    """The walk through one record; its arrays are filled on the way."""
+    """The filter on one record; its arrays are filled sample by sample."""
 
     def __init__(
         self,
@@ -122,7 +122,7 @@ class _Walk:
         self.found: KnownParameters | None = None
 
     def done(self, start: Start | FloatArray) -> Passage:
-        """Walk from a start to the end of the record."""
+        """Filter from a start to the end of the record."""
         N, whole = self.y.shape[0], self.whole
         gaps = np.flatnonzero(~whole)
         stretches: list[tuple[int, int, bool]] = []

@@ -12,7 +12,7 @@ from .realisation import ModalRealisation
 
 
 class _Unknown:
-    """What is not known of a plant unless its origin says so."""
+    """What is known of a plant only when it was assembled from a structure."""
 
     #: what it was assembled from, the plant before weights, and the block before y
     structure: Any = None

@@ -30,7 +30,7 @@ class SelectionCriterion(Value):
         raise NotImplementedError
 
     def values(self, rows: Rows) -> FloatArray:
-        """Return what the criterion says of each of the chosen rows, in their order."""
+        """Return the value of the criterion at each of the chosen rows, in their order."""
         raise NotImplementedError
 
 

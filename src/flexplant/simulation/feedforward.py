@@ -1,4 +1,4 @@
-"""Feedforward: forces from the derivatives of a set-point, as the plant's own inverse says."""
+"""Feedforward: forces from the derivatives of a set-point, by the inverse of the plant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Singular problems made regular: a little noise on each sensor, effort of each actuator."""
+"""Singular problems made regular by a little noise on each sensor and weight on each actuator."""
 
 from __future__ import annotations
 
