@@ -18,6 +18,11 @@ from .loop_design import LoopDesign as LoopDesign
 from .loop_design import design_loops as design_loops
 from .ncf import design_ncf as design_ncf
 from .ncf import ncf_margin as ncf_margin
+from .objectives.design import design_lmi as design_lmi
+from .objectives.specifications import H2 as H2
+from .objectives.specifications import Hinf as Hinf
+from .objectives.specifications import PeakGain as PeakGain
+from .objectives.specifications import PoleRegion as PoleRegion
 from .riccati import Riccati as Riccati
 from .robustness.blocks import FullBlock as FullBlock
 from .robustness.blocks import RepeatedScalar as RepeatedScalar

@@ -38,7 +38,7 @@ class Optimum(NamedTuple):
     scale: float
 
 
-def _cvxpy() -> Any:
+def modelling() -> Any:
     """Return cvxpy, which takes more than a second to import."""
     import cvxpy
 
@@ -51,7 +51,7 @@ def symmetric_blocks(rows: list[list[Any]]) -> Any:
     cvxpy's ``M >> 0`` constrains only the symmetric part of M and says nothing: every LMI is
     made here, where the lower triangle is a mirror and diagonal blocks are symmetrised.
     """
-    cp = _cvxpy()
+    cp = modelling()
     count = len(rows)
     full = [
         [
@@ -65,7 +65,7 @@ def symmetric_blocks(rows: list[list[Any]]) -> Any:
 
 def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimum:
     """Return the smallest gamma of the projected LMIs (Gahinet and Apkarian, theorem 4.3)."""
-    cp = _cvxpy()
+    cp = modelling()
     n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))
     gamma = cp.Variable()
@@ -81,7 +81,7 @@ def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimu
     ]
     # the little trace picks one of the many X and Y, and keeps them finite
     size = cp.trace(X) + cp.trace(Y)
-    _solve(cp.Problem(cp.Minimize(gamma + 1e-9 * size), constraints), settings)
+    solve_program(cp.Problem(cp.Minimize(gamma + 1e-9 * size), constraints), settings)
     value = max(float(gamma.value), 1e-12)
     U = onto_u @ constraints[0].dual_value @ onto_u.T
     V = onto_y @ constraints[1].dual_value @ onto_y.T
@@ -100,7 +100,7 @@ def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> M
     Their LMI holds for some Â exactly when its two diagonal parts do, which are linear in
     (Y, Ĉ, D) and (X, B̂, D): Schur's complement about the columns of w and z.
     """
-    cp = _cvxpy()
+    cp = modelling()
     n, nw, nz, nu, ny = *p.A.shape[:1], p.B1.shape[1], p.C1.shape[0], p.B2.shape[1], p.C2.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))
     B, C, D = cp.Variable((n, ny)), cp.Variable((nu, n)), cp.Variable((nu, ny))
@@ -115,18 +115,21 @@ def moderate_controller(p: Plant, gamma: float, settings: dict[str, float]) -> M
         symmetric_blocks([[Y, apart], [X]]) >> 0,
     ]
     gains = cp.norm(B, "fro") + cp.norm(C, "fro") + cp.norm(D, "fro")
-    _solve(
+    solve_program(
         cp.Problem(cp.Minimize(cp.trace(X) + cp.trace(Y) + MODERATION * gains), constraints),
         settings,
     )
     return reconstructed(p, gamma, X.value, Y.value, B.value, C.value, D.value)
 
 
-def _solve(problem: Any, settings: dict[str, float]) -> None:
+def solve_program(
+    problem: Any, settings: dict[str, float], *, violation: float = VIOLATION
+) -> None:
     """Solve a semidefinite program; its LMIs are checked by their eigenvalues afterwards.
 
     Where Clarabel stops without an answer, the next of `ATTEMPTS` is made; the last resort is a
-    point at which progress became insufficient, which often is one that holds.
+    point at which progress became insufficient, which often is one that holds; with a larger
+    `violation` also one at which numbers failed, its residuals below that.
 
     Raises
     ------
@@ -148,7 +151,10 @@ def _solve(problem: Any, settings: dict[str, float]) -> None:
         if status in ("Solved", "AlmostSolved"):
             reached = raw
             break
-        if status == "InsufficientProgress" and reached is None:
+        failed = status == "NumericalError" and max(raw.r_prim, raw.r_dual) < violation
+        if reached is None and (
+            status == "InsufficientProgress" or (failed and violation > VIOLATION)
+        ):
             reached = raw
         if "MaxTime" in status:
             break
@@ -168,16 +174,22 @@ def _solve(problem: Any, settings: dict[str, float]) -> None:
     how = f"Clarabel: {reached.status} after {reached.iterations} iterations"
     for constraint in problem.constraints:
         M = constraint.args[0].value
+        if not _is_lmi(constraint):
+            continue
         values = la.eigvalsh(half(M))
         if np.max(np.abs(M - M.T)) > 1e-9 * max(float(values[-1]), 1.0):
             raise SolverError(
                 "an LMI was not symmetric, and so not imposed as it was meant. Report it."
             )
-        if not values[0] >= -VIOLATION * max(float(values[-1]), 1.0):
+        if not values[0] >= -violation * max(float(values[-1]), 1.0):
             raise SolverError(
                 f"an LMI is violated: smallest eigenvalue {values[0]:.1e}, largest "
                 f"{values[-1]:.1e} ({how}). Loosen weights or reduce the order of the plant."
             )
+
+
+def _is_lmi(constraint: Any) -> bool:
+    return bool(constraint.__class__.__name__ == "PSD")
 
 
 def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:

@@ -1,0 +1,1 @@
+"""Several objectives for one controller: specifications as values, and their LMIs."""

@@ -1,0 +1,381 @@
+"""design_lmi: one controller for several objectives, each verified by its own norm."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, SolverError
+from ...lti.interconnection import lft
+from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
+from ...lti.scaling import mean_speed, state_scale
+from ...lti.statespace import StateSpace, System
+from ...parallel import one_thread
+from ...plant import StandardPlant, standard_plant
+from ...values import positive, short, whole
+from ..controller import Controller
+from ..lmi_plant import Plant
+from ..lmi_programs import modelling, solve_program
+from ..spill_over import spill_over, unchecked
+from . import lmis
+from .specifications import H2, Hinf, PeakGain, PoleRegion
+
+#: what a verified norm may exceed its bound by
+_EXCESS = 1e-3
+#: rates of decay that are tried for peak gains, beside the plant's own speed
+_RATES = (0.1, 0.3, 1.0, 3.0)
+#: multiples of the back-off that are tried in turn, and multiples of the optimum after them
+_LOOSER, _FARTHER = (1.0, 2.0, 4.0, 8.0), (1.5, 2.5, 5.0, 12.0, 30.0)
+#: of the solver, tried in turn
+_TOLERANCES = (1e-8, 1e-6, 1e-5)
+_KINDS = (H2, Hinf, PeakGain)
+
+
+@one_thread()
+def design_lmi(
+    plant: StandardPlant | System,
+    *,
+    minimize: H2 | Hinf | PeakGain,
+    subject_to: Sequence[H2 | Hinf | PeakGain | PoleRegion] = (),
+    back_off: float = 0.03,
+    max_states: int = 20,
+    time_limit: float = 60.0,
+    larger: Any = None,
+) -> Controller:
+    """Return a controller that keeps several norms below bounds and makes one of them small.
+
+    Mixed H2/H-infinity is ``minimize=H2(...), subject_to=[Hinf(..., below=...)]``. All objectives
+    share one Lyapunov matrix, which makes the problem convex and its optimum an upper bound: a
+    controller may exist that does better. What is reached is found anew from the closed loop:
+    H-infinity by level sets, H2 by Gramians, peaks by the impulse response, poles as eigenvalues.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Usually weighted; at most max_states states. A sampled one takes H2, Hinf and the decay of
+        a PoleRegion.
+    minimize : H2, Hinf or PeakGain
+        Without `below`.
+    subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
+        What has to hold.
+    back_off : float
+        Relative distance of what is minimised from its optimum, where gains may be infinite;
+        more where no controller keeps the bounds there: the certificate says how much.
+    max_states : int
+        Larger problems are refused: the time grows with the sixth power.
+    time_limit : float [s]
+        For each semidefinite program.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`.
+
+    Returns
+    -------
+    Controller
+        `gamma` is the verified norm of what was minimised, `reached` that of every objective,
+        the certificate holds the bound of the LMIs beside it.
+
+    Raises
+    ------
+    AssumptionError
+        When w reaches z of an H2 norm at once in a continuous plant.
+    CertificateError
+        When the closed loop does not keep a bound.
+    InfeasibleError
+        When the solver proves that no controller keeps the bounds with one Lyapunov matrix.
+    ModelError, LabelError
+        When specifications do not fit the plant.
+    SolverError
+        When the solver stops early, or no controller keeps what the LMIs promise.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+
+    References
+    ----------
+    Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI optimization, IEEE
+    Trans. Autom. Control 42, 1997.
+    """
+    given = standard_plant(plant)
+    _checked(given, minimize, subject_to, whole(max_states, "max_states"))
+    scaled = _prepared(given)
+    problem = _Problem(
+        given, scaled, minimize, tuple(subject_to), positive(time_limit, "time_limit")
+    )
+    rates = _rates(problem)
+    failures: list[Exception] = []
+    best: tuple[float, float] | None = None
+    for rate in rates:
+        try:
+            value = problem.smallest(rate)
+        except (SolverError, InfeasibleError) as error:
+            failures.append(error)
+            continue
+        if best is None or value < best[0]:
+            best = value, rate
+    if best is None:
+        raise failures[0]
+    claim, rate = best
+    own_back_off = positive(back_off, "back_off")
+    for factor in (*(1.0 + own_back_off * looser for looser in _LOOSER), *_FARTHER):
+        bound = factor * claim
+        try:
+            K = problem.controller(bound, rate)
+            reached = _verified(given, K, minimize, subject_to)
+        except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
+            failures.append(error)
+            continue
+        left_out = spill_over(given, [K], larger)
+        own = repr(minimize)
+        return Controller(
+            K,
+            "several objectives by LMIs",
+            gamma=reached[own],
+            certificate={"LMI optimum": claim, "LMI bound": bound, **reached}
+            | (left_out.certificate if left_out is not None else {}),
+            reached=reached,
+            left_out=left_out,
+            notes=() if left_out is not None else unchecked(given),
+        )
+    raise CertificateError(
+        f"the LMIs promise {claim:.6g}, but no controller kept all bounds: {failures[-1]} Loosen "
+        "bounds, add a little noise to each sensor, or raise back_off."
+    )
+
+
+def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) -> None:
+    """Refuse specifications that do not fit."""
+    if not isinstance(minimize, _KINDS) or minimize.below is not None:
+        raise ModelError(
+            f"minimize takes H2(...), Hinf(...) or PeakGain(...) without below, got "
+            f"{short(minimize)}."
+        )
+    if not isinstance(subject_to, Sequence) or isinstance(subject_to, str):
+        raise ModelError(f"subject_to must be a list of specifications, got {short(subject_to)}.")
+    for one in (minimize, *subject_to):
+        if isinstance(one, PoleRegion):
+            if plant.dt and (one.damping is not None or one.bandwidth is not None):
+                raise ModelError(
+                    "damping and bandwidth of poles are no convex regions of a sampled plant: "
+                    "require decay, or design on plant.continuous and discretise_controller."
+                )
+            continue
+        if not isinstance(one, _KINDS) or (one is not minimize and one.below is None):
+            raise ModelError(
+                f"subject_to takes H2, Hinf and PeakGain with below=, and PoleRegion, got "
+                f"{short(one)}."
+            )
+        w, z = one.chosen(plant)
+        direct = plant.system[list(z), list(w)].D
+        if isinstance(one, H2) and not plant.dt and np.any(direct):
+            i, k = np.argwhere(direct)[0]
+            raise AssumptionError(
+                f"white noise on {w[k]} reaches {z[i]} at once: the H2 norm is infinite. Weight "
+                "that w or z by a low-pass, leave one of them out, or sample the plant."
+            )
+        if isinstance(one, PeakGain) and plant.dt:
+            raise ModelError("PeakGain is of continuous plants: design on plant.continuous.")
+    n = plant.system.n_states
+    if not 0 < n <= most:
+        raise ModelError(
+            f"design_lmi takes plants of 1 to {most} states, got {n}: time grows as n^6. Reduce "
+            "the order first, or raise max_states."
+        )
+
+
+def _prepared(plant: StandardPlant) -> Plant:
+    """Return the plant in balanced states and units of its own, its w and z as they are."""
+    g = plant.system
+    d = state_scale(g.A, g.B, g.C)
+    m, p = len(plant.w), len(plant.z)
+    A, B, C, D = g.A * d / d[:, None], g.B / d[:, None], g.C * d, g.D
+    found = Plant(
+        A, B[:, :m], B[:, m:], C[:p], C[p:], D[:p, :m], D[:p, m:], D[p:, :m],
+        np.ones(B.shape[1] - m), np.ones(C.shape[0] - p),
+    )  # fmt: skip
+    if not plant.dt:
+        found = found.timed(mean_speed(g.poles()))
+    found = found.with_unit_channels()
+    n = A.shape[0]
+    # each channel counts alike: a little of everything, no rank is assumed
+    into = found.B1 / np.maximum(np.linalg.norm(found.B1, axis=0), 1e-300)
+    out = found.C1 / np.maximum(np.linalg.norm(found.C1, axis=1), 1e-300)[:, None]
+    Q, W = out.T @ out + 1e-6 * np.eye(n), into @ into.T + 1e-6 * np.eye(n)
+    solve_control, solve_filter = (
+        (control_dare, solve_dare) if plant.dt else (control_care, solve_care)
+    )
+    control = solve_control(found.A, found.B2, Q=Q, R=0.1 * np.eye(found.B2.shape[1]))
+    filtered = solve_filter(found.A, found.C2, Q=W, R=0.1 * np.eye(found.C2.shape[0]))
+    balanced = found.balanced(control.P, filtered.P)
+    closed = np.concatenate([control.poles, filtered.poles])
+    if plant.dt:
+        balanced = balanced._replace(A=balanced.A - np.eye(n))
+        closed = closed - 1.0
+    speeds = np.maximum(np.abs(closed), 1e-300)
+    return balanced.timed(float(np.exp(np.mean(np.log(speeds))))).with_unit_channels()
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The semidefinite programs of one design."""
+
+    given: StandardPlant
+    plant: Plant
+    minimize: Any
+    subject_to: tuple[Any, ...]
+    time_limit: float
+
+    def unit(self, spec: Any, bound: float) -> float:
+        """Return a bound in the scaled plant: H2 norms depend on the unit of time."""
+        return bound / np.sqrt(self.plant.speed) if isinstance(spec, H2) else bound
+
+    def variables(self) -> lmis.Variables:
+        """Return the unknowns: no feedthrough where it would make a continuous H2 norm infinite."""
+        proper = False
+        if not self.given.dt:
+            p = self.plant
+            for spec in (self.minimize, *self.subject_to):
+                if isinstance(spec, H2):
+                    own = self.channel(spec, 1.0)
+                    proper |= bool(np.any(p.D12[own.rows]) and np.any(p.D21[:, own.columns]))
+        root = np.sqrt(self.plant.speed) if self.given.dt else 0.0
+        return lmis.Variables(self.plant, root, proper=proper)
+
+    def channel(self, spec: Any, bound: float) -> lmis.Channel:
+        w, z = spec.chosen(self.given)
+        columns = [self.given.w.index(name) for name in w]
+        rows = [self.given.z.index(name) for name in z]
+        return lmis.Channel(columns, rows, self.unit(spec, bound))
+
+    def constraints(
+        self, v: lmis.Variables, spec: Any, level: Any, bound: float, rate: float
+    ) -> Any:
+        """Return the LMIs of a specification, in units of its bound."""
+        sampled = bool(self.given.dt)
+        if isinstance(spec, PoleRegion):
+            speed = self.plant.speed
+            radius = float(np.exp(-spec.decay * self.given.dt)) if sampled else 0.0
+            top = None if spec.bandwidth is None else 2 * np.pi * spec.bandwidth / speed
+            return lmis.poles(v, spec.decay / speed, spec.damping, top, radius)
+        own = self.channel(spec, bound)
+        if isinstance(spec, H2):
+            return lmis.h2(v, own, level)
+        if isinstance(spec, PeakGain):
+            decay = rate if spec.decay is None else spec.decay / self.plant.speed
+            return lmis.peak(v, own, level, decay)
+        return lmis.hinf(v, own, level)
+
+    def program(self, v: lmis.Variables, level: Any, unit: float, rate: float) -> list[Any]:
+        found = [v.positive(), *self.constraints(v, self.minimize, level, unit, rate)]
+        for spec in self.subject_to:
+            bound = 1.0 if isinstance(spec, PoleRegion) else float(spec.below)
+            found += self.constraints(v, spec, 1.0, bound, rate)
+        return found
+
+    def smallest(self, rate: float) -> float:
+        """Return the smallest bound of what is minimised, sought again in its own unit."""
+        cp = modelling()
+
+        unit = self._guess()
+        for _ in range(4):
+            v, level = self.variables(), cp.Variable()
+            program = cp.Problem(
+                cp.Minimize(level + 1e-7 * (cp.trace(v.X) + cp.trace(v.Y))),
+                self.program(v, level, unit, rate),
+            )
+            self._solve(program)
+            square = max(float(level.value), 1e-12)
+            found = unit * (np.sqrt(square) if isinstance(self.minimize, H2) else square)
+            if 0.1 < found / unit < 10.0:
+                return float(found)
+            unit = found
+        return float(found)
+
+    def controller(self, bound: float, rate: float) -> StateSpace:
+        """Return a moderate controller for a bound on what is minimised."""
+        cp = modelling()
+
+        v = self.variables()
+        program = cp.Problem(cp.Minimize(lmis.size(v)), self.program(v, 1.0, bound, rate))
+        self._solve(program)
+        A, B, C, D = v.controller()
+        g = self.given
+        D22 = g.system.D[len(g.z) :, len(g.w) :]
+        loop = np.linalg.inv(np.eye(D.shape[0]) + D @ D22)  # u = K (y - D22 u)
+        return StateSpace(
+            A - B @ D22 @ loop @ C,
+            B @ (np.eye(B.shape[1]) - D22 @ loop @ D),
+            loop @ C,
+            loop @ D,
+            g.dt,
+            inputs=g.y,
+            outputs=g.u,
+            name="lmi",
+            units=g.units,
+        )
+
+    def _solve(self, program: Any) -> None:
+        """Solve a program, less accurately where it stops before its tolerance."""
+        for i, tolerance in enumerate(_TOLERANCES, 1):
+            names = ("tol_gap_abs", "tol_gap_rel", "tol_feas")
+            try:
+                settings = dict.fromkeys(names, tolerance) | {"time_limit": self.time_limit}
+                # every claim is verified by the closed loop: a little violation is no harm
+                solve_program(program, settings, violation=10.0 * tolerance)
+            except SolverError:
+                if i == len(_TOLERANCES):
+                    raise
+                continue
+            return
+
+    def _guess(self) -> float:
+        """Return the open gain of what is minimised, away from its poles."""
+        own = self.channel(self.minimize, 1.0)
+        p = self.plant
+        s = 1.3 + 0.7j
+        part = np.linalg.solve(s * np.eye(p.A.shape[0]) - p.A, p.B1[:, own.columns])
+        gain = float(np.linalg.norm(p.C1[own.rows] @ part + p.D11[np.ix_(own.rows, own.columns)]))
+        return (gain or 1.0) / own.unit
+
+
+def _rates(problem: _Problem) -> tuple[float, ...]:
+    """Return the rates of decay to be tried: one where none is needed."""
+    free = any(
+        isinstance(one, PeakGain) and one.decay is None
+        for one in (problem.minimize, *problem.subject_to)
+    )
+    return _RATES if free else (1.0,)
+
+
+def _verified(
+    plant: StandardPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
+) -> dict[str, float]:
+    """Return what every objective reaches, computed from the closed loop.
+
+    Raises
+    ------
+    CertificateError
+        When the loop is unstable, or a bound does not hold.
+    """
+    closed = lft(plant.system, K)
+    if not closed.is_stable:
+        raise CertificateError("the closed loop is not stable.")
+    reached = {}
+    for spec in (minimize, *subject_to):
+        if isinstance(spec, PoleRegion):
+            outside = spec.outside(closed)
+            if outside:
+                raise CertificateError(
+                    f"a pole of the closed loop lies outside its region: {outside}."
+                )
+            continue
+        w, z = spec.chosen(plant)
+        value = spec.measured(closed.select(z, w))
+        if spec.below is not None and not value <= spec.below * (1.0 + _EXCESS):
+            raise CertificateError(f"{spec!r} is {value:.6g} in the closed loop.")
+        reached[repr(spec)] = value
+    return reached

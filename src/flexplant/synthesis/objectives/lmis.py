@@ -1,0 +1,181 @@
+"""The LMIs of several objectives: one Lyapunov matrix for all (Scherer, Gahinet, Chilali 1997)."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ...values import FloatArray
+from ..lmi_plant import Plant
+from ..lmi_programs import modelling, symmetric_blocks
+
+#: strictness of the inequalities, relative to unit scale
+_STRICT = 1e-7
+#: how far X Y stays above one
+_APART = 1.005
+
+
+class Channel(NamedTuple):
+    """The columns of B1 and rows of C1 of one specification, z in multiples of its bound."""
+
+    columns: list[int]
+    rows: list[int]
+    unit: float
+
+
+class Variables:
+    """X, Y and the changed controller, with the closed loop's blocks that are affine in them.
+
+    ::
+
+        P = [Y I; I X],   A = [A Y + B2 C_   A + B2 D_ C2],   B = [B1 + B2 D_ D21  ],
+                              [A_            X A + B_ C2 ]        [X B1 + B_ D21   ]
+        C = [C1 Y + D12 C_,  C1 + D12 D_ C2],   D = D11 + D12 D_ D21
+
+    Parameters
+    ----------
+    plant : Plant
+        Of a sampled system A holds ``(A - I) / t``, B and C their matrices over t^(1/2): with
+        small t the LMIs are those of continuous time, and as well conditioned.
+    root : float
+        t^(1/2) of a sampled system, 0 of a continuous one.
+    proper : bool
+        Whether the controller has no feedthrough.
+    """
+
+    def __init__(self, plant: Plant, root: float, *, proper: bool) -> None:
+        cp = modelling()
+
+        p, self.plant, self.root = plant, plant, root
+        n, nu, ny = p.A.shape[0], p.B2.shape[1], p.C2.shape[0]
+        self.X, self.Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))
+        self.K_A, self.K_B = cp.Variable((n, n)), cp.Variable((n, ny))
+        self.K_C = cp.Variable((nu, n))
+        self.K_D = cp.Constant(np.zeros((nu, ny))) if proper else cp.Variable((nu, ny))
+        self.P = symmetric_blocks([[self.Y, np.eye(n)], [self.X]])
+        self.A = cp.bmat([
+            [p.A @ self.Y + p.B2 @ self.K_C, p.A + p.B2 @ self.K_D @ p.C2],
+            [self.K_A, self.X @ p.A + self.K_B @ p.C2],
+        ])  # fmt: skip
+
+    def of(self, channel: Channel) -> tuple[Any, Any, Any]:
+        """Return B, C and D of a channel, z in its unit."""
+        cp = modelling()
+
+        p, (columns, rows, unit) = self.plant, channel
+        B1, D21 = p.B1[:, columns], p.D21[:, columns]
+        C1, D12 = p.C1[rows] / unit, p.D12[rows] / unit
+        B = cp.vstack([B1 + p.B2 @ self.K_D @ D21, self.X @ B1 + self.K_B @ D21])
+        C = cp.hstack([C1 @ self.Y + D12 @ self.K_C, C1 + D12 @ self.K_D @ p.C2])
+        return B, C, p.D11[np.ix_(rows, columns)] / unit + D12 @ self.K_D @ D21
+
+    def sampled(self, rows: list[list[Any]], beside: list[Any]) -> Any:
+        """Return a block matrix, of a sampled system with the row [t^(1/2) A'; P; ...] second."""
+        if not self.root:
+            return symmetric_blocks(rows)
+        (first, *others), rest = rows[0], rows[1:]
+        return symmetric_blocks([[first, self.root * self.A, *others], [self.P, *beside], *rest])
+
+    def positive(self) -> Any:
+        """Return ``[Y t; t X] > 0``, t above 1: away from the singular I - X Y."""
+        n = self.plant.A.shape[0]
+        return symmetric_blocks([[self.Y, _APART * np.eye(n)], [self.X]]) >> _STRICT * np.eye(2 * n)
+
+    def controller(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+        """Return A, B, C, D of the controller in the plant's units, from ``N M' = I - X Y``."""
+        p = self.plant
+        X, Y, D = self.X.value, self.Y.value, self.K_D.value
+        n = p.A.shape[0]
+        left, values, right = la.svd(np.eye(n) - X @ Y)
+        N, M = left * np.sqrt(values), right.T * np.sqrt(values)
+        C, B = self.K_C.value - D @ p.C2 @ Y, self.K_B.value - X @ p.B2 @ D
+        A = self.K_A.value - X @ (p.A + p.B2 @ D @ p.C2) @ Y - X @ p.B2 @ C - B @ p.C2 @ Y
+        A, B, C = la.solve(N, la.solve(M, A.T).T), la.solve(N, B), la.solve(M, C.T).T
+        root, u_size = np.sqrt(p.speed), p.u_size[:, None]
+        A = p.speed * A + (np.eye(n) if self.root else 0.0)
+        return A, root * B / p.y_size, root * C / u_size, D / u_size / p.y_size
+
+
+def hinf(v: Variables, channel: Channel, gamma: Any) -> list[Any]:
+    """Return the bounded real lemma: the gain of a channel is below gamma times its unit."""
+    B, C, D = v.of(channel)
+    z, w = D.shape
+    rows = [
+        [-(v.A + v.A.T), B, -C.T],
+        [gamma * np.eye(w), D.T],
+        [gamma * np.eye(z)],
+    ]  # fmt: skip
+    block = v.sampled(rows, [np.zeros((v.P.shape[0], w)), v.root * C.T])
+    return [block >> _STRICT * np.eye(block.shape[0])]
+
+
+def h2(v: Variables, channel: Channel, square: Any) -> list[Any]:
+    """Return the LMIs of an H2 norm: its square is below some number of squared units."""
+    cp = modelling()
+
+    B, C, D = v.of(channel)
+    z, w = D.shape
+    n = v.P.shape[0]
+    Q = cp.Variable((z, z), symmetric=True)
+    first = v.sampled([[-(v.A + v.A.T), B], [np.eye(w)]], [np.zeros((n, w))])
+    if v.root:
+        second = symmetric_blocks([[Q, C, D / v.root], [v.P, np.zeros((n, w))], [np.eye(w)]])
+    else:
+        second = symmetric_blocks([[v.P, C.T], [Q]])
+    return [
+        first >> _STRICT * np.eye(first.shape[0]),
+        second >> _STRICT * np.eye(second.shape[0]),
+        cp.trace(Q) <= square,
+    ]
+
+
+def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
+    """Return the LMIs of the star norm: peak to peak below gamma units, for one rate."""
+    cp = modelling()
+
+    B, C, D = v.of(channel)
+    z, w = D.shape
+    n = v.P.shape[0]
+    part = cp.Variable()
+    first = -symmetric_blocks([[v.A + v.A.T + decay * v.P, B], [-part * np.eye(w)]])
+    second = symmetric_blocks([
+        [decay * v.P, np.zeros((n, w)), C.T],
+        [(gamma - part) * np.eye(w), D.T],
+        [gamma * np.eye(z)],
+    ])  # fmt: skip
+    return [one >> _STRICT * np.eye(one.shape[0]) for one in (first, second)]
+
+
+def poles(
+    v: Variables, decay: float, damping: float | None, bandwidth: float | None, radius: float
+) -> list[Any]:
+    """Return the LMIs of a region of poles, in the plant's unit of time.
+
+    Of a sampled plant the disc of a radius.
+    """
+    found = []
+    if v.root:
+        less = 1.0 - radius
+        found.append(symmetric_blocks([
+            [-(v.A + v.A.T) - 2.0 * less / v.root**2 * v.P, v.root * v.A + less / v.root * v.P],
+            [radius * v.P],
+        ]))  # fmt: skip
+    else:
+        found.append(-symmetric_blocks([[v.A + v.A.T + 2.0 * decay * v.P]]))
+    if damping is not None:
+        angle = np.arccos(damping)
+        even, odd = np.sin(angle) * (v.A + v.A.T), np.cos(angle) * (v.A - v.A.T)
+        found.append(-symmetric_blocks([[even, odd], [even]]))
+    if bandwidth is not None:
+        found.append(-symmetric_blocks([[-bandwidth * v.P, v.A], [-bandwidth * v.P]]))
+    return [one >> _STRICT * np.eye(one.shape[0]) for one in found]
+
+
+def size(v: Variables) -> Any:
+    """Return a measure of X, Y and the controller that picks one of many."""
+    cp = modelling()
+
+    gains = sum(cp.norm(one, "fro") for one in (v.K_B, v.K_C, v.K_D))
+    return cp.trace(v.X) + cp.trace(v.Y) + 0.1 * gains

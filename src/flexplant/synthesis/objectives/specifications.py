@@ -1,0 +1,188 @@
+"""What a controller of several objectives has to keep: norms of channels, and where poles lie."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ...errors import ModelError, unknown_label
+from ...lti.norms import h2_norm, peak_gain
+from ...lti.responses import continuous_poles
+from ...lti.statespace import StateSpace
+from ...plant import StandardPlant
+from ...values import FloatArray, Value, name_list, positive
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class _Channels(Value):
+    """Some w, some z, and a bound on what happens between."""
+
+    w: tuple[str, ...] | None = None
+    z: tuple[str, ...] | None = None
+    below: float | None = None
+
+    def __post_init__(self) -> None:
+        for side in "wz":
+            given: Any = getattr(self, side)
+            if given is not None:
+                self._set(**{side: name_list(given, side)})
+        if self.below is not None:
+            self._set(below=positive(self.below, "below"))
+
+    def __repr__(self) -> str:
+        sides = f"w={list(self.w or ['all'])}, z={list(self.z or ['all'])}"
+        bound = "" if self.below is None else f", below={self.below:g}"
+        return f"{type(self).__name__}({sides}{bound})"
+
+    def chosen(self, plant: StandardPlant) -> tuple[tuple[str, ...], tuple[str, ...]]:
+        """Return the names of w and z, all where none were given.
+
+        Raises
+        ------
+        LabelError
+            When the plant has no such channel.
+        """
+        for side in "wz":
+            for name in getattr(self, side) or ():
+                if name not in getattr(plant, side):
+                    raise unknown_label(f"channel of {side}", name, getattr(plant, side))
+        return self.w or plant.w, self.z or plant.z
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class H2(_Channels):
+    """The H2 norm from w to z: the rms of z for white w of unit intensity.
+
+    Parameters
+    ----------
+    w, z : sequences of str, optional
+        Channels; all when not given.
+    below : float, optional
+        What it has to stay below; none for what is minimised.
+    """
+
+    def measured(self, closed: StateSpace) -> float:
+        """Return the norm of a closed loop by its Gramians."""
+        return h2_norm(closed)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Hinf(_Channels):
+    """The H-infinity norm from w to z: the largest gain over all frequencies.
+
+    Parameters
+    ----------
+    w, z : sequences of str, optional
+        Channels; all when not given.
+    below : float, optional
+        What it has to stay below; none for what is minimised.
+    """
+
+    def measured(self, closed: StateSpace) -> float:
+        """Return the norm of a closed loop by level sets."""
+        return peak_gain(closed)[0]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PeakGain(_Channels):
+    """The largest amplitude of z for w of amplitude one: peak to peak, continuous plants.
+
+    The LMI bounds the length of z for w of length one (the star norm); what is verified is the
+    integral of the absolute impulse response of each channel, which is its gain exactly.
+
+    Parameters
+    ----------
+    w, z : sequences of str, optional
+        Channels; all when not given.
+    below : float, optional
+        What it has to stay below; none for what is minimised.
+    decay : float [rad/s], optional
+        Rate at which the reachable set is taken to shrink; several are tried when not given.
+    """
+
+    decay: float | None = None
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.decay is not None:
+            self._set(decay=positive(self.decay, "decay"))
+
+    def measured(self, closed: StateSpace) -> float:
+        """Return the largest integral of an absolute impulse response, from samples of it."""
+        return impulse_integral(closed)
+
+
+@dataclass(frozen=True, eq=False)
+class PoleRegion(Value):
+    """Where all poles of the closed loop lie, those of the weights that the plant carries too.
+
+    Parameters
+    ----------
+    decay : float [rad/s]
+        Real parts are below -decay; of a sampled plant magnitudes below e^(-decay dt).
+    damping : float, optional
+        Smallest damping ratio, continuous plants.
+    bandwidth : float [Hz], optional
+        Largest magnitude over 2 pi, continuous plants: no faster poles than the sampling bears.
+    """
+
+    decay: float = 0.0
+    damping: float | None = None
+    bandwidth: float | None = None
+
+    def __post_init__(self) -> None:
+        self._set(decay=positive(self.decay, "decay", zero=True))
+        if self.damping is not None:
+            self._set(damping=positive(self.damping, "damping"))
+            if self.damping >= 1:
+                raise ModelError(f"damping is a ratio below 1, got {self.damping:g}.")
+        if self.bandwidth is not None:
+            self._set(bandwidth=positive(self.bandwidth, "bandwidth"))
+
+    def outside(self, closed: StateSpace) -> str:
+        """Return which pole of a closed loop lies outside, in words; empty when none does."""
+        poles = continuous_poles(closed)
+        if not poles.size:
+            return ""
+        slow = poles[np.argmax(poles.real)]
+        if slow.real > -self.decay * (1 - 1e-3) - (1e-9 if not self.decay else 0.0):
+            return f"{slow:.4g} rad/s decays slower than {self.decay:g} rad/s"
+        ratio = -poles.real / np.maximum(np.abs(poles), 1e-300)
+        if self.damping is not None and ratio.min() < self.damping * (1 - 1e-3):
+            return f"{poles[np.argmin(ratio)]:.4g} rad/s has the damping {ratio.min():.4g}"
+        size = np.abs(poles) / (2 * np.pi)
+        if self.bandwidth is not None and size.max() > self.bandwidth * (1 + 1e-3):
+            return f"a pole lies at {size.max():.4g} Hz"
+        return ""
+
+
+def impulse_integral(closed: StateSpace, *, points: int = 4000) -> float:
+    """Return the largest of ``|D_ij| + int |h_ij(t)| dt`` of a stable continuous system.
+
+    By the trapezoidal rule until the slowest pole has decayed by e^-25, with a step that resolves
+    the fastest pole that matters; refined until it changes by less than 1e-4.
+    """
+    from scipy.linalg import expm
+
+    poles = closed.poles()
+    if not poles.size:
+        return float(np.abs(closed.D).max(initial=0.0))
+    if not np.max(poles.real) < 0:
+        return float("inf")
+    end = 25.0 / float(np.min(-poles.real))
+    count = int(min(max(points, 20 * end * np.abs(poles.imag).max() / np.pi), 400_000))
+    last = np.inf
+    for _ in range(4):
+        step = expm(closed.A * (end / count))
+        x: FloatArray = closed.B.copy()
+        total = 0.5 * np.abs(closed.C @ x)
+        for _ in range(count):
+            x = step @ x
+            total += np.abs(closed.C @ x)
+        found = float((np.abs(closed.D) + total * (end / count)).max())
+        if abs(found - last) < 1e-4 * found or count >= 400_000:
+            break
+        last, count = found, 2 * count
+    return found
