@@ -23,7 +23,7 @@ from ..spill_over import spill_over, unchecked
 from .loop_check import LoopFacts, kept, loop_facts, required, stable_before
 
 
-class _Problem(NamedTuple):
+class _FactoredController(NamedTuple):
     """A controller, what is kept of it as it is, and the factors of the rest with their weight."""
 
     K: StateSpace
@@ -34,7 +34,7 @@ class _Problem(NamedTuple):
     size: float
 
     @classmethod
-    def of(cls, plant: StandardPlant, K: StateSpace) -> _Problem:
+    def of(cls, plant: StandardPlant, K: StateSpace) -> _FactoredController:
         size = _size(plant, K)
         split = split_stable(K)
         scaled = split.stable.replace(C=split.stable.C / size, D=split.stable.D / size, blocks=None)
@@ -138,7 +138,7 @@ def reduce_controller(
     before = stable_before(given, K)
     if K.n_states < 1:
         raise ModelError("the controller is a static gain: it has no states to leave out.")
-    problem = _Problem.of(given, K)
+    problem = _FactoredController.of(given, K)
     if order is not None:
         least = problem.kept.n_states
         chosen = whole(order, "order", minimum=least, maximum=max(K.n_states - 1, least))
@@ -164,7 +164,7 @@ def reduce_controller(
 
 
 def _smallest(
-    plant: StandardPlant, problem: _Problem, before: LoopFacts, loss: float
+    plant: StandardPlant, problem: _FactoredController, before: LoopFacts, loss: float
 ) -> tuple[StateSpace, float, LoopFacts]:
     """Return the reduced controller of the fewest states that keeps the loop, from halvings."""
     best: tuple[StateSpace, float, LoopFacts] | None = None

@@ -103,7 +103,7 @@ def design_lmi(
     given = standard_plant(plant)
     _checked(given, minimize, subject_to, whole(max_states, "max_states"))
     scaled = _prepared(given)
-    problem = _Problem(
+    problem = _Programs(
         given, scaled, minimize, tuple(subject_to), positive(time_limit, "time_limit")
     )
     rates = _rates(problem)
@@ -220,7 +220,7 @@ def _prepared(plant: StandardPlant) -> Plant:
 
 
 @dataclass(frozen=True)
-class _Problem:
+class _Programs:
     """The semidefinite programs of one design."""
 
     given: StandardPlant
@@ -342,7 +342,7 @@ class _Problem:
         return (gain or 1.0) / own.unit
 
 
-def _rates(problem: _Problem) -> tuple[float, ...]:
+def _rates(problem: _Programs) -> tuple[float, ...]:
     """Return the rates of decay to be tried: one where none is needed."""
     free = any(
         isinstance(one, PeakGain) and one.decay is None

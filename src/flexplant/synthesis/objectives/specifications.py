@@ -16,7 +16,7 @@ from ...values import FloatArray, Value, name_list, positive
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class _Channels(Value):
+class _ChannelNorm(Value):
     """Some w, some z, and a bound on what happens between."""
 
     w: tuple[str, ...] | None = None
@@ -52,7 +52,7 @@ class _Channels(Value):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class H2(_Channels):
+class H2(_ChannelNorm):
     """The H2 norm from w to z: the rms of z for white w of unit intensity.
 
     Parameters
@@ -69,7 +69,7 @@ class H2(_Channels):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Hinf(_Channels):
+class Hinf(_ChannelNorm):
     """The H-infinity norm from w to z: the largest gain over all frequencies.
 
     Parameters
@@ -86,7 +86,7 @@ class Hinf(_Channels):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PeakGain(_Channels):
+class PeakGain(_ChannelNorm):
     """The largest amplitude of z for w of amplitude one: peak to peak, continuous plants.
 
     The LMI bounds the length of z for w of length one (the star norm); what is verified is the
