@@ -43,6 +43,8 @@ class Checkpoint:
         header: Mapping[str, Any],
         free: Iterable[str] = (),
     ) -> None:
+        if not isinstance(path, str | Path | None):
+            raise ModelError(f"a checkpoint is a path, got {path!r:.80}. Pass 'search.jsonl', say.")
         self.path = None if path is None else Path(path)
         self.header = {"kind": f"flexplant {kind}", **header}
         self.rows: dict[int, Any] = {}

@@ -72,7 +72,10 @@ def test_the_cost_is_the_h2_norm_of_the_best_controller(make):
     assert COST(led) == pytest.approx(COST(plant), rel=1e-9, abs=0.0)
 
 
-@pytest.mark.parametrize("delay", [0.0, 1.0, 2.0])
+@pytest.mark.parametrize(
+    "delay",
+    [pytest.param(0.0, marks=pytest.mark.slow), 1.0, pytest.param(2.0, marks=pytest.mark.slow)],
+)
 def test_pairs_equal_every_pair_and_the_bound_bounds(make, delay):
     plant, sensors, actuators = make(44, count=6, delay=delay)
     every = place_both(plant, sensors, actuators, (3, 3), COST, method=Exhaustive())
@@ -128,6 +131,7 @@ def held_chain(count=5):
     return assemble_plant(modes, ports).discretized(5e3, delay=1), sensors, actuators
 
 
+@pytest.mark.slow
 def test_what_one_more_device_buys(make, tmp_path):
     plant, sensors, _ = make(45)
     curve = pareto_curve(plant, sensors, range(2, 7), PoiVariance("die"))
@@ -168,6 +172,7 @@ def test_the_worth_of_each_device(make):
     assert "do not suffice" in repr(both)
 
 
+@pytest.mark.slow
 def test_screening_finds_what_every_subset_shows():
     """Eight modes rank the choices; twenty as noise confirm the first few."""
     many = plate_modes(20)

@@ -7,6 +7,7 @@ import pytest
 
 from flexplant.errors import InfeasibleError, LabelError, ModelError
 from flexplant.placement import (
+    Among,
     BranchAndBound,
     Budget,
     Exchange,
@@ -63,6 +64,10 @@ CASES = {
         lambda s: len(s & {0, 11}) != 1 and len(s & {2, 9, 5}) in (0, 3),
     ),
     "mirrored": (Mirrored("x", 0.25), lambda s: {image(i) for i in s} == s),
+    "one type at a place": (
+        Among(["c0", "c1", "c2"], at_most=1),
+        lambda s: len(s & {0, 1, 2}) <= 1,
+    ),
     "budget": (
         Budget(7.0, {f"c{i}": cost for i, cost in COSTS.items()}),
         lambda s: sum(COSTS.get(i, 1.0) for i in s) <= 7.0,
@@ -144,6 +149,40 @@ def test_places_of_ports_with_several_points(machine):
     assert not {"across", "c0"} <= set(near.chosen)
 
 
+def test_several_types_of_devices_at_one_place(machine):
+    """A cheap encoder, a good one and a velocity sensor at each place: one of them at most."""
+    plant, sensors, _ = machine
+    places = [GRID[i] for i in (0, 2, 9, 11, 4)]
+    types = {"cheap": (3e-10, 0), "good": (1e-11, 0), "speed": (1e-8, 1)}
+    given = [
+        Sensor(f"{kind}{i}", at=p, asd=asd, quantity=("displacement", "velocity")[order])
+        for kind, (asd, order) in types.items()
+        for i, p in enumerate(places)
+    ]
+    one_each = [Among([f"{kind}{i}" for kind in types], at_most=1) for i in range(5)]
+    few_good = Among([f"good{i}" for i in range(5)], at_most=2)
+    price = {p.name: {"c": 1.0, "g": 5.0, "s": 2.0}[p.name[0]] for p in given}
+    limits = [*one_each, few_good, Budget(13.0, price)]
+    search = Exchange(starts=4)
+    found = place_sensors(plant, given, 4, constraints=limits, method=search, rng=0)
+    assert len({name[-1] for name in found.chosen}) == 4
+    assert sum(name.startswith("good") for name in found.chosen) == 2
+    assert sum(price[name] for name in found.chosen) <= 13.0
+    free = place_sensors(plant, given, 4, method=search, rng=0)
+    assert free.value < found.value and found.bound <= found.value
+    # all axes of a unit at one place, or none
+    unit = [
+        Sensor(f"u{i}{axis}", at=GRID[i], direction=axis, asd=1e-9)
+        for i in (0, 11)
+        for axis in ("z", "rx")
+    ]
+    groups = Together([("u0z", "u0rx"), ("u11z", "u11rx")])
+    both = place_sensors(
+        plant, [*sensors[:3], *unit], 4, constraints=[groups], method=search, rng=0
+    )
+    assert sum(name.startswith("u0") for name in both.chosen) in (0, 2)
+
+
 def test_no_sensor_of_a_map_is_on_the_die(machine):
     plant, sensors, _ = machine
     plant = plant.with_ports(plant.assembled.ports.replace(y=[sensors[i] for i in (0, 2, 9)]))
@@ -176,6 +215,8 @@ def test_constraints_are_values_and_refuse_what_they_are_not(machine, tmp_path):
         Together([("a",)])
     with pytest.raises(LabelError, match="candidate of a group 'a'"):
         place_sensors(plant, sensors, 4, constraints=[Together([("a", "c1")])])
+    with pytest.raises(LabelError, match="candidate among others 'a'"):
+        place_sensors(plant, sensors, 4, constraints=[Among(["a"], at_most=1)])
     with pytest.raises(LabelError, match="candidate with a cost 'a'"):
         place_sensors(plant, sensors, 4, constraints=[Budget(1.0, {"a": 2.0})])
     for bad in ("none", [3], Disc((0, 0), 1), 3.0):

@@ -135,8 +135,9 @@ def pareto_curve(
     if not isinstance(amounts, Sequence | np.ndarray | range) or isinstance(amounts, str):
         raise ModelError(f"amounts are counts or budgets, got {short(amounts)}. Type range(3, 8).")
     given = (constraints,) if isinstance(constraints, Constraint) else tuple(constraints)
-    side = "u" if any(isinstance(c, Actuator) or c in plant.u for c in candidates) else "y"
-    place = place_actuators if side == "u" else place_sensors
+    listed = isinstance(candidates, Sequence)
+    pushing = listed and any(isinstance(c, Actuator) or c in plant.u for c in candidates)
+    place = place_actuators if pushing else place_sensors
 
     def best(count: int, extra: tuple[Constraint, ...]) -> Placement | None:
         try:
@@ -150,14 +151,14 @@ def pareto_curve(
     rows: list[tuple[float, Placement, float]] = []
     for amount in sorted(amounts):
         if costs is None:
-            listed = [best(amount, ())]  # type: ignore[arg-type]
+            tried = [best(amount, ())]  # type: ignore[arg-type]
         else:
             limit = Budget(positive(amount, "a budget"), dict(costs))
             names = [c if isinstance(c, str) else c.name for c in candidates]
             prices = np.cumsum(sorted(limit.costs.get(name, limit.default) for name in names))
             most = int(np.searchsorted(prices, limit.total, side="right"))
-            listed = [best(count, (limit,)) for count in range(max(len(required), 1), most + 1)]
-        found = [one for one in listed if one is not None]
+            tried = [best(count, (limit,)) for count in range(max(len(required), 1), most + 1)]
+        found = [one for one in tried if one is not None]
         if found:
             low = min(one.bound for one in found)
             rows.append((float(amount), min(found, key=lambda one: one.value), low))

@@ -12,7 +12,7 @@ from ..estimation.channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, Disturbance, StandardPlant
-from ..values import FloatArray, positive
+from ..values import FloatArray, positive, short
 from .candidates import PlantChannel
 
 #: POIs, or axes of a POI, that count, each once or by a factor
@@ -39,7 +39,10 @@ def checked_names(given: Any, what: str) -> tuple[str, ...] | Mapping[str, float
             raise LabelError(f"{what} {listed} twice: name each once, with a factor.")
         named = dict.fromkeys(listed, 1.0)
     else:
-        raise ModelError(f"{what} is a name, several, or a mapping to factors, got {given!r}.")
+        raise ModelError(
+            f"{what} is a name, several, or a mapping to factors, got {short(given)}. Type "
+            "('die', 'lens'), say."
+        )
     if not named:
         raise LabelError(f"a criterion without any {what} has nothing to sum over: name one.")
     return named if isinstance(given, Mapping) else tuple(named)

@@ -68,7 +68,10 @@ class OverMachines(Wrapping):
     def __post_init__(self) -> None:
         super().__post_init__()
         if isinstance(self.machines, str) or not isinstance(self.machines, Sequence):
-            raise ModelError(f"machines are a list of plants, got {short(self.machines)}.")
+            raise ModelError(
+                f"machines are a list of plants, got {short(self.machines)}. Pass "
+                "plant.uncertain(fit).sample(rng, 20), say."
+            )
         if not self.machines:
             raise ModelError("there are no machines: give at least one plant.")
         machines = tuple(checked_plant(machine) for machine in self.machines)

@@ -12,7 +12,7 @@ import numpy as np
 from ..checkpoint import fingerprint
 from ..errors import InfeasibleError, ModelError
 from ..plant import StandardPlant
-from ..values import Rng, instance
+from ..values import Rng, instance, short
 from ..work import Work
 from .candidates import checked_plant
 from .constraints import Constraint
@@ -231,7 +231,9 @@ def place_both(
         When the score is not confirmed by the other route.
     """
     if isinstance(counts, str) or not isinstance(counts, Sequence) or len(counts) != 2:
-        raise ModelError(f"counts are two numbers, of sensors and of actuators, got {counts!r}.")
+        raise ModelError(
+            f"counts are two numbers, of sensors and actuators, got {short(counts)}. Type (4, 3)."
+        )
     options = (constraints, method, executor, checkpoint, progress, rng)
     chosen = {"y": (sensors, counts[0]), "u": (actuators, counts[1])}
     return _placed(plant, chosen, criterion, required, *options)
