@@ -1,5 +1,8 @@
 """The default call of design_hinf: units, rounding and methods that fail are not the caller's."""
 
+import re
+import time
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -167,21 +170,154 @@ def test_nothing_is_added_where_it_must_not_be():
     assert added.gamma == pytest.approx(plain.gamma, rel=1e-2, abs=0)
 
 
-def test_an_infimum_of_zero_is_found_before_rounding_hides_it():
-    """Force and motion at one place, seen without noise: u cancels w, gamma falls to rounding."""
+def oscillator():
+    """A mode at 1 rad/s: w force and noise, z position and effort, u force, y position."""
+    A, force, position = [[0.0, 1], [-1, -0.02]], [[0.0], [1]], [[1.0, 0]]
+    B = np.hstack([force, np.zeros((2, 1)), force])
+    C = np.vstack([position, np.zeros((1, 2)), position])
+    return np.array(A), B, C, np.array([[0, 0, 0], [0, 0, 1.0], [0, 1.0, 0]])
+
+
+def unseen(side):
+    """An undamped mode at 3 rad/s that y does not see, or u does not reach, beside the other."""
+    A, B, C, D = oscillator()
+    A = np.block([[A, np.zeros((2, 2))], [np.zeros((2, 2)), np.array([[0.0, 3], [-3, 0]])]])
+    B, C = np.vstack([B, [[0, 0, 0], [1, 0, 1]]]), np.hstack([C, [[1.0, 0], [0, 0], [1, 0]]])
+    if side == "y":
+        C[2, 2] = 0.0
+    else:
+        B[3, 2] = 0.0
+    return A, B, C, D
+
+
+def without(which):
+    """The oscillator without effort in z (a column of D12), or noise in w (a row of D21)."""
+    A, B, C, D = oscillator()
+    D[(1, 2) if which == "effort" else (2, 1)] = 0.0
+    return A, B, C, D
+
+
+def zero_on_axis(side):
+    """``u -> z = (s^2 + 9) / (s + 1)^2``, or ``w -> y``, D12 (D21) of full rank."""
+    A, b, c = np.array([[0.0, 1], [-1, -2]]), np.array([[0.0], [1]]), np.array([[8.0, -2]])
+    B, C = np.hstack([b, 0 * b, b]), np.vstack([c, [[1.0, 0]]])
+    D = np.array([[0, 0, 1.0], [0, 0.1, 0]])
+    if side == "z":
+        return A, B, C, D
+    return A.T, C.T, B.T, D.T
+
+
+def delayed(samples):
+    """A mode that grows e-fold in a second, u delayed by samples of one second."""
+    n = samples + 1
+    A, B, C = np.eye(n, k=1), np.zeros((n, 3)), np.zeros((3, n))
+    A[0, 0], B[0, 0], B[-1, 2], C[0, 0], C[2, 0] = np.e, 1.0, 1.0, 1.0, 1.0
+    D = np.zeros((3, 3))
+    D[1, 2] = D[2, 1] = 1.0
+    return A, B, C, D
+
+
+def cancelled(gap):
+    """An unstable pole at 1 with a zero of u -> y beside it: gamma grows as 1 / gap."""
+    _, B, C, D = oscillator()
+    C[[0, 2]] = [-1.0 - gap, 1.0]
+    return np.array([[0.0, 1], [1, 0]]), B, C, D
+
+
+def collocated():
     A, B, C, D = structure(0)
     B[:, 1], C[:, : A.shape[0] // 2] = B[:, 0], B[A.shape[0] // 2 :, 0]
-    with pytest.raises(InfeasibleError, match=r"the infimum is 0\. .* Weight the efforts in z"):
-        solved(A, B, C, D)
+    return A, B, C, D
 
 
-def test_poles_that_no_gain_holds_in_rounding_are_counted():
+def growing(states=6):
     rng = np.random.default_rng(4006)
-    A = rng.normal(size=(6, 6))
-    A += (100.0 - np.max(np.linalg.eigvals(A).real)) * np.eye(6)
-    message = (
-        r"the plant has 6 unstable pole\(s\), growing e-fold in 0\.01 s, which u \(u0\) "
-        r"and y \(y0\) .* Add actuators and sensors"
-    )
-    with pytest.raises(SolverError, match=message):
-        solved(A, rng.normal(size=(6, 3)), rng.normal(size=(3, 6)), np.zeros((3, 3)))
+    A = rng.normal(size=(states, states))
+    A += (100.0 - np.max(np.linalg.eigvals(A).real)) * np.eye(states)
+    D = np.zeros((3, 3))
+    return A, rng.normal(size=(states, 3)), rng.normal(size=(3, states)), D
+
+
+STRICT = Riccati(regularised=False)
+#: problem, sampling time, method, what the message has to say: assumption, channel, where, cure
+FAILURES = {
+    "an undetectable mode": (
+        *(unseen("y"), 0.0, None),
+        [r"y \(y0\) does not see a mode .* not stable", r"at 0\.477 Hz", "Add or move .* a sensor"],
+    ),
+    "an unstabilisable mode": (
+        *(unseen("u"), 0.0, None),
+        [
+            r"u \(u0\) does not reach a mode .* not stable",
+            r"at 0\.477 Hz",
+            "Add or move an actuator",
+        ],
+    ),
+    "a column of D12 zero": (
+        *(without("effort"), 0.0, STRICT),
+        ["^D12 has rank 0 of 1", "u0 costs nothing in z at high", r"\. Weight the efforts in z\."],
+    ),
+    "a row of D21 zero": (
+        *(without("noise"), 0.0, STRICT),
+        [
+            "^D21 has rank 0 of 1",
+            "y0 is free of noise in w at high",
+            r"\. Give each sensor noise in w",
+        ],
+    ),
+    "z has a zero on the axis": (
+        *(zero_on_axis("z"), 0.0, STRICT),
+        [
+            r"z does not feel all that u moves at 0\.477 Hz",
+            "u -> z .* has a zero",
+            "Keep that motion",
+        ],
+    ),
+    "w has a zero on the axis": (
+        *(zero_on_axis("w"), 0.0, STRICT),
+        [r"w does not excite all that y sees at 0\.477 Hz", "w -> y .* zero", "Add a disturbance"],
+    ),
+    "a delay too long": (
+        *(delayed(25), 1.0, None),
+        [
+            r"the delay of 25 s between u \(u0\) and y \(y0\)",
+            r"7\.2e\+10 times",
+            "Shorten the delay",
+        ],
+    ),
+    "an infimum beyond all gains": (
+        *(cancelled(1e-9), 0.0, None),
+        [
+            r"1 unstable pole\(s\), growing e-fold in 1 s",
+            r"u \(u0\) and y \(y0\)",
+            "move zeros away",
+        ],
+    ),
+    "poles that no gain holds in rounding": (
+        *(growing(), 0.0, None),
+        [
+            r"6 unstable pole\(s\), growing e-fold in 0\.01 s",
+            r"u \(u0\)",
+            "Add actuators and sensors",
+        ],
+    ),
+    "an infimum of zero": (
+        *(collocated(), 0.0, None),
+        [
+            r"no smallest gamma: the infimum is 0",
+            r"u \(u0\) cancels w",
+            "Weight the efforts in z and",
+        ],
+    ),
+}
+
+
+@pytest.mark.parametrize("case", FAILURES)
+def test_each_failure_names_assumption_channel_place_and_cure_at_once(case):
+    plant, dt, method, words = FAILURES[case]
+    start = time.perf_counter()
+    with pytest.raises((AssumptionError, InfeasibleError, SolverError)) as caught:
+        solved(*plant, dt=dt, method=method)
+    assert time.perf_counter() - start < 5.0
+    for word in words:
+        assert re.search(word, str(caught.value)), str(caught.value)

@@ -144,7 +144,7 @@ def quadratic(p: Prepared) -> StateSpace:
 def _missed_by_z(p: Prepared, found: OnAxisError) -> AssumptionError:
     return AssumptionError(
         f"z does not feel all that u moves at {_listed(p, found)}: an undamped (rigid-body or "
-        "integrating) mode there is left out of z, or hidden by a zero of its weight. Keep "
+        "integrating) mode there is left out of z, or u -> z (a weight) has a zero there. Keep "
         "that motion in z with a weight of finite gain, or give it damping."
     )
 
@@ -152,7 +152,7 @@ def _missed_by_z(p: Prepared, found: OnAxisError) -> AssumptionError:
 def _missed_by_w(p: Prepared, found: OnAxisError) -> AssumptionError:
     return AssumptionError(
         f"w does not excite all that y sees at {_listed(p, found)}: an undamped (rigid-body or "
-        "integrating) mode there has no disturbance, or it is hidden by a zero of its weight. "
+        "integrating) mode there has no disturbance, or w -> y (a weight) has a zero there. "
         "Add a disturbance that reaches it, or give it damping."
     )
 

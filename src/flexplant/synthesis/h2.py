@@ -116,7 +116,7 @@ def design_h2(
         try:
             found = _solved(problem)
         except AssumptionError as error:  # a mode on the stability boundary is missed by w or z
-            found = made_regular(problem, _solved, (str(error),), h2_norm)
+            found = made_regular(problem, _solved, (str(error).rstrip("."),), h2_norm)
     K = problem.restored(found.A, found.B, found.C, found.D).replace(name="h2", units=plant.units)
     # a norm of the scaled problem, in the user's unit of time
     certificate = _certified(plant.system, K, float(np.sqrt(problem.speed)) * found.gamma)

@@ -124,8 +124,8 @@ def lqg_states(p: Plant) -> Plant:
     try:
         control = control_care(p.A, p.B2, Q=Q, R=p.D12.T @ p.D12 + 0.1 * np.eye(nu))
         filtered = solve_care(p.A, p.C2, Q=W, R=p.D21 @ p.D21.T + 0.1 * np.eye(ny))
-    except la.LinAlgError as error:
-        raise SolverError(f"no LQG design for the choice of states: {error}.") from error
+    except (SolverError, la.LinAlgError) as error:
+        raise SolverError("rounding hides every stabilising controller.") from error
     sizes = np.abs(np.concatenate([control.poles, filtered.poles]))
     speed = float(np.exp(np.mean(np.log(np.maximum(sizes, 1e-300)))))
     return p.balanced(control.P, filtered.P).timed(speed)

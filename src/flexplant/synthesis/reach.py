@@ -11,6 +11,8 @@ from ..lti.preparation import Prepared
 _ZERO, _STABLE = 1e-6, -1e-10
 #: relative: a singular value of Hautus' matrix that is zero
 _MISSED = 1e-12
+#: |z| of poles that are delays; e-folds of a mode during them that leave nothing to be gained
+_NILPOTENT, _TOO_LONG = 0.5, 15.0
 
 
 def require_reach(problem: Prepared) -> None:
@@ -32,7 +34,8 @@ def require_reach(problem: Prepared) -> None:
             pencil = np.hstack([matrix - pole * np.eye(A.shape[0]), reach])
             if np.linalg.svd(pencil, compute_uv=False)[-1] < _MISSED * size:
                 raise AssumptionError(
-                    f"{text} a mode of the plant or of a weight that is not stable "
+                    _delayed(problem, float(pole.real))
+                    or f"{text} a mode of the plant or of a weight that is not stable "
                     f"({_described(problem, complex(pole))}): no controller can stabilise it. "
                     "Add or move an actuator or a sensor, or give the weight finite gain."
                 )
@@ -48,12 +51,32 @@ def beyond_rounding(problem: Prepared) -> str:
             "(metres beside newtons are not; stage_weights), or leave out states that u hardly "
             "reaches or y hardly sees."
         )
-    growth = problem.speed * float(np.max(unstable.real))
+    growth = float(np.max(unstable.real))
+    return _delayed(problem, growth) or (
+        f"the plant has {unstable.size} unstable pole(s), growing e-fold in "
+        f"{1.0 / (problem.speed * growth):.3g} s, which u ({', '.join(problem.u)}) and y "
+        f"({', '.join(problem.y)}) can hold only with gains that 16 digits do not resolve. Add "
+        "actuators and sensors that act on these modes one by one, move zeros away from them, or "
+        "correct the model where the machine is stable (signs of stiffness and damping)."
+    )
+
+
+def _delayed(problem: Prepared, growth: float) -> str:
+    """Return what a delay does to a mode of that growth, in words; empty where it does little."""
+    if not problem.dt or problem.direct or growth <= _ZERO:
+        return ""
+    half = 0.5 * problem.dt * problem.speed
+    # delays are poles at z = 0; a chain of n of them comes out of rounding on a circle eps^(1/n)
+    s = half * np.linalg.eigvals(problem.A)
+    delay = problem.dt * int(np.count_nonzero(np.abs(1.0 + s) < _NILPOTENT * np.abs(1.0 - s)))
+    rate = 2.0 * np.arctanh(min(half * growth, 0.999)) / problem.dt
+    if rate * delay < _TOO_LONG:
+        return ""
     return (
-        f"the plant has {unstable.size} unstable pole(s), growing e-fold in {1.0 / growth:.3g} s, "
-        f"which u ({', '.join(problem.u)}) and y ({', '.join(problem.y)}) can hold only with gains "
-        "that 16 digits do not resolve. Add actuators and sensors that act on these modes one by "
-        "one, or correct the model where the machine is stable (signs of stiffness and damping)."
+        f"the delay of {delay:.3g} s between u ({', '.join(problem.u)}) and y "
+        f"({', '.join(problem.y)}) is too long: an unstable mode grows e-fold in "
+        f"{1.0 / rate:.3g} s, {np.exp(min(rate * delay, 700.0)):.1e} times meanwhile, and gamma by "
+        "as much. Shorten the delay, or make the mode slower."
     )
 
 

@@ -97,7 +97,7 @@ class Riccati(Value):
             try:
                 return self._regular(problem)
             except (AssumptionError, SolverError) as error:
-                lacking = (str(error),)
+                lacking = (str(error).rstrip("."),)
         return made_regular(problem, self._regular, lacking)
 
     def _regular(self, problem: Prepared) -> SolvedController:
