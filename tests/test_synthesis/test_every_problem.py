@@ -10,7 +10,7 @@ import scipy.signal
 import oracles_synthesis as oracle
 from flexplant.errors import AssumptionError, InfeasibleError, SolverError
 from flexplant.lti import StateSpace
-from flexplant.synthesis import Riccati, attempts, design_hinf
+from flexplant.synthesis import Riccati, StructuredLmi, attempts, design_hinf
 
 
 def structure(seed, w=1, u=1, z=1, y=1, noise=0.0, effort=0.0, modes=3):
@@ -135,6 +135,15 @@ def test_a_method_that_fails_leaves_the_problem_to_the_next(monkeypatch):
     assert "by StructuredLmi" in found.method
     assert found.gamma == pytest.approx(best.gamma, rel=0.05, abs=0)
     assert found.lower == pytest.approx(best.lower, rel=1e-2, abs=0)
+
+
+def test_the_lmis_hand_over_what_rounding_hides():
+    """Sampled by Tustin without noise and effort: gamma is found, its controller is not."""
+    A, B, C, D, dt = scipy.signal.cont2discrete(structure(3, w=3, u=2), 1e-3, method="bilinear")
+    found = solved(A, B, C, D, u=2, dt=dt, method=StructuredLmi())
+    assert found.notes[0].startswith("the LMIs give gamma = ")
+    assert found.certificate["added noise"] <= 1e-3
+    assert found.gamma <= 1.05 * found.lower
 
 
 def test_where_all_fail_each_says_why(monkeypatch):

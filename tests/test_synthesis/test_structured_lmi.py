@@ -148,6 +148,16 @@ def test_rigid_body_and_light_damping(modes):
     assert found.lower <= other.gamma
 
 
+def test_units_of_z_change_nothing():
+    P, u, y = flexible(4)
+    plain = design_hinf(P, StructuredLmi(), u=u, y=y)
+    for unit in (1e-9, 1e-3, 1e6):
+        rows = np.where(np.arange(len(P.outputs)) < len(P.outputs) - len(y), unit, 1.0)[:, None]
+        found = design_hinf(P.replace(C=rows * P.C, D=rows * P.D), StructuredLmi(), u=u, y=y)
+        assert found.gamma == pytest.approx(unit * plain.gamma, rel=3e-3, abs=0)
+        assert found.lower == pytest.approx(unit * plain.lower, rel=1e-3, abs=0)
+
+
 def test_the_pointwise_bound_by_hand():
     """Two z, one u that moves the first only: the second is w's own gain, at most 2."""
     P, u, y = named(

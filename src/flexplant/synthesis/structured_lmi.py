@@ -28,6 +28,7 @@ from .lmi_plant import Plant, half, lqg_states, same_states
 from .lmi_solution import Matrices, dual_bound, reconstructed
 from .method import SolvedController
 from .projected_lmis import ProjectedLmis
+from .singular import made_regular
 
 #: R, S, gamma and the blocks of the LMIs at the start, in a plant scaled to gamma near 1
 _START = 10.0
@@ -52,7 +53,8 @@ class StructuredLmi(Value):
     boundary are allowed. About 1 s at 24 states and 15 s at 48.
 
     The controller is that of a point on the central path, where R and S are moderate, with gamma
-    within back_off of the smallest.
+    within back_off of the smallest. Where rounding hides it (D12 and D21 lack rank, and its gains
+    are close to infinite), that of the problem with a little noise and effort, as for `Riccati`.
 
     Parameters
     ----------
@@ -106,6 +108,18 @@ class StructuredLmi(Value):
         SolverError
             When the method stops early, or no controller keeps what the LMIs promise.
         """
+        found = self.smallest(problem)
+        try:
+            return self.controller(problem, found)
+        except SolverError as error:
+            hidden = f"the LMIs give gamma = {found.value:.6g}, whose controller rounding hides"
+            try:
+                K = made_regular(problem, self._plain, (hidden,))
+            except SolverError:
+                raise error from None
+            return K._replace(lower=min(found.lower, K.gamma))
+
+    def _plain(self, problem: Prepared) -> SolvedController:
         return self.controller(problem, self.smallest(problem))
 
     def controller(self, problem: Prepared, found: SmallestGamma) -> SolvedController:
@@ -139,9 +153,9 @@ class StructuredLmi(Value):
         failures: list[FlexplantError] = []
         for states in (lqg_states, same_states):
             try:
-                start = states(plant)
+                start = states(plant.scaled(guess).with_unit_channels())  # whatever the unit of z
                 for _ in range(3):
-                    found = self._solved(start.scaled(scale), scale, left)
+                    found = self._solved(start.scaled(scale / guess), scale, left)
                     low, high = _ROUGH
                     settled = found.value - found.lower <= _SETTLED * found.value
                     if settled or low < found.value / scale < high:
