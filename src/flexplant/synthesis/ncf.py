@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..loop import modulus_margin
@@ -104,7 +105,7 @@ def design_ncf(
         inputs=G.outputs, outputs=G.inputs, name="ncf", units=G.units
     )
     if not loop_margin(G, whole)[0]:
-        raise hidden_mode()
+        raise hidden_mode(G, whole)
     left_out = spill_over(plant, [whole], larger) if isinstance(plant, StandardPlant) else None
     lacking = unchecked(plant) if isinstance(plant, StandardPlant) and left_out is None else ()
     return Controller(
@@ -150,6 +151,23 @@ def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -
 
 def loop_margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
     """Return 1 / the norm of the loop, 0 when unstable, and its stability."""
+    loop = _four_block(G, K)
+    poles = loop.poles()
+    growth = np.abs(poles) if loop.dt else poles.real
+    stability = float(np.max(growth, initial=0.0 if loop.dt else -np.inf))
+    if not stability < (1.0 if loop.dt else 0.0):
+        return 0.0, stability
+    return 1.0 / peak_gain(loop)[0], stability
+
+
+def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
+    """Return ``[K; I] (I - G K)^-1 [I, G]``.
+
+    Raises
+    ------
+    ModelError
+        When the two do not go together.
+    """
     p, m = len(G.outputs), len(G.inputs)
     if (len(K.inputs), len(K.outputs)) != (p, m):
         raise ModelError(
@@ -174,13 +192,7 @@ def loop_margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
         outputs=[*(f"zu{i}" for i in range(m)), *(f"zy{i}" for i in range(p)), *_names("y", p)],
         dt=G.dt,
     )
-    loop = lft(P, K.replace(inputs=_names("y", p), outputs=_names("u", m), units={}))
-    poles = loop.poles()
-    growth = np.abs(poles) if loop.dt else poles.real
-    stability = float(np.max(growth, initial=0.0 if loop.dt else -np.inf))
-    if not stability < (1.0 if loop.dt else 0.0):
-        return 0.0, stability
-    return 1.0 / peak_gain(loop)[0], stability
+    return lft(P, K.replace(inputs=_names("y", p), outputs=_names("u", m), units={}))
 
 
 def verified_controller(
@@ -200,7 +212,7 @@ def verified_controller(
     margin, stability = loop_margin(shaped, K)
     other = _least_by_factors(part)
     if not margin:
-        raise hidden_mode()
+        raise hidden_mode(shaped, K)
     if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
         raise CertificateError(
             f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
@@ -217,13 +229,26 @@ def verified_controller(
     return K, least, found
 
 
-def hidden_mode() -> AssumptionError:
-    """Return the error for a loop that cannot be stable."""
+def hidden_mode(G: StateSpace, K: StateSpace) -> AssumptionError:
+    """Return the error for a loop that is not stable: its worst pole, and what misses that mode."""
+    poles = _four_block(G, K).poles()
+    pole = complex(poles[int(np.argmax(np.abs(poles) if G.dt else poles.real))])
+    speed = abs(np.log(pole)) / G.dt if G.dt and pole else abs(pole)
+    rounding = 1e-9 * (1.0 / G.dt if G.dt else float(np.abs(poles).max()))
+    speed = speed if speed > rounding else 0.0
+    shifted = G.A - pole * np.eye(G.n_states)
+    reached = float(la.svdvals(np.hstack([shifted, G.B]))[-1]) if G.n_states else 1.0
+    seen = float(la.svdvals(np.vstack([shifted, G.C]))[-1]) if G.n_states else 1.0
+    missed = (
+        f"not reached by {', '.join(G.inputs)}"
+        if reached < seen
+        else f"not seen in {', '.join(G.outputs)}"
+    )
     return AssumptionError(
-        "a mode that is undamped, integrating or unstable is not reached by u, not seen in y, "
-        "or hidden by the shaping (a zero of `before` or `after` on its pole, or an integrator "
-        "on a zero of the plant): the loop is not stable. Move that zero, or add an actuator "
-        "or a sensor."
+        f"the loop keeps a pole at {speed / (2.0 * np.pi):.4g} Hz that is not stable: a mode that "
+        f"is undamped, integrating or unstable is {missed}, or hidden by the shaping (a zero of "
+        "`before` or `after` on its pole, or an integrator on a zero of the plant). Move that "
+        "zero, or add an actuator or a sensor."
     )
 
 
