@@ -3,7 +3,15 @@
 Run it: ``python examples/feedforward.py``. Two loops of `wafer_stage.py`, designed on the updated
 model, move the virtual machine by 100 um. Feedforward is designed on the model of each loop: term
 by term, and as an inverse with preview. Then a loop whose model lacks the half kilogram learns its
-gains from repeated moves.
+gains from repeated moves. Errors at the die in nm, the largest and the mean over 5 ms after it::
+
+    feedforward      best servo        H-infinity
+                   largest   after   largest   after
+    none              5054     765      1005      92
+    acceleration        78     6.8        18     4.2
+    jerk               7.1     1.8       5.9     0.8
+    snap               5.4     0.3       3.9     0.8
+    inverse            2.7     0.2       2.5     0.2
 """
 
 # %% Names and numbers

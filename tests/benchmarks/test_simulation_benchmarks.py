@@ -40,7 +40,8 @@ def test_a_linear_loop():
     given[:, loop.plant.w.index("die:ref")] = 1e-6
 
     def plain():
-        single = SampleBySample(loop, machine(loop), Drawn(white_noise(loop.plant.replace(asd={}))))
+        silent = loop.plant.replace(asd={})
+        single = SampleBySample(loop, machine(loop), Drawn(white_noise(silent), silent))
         single.begin(np.zeros(g.n_states), [np.random.default_rng(0)])
         data = np.zeros((1, len(g.outputs), COUNT))
         with one_thread():

@@ -11,7 +11,7 @@ from flexplant.loop import close_loop
 from flexplant.loop.noise import white_noise
 from flexplant.plant import assemble_plant
 from flexplant.simulation import Quantiser, Saturation, simulate
-from flexplant.simulation.conditions import Conditions
+from flexplant.simulation.conditions import Conditions, finer_loop
 from flexplant.simulation.runs import InBlocks, SampleBySample, make_runner
 from flexplant.synthesis import design_servo
 from machines import block, matrices, observer, servo, stage
@@ -102,18 +102,22 @@ def test_a_moving_poi_is_at_each_sample_that_of_its_place(loop):
     assert np.abs(run["die:ry"] - plain["die:ry"]).max() > 0.01 * plain.peak("die:ry")
 
 
-def test_a_moving_poi_in_blocks_is_that_of_single_samples(loop):
-    """Under noise, over more than one piece; the tests of single places hold for both then."""
-    steps = 5000
+@pytest.mark.parametrize(("finer", "moves"), [(1, True), (3, False), (4, True)])
+def test_in_blocks_all_is_as_in_single_samples(loop, finer, moves):
+    """Under noise, over more than one piece: a POI that moves, and between samples."""
+    steps, loop = 5000, finer_loop(loop, finer)
     place = np.linspace(0.1, 0.5, steps)
-    met = Conditions(paths={"die": np.stack([place, 0.3 + 0 * place, 0 * place], axis=1)})
+    path = np.stack([place, 0.3 + 0 * place, 0 * place], axis=1)
+    met = Conditions(paths={"die": path} if moves else {}, finer=finer)
     given, noise = np.full((steps, len(loop.plant.w)), 1e-7), white_noise(loop.plant)
     found = []
     for grows, kind in ((False, InBlocks), (True, SampleBySample)):
         runner = make_runner(loop, noise, given, grows=grows, met=met)
         assert type(runner) is kind
-        data = np.zeros((1, len(loop.monitored.outputs), steps))
-        runner.begin(np.zeros(loop.monitored.n_states), [np.random.default_rng(1)])
+        shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
+        data = np.zeros((1, shown, steps))
+        start = np.zeros(loop.plant.system.n_states + loop.controller.n_states)
+        runner.begin(start, [np.random.default_rng(1)])
         for first in range(0, steps, runner.stretch):
             part = slice(first, min(first + runner.stretch, steps))
             assert runner.fill(given[part], data[:, :, part])

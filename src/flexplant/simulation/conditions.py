@@ -29,8 +29,8 @@ class Conditions(NamedTuple):
 
     @property
     def one_by_one(self) -> bool:
-        """Whether samples differ in more than in what is shown of them."""
-        return bool(self.on_y or self.on_u or self.finer > 1)
+        """Whether there is something that is not linear."""
+        return bool(self.on_y or self.on_u)
 
 
 def conditions(

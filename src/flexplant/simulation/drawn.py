@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..loop.noise import WhiteNoise
+from ..plant import StandardPlant
 from ..values import FloatArray
 
 #: part of a state's largest noise that is rounding: its square is that of a covariance
@@ -31,7 +32,9 @@ class Drawn:
         Of w that have noises of their own.
     """
 
-    def __init__(self, noise: WhiteNoise) -> None:
+    def __init__(self, noise: WhiteNoise, plant: StandardPlant) -> None:
+        names = [plant.w[i].removesuffix(":noise") for i in noise.columns]
+        self.read = np.array([name in plant.y for name in names], dtype=bool)
         self.columns, self.deviation = noise.columns, noise.deviation
         self.factor, self.mix = noise.factor, np.eye(noise.factor.shape[1])
         self.thin = noise.factor.shape[0] <= _MANY
@@ -49,8 +52,13 @@ class Drawn:
         """Operations for a sample: products of matrices."""
         return 2 * (self.factor.size + (self.mix.size if self.thin else 0))
 
-    def draw(self, generator: np.random.Generator, samples: int) -> tuple[FloatArray, FloatArray]:
-        """Return white samples (samples, few) for the factor, and noises of the columns of w."""
+    def draw(
+        self, generator: np.random.Generator, samples: int, hold: int = 1
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return white samples (samples, few) for the factor, and noises of the columns of w.
+
+        Sensors are read in the first of every `hold` samples, with the noise of that rate.
+        """
         rank, few = self.mix.shape
         white, single = np.empty((samples, few)), np.empty((samples, self.columns.size))
         for start in range(0, samples, _CHUNK):
@@ -62,4 +70,7 @@ class Drawn:
             else:
                 white[part] = drawn[:, :rank]
             np.multiply(drawn[:, rank:], self.deviation, out=single[part])
+        if hold > 1:
+            single[:, self.read] /= np.sqrt(hold)
+            single[np.ix_(np.arange(samples) % hold > 0, self.read)] = 0.0
         return white, single

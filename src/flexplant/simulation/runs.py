@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
 
 from ..loop import ClosedLoop
 from ..loop.noise import WhiteNoise
-from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Recursion, cheapest
+from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, cheapest
 from ..values import FloatArray
 from .anti_windup import split_law
 from .conditions import Conditions, Moving
 from .drawn import Drawn
 from .elements import Acting
+from .lifting import lifted
 from .stepping import Buffers, Machine, machine, step_through
 
 #: samples per stretch and runs side by side: what fits the cache of one core
 STRETCH, ABREAST = 128, 16
+#: samples of the controller of which a stretch in blocks has a whole number: those of any block
+_WHOLE = 128
 #: a run for which the preparation of blocks must pay [samples]; a fixed one, because the first
 #: samples of a long run are those of a short one to the last bit
 _TYPICAL = 10_000
@@ -56,21 +60,18 @@ def make_runner(
     for a sample are fewer. They are taken when a block agrees with the same samples one by one to
     1e-10 of each channel's peak, for white inputs as large as those of the run; the rounding of
     single samples is seen by running them with inputs three times as large. POIs that move are
-    shown from the plant's states, which come in blocks too. An unstable loop goes sample by sample,
-    and so does one with elements that are not linear, or finer samples.
+    shown from the plant's states, which come in blocks too; of finer samples, those of one sample
+    of the controller are one step. An unstable loop goes sample by sample, and so does one with
+    elements that are not linear.
     """
-    drawn, met = Drawn(noise), met or Conditions()
+    drawn, met = Drawn(noise, loop.plant), met or Conditions()
     if met.one_by_one:
         return _under(loop, drawn, met)
     moving = Moving(loop.plant, met.paths) if met.paths else None
-    single = SampleBySample(loop, machine(loop), drawn)
-    n = loop.plant.system.n_states + loop.controller.n_states
-    shown = len(loop.plant.z) + len(loop.plant.y) + len(loop.controller.outputs)
-    shown += loop.plant.system.n_states if moving else 0
-    m = given.shape[1] + drawn.factor.shape[1]
-    if not grows and n and cheapest(n, shown, m, _TYPICAL)[1] < single.cost:
-        blocks = InBlocks(loop, drawn, given, moving)
-        if blocks.agrees(single, given):
+    single = SampleBySample(loop, machine(loop), drawn, hold=met.finer)
+    if not grows and loop.plant.system.n_states + loop.controller.n_states:
+        blocks = InBlocks(loop, drawn, given, moving, met.finer)
+        if blocks.cost < single.cost and blocks.agrees(single, given):
             return blocks
     single.moving = moving
     return single
@@ -107,10 +108,6 @@ class SampleBySample:
         plant, self.sensed, self.applied = loop.plant, sensed, applied
         self.moving, self.hold = moving, hold
         self.stretch = hold * -(-STRETCH // hold)
-        names = np.array(plant.w, dtype=object)[noise.columns]
-        self.read = np.array([n.removesuffix(":noise") in plant.y for n in names], dtype=bool)
-        # a sample that is read has the noise of the controller's rate
-        self.level = np.where(self.read, 1.0 / np.sqrt(hold), 1.0)
         self.parts, self.n, self.ny = parts, plant.system.n_states, len(plant.y)
         self.noise = noise
         u = np.array([plant.u.index(name) for name in loop.driven], dtype=np.int64)
@@ -147,11 +144,7 @@ class SampleBySample:
         k = given.shape[0]
         self.w[:, :k], self.w[:, k:] = given, 0.0
         for r, generator in enumerate(self.generators):
-            white, single = self.noise.draw(generator, self.stretch)
-            if self.hold > 1:
-                single = single * self.level
-                between = np.arange(self.stretch) % self.hold > 0
-                single[np.ix_(between, self.read)] = 0.0
+            white, single = self.noise.draw(generator, self.stretch, self.hold)
             w = self.w[r]
             w[:, self.noise.columns] += single
             states[1:, r] = white @ self.noise.factor.T + w @ self.B1.T
@@ -185,30 +178,44 @@ class SampleBySample:
 class InBlocks:
     """One run after the other, in blocks of samples of the closed loop as one system."""
 
-    stretch, abreast = PIECE, 1
+    abreast = 1
 
     def __init__(
-        self, loop: ClosedLoop, noise: Drawn, given: FloatArray, moving: Moving | None = None
+        self,
+        loop: ClosedLoop,
+        noise: Drawn,
+        given: FloatArray,
+        moving: Moving | None = None,
+        hold: int = 1,
     ) -> None:
-        g, self.noise, self.n = loop.monitored, noise, loop.plant.system.n_states
-        self.moving, self.n_shown, self.plant = moving, len(g.outputs), loop.plant
-        self.driven = [g.outputs.index(name) for name in loop.driven]
-        self.u = [len(loop.plant.w) + loop.plant.u.index(name) for name in loop.driven]
+        plant, self.plant, self.noise, self.moving = loop.plant, loop.plant, noise, moving
+        self.loop, self.hold = loop, hold
+        before = len(plant.z) + len(plant.y)
+        self.n_shown = before + len(loop.controller.outputs)
+        self.driven = slice(before, before + len(loop.driven))
+        self.u = [len(plant.w) + plant.u.index(name) for name in loop.driven]
         named = np.any(given != 0.0, axis=0)
         named[noise.columns] = True
         self.columns = np.flatnonzero(named)
-        factor = self.noise.factor
-        rest = np.zeros((g.n_states - self.n, factor.shape[1]))
-        states = np.eye(self.n if moving else 0, g.n_states)
-        seen = np.vstack([g.C, states])
-        direct = np.zeros((seen.shape[0], self.columns.size + factor.shape[1]))
-        direct[: self.n_shown, : self.columns.size] = g.D[:, self.columns]
-        self.system = Recursion(
-            g.A, np.hstack([g.B[:, self.columns], np.vstack([factor, rest])]), seen, direct
+        self.inputs = self.columns.size + noise.factor.shape[1]
+        self.outputs = self.n_shown + (plant.system.n_states if moving else 0)
+        n, m = plant.system.n_states + loop.controller.n_states, hold * self.inputs
+        self.size, cost = cheapest(n, hold * self.outputs, m, _TYPICAL // hold)
+        cost += 2 * hold**2 * n**2 * (n + m) / _TYPICAL  # of the samples in one of the controller
+        while self.size > 1 and self.size * hold > STRETCH:
+            self.size //= 2
+        self.cost = cost / hold
+        self.stretch = hold * max(PIECE // hold // _WHOLE, 1) * _WHOLE
+        self.w = np.zeros((self.stretch, given.shape[1]))
+        self.v = np.empty((self.stretch, self.inputs))
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """The matrices of a block."""
+        system = lifted(
+            self.loop, self.noise.factor, self.columns, self.hold, self.moving is not None
         )
-        self.w = np.zeros((PIECE, given.shape[1]))
-        self.v = np.empty((PIECE, self.system.G.shape[1]))
-        self.blocks = self.system.in_blocks(self.system.best_size(_TYPICAL))
+        return system.in_blocks(self.size)
 
     def begin(self, start: FloatArray, generators: list[np.random.Generator]) -> None:
         """Put the run at a state of plant and controller; it draws from its generator."""
@@ -217,16 +224,21 @@ class InBlocks:
     def fill(self, given: FloatArray, data: FloatArray) -> bool:
         """Run one stretch."""
         k, known = given.shape[0], self.columns.size
-        white, single = self.noise.draw(self.generator, PIECE)
+        white, single = self.noise.draw(self.generator, self.stretch, self.hold)
         self.w[:k], self.w[k:] = given, 0.0
         self.w[:, self.noise.columns] += single
         self.v[:, :known], self.v[:, known:] = self.w[:, self.columns], white
-        out, self.x = self.blocks.run(self.v, self.x)
+        out, self.x = self._run(self.v, self.x)
         if self.moving is not None:
             self._move(self.moving, out[:k])
         data[0] = out[:k, : self.n_shown].T
         self.first += k
         return bool(np.all(np.isfinite(self.x)))
+
+    def _run(self, v: FloatArray, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return the outputs of single samples, and the last state."""
+        out, x = self.blocks.run(v.reshape(len(v) // self.hold, -1), x)
+        return out.reshape(-1, self.outputs), x
 
     def _move(self, moving: Moving, out: FloatArray) -> None:
         """Put what POIs along their paths do into out (k, channels, then states)."""
@@ -240,14 +252,15 @@ class InBlocks:
                 rows.show(z, states, inputs[part])
 
     def agrees(self, single: SampleBySample, given: FloatArray) -> bool:
-        """Return whether two blocks (or 128 samples) are the same samples one by one."""
-        k, rng = min(2 * self.blocks.size, STRETCH), np.random.default_rng(0)
+        """Return whether two blocks (or one that fills a stretch) are the same samples singly."""
+        block, rng = self.size * self.hold, np.random.default_rng(0)
+        k = min(2 * block, max(single.stretch // block, 1) * block)
         size = np.abs(given).max(axis=0, initial=0.0)
         w = size * rng.standard_normal((k, size.size))
         white, extra = self.noise.draw(rng, k)
         w[:, self.noise.columns] += extra
         v = np.hstack([w[:, self.columns], white])
-        start = np.zeros(self.system.F.shape[0])
+        start = np.zeros(self.plant.system.n_states + self.loop.controller.n_states)
         expected = np.zeros((2, self.n_shown, k))
         single.begin(start, [rng, rng])
         states, y, _ = single.buffers
@@ -257,7 +270,6 @@ class InBlocks:
             y[:k, r] = times * (w @ single.D21.T)
         single.advance(k, expected)
         rounding = np.abs(expected[1] / 3.0 - expected[0]).max(axis=1)
-        found = self.blocks.run(v, start)[0][:, : self.n_shown].T
-        wrong = np.abs(found - expected[0]).max(axis=1)
+        wrong = np.abs(self._run(v, start)[0][:, : self.n_shown].T - expected[0]).max(axis=1)
         allowed = _AGREE * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
         return bool(np.all(wrong <= allowed))
