@@ -10,6 +10,7 @@ from flexplant.labels import DofSet
 from flexplant.lti import StateSpace
 from flexplant.modes import solve_modes
 from flexplant.placement import (
+    BranchAndBound,
     ClosedLoopH2,
     Exchange,
     Exhaustive,
@@ -95,6 +96,17 @@ def test_pairs_equal_every_pair_and_the_bound_bounds(make, delay):
     points = np.array([port.at for port in apart.ports])
     gaps = np.linalg.norm(points[:, None] - points[None], axis=2) + np.eye(6)
     assert gaps.min() >= 0.05
+
+
+def test_one_side_of_the_loop_has_a_proof(make):
+    """Beside given sensors (actuators) the cost is a convex one of the actuators (sensors)."""
+    plant, sensors, actuators = make(44, count=8)
+    for place, given in ((place_sensors, sensors), (place_actuators, actuators)):
+        every = place(plant, given, 4, COST, method=Exhaustive())
+        proven = place(plant, given, 4, COST, method=BranchAndBound(starts=1), rng=0)
+        assert proven.proven and proven.chosen == every.chosen
+        start = place(plant, given, 4, COST, method=Exchange(1))
+        assert 0.7 * every.value < start.bound <= every.value
 
 
 def test_more_and_fewer_actuators_than_motions(make):

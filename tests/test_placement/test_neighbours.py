@@ -107,6 +107,7 @@ def test_several_pois_are_summed_with_their_weights(make):
     assert both(two) == pytest.approx(4 * die + far, rel=1e-9, abs=0.0)
     largest = PoiVariance(("die", "lens"), measure="max")
     assert largest(two) == pytest.approx(max(die, far), rel=1e-9, abs=0.0)
+    assert "nrad rms" in repr(place_sensors(two, sensors, 4, PoiVariance("die", "rx")))
     chosen = {
         key: place_sensors(two, sensors, 4, criterion).chosen
         for key, criterion in (("die", PoiVariance("die")), ("lens", PoiVariance("lens")))
@@ -199,6 +200,10 @@ def test_what_wrappers_refuse(make):
         place_actuators(plant, actuators, 4, AfterLoss(PoiVariance("die"), of="actuators"))
     with pytest.raises(ModelError, match="no mass matrix"):
         place_sensors(plant, sensors, 4, KineticEnergy())
+    mixed = [sensors[0].replace(asd=0.0), *sensors[1:]]
+    for criterion in (ModalObservability(), SensorIndices()):
+        with pytest.raises(AssumptionError, match="s0 have no noise"):
+            place_sensors(plant, mixed, 4, criterion)
     for wrong in (lambda: AfterLoss("die"), lambda: Penalised(PoiVariance(), 3.0)):
         with pytest.raises(ModelError, match="callable"):
             wrong()

@@ -52,8 +52,9 @@ class BranchAndBound(Search):
 
     Notes
     -----
-    It needs a criterion whose relaxation is convex: `PoiVariance` of the plant's own modes or
-    `PoiLqr`, of ports without a filter or delay of their own.
+    It needs a criterion whose relaxation is convex: `PoiVariance` of the plant's own modes (sum),
+    `PoiLqr`, `ClosedLoopH2` of one kind of device, all of ports without a filter or delay of their
+    own; `ModeInformation` and log det of Gramians.
     """
 
     gap: float = 0.0
@@ -81,8 +82,8 @@ class BranchAndBound(Search):
         if not isinstance(scorer, Convex):
             raise ModelError(
                 f"{problem.layouts.criterion!r} has no convex relaxation here, so nothing can be "
-                "bounded: branch and bound needs PoiVariance(own_modes=True) or PoiLqr, of ports "
-                "without a filter or delay of their own. Use Exhaustive() or Exchange()."
+                "bounded: it takes PoiVariance(own_modes=True), PoiLqr or ClosedLoopH2, "
+                "of ports without a filter or delay of their own. Use Exhaustive() or Exchange()."
             )
         end = monotonic() + self.time_limit
         chosen, history, evaluations = best_start(problem, self.starts, problem.relaxed(), work)

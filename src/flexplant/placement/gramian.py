@@ -13,6 +13,7 @@ from ..plant import StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..values import FloatArray, one_of
 from .criterion import Criterion, Scorer
+from .shapes import noise_sizes
 from .summed import MEASURES, summed
 
 
@@ -61,6 +62,7 @@ class ModalGramian(Criterion):
         start = 2 * real.n_rigid
         A = real.A[start:, start:]
         rows = np.array([self._row(real, port) for port in ports])[:, start:]
+        rows = rows / noise_sizes(ports)[:, None]
         if not A.size:
             raise ModelError("the plant has no elastic mode, so no Gramian. Keep some modes.")
         poles, modes = np.linalg.eig(A.T if self.sides == "u" else A)
@@ -95,7 +97,7 @@ class ModalObservability(ModalGramian):
     sides: ClassVar[str] = "y"
 
     def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
-        return np.asarray(port.see(real).row / (port.asd or 1.0))
+        return np.asarray(port.see(real).row)
 
 
 @dataclass(frozen=True, eq=False)

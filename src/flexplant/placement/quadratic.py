@@ -100,6 +100,15 @@ class Quadratic(Value, Convex):
         cost, _, _, adjoint, seen = self._stationary(weights)
         return cost, -np.sum((seen @ adjoint) * seen, axis=1)
 
+    def cost(self, weights: FloatArray) -> float:
+        """Return J at weights (N,); infinite where it has none."""
+        used = weights > 0
+        g = _compressed(np.sqrt(weights[used])[:, None] * self.items[used])
+        try:
+            return float(np.sum(_terms(self.S, solved(self.A, self.H, g), g))) + self.constant
+        except SolverError:
+            return np.inf
+
     def tangent(self, weights: FloatArray) -> Tangent:
         """Return the tangent of the information ``(X+)^-1`` at weights (N,).
 

@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..errors import AssumptionError
 from ..plant import SensorPort, StandardPlant
 from ..values import FloatArray
 from .criterion import Criterion, Scorer
@@ -57,8 +58,25 @@ def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
     full = real.inputs[:, 1 : 2 * m : 2]
     rows = [p.row(real) if isinstance(p, SensorPort) else p.push(real) for p in ports]
     stacked = np.array(rows).reshape(len(ports), full.shape[0])
-    asd = np.array([(p.asd or 1.0) if isinstance(p, SensorPort) else 1.0 for p in ports])
-    return Shapes(stacked @ full, omega, zeta, stacked, full, asd)
+    return Shapes(stacked @ full, omega, zeta, stacked, full, noise_sizes(ports))
+
+
+def noise_sizes(ports: Sequence[Any]) -> FloatArray:
+    """Return the densities (N,) of sensors; 1 of actuators, and of sensors if none has noise.
+
+    Raises
+    ------
+    AssumptionError
+        When some sensors have noise and others have not.
+    """
+    sizes = np.array([p.asd if isinstance(p, SensorPort) else 1.0 for p in ports])
+    silent = [port.name for port, size in zip(ports, sizes, strict=True) if not size]
+    if 0 < len(silent) < sizes.size:
+        raise AssumptionError(
+            f"sensors {', '.join(silent[:6])} have no noise (asd 0) beside others that have some: "
+            "they would count without limit. Give all of them Sensor(..., asd=), or none."
+        )
+    return np.where(sizes > 0, sizes, 1.0)
 
 
 class ByShapes(Criterion):

@@ -15,8 +15,8 @@ from .criterion import Scorer
 
 #: steps in the weights on one tangent, and the relative gap at which they stop
 _STEPS, _GAP = 40, 1e-3
-#: tangents of a bound at the root
-_TANGENTS = 12
+#: tangents of a bound at the root, and the parts of a step between them
+_TANGENTS, _HALVES = 20, (1.0, 0.5, 0.25, 0.125, 0.0625)
 #: what rounding may have added to a bound, relative
 _ROUNDING = 1e-9
 
@@ -131,6 +131,10 @@ class Convex(Scorer):
         """
         raise NotImplementedError
 
+    def cost(self, weights: FloatArray) -> float:
+        """Return the cost at weights (N,); infinite where it has none."""
+        raise NotImplementedError
+
     def inner_tangent(self, branch: Branch, weights: FloatArray) -> Below | None:
         """Return the tangent at weights of a branch moved slightly inwards; None if there is none.
 
@@ -149,18 +153,30 @@ class Convex(Scorer):
         return self.relaxation(Branch(tuple((g, n) for g, n in groups if n)))[0]
 
     def relaxation(self, branch: Branch) -> tuple[float, FloatArray]:
-        """Return a lower bound over a branch, and weights near the least relaxed cost."""
-        weights = branch.centre(self.total)
-        best = self.everything()
+        """Return a lower bound over a branch, and weights near the least relaxed cost.
+
+        The least weights of a tangent are in a direction in which the cost falls: it is convex,
+        above the tangent and equal to it where they touch. The step is halved until it does fall,
+        for whole steps may jump to and fro.
+        """
+        centre = branch.centre(self.total)
+        weights, best, cost = centre, self.everything(), np.inf
         for _ in range(_TANGENTS):
             tangent = self.inner_tangent(branch, weights)
             if tangent is None:
                 break
-            found, weights = tangent.least(branch, weights)
-            if found <= best + _GAP * abs(best):
-                best = max(best, found)
+            found, least = tangent.least(branch, weights)
+            best = max(best, found)
+            for step in _HALVES:
+                moved = weights + step * (least - weights)
+                lower = self.cost(0.999 * moved + 0.001 * centre)
+                if lower < cost:
+                    break
+            if not lower < cost - _GAP * abs(cost) and np.isfinite(cost):
                 break
-            best = found
+            weights, cost = moved, lower
+            if cost - best <= _GAP * abs(cost):
+                break
         return best, weights
 
     def everything(self) -> float:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor
 from dataclasses import dataclass
 
 import numpy as np
@@ -57,6 +58,9 @@ def device_worth(
     plant: StandardPlant,
     placement: Placement,
     criterion: Criterion | Callable[[StandardPlant], float] | None = None,
+    *,
+    executor: Executor | None = None,
+    progress: bool | None = None,
 ) -> DeviceWorth:
     """Return what each chosen device is worth: the value when it alone is left out.
 
@@ -68,6 +72,10 @@ def device_worth(
         From `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
         As for the placement.
+    executor : concurrent.futures.Executor, optional
+        As for `place_sensors`.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
 
     Raises
     ------
@@ -82,6 +90,6 @@ def device_worth(
     layouts.require_any()
     every = tuple(range(len(placement.ports)))
     sets = [every, *(tuple(j for j in every if j != i) for i in every)]
-    values = layouts.scores(sets, Work(progress=False), "devices")
+    values = layouts.scores(sets, Work(executor, progress), "devices")
     unit = layouts.criterion.unit(plant)
     return DeviceWorth(placement.chosen, float(values[0]), values[1:], unit)
