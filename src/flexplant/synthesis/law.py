@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from ..errors import ModelError
-from ..lti.discretisation import tustin
+from ..lti.discretisation import trapezoidal
 from ..lti.frequency import sampled_freq
-from ..lti.interconnection import series
+from ..lti.joining import cascaded
 from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
 
@@ -219,13 +219,24 @@ class Law(Element):
     @cached_property
     def system(self) -> StateSpace:
         """The system from error to command, sampled where the law is."""
-        static = StateSpace([], [], [], [[1.0]], inputs=["error"], outputs=["command"])
-        parts = [section.system for section in self._sections]
-        if self.rate:  # each on its own: states of one size
-            parts = [tustin(part, self.rate) for part in parts]
-        joined = self.gain * reduce(series, parts, static)
-        dt = 1.0 / self.rate if self.rate else 0.0
-        return joined.replace(dt=dt, states=[f"x{i}" for i in range(1, joined.n_states + 1)])
+        a = 2.0 * self.rate
+        joined = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
+        for section in self._sections:
+            part = section.matrices
+            # sampled each on its own: states of one size
+            joined = cascaded(joined, trapezoidal(part, a) if a else part)
+        A, B, C, D = joined
+        sizes = [2 if section.a[0] else 1 for section in self._sections]
+        return StateSpace(
+            A,
+            B,
+            self.gain * C,
+            self.gain * D,
+            1.0 / self.rate if self.rate else 0.0,
+            inputs=["error"],
+            outputs=["command"],
+            blocks=sizes[::-1],
+        )
 
     def response(self, freq: npt.ArrayLike) -> ComplexArray:
         """Return the response (n_freq,), in closed form.
