@@ -26,6 +26,7 @@ from .objectives.specifications import PoleRegion as PoleRegion
 from .riccati import Riccati as Riccati
 from .robustness.blocks import FullBlock as FullBlock
 from .robustness.blocks import RepeatedScalar as RepeatedScalar
+from .robustness.dk import design_mu as design_mu
 from .robustness.gain import WorstCaseGain as WorstCaseGain
 from .robustness.gain import worst_case_gain as worst_case_gain
 from .robustness.mu import MuBounds as MuBounds

@@ -70,6 +70,7 @@ class _Cover:
     leveled: Sequence[bool] | None = None
     heights: Heights | None = None
     least: float = 0.0
+    accuracy: float = _ABOVE
 
     def __post_init__(self) -> None:
         g = self.M
@@ -136,8 +137,8 @@ class _Cover:
         near = min(self.last, key=lambda one: abs(one[0] - omega))[1] if self.last else None
         found = upper_level(M, self.scalings, near, enough=0.97 * self.level)
         self.found.append((omega, found.level))
-        if not found.level * (1 + _ABOVE) ** 2 <= self.level:
-            self.level = max(self.level, found.level * (1 + _ABOVE) ** 2)
+        if not found.level * (1 + self.accuracy) ** 2 <= self.level:
+            self.level = max(self.level, found.level * (1 + self.accuracy) ** 2)
             self.omega = omega
         if np.isfinite(self.level):
             self.last = [*self.last[-30:], (omega, found.x)]
@@ -266,6 +267,7 @@ def covered(
     leveled: Sequence[bool] | None = None,
     heights: Heights | None = None,
     least: float = 1e-12,
+    accuracy: float = _ABOVE,
 ) -> Covered:
     """Return an upper level that holds at all frequencies of a stable continuous system.
 
@@ -281,5 +283,7 @@ def covered(
         Factors of the columns of M by frequency: magnitudes of weights.
     least : float
         Levels below are not resolved.
+    accuracy : float
+        Relative distance of the root of the level to the largest bound of one frequency.
     """
-    return _Cover(M, blocks, leveled, heights, least).run()
+    return _Cover(M, blocks, leveled, heights, least, accuracy).run()

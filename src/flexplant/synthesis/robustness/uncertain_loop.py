@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -27,15 +27,14 @@ _POINTS = 9
 
 
 @dataclass(frozen=True)
-class UncertainLoop:
-    """``[z_Delta; neglected; z] = M [w_Delta; neglected; w]`` with the controller closed.
+class OpenPlant:
+    """``[z_Delta; neglected; z; y] = G [w_Delta; neglected; w; u]``, z and w weighted.
 
-    Continuous: of a sampled loop the bilinear image. Columns of neglected modes lack their
-    weights, whose magnitudes `heights` gives; `weighted` has them as states.
+    Continuous: of a sampled plant the bilinear image. Columns of neglected modes lack their
+    weights, whose magnitudes `heights` gives.
     """
 
     uncertain: UncertainPlant[Any]
-    loop: ClosedLoop
     channels: DeltaChannels
     system: StateSpace
     blocks: tuple[Block, ...]
@@ -47,6 +46,16 @@ class UncertainLoop:
     def with_weights(self, closed: StateSpace) -> StateSpace:
         """Return a closed loop, sampled as it is, with the weights of its w and z."""
         return _with_weights(closed, closed.inputs, closed.outputs, self.before, self.behind)
+
+    @property
+    def u(self) -> tuple[str, ...]:
+        """The inputs that a controller drives."""
+        return tuple(self.uncertain.plant.u)
+
+    @property
+    def y(self) -> tuple[str, ...]:
+        """The outputs that it reads."""
+        return tuple(self.uncertain.plant.y)
 
     @property
     def dt(self) -> float:
@@ -97,21 +106,72 @@ class UncertainLoop:
             points = np.concatenate([points, np.geomspace(max(low, 1e-4 * end), end, 4 * _POINTS)])
         return np.unique(points / (2 * np.pi))
 
-    def weighted(self) -> StateSpace:
-        """Return M with the weights of neglected modes as states."""
-        if not self.neglected_w or self.channels.neglected is None:
-            return self.system
-        own = [name.removesuffix(":neglected:w") for name in self.neglected_w]
-        W = self.channels.neglected.weights.select(own, own)
-        others = [name for name in self.system.inputs if name not in self.neglected_w]
-        order = list(self.system.inputs)
-        plain = StateSpace(
-            np.zeros((0, 0)), np.zeros((0, len(others))), np.zeros((len(others), 0)),
-            np.eye(len(others)), inputs=others, outputs=others,
-        )  # fmt: skip
-        W = W.replace(inputs=[f"{n}:neglected:w" for n in own], outputs=list(self.neglected_w))
-        both = append(plain, W)
-        return series(both.select(order, order), self.system).replace(inputs=order)
+
+@dataclass(frozen=True)
+class UncertainLoop(OpenPlant):
+    """``[z_Delta; neglected; z] = M [w_Delta; neglected; w]`` with the controller closed."""
+
+    loop: ClosedLoop
+
+
+def open_plant(
+    uncertain: UncertainPlant[Any],
+    *,
+    w: Any = (),
+    z: Any = (),
+    seen: Sequence[str] | None = None,
+    driven: Sequence[str] | None = None,
+) -> OpenPlant:
+    """Return an uncertain plant with its channels, weighted w and z, and all y and u.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+        The plant.
+    w, z : sequence of str or mapping {name: weight}
+        Channels of performance.
+    seen, driven : sequences of str, optional
+        Channels of y and u to which neglected modes are confined; all when not given.
+
+    Raises
+    ------
+    ModelError
+        When `uncertain` is no uncertain plant, or a weight does not fit.
+    """
+    if not isinstance(uncertain, UncertainPlant):
+        raise ModelError(
+            f"need an UncertainPlant, got {short(uncertain)}. Make it by plant.uncertain(fit)."
+        )
+    channels = delta_channels(uncertain)
+    into, weights_in = _weighted_names(w, "w")
+    out, weights_out = _weighted_names(z, "z")
+    g, plant = channels.system, uncertain.plant
+    n_real = sum(size for _, size in channels.deltas)
+    neglected = channels.neglected
+    ends = [] if neglected is None else list(neglected.outputs)
+    starts = [] if neglected is None else list(neglected.inputs)
+    if seen is not None and driven is not None:
+        ends = [name for name in ends if name in seen]
+        starts = [name for name in starts if name in driven]
+    w_names = [f"{name}:neglected:w" for name in ends]
+    z_names = [f"{name}:neglected:z" for name in starts]
+    listed: list[Block] = [
+        RepeatedScalar(size, real=True, name=name) for name, size in channels.deltas
+    ]
+    if w_names and z_names:
+        listed.append(FullBlock(len(w_names), len(z_names), name="neglected modes"))
+    else:
+        w_names, z_names = [], []
+    inputs = [*g.inputs[:n_real], *w_names, *into, *plant.u]
+    outputs = [*g.outputs[:n_real], *z_names, *out, *plant.y]
+    before, behind = _checked_weights(weights_in, plant.dt), _checked_weights(weights_out, plant.dt)
+    system = _with_weights(
+        g.select(outputs, inputs), inputs, outputs,
+        *(_images(part, plant.dt) for part in (before, behind)),
+    )  # fmt: skip
+    return OpenPlant(
+        uncertain, channels, system, tuple(listed), tuple(w_names), tuple(z_names), before, behind
+    )
 
 
 def uncertain_loop(
@@ -140,39 +200,19 @@ def uncertain_loop(
             f"the loop is {loop.obstacle.reason} without any uncertainty: there is nothing to be "
             "robust about. Design a controller that stabilises the nominal plant first."
         )
-    channels = delta_channels(uncertain)
+    confined = None if z else (loop.fed_back, loop.driven)
+    seen, driven = confined or (None, None)  # stability: what the loop does not see has no part
+    plant = open_plant(uncertain, w=w, z=z, seen=seen, driven=driven)
     controller = loop.controller.select(outputs=loop.driven)
-    if loop.plant.dt:
-        controller = bilinear(controller, 1.0 / loop.plant.dt)
-    into, weights_in = _weighted_names(w, "w")
-    out, weights_out = _weighted_names(z, "z")
-    g = channels.system
-    n_real = sum(size for _, size in channels.deltas)
-    neglected = channels.neglected
-    ends = [] if neglected is None else list(neglected.outputs)
-    starts = [] if neglected is None else list(neglected.inputs)
-    if not out:  # stability: what the loop does not see of them has no part in it
-        ends = [name for name in ends if name in loop.fed_back]
-        starts = [name for name in starts if name in loop.driven]
-    w_names = [f"{name}:neglected:w" for name in ends]
-    z_names = [f"{name}:neglected:z" for name in starts]
-    listed: list[Block] = [
-        RepeatedScalar(size, real=True, name=name) for name, size in channels.deltas
-    ]
-    if w_names and z_names:
-        listed.append(FullBlock(len(w_names), len(z_names), name="neglected modes"))
-    else:
-        w_names, z_names = [], []
-    inputs = [*g.inputs[:n_real], *w_names, *into]
-    outputs = [*g.outputs[:n_real], *z_names, *out]
-    plant = g.select([*outputs, *loop.plant.y], [*inputs, *loop.driven])
-    M = lft(plant, controller)
-    dt = loop.plant.dt
-    before, behind = _checked_weights(weights_in, dt), _checked_weights(weights_out, dt)
-    M = _with_weights(M, inputs, outputs, *(_images(part, dt) for part in (before, behind)))
-    return UncertainLoop(
-        uncertain, loop, channels, M, tuple(listed), tuple(w_names), tuple(z_names), before, behind
-    )
+    if plant.dt:
+        controller = bilinear(controller, 1.0 / plant.dt)
+    g = plant.system
+    idle = [name for name in plant.u if name not in loop.driven]
+    M = lft(g.select(inputs=[name for name in g.inputs if name not in idle]), controller)
+    M = M.replace(states=[f"x{i}" for i in range(1, M.n_states + 1)])
+    return UncertainLoop(**{f.name: getattr(plant, f.name) for f in fields(plant)} | {
+        "system": M, "loop": loop,
+    })  # fmt: skip
 
 
 def _weighted_names(given: Any, side: str) -> tuple[list[str], dict[str, Any]]:

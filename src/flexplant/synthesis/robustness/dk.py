@@ -1,0 +1,231 @@
+"""design_mu: a controller for a whole uncertainty, by D-K iteration, verified by mixed mu."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ...errors import AssumptionError, FlexplantError, ModelError, SolverError
+from ...lti.discretisation import tustin
+from ...lti.grid import resonance_grid
+from ...lti.interconnection import append, series
+from ...lti.statespace import StateSpace
+from ...parallel import one_thread
+from ...plant import StandardPlant
+from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...values import FloatArray, whole
+from ..controller import Controller
+from ..hinf import design_hinf
+from ..method import SynthesisMethod
+from ..spill_over import spill_over, unchecked
+from .blocks import FullBlock, Scalings, osborne, places
+from .magnitude import fitted_magnitude, inverse
+from .sweep import covered
+from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, uncertain_loop
+from .upper import upper_level
+
+#: frequencies at which D is found
+_POINTS = 40
+#: relative decrease of mu below which the iteration ends
+_SETTLED = 0.01
+
+
+class _Step(NamedTuple):
+    """A controller with its mixed mu, and the loop it was found from."""
+
+    mu: float
+    controller: StateSpace
+    loop: UncertainLoop
+    freq: float
+
+
+@one_thread()
+def design_mu(
+    uncertain: UncertainPlant[Any],
+    *,
+    w: Any,
+    z: Any,
+    method: SynthesisMethod | None = None,
+    iterations: int = 4,
+    order: int = 1,
+    larger: Any = None,
+) -> Controller:
+    """Return a controller whose weighted gain stays small on every machine of an uncertainty.
+
+    D-K iteration: an H-infinity controller for the plant with its Deltas scaled by D(s), then D
+    for its loop, a filter of few states per Delta, and so on. In the design real Deltas count as
+    complex, which is cautious; what is judged, and kept, is the controller of the smallest mixed
+    mu, real Deltas real, between all frequencies. The first candidate is that without uncertainty.
+
+    Parameters
+    ----------
+    uncertain : UncertainPlant
+        From `plant.uncertain(fit, neglected=larger)`, continuous or sampled.
+    w, z : mapping {name: weight}, or sequence of str
+        Weights of performance, as for `StandardPlant.weighted`.
+    method : Riccati, StructuredLmi or Lmi, optional
+        As for `design_hinf`.
+    iterations : int
+        Most steps.
+    order : int
+        Most states of D for each Delta and side.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        A model with the modes that the plant left out, as for `larger_plant`.
+
+    Returns
+    -------
+    Controller
+        `gamma` is mu of robust performance from above: below 1 all machines are stable with
+        weighted gains below 1. The certificate holds mu of every step.
+
+    Raises
+    ------
+    AssumptionError, SolverError, InfeasibleError, CertificateError
+        When no step gives a controller; see `design_hinf`.
+    ModelError, LabelError
+        When `uncertain` is no uncertain plant, or channels are missing or unknown.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+
+    References
+    ----------
+    Doyle, Lenz, Packard, Design examples using mu-synthesis, CDC 1986. Zhou, Doyle, Glover, Robust
+    and Optimal Control, 1996, section 11.4.
+    """
+    if not w or not z:
+        raise ModelError("name the channels of performance: w={'d': 1.0}, z={'tip:x': weight}.")
+    plant = open_plant(uncertain, w=w, z=z)
+    most = whole(iterations, "iterations")
+    states = whole(order, "order", minimum=0)
+    scales = _Scales.none(plant)
+    best: _Step | None = None
+    found: list[float] = []
+    failure: FlexplantError | None = None
+    for number in range(most + 1):
+        try:
+            K = _designed(plant, scales, method, nominal=not number)
+            step = _judged(uncertain, K, w, z)
+        except FlexplantError as error:
+            failure = error
+            if number or not isinstance(error, AssumptionError | SolverError):
+                break
+            scales = _Scales.none(plant)
+            continue
+        found.append(step.mu)
+        settled = best is not None and number > 1 and step.mu > (1.0 - _SETTLED) * best.mu
+        if best is None or step.mu < best.mu:
+            best = step
+        if settled:
+            break
+        scales = _scales_of(plant, step.loop, states)
+    if best is None:
+        raise failure or SolverError("no step of the D-K iteration gave a controller. Report it.")
+    left_out = spill_over(uncertain.plant, [best.controller], larger)
+    steps = {f"mu of step {i}": value for i, value in enumerate(found)}
+    return Controller(
+        best.controller,
+        f"D-K iteration, {len(found)} steps",
+        gamma=best.mu,
+        certificate={"mu": best.mu, "at Hz": best.freq}
+        | steps
+        | (left_out.certificate if left_out is not None else {}),
+        left_out=left_out,
+        notes=() if left_out is not None else unchecked(uncertain.plant),
+    )
+
+
+class _Scales(NamedTuple):
+    """Filters on each output and each input of the uncertainty's channels."""
+
+    out: tuple[StateSpace, ...]
+    into: tuple[StateSpace, ...]
+
+    @classmethod
+    def none(cls, plant: OpenPlant) -> _Scales:
+        """Return ones, and the weights of neglected modes by few states."""
+        n = sum(block.z for block in plant.blocks)
+        m = sum(block.w for block in plant.blocks)
+        omega = _grid(plant.system)
+        tall = np.array([plant.heights(one, one) for one in omega])[:, :m]
+        return cls(
+            tuple(StateSpace([], [], [], [[1.0]]) for _ in range(n)),
+            tuple(fitted_magnitude(omega, column, 2) for column in tall.T),
+        )
+
+
+def _grid(g: StateSpace) -> FloatArray:
+    """Return frequencies [rad/s] over which D is fitted."""
+    grid = resonance_grid(g.poles(), 0.0, points=200)
+    return 2 * np.pi * np.geomspace(grid[0], grid[-1], _POINTS)
+
+
+def _designed(
+    plant: OpenPlant, scales: _Scales, method: SynthesisMethod | None, *, nominal: bool
+) -> StateSpace:
+    """Return the H-infinity controller of the scaled plant, sampled like the plant."""
+    g, n, m = plant.system, len(scales.out), len(scales.into)
+    if nominal:
+        scaled = g.select(g.outputs[n:], g.inputs[m:])
+    else:
+        ones = [StateSpace([], [], [], [[1.0]])]
+        into = [*scales.into, *ones * (len(g.inputs) - m)]
+        out = [*scales.out, *ones * (len(g.outputs) - n)]
+        scaled = series(series(_side_by_side(into, g.inputs), g), _side_by_side(out, g.outputs))
+    standard = StandardPlant.from_statespace(scaled, u=plant.u, y=plant.y)
+    K = design_hinf(standard, method).system
+    return tustin(K, 1.0 / plant.dt) if plant.dt else K
+
+
+def _side_by_side(filters: list[StateSpace], names: Any) -> StateSpace:
+    named = []
+    for one, name in zip(filters, names, strict=True):
+        states = [f"{name}:D{i}" for i in range(one.n_states)]
+        named.append(one.replace(inputs=[name], outputs=[name], states=states))
+    return append(*named)
+
+
+def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _Step:
+    """Return mu of robust performance of a controller, real Deltas real."""
+    loop = uncertain_loop(uncertain, [K], w=w, z=z)
+    p = len(loop.system.outputs) - sum(block.z for block in loop.blocks)
+    m = len(loop.system.inputs) - sum(block.w for block in loop.blocks)
+    blocks = [*loop.blocks, FullBlock(m, p, name="performance")]
+    found = covered(loop.system, blocks, heights=loop.heights, accuracy=0.02)
+    return _Step(float(np.sqrt(found.level)), K, loop, loop.freq(found.omega))
+
+
+def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _Scales:
+    """Return D of a loop as filters: one for each block, its Delta taken as complex."""
+    p = len(loop.system.outputs) - sum(block.z for block in loop.blocks)
+    m = len(loop.system.inputs) - sum(block.w for block in loop.blocks)
+    blocks = [FullBlock(block.w, block.z) for block in loop.blocks] + [FullBlock(m, p)]
+    scalings, where = Scalings(blocks), places(blocks)
+    omega = _grid(loop.system)
+    rows = []
+    for one in omega:
+        M = loop.system.evaluated(1j * one) * loop.heights(one, one)
+        if not np.any(M):
+            rows.append(np.ones(len(blocks)))
+            continue
+        start = scalings.scaled(scalings.start, osborne(M, where))
+        x = upper_level(M, scalings, start).x
+        rows.append(np.sqrt(np.array([D[0, 0].real for D in scalings.D(x)])))
+    d = np.array(rows)
+    d = d / d[:, -1:]  # performance is not scaled
+    tall = np.array([plant.heights(one, one) for one in omega])
+    out, into, column = [], [], 0
+    for i, block in enumerate(loop.blocks):
+        one = fitted_magnitude(omega, d[:, i], order)
+        out += [one] * block.z
+        for _ in range(block.w):
+            weight = tall[:, column]
+            flat = np.ptp(weight) < 1e-12 * weight.max()
+            into.append(
+                inverse(one) if flat else fitted_magnitude(omega, weight / d[:, i], order + 1)
+            )
+            column += 1
+    return _Scales(tuple(out), tuple(into))
