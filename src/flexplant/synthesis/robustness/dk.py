@@ -31,7 +31,7 @@ _POINTS = 40
 _SETTLED = 0.01
 
 
-class _Step(NamedTuple):
+class _DkStep(NamedTuple):
     """A controller with its mixed mu, and the loop it was found from."""
 
     mu: float
@@ -101,8 +101,8 @@ def design_mu(
     plant = open_plant(uncertain, w=w, z=z)
     most = whole(iterations, "iterations")
     states = whole(order, "order", minimum=0)
-    scales = _Scales.none(plant)
-    best: _Step | None = None
+    scales = _DFilters.none(plant)
+    best: _DkStep | None = None
     found: list[float] = []
     failure: FlexplantError | None = None
     for number in range(most + 1):
@@ -113,7 +113,7 @@ def design_mu(
             failure = error
             if number or not isinstance(error, AssumptionError | SolverError):
                 break
-            scales = _Scales.none(plant)
+            scales = _DFilters.none(plant)
             continue
         found.append(step.mu)
         settled = best is not None and number > 1 and step.mu > (1.0 - _SETTLED) * best.mu
@@ -138,14 +138,14 @@ def design_mu(
     )
 
 
-class _Scales(NamedTuple):
+class _DFilters(NamedTuple):
     """Filters on each output and each input of the uncertainty's channels."""
 
     out: tuple[StateSpace, ...]
     into: tuple[StateSpace, ...]
 
     @classmethod
-    def none(cls, plant: OpenPlant) -> _Scales:
+    def none(cls, plant: OpenPlant) -> _DFilters:
         """Return ones, and the weights of neglected modes by few states."""
         n = sum(block.z for block in plant.blocks)
         m = sum(block.w for block in plant.blocks)
@@ -164,7 +164,7 @@ def _grid(g: StateSpace) -> FloatArray:
 
 
 def _designed(
-    plant: OpenPlant, scales: _Scales, method: SynthesisMethod | None, *, nominal: bool
+    plant: OpenPlant, scales: _DFilters, method: SynthesisMethod | None, *, nominal: bool
 ) -> StateSpace:
     """Return the H-infinity controller of the scaled plant, sampled like the plant."""
     g, n, m = plant.system, len(scales.out), len(scales.into)
@@ -188,17 +188,17 @@ def _side_by_side(filters: list[StateSpace], names: Any) -> StateSpace:
     return append(*named)
 
 
-def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _Step:
+def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _DkStep:
     """Return mu of robust performance of a controller, real Deltas real."""
     loop = uncertain_loop(uncertain, [K], w=w, z=z)
     p = len(loop.system.outputs) - sum(block.z for block in loop.blocks)
     m = len(loop.system.inputs) - sum(block.w for block in loop.blocks)
     blocks = [*loop.blocks, FullBlock(m, p, name="performance")]
     found = covered(loop.system, blocks, heights=loop.heights, accuracy=0.02)
-    return _Step(float(np.sqrt(found.level)), K, loop, loop.freq(found.omega))
+    return _DkStep(float(np.sqrt(found.level)), K, loop, loop.freq(found.omega))
 
 
-def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _Scales:
+def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
     """Return D of a loop as filters: one for each block, its Delta taken as complex."""
     p = len(loop.system.outputs) - sum(block.z for block in loop.blocks)
     m = len(loop.system.inputs) - sum(block.w for block in loop.blocks)
@@ -228,4 +228,4 @@ def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _Scales:
                 inverse(one) if flat else fitted_magnitude(omega, weight / d[:, i], order + 1)
             )
             column += 1
-    return _Scales(tuple(out), tuple(into))
+    return _DFilters(tuple(out), tuple(into))
