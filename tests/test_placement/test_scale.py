@@ -103,8 +103,14 @@ def test_a_file_that_was_cut_gives_the_same_answer(make, tmp_path, method):
     for kept in (1 + len(lines) // 2, len(lines)):
         path.write_bytes(b"".join(lines[:kept]))
         same(place_sensors(plant, sensors, 4, method=method, checkpoint=path), found)
-    with pytest.raises(ModelError, match="checkpoint of another search"):
-        place_sensors(plant, sensors, 5, method=method, checkpoint=path)
+    other = make(13)[0]
+    for changed, count, criterion in (
+        (plant, 5, None),
+        (other, 4, None),
+        (plant, 4, PoiVariance("die", "rx")),
+    ):
+        with pytest.raises(ModelError, match="checkpoint of another search"):
+            place_sensors(changed, sensors, count, criterion, method=method, checkpoint=path)
 
 
 def ends_once(item):

@@ -1,25 +1,21 @@
 """Where sensors and actuators go: criteria, scores, search and bounds."""
 
-from .among import Among as Among
 from .auto_mac import AutoMac as AutoMac
 from .branch_and_bound import BranchAndBound as BranchAndBound
+from .budget import Budget as Budget
 from .by_rows import ByRows as ByRows
 from .candidates import PlantChannel as PlantChannel
 from .closed_loop_h2 import ClosedLoopH2 as ClosedLoopH2
-from .constraints import Budget as Budget
-from .constraints import Constraint as Constraint
-from .constraints import Excluded as Excluded
-from .constraints import MinimumDistance as MinimumDistance
-from .constraints import Mirrored as Mirrored
-from .constraints import OffPoi as OffPoi
-from .constraints import Together as Together
-from .constraints import Within as Within
+from .constraint import Constraint as Constraint
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
 from .exchange import Exchange as Exchange
 from .exhaustive import Exhaustive as Exhaustive
 from .gramian import ModalControllability as ModalControllability
 from .gramian import ModalObservability as ModalObservability
+from .groups import Among as Among
+from .groups import Mirrored as Mirrored
+from .groups import Together as Together
 from .hinf_level import HinfLevel as HinfLevel
 from .kinetic_energy import KineticEnergy as KineticEnergy
 from .modal_indices import ActuatorIndices as ActuatorIndices
@@ -46,5 +42,9 @@ from .search import place_both as place_both
 from .search import place_sensors as place_sensors
 from .sensor_map import SensorMap as SensorMap
 from .sensor_map import sensor_map as sensor_map
+from .spacing import MinimumDistance as MinimumDistance
 from .worth import DeviceWorth as DeviceWorth
 from .worth import device_worth as device_worth
+from .zones import Excluded as Excluded
+from .zones import OffPoi as OffPoi
+from .zones import Within as Within

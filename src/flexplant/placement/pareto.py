@@ -12,8 +12,9 @@ import numpy as np
 from ..errors import InfeasibleError, ModelError
 from ..plant import Actuator, StandardPlant
 from ..values import FloatArray, Rng, Value, positive, real_array, short
+from .budget import Budget
 from .candidates import checked_plant
-from .constraints import Budget, Constraint
+from .constraint import Constraint
 from .criterion import Criterion, in_words
 from .placement import Placement
 from .problem import Search

@@ -39,20 +39,21 @@ class Places:
 
     def inside(self, zones: Sequence[Zone]) -> FloatArray:
         """Return 1 for candidates with any point in any zone, seen from above, else 0."""
-        self._require_places()
+        self.require_points()
         hit = [any(np.any(zone.holds(p[:, :2])) for zone in zones) for p in self.points]
         return np.array(hit, dtype=np.float64)
 
     def distances(self, others: Sequence[FloatArray]) -> FloatArray:
         """Return the least distance [m] of each candidate (rows) to each of other points."""
-        self._require_places()
+        self.require_points()
         found = [
             [np.min(np.linalg.norm(p[:, None] - q[None], axis=2)) for q in others]
             for p in self.points
         ]
         return np.array(found, dtype=np.float64).reshape(self.total, len(others))
 
-    def _require_places(self) -> None:
+    def require_points(self) -> None:
+        """Raise ModelError where it is not known where candidates are."""
         if len(self.points) < self.total:
             raise ModelError(
                 "the plant was made elsewhere, and where its sensors and actuators are is not "

@@ -15,7 +15,7 @@ from ..plant import StandardPlant
 from ..values import Rng, instance, short
 from ..work import Work
 from .candidates import checked_plant
-from .constraints import Constraint
+from .constraint import Constraint
 from .criterion import Criterion
 from .exchange import Exchange
 from .exhaustive import Exhaustive
@@ -257,8 +257,11 @@ def _placed(
     if method is None:
         method = Exhaustive() if problem.subsets <= _FEW else Exchange()
     instance(method, Search, "method", "Pass Exchange(...), BranchAndBound(...) or Exhaustive().")
-    mark = fingerprint([layouts, problem.count, problem.required, problem.rows, method])
-    work = Work(executor, progress, rng, checkpoint, "search", {"problem": mark})
+    header = {}
+    if checkpoint is not None:
+        parts = [plant, *ports, layouts.criterion, problem.count, problem.required, problem.rows]
+        header = {"problem": fingerprint([*parts, method])}
+    work = Work(executor, progress, rng, checkpoint, "search", header)
     found = method.search(problem, work)
     if not np.isfinite(found.value):
         raise InfeasibleError(

@@ -16,7 +16,8 @@ from ..structure import Disc, Rectangle
 from ..values import FloatArray, Value, positive, real_array
 from ..work import Work
 from .candidates import checked_plant
-from .constraints import Constraint, all_of, rows_of
+from .constraint import Constraint
+from .constraints import all_of, rows_of
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .places import places_of

@@ -1,0 +1,60 @@
+"""A budget for the devices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import ModelError, unknown_label
+from ..values import positive, short
+from .constraint import Constraint
+from .places import Places
+from .rows import LinearRows
+
+
+@dataclass(frozen=True, eq=False)
+class Budget(Constraint):
+    """The costs of the chosen candidates together are at most this.
+
+    Parameters
+    ----------
+    total : float
+        What they may cost.
+    costs : mapping {str: float}, optional
+        Cost of candidates by name.
+    default : float
+        Cost of the others.
+
+    Raises
+    ------
+    ModelError
+        When a number is negative.
+    LabelError
+        When used, for an unknown name.
+    """
+
+    total: float
+    costs: Mapping[str, float] = field(default_factory=dict)
+    default: float = field(default=1.0, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.costs, Mapping):
+            raise ModelError(f"costs are a mapping from name to cost, got {short(self.costs)}.")
+        self._set(
+            total=positive(self.total, "total", zero=True),
+            costs={
+                str(name): positive(cost, f"cost of {name!r}", zero=True)
+                for name, cost in self.costs.items()
+            },
+            default=positive(self.default, "default", zero=True),
+        )
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return the sum of costs, at most the total."""
+        for name in self.costs:
+            if name not in places.names:
+                raise unknown_label("candidate with a cost", name, places.names)
+        costs = np.array([self.costs.get(name, self.default) for name in places.names])
+        return LinearRows(costs[None], np.array([0.0]), np.array([self.total]))

@@ -1,0 +1,140 @@
+"""Constraints on groups of devices: all or none, mirror images, so many among some."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..errors import LabelError, unknown_label
+from ..values import FloatArray, name_list, one_of, real_array, short
+from .constraint import Constraint, limits
+from .places import Places
+from .rows import LinearRows
+
+
+@dataclass(frozen=True, eq=False)
+class Together(Constraint):
+    """Groups of candidates of which all or none are chosen: symmetric sets, multi-axis units.
+
+    Parameters
+    ----------
+    groups : sequence of sequences of str
+        Names, two or more in each group.
+
+    Raises
+    ------
+    LabelError
+        When a group has fewer than two names; when used, for an unknown name.
+    """
+
+    groups: Sequence[Sequence[str]]
+
+    def __post_init__(self) -> None:
+        if isinstance(self.groups, str) or not isinstance(self.groups, Sequence):
+            raise LabelError(
+                f"groups are lists of names, got {short(self.groups)}. Type [('a', 'b'), ...]."
+            )
+        listed = tuple(name_list(group, "a group") for group in self.groups)
+        for group in listed:
+            if len(set(group)) < 2:
+                raise LabelError(f"the group {group} has fewer than two names: name more.")
+        self._set(groups=listed)
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i - x_j = 0 within each group."""
+        pairs = []
+        for group in self.groups:
+            for name in group:
+                if name not in places.names:
+                    raise unknown_label("candidate of a group", name, places.names)
+            at = [places.names.index(name) for name in group]
+            pairs += [(at[0], other) for other in at[1:]]
+        return LinearRows.equal(pairs, places.total)
+
+
+@dataclass(frozen=True, eq=False)
+class Mirrored(Constraint):
+    """Each chosen candidate with its mirror image: layouts are symmetric about a plane.
+
+    Candidates without an image among the others are excluded, those on the plane are their own.
+
+    Parameters
+    ----------
+    axis : {"x", "y", "z"}
+        Normal of the plane.
+    at : float [m]
+        Where the plane is.
+
+    Raises
+    ------
+    ModelError
+        When the axis is none of these or the place no number.
+    """
+
+    axis: str
+    at: float
+
+    def __post_init__(self) -> None:
+        self._set(axis=one_of(self.axis, "axis", "xyz"), at=float(real_array(self.at, "at", ())))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i - x_j = 0 for images, x_i <= 0 without one."""
+        places.require_points()
+        k = "xyz".index(self.axis)
+        images = []
+        for points in places.points:
+            image = points.copy()
+            image[:, k] = 2.0 * self.at - image[:, k]
+            images.append(image)
+        near = np.array([[_apart(p, q) for q in images] for p in places.points])
+        found = near.argmin(axis=1)
+        lone = near.min(axis=1) > places.same
+        pairs = [(i, int(j)) for i, j in enumerate(found) if i < j and not lone[i]]
+        return LinearRows.equal(pairs, places.total).and_(LinearRows.closed(lone))
+
+
+@dataclass(frozen=True, eq=False)
+class Among(Constraint):
+    """So many of the chosen among these names: at most two accelerometers, one kind at a place.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Candidates.
+    at_least, at_most : int, optional
+        How many of them.
+
+    Raises
+    ------
+    ModelError
+        When a count is no whole number, or at_least is above at_most.
+    LabelError
+        When these are no names; when used, for an unknown name.
+    """
+
+    names: Sequence[str]
+    at_least: int | None = field(default=None, kw_only=True)
+    at_most: int | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        low, high = limits(self.at_least, self.at_most)
+        self._set(names=name_list(self.names, "names"), at_least=low, at_most=high)
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return the count of them between its limits."""
+        for name in self.names:
+            if name not in places.names:
+                raise unknown_label("candidate among others", name, places.names)
+        row = np.array([[name in self.names for name in places.names]], dtype=np.float64)
+        high = np.inf if self.at_most is None else float(self.at_most)
+        return LinearRows(row, np.array([float(self.at_least or 0)]), np.array([high]))
+
+
+def _apart(points: FloatArray, others: FloatArray) -> float:
+    """Return the largest distance from any point of one set to the other; inf if sizes differ."""
+    if len(points) != len(others):
+        return np.inf
+    between = np.linalg.norm(points[:, None] - others[None], axis=2)
+    return float(max(between.min(axis=0).max(), between.min(axis=1).max()))

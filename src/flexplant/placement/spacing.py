@@ -1,0 +1,42 @@
+"""A minimum distance between devices."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..values import positive
+from .constraint import Constraint
+from .places import Places
+from .rows import LinearRows
+
+
+@dataclass(frozen=True, eq=False)
+class MinimumDistance(Constraint):
+    """No two chosen candidates closer to each other than this.
+
+    Parameters
+    ----------
+    distance : float [m]
+        Between the nearest points of the two.
+
+    Raises
+    ------
+    ModelError
+        When it is not positive.
+    """
+
+    distance: float
+
+    def __post_init__(self) -> None:
+        self._set(distance=positive(self.distance, "distance"))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i + x_j <= 1 for each pair that is too close."""
+        close = places.distances(places.points) < self.distance - places.same
+        first, second = np.nonzero(np.triu(close, 1))
+        pairs = np.zeros((first.size, places.total))
+        line = np.arange(first.size)
+        pairs[line, first] = pairs[line, second] = 1.0
+        return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))

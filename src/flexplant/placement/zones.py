@@ -1,0 +1,133 @@
+"""Constraints on where devices may be: zones without any, or with so many, and off the die."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..errors import ModelError
+from ..structure import Disc
+from ..values import real_array, short
+from .constraint import Constraint, limits
+from .places import Places, Zone
+from .rows import LinearRows
+
+
+@dataclass(frozen=True, eq=False)
+class Excluded(Constraint):
+    """No candidate with a point inside any of the zones, seen from above.
+
+    Parameters
+    ----------
+    zones : Rectangle, Disc or sequence of them
+        At least one.
+
+    Raises
+    ------
+    ModelError
+        When a zone is something else, or there is none.
+    """
+
+    zones: Zone | Sequence[Zone]
+
+    def __post_init__(self) -> None:
+        self._set(zones=_zones(self.zones, "an excluded zone"))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i <= 0 inside."""
+        return LinearRows.closed(places.inside(_listed(self.zones)) > 0)
+
+    def drawn(self, places: Places) -> tuple[Zone, ...]:
+        """Return the zones."""
+        return _listed(self.zones)
+
+
+@dataclass(frozen=True, eq=False)
+class OffPoi(Constraint):
+    """No candidate on a POI: what is there cannot be measured.
+
+    Sensors are never placed on the point of a POI. A radius keeps them off the whole die; a
+    negative one allows all places.
+
+    Parameters
+    ----------
+    radius : float [m]
+        Candidates with a point no farther from any POI are excluded.
+
+    Raises
+    ------
+    ModelError
+        When the radius is no finite number.
+    """
+
+    radius: float = 0.0
+
+    def __post_init__(self) -> None:
+        self._set(radius=float(real_array(self.radius, "radius", ())))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i <= 0 near a POI."""
+        if self.radius < 0 or not places.pois:
+            return LinearRows.closed(np.zeros(places.total, dtype=bool))
+        near = places.distances(places.pois).min(axis=1)
+        return LinearRows.closed(near <= self.radius + places.same)
+
+    def drawn(self, places: Places) -> tuple[Zone, ...]:
+        """Return discs about the POIs."""
+        if self.radius <= 0:
+            return ()
+        return tuple(Disc(point[:2], self.radius) for poi in places.pois for point in poi)
+
+
+@dataclass(frozen=True, eq=False)
+class Within(Constraint):
+    """So many of the chosen inside the zones, seen from above; all of them when no count is given.
+
+    Parameters
+    ----------
+    zones : Rectangle, Disc or sequence of them
+        At least one; their union counts.
+    at_least, at_most : int, optional
+        How many. A candidate is inside when any of its points is.
+
+    Raises
+    ------
+    ModelError
+        When a zone or a count is not of its kind, or at_least is above at_most.
+    """
+
+    zones: Zone | Sequence[Zone]
+    at_least: int | None = field(default=None, kw_only=True)
+    at_most: int | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        low, high = limits(self.at_least, self.at_most)
+        self._set(zones=_zones(self.zones, "a zone"), at_least=low, at_most=high)
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return the count inside between its limits, or x_i <= 0 outside."""
+        inside = places.inside(_listed(self.zones))
+        if self.at_least is None and self.at_most is None:
+            return LinearRows.closed(inside == 0)
+        high = np.inf if self.at_most is None else float(self.at_most)
+        return LinearRows(inside[None], np.array([float(self.at_least or 0)]), np.array([high]))
+
+
+def _zones(given: Any, what: str) -> tuple[Zone, ...]:
+    listed = (given,) if isinstance(given, Zone) or not isinstance(given, Sequence) else given
+    for zone in listed:
+        if not isinstance(zone, Zone):
+            raise ModelError(
+                f"{what} is a Rectangle or a Disc, got {short(zone)}. Type "
+                "Disc((0.3, 0.3), radius=0.05)."
+            )
+    if not listed:
+        raise ModelError(f"there is no zone: {what} is a Rectangle or a Disc. Give one.")
+    return tuple(listed)
+
+
+def _listed(zones: Zone | Sequence[Zone]) -> tuple[Zone, ...]:
+    return (zones,) if isinstance(zones, Zone) else tuple(zones)
