@@ -129,6 +129,23 @@ def test_a_peak_between_the_poles_is_found_by_the_level_set():
     assert found <= hinf_norm(g) * (1 + 1e-9)
 
 
+def test_a_flat_peak_just_above_the_feedthrough_is_found():
+    """Near the gain of D the Hamiltonian matrix is nearly singular; a sweep finds 8e-4 more."""
+    A = [[-0.307, 1.4, -0.0211, 0], [0.78, 0, -5.72, 0], [31.4, 30.5, -52.5, 0]]
+    A = np.array([*A, [-0.0873, 0, 0, -0.0175]])
+    B = np.array([[0.0, 0], [0, 0], [106, 0.258], [-0.295, 0]])
+    C, D = (
+        np.array([[0.074, 0, 0, -4.13], [0.266, 0.258, -0.444, 0]]),
+        [[0.25, 0], [0.9014, 0.0022]],
+    )
+    points = 2j * np.pi * np.geomspace(1e-3, 1.0, 4000)
+    wanted = max(np.linalg.norm(C @ np.linalg.solve(s * np.eye(4) - A, B) + D, 2) for s in points)
+    found, freq = peak_gain(StateSpace(A, B, C, D))
+    assert wanted > 1.0007 * np.linalg.norm(D, 2)
+    assert found == pytest.approx(wanted, rel=1e-6)
+    assert 0.01 < freq < 0.03
+
+
 def test_a_narrow_peak_of_a_closed_loop_is_found():
     # a loop whose poles differ from the plant's: dense A, one very light mode
     g = machine(0, 8, zeta=1e-4, m=1, p=1, seed=3)

@@ -21,6 +21,8 @@ TOLERANCE = 1e-9
 #: the squares of the H2 norm by both Gramians agree to this, or to rounding of their terms
 AGREEMENT, ROUNDING = 2e-8, 1e-13
 LEVELS = 30
+#: how far above the largest gain of the feedthrough a level set is not lost in rounding
+CLEAR = 1e-7
 #: points across each resonance at first; parabolas from there on, each on an interval so much
 #: narrower: the last one is 1e-3 of a resonance wide, its error in the gain below 1e-10
 ACROSS, PARABOLAS, NARROWER = 9, 3, 8.0
@@ -204,8 +206,11 @@ def _peak(g: StateSpace) -> tuple[float, float]:
         return 0.0, 0.0
     level = _Level(g)
     for _ in range(LEVELS):
-        crossings = level.crossings(gain * (1 + TOLERANCE))
-        middles = np.concatenate([crossings, 0.5 * (crossings[1:] + crossings[:-1])])
+        # just above the feedthrough the Hamiltonian matrix is nearly singular: a level more
+        close = gain <= (1 + CLEAR) * level.through
+        levels = (TOLERANCE, CLEAR) if close else (TOLERANCE,)
+        found = [level.crossings(gain * (1 + one)) for one in levels]
+        middles = np.concatenate([one for c in found for one in (c, 0.5 * (c[1:] + c[:-1]))])
         middles = middles[middles < top]
         gains = find(middles)
         if not gains.size or gains.max() <= gain * (1 + TOLERANCE):
@@ -310,6 +315,7 @@ class _Level:
             C = np.sqrt(2.0) * la.lu_solve(factor, C.T, trans=1).T
             B = np.sqrt(2.0) * inverse_B
         self.A, self.B, self.C, self.D = A, B, C, D
+        self.through = float(np.linalg.norm(D, 2))
 
     def crossings(self, gamma: float) -> FloatArray:
         """Return the sorted frequencies [Hz] of eigenvalues on, or nearly on, the axis."""

@@ -25,6 +25,8 @@ from .structures import ControllerFamily, ControllerStructure, as_system
 
 #: steps of BFGS for stability and for the norm
 _STEPS = 300
+#: what the search adds to the norm, relative to it, for parameters of size 1
+_SMALL = 1e-6
 #: rounds of gradient sampling and BFGS, and what one has to gain for another
 _ROUNDS, _ROUND_GAIN = 10, 1e-4
 #: of the time, what is for BFGS; the rest is for gradient sampling
@@ -118,12 +120,13 @@ def design_structured(
     K = as_system(family.matrices(found.x), (plants[0].y, plants[0].u), plants[0].dt)
     K = K.replace(name="structured", units=plants[0].units)
     closed = [lft(one.system, K) for one in plants]
-    each = [certified_norm(loop, found.value) for loop in closed]
+    claim = found.value / (1.0 + _SMALL * float(np.sqrt(1.0 + found.x @ found.x)))
+    each = [certified_norm(loop, claim) for loop in closed]
     worst = int(np.argmax([one["norm"] for one in each]))
-    if not abs(each[worst]["norm"] - found.value) <= _AGREEMENT * found.value:
+    if not abs(each[worst]["norm"] - claim) <= _AGREEMENT * claim:
         raise CertificateError(
             f"the closed loop has the norm {each[worst]['norm']:.6g} on the plant as given, "
-            f"{found.value:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
+            f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
     certificate = dict(each[worst]) | {
@@ -203,7 +206,10 @@ class _StructureSearch:
         return value, self.family.slope(theta, by)
 
     def norm(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """Return the largest norm of the loops and its gradient."""
+        """Return the largest norm of the loops, a little more for large parameters; its gradient.
+
+        Some infima are only neared as gains grow without bound: this ends them at finite ones.
+        """
         K = self.family.matrices(theta)
         if not all(np.all(np.isfinite(part)) for part in K):
             return np.inf, np.zeros(theta.size)
@@ -214,7 +220,9 @@ class _StructureSearch:
                 return np.inf, np.zeros(theta.size)
             best = max(best, (value, by), key=lambda one: one[0])
         assert best[1] is not None  # noqa: S101 - there is at least one loop, and none was unstable
-        return best[0], self.family.slope(theta, best[1])
+        size = float(np.sqrt(1.0 + theta @ theta))
+        slope = (1.0 + _SMALL * size) * self.family.slope(theta, best[1])
+        return (1.0 + _SMALL * size) * best[0], slope + _SMALL * best[0] / size * theta
 
     def best(self, starts: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
         """Return the best parameters from all starts and the norm there.
