@@ -8,6 +8,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError
+from flexplant.simulation import machine_pipeline
 
 EXAMPLE = Path(__file__).parents[1] / "examples" / "fleet.py"
 
@@ -98,6 +99,25 @@ def test_the_whole_chain_from_a_measured_frf(fleet, tmp_path):
     assert chain.replace(candidates=()).report(poles, 1).measured.modes == poles.modes
 
 
+def test_a_virtual_machine_is_measured_with_the_options_given(fleet, monkeypatch):
+    """Where it is not its poles that are taken; the identification has the band and the hold."""
+
+    class Rig:
+        def measure_frf(self, ports, *, period, rng):
+            return "frf", len(ports.u), period, rng
+
+    seen = {}
+
+    def identified(frf, **options):
+        seen.update(options, frf=frf)
+        return fx.MeasuredModes([-1 + 1j], modes=[4])
+
+    monkeypatch.setattr(machine_pipeline, "identify_modes", identified)
+    chain = fleet.pipeline().replace(measurement={"period": 0.5}, band=(1.0, 2.0), hold=3.0)
+    assert chain._measured(Rig(), 7).modes == (4,)
+    assert seen == {"band": (1.0, 2.0), "hold": 3.0, "frf": ("frf", 4, 0.5, 7)}
+
+
 def test_the_chain_refuses_what_it_cannot_use(fleet):
     chain = fleet.pipeline()
     assert repr(chain) == "<MachinePipeline: 5 parameters updated, H-infinity, 80, 60, 40 Hz>"
@@ -105,6 +125,10 @@ def test_the_chain_refuses_what_it_cannot_use(fleet):
         chain.replace(full=chain.model)
     with pytest.raises(ModelError, match="the ports need a reference"):
         chain.replace(ports=chain.ports.replace(references=()))
+    with pytest.raises(ModelError, match="measurement"):
+        chain.replace(measurement=3)
+    with pytest.raises(ModelError, match="mode must be a whole number"):
+        chain.replace(modes=[4.5])
     with pytest.raises(ModelError, match="bandwidth"):
         chain.replace(bandwidth=(80.0, -1.0))
     with pytest.raises(ModelError, match=r"it is not said what to measure on it. Give modes="):

@@ -1,5 +1,8 @@
 """A linear loop over 100 000 samples: ours beside python-control and SciPy."""
 
+import time
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.signal
@@ -81,3 +84,27 @@ def test_a_linear_loop():
     print(f"\n{COUNT} samples, {g.n_states} states, {len(run.names)} channels")
     for name, seconds in rows:
         print(f"{name:36s}{1e3 * seconds:10.1f} ms{seconds / rows[0][1]:9.1f} x")
+
+
+@pytest.mark.benchmark
+def test_a_machine_of_a_fleet(monkeypatch):
+    """Update, plant, Kalman, H-infinity and a second at 10 kHz, on one core: CPU seconds."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "examples"))
+    import fleet
+
+    chain, machines = fleet.pipeline().replace(duration=1.0), fleet.fleet(4)
+    kinds = {
+        "poles, run on the updated model of 164 states": [
+            m.poles(fleet.MEASURED) for m in machines
+        ],
+        "virtual, run on all its 490 states": machines,
+    }
+    print()
+    with one_thread():
+        for name, found in kinds.items():
+            times = []
+            for machine in found:
+                start = time.process_time()
+                assert chain(machine, np.random.default_rng(0))["stable"]
+                times.append(time.process_time() - start)
+            print(f"{name:48s}" + "".join(f"{seconds:8.2f} s" for seconds in times))

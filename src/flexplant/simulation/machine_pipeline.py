@@ -17,7 +17,14 @@ from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
 from ..lti.frequency import Frf
 from ..modes import Modes, solve_modes
-from ..plant import Ports, StandardPlant, assemble_plant, reference_errors, stage_weights
+from ..plant import (
+    Ports,
+    StandardPlant,
+    assemble_plant,
+    larger_plant,
+    reference_errors,
+    stage_weights,
+)
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..synthesis import design_hinf
@@ -124,15 +131,16 @@ class MachinePipeline(Value):
     def __post_init__(self) -> None:
         for name, kind in (("model", ReducedModel), ("full", FEModel), ("ports", Ports)):
             instance(getattr(self, name), kind, name, "Give one of that type.")
+        if self.measurement is not None:
+            instance(self.measurement, Mapping, "measurement", "Give {'period': 0.5}, say, or {}.")
         if not self.ports.references:
             raise ModelError("the ports need a reference for the POI: references=[Reference(...)].")
         self._set(
             parameters=tuple(self.parameters),
             rate=positive(self.rate, "rate"),
             delay=whole(self.delay, "delay", minimum=0),
-            modes=None if self.modes is None else tuple(self.modes),
+            modes=None if self.modes is None else tuple(map(_number, np.ravel(self.modes))),
             measurement=None if self.measurement is None else dict(self.measurement),
-            band=None if self.band is None else tuple(self.band),
             candidates=tuple(self.candidates),
             bandwidth=tuple(sorted(map(_hertz, np.atleast_1d(self.bandwidth)), reverse=True)),
             margin=positive(self.margin, "margin"),
@@ -195,16 +203,16 @@ class MachinePipeline(Value):
             run = simulate(loop, duration=self.duration, reference=self.reference, rng=of_run)
             check = self.specification
             report = MachineReport(
-                {},
-                measured,
-                fit,
-                observer,
-                blocks,
-                left_out,
-                loop,
-                run,
-                None if check is None else check.check(loop, run),
-                places,
+                row={},
+                measured=measured,
+                places=places,
+                fit=fit,
+                observer=observer,
+                blocks=blocks,
+                left_out=left_out,
+                loop=loop,
+                run=run,
+                verdict=None if check is None else check.check(loop, run),
             )
             row = self._row(report)
         row["warnings"] = len(said)
@@ -281,8 +289,8 @@ class MachinePipeline(Value):
         if hasattr(machine, "loop"):
             own: ClosedLoop = machine.loop(self.ports, *blocks)
             return own
-        loop = close_loop(plant, *blocks, larger=many)
-        return loop.completed or loop
+        whole = larger_plant(plant, many)
+        return close_loop(plant if whole is None else whole, *blocks)
 
     def _row(self, found: MachineReport) -> dict[str, Any]:
         fit, loop = found.fit, found.loop
@@ -307,6 +315,10 @@ class MachinePipeline(Value):
             row |= {n: found.verdict[n] for n in found.verdict.names if n not in row}
             row["passed"] = found.verdict.passed
         return row
+
+
+def _number(value: Any) -> int:
+    return whole(value, "mode")
 
 
 def _hertz(value: Any) -> float:
