@@ -27,7 +27,7 @@ from flexplant.lti import (
 )
 from flexplant.lti.riccati import control_care
 from flexplant.parallel import CHUNK, PROBE, mapped
-from flexplant.synthesis import hinf, servo
+from flexplant.synthesis import attempts, servo
 
 
 def square(item):
@@ -236,7 +236,7 @@ def loaded(g):
             "servo_task",
             lambda g: flexplant.design_servo(stages.sampled(stages.reduced()), bandwidth=20.0),
         ),
-        (hinf, "certified_norm", lambda g: flexplant.design_hinf(loaded(g), u=["u"], y=["y"])),
+        (attempts, "certified_norm", lambda g: flexplant.design_hinf(loaded(g), u=["u"], y=["y"])),
     ],
 )
 def test_dense_loops_run_on_one_thread(monkeypatch, module, inner, call):

@@ -114,7 +114,7 @@ def test_what_is_no_system_is_refused(tmp_path):
     scipy.io.savemat(path, matrices | sides)
     with pytest.raises(LabelError):
         read_mat(path)
-    with pytest.raises(ModelError, match="python-control StateSpace, got str"):
+    with pytest.raises(ModelError, match="python-control or SciPy, got str"):
         write_mat(path, "plant")
 
 

@@ -272,7 +272,7 @@ def test_a_program_that_falls_into_the_trap_is_refused():
     M = cp.Variable((2, 2))
     trap = cp.Problem(cp.Maximize(M[0, 1]), [M >> 0, cp.diag(M) == 1, M[1, 0] == -10])
     with pytest.raises(SolverError, match="not symmetric"):
-        lmi_programs._solve(trap, SETTINGS)
+        lmi_programs.solve_program(trap, SETTINGS)
 
 
 def test_blocks_are_mirrored():
@@ -296,7 +296,7 @@ def test_every_lmi_is_symmetric_for_any_values(monkeypatch):
             seen.append(M.shape)
         raise SolverError("seen")
 
-    monkeypatch.setattr(lmi_programs, "_solve", look)
+    monkeypatch.setattr(lmi_programs, "solve_program", look)
     p = Plant.of(problem(random_parts(5, n=4)))
     with pytest.raises(SolverError, match="seen"):
         smallest_gamma(p, 1.0, SETTINGS)
@@ -390,13 +390,16 @@ def test_a_proof_of_infeasibility_is_named():
     X = cp.Variable((2, 2), symmetric=True)
     impossible = cp.Problem(cp.Minimize(0), [X - np.eye(2) >> 0, -X - np.eye(2) >> 0])
     with pytest.raises(InfeasibleError, match="PrimalInfeasible after"):
-        lmi_programs._solve(impossible, SETTINGS)
+        lmi_programs.solve_program(impossible, SETTINGS)
 
 
-def test_a_violated_lmi_is_named(monkeypatch):
-    monkeypatch.setattr(lmi_programs, "VIOLATION", -1e-3)
+def test_a_violated_lmi_is_named():
+    import cvxpy as cp
+
+    X = cp.Variable((2, 2), symmetric=True)
+    tight = cp.Problem(cp.Minimize(cp.trace(X)), [X - np.eye(2) >> 0])
     with pytest.raises(SolverError, match=r"an LMI is violated: smallest eigenvalue"):
-        Lmi().solve(problem(scalar(1.0, 1.0)))
+        lmi_programs.solve_program(tight, SETTINGS, violation=-1e-3)
 
 
 def test_time_limit_is_kept_and_named():

@@ -206,7 +206,12 @@ def checked_residuals(residuals: Any) -> tuple[Residual, ...]:
     """Return the residuals as a tuple, checked."""
     listed = tuple(residuals) if isinstance(residuals, Sequence) else (residuals,)
     for residual in listed:
-        instance(residual, Residual, "a residual", "Wrap the measurement: [Eigenvalues(measured)].")
+        instance(
+            residual,
+            Residual,
+            "a residual",
+            "Pass the measurement as one: [Eigenvalues(measured)].",
+        )
     if not listed:
         raise ModelError("residuals is empty: nothing was measured to update from.")
     return listed
