@@ -321,3 +321,9 @@ def test_the_check_of_words_can_fail():
     assert figures(source) == [(1, "knows"), (2, "to look at"), (3, "ask")]
     assert figures("x\n  of the doors")[0] == (2, "doors")
     assert advice("doubted") == "uncertainty, variance"
+
+
+def test_files_of_tests_have_names_of_their_own():
+    """Two of one name cannot be collected in one run."""
+    names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
