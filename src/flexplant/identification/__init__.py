@@ -9,6 +9,7 @@ from .identify import identify_modes as identify_modes
 from .identify import stabilisation_diagram as stabilisation_diagram
 from .measured import MeasuredModes as MeasuredModes
 from .numbering import numbered as numbered
+from .output_only import identify_output_only as identify_output_only
 from .periodic import Periodic as Periodic
 from .periodic import multisine as multisine
 from .spectra import H1Estimator as H1Estimator

@@ -80,7 +80,7 @@ def stabilisation_diagram(
     top = positive(max_zeta, "max_zeta")
     if top >= 1:
         raise ModelError(f"max_zeta must be below 1, where nothing oscillates, got {top:g}.")
-    ready, listed = prepared(frf, band), _checked_orders(orders)
+    ready, listed = prepared(frf, band), checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])
     with one_thread():
@@ -193,7 +193,7 @@ def _identified(
     if rate is not None and high > rate / 2 * (1 + 1e-12):
         raise ModelError(f"a hold at {rate:g} Hz and lines up to {high:g} Hz do not go together.")
     labels = checked_channels(dofs, frf)
-    listed = _checked_orders(orders)
+    listed = checked_orders(orders)
     if start is not None:
         instance(start, PoleSelection, "start", "Pass diagram.select(freq=[...]).")
     if not ready.known:
@@ -282,7 +282,8 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     return {str(name): str(label) for name, label in dofs.items()}
 
 
-def _checked_orders(orders: Iterable[int] | None) -> list[int]:
+def checked_orders(orders: Iterable[int] | None) -> list[int]:
+    """Return rising model orders, 2 to 40 where none are given."""
     given = range(2, 41) if orders is None else orders
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ModelError(

@@ -26,12 +26,12 @@ class Records:
 
 def records(inputs: Any, outputs: Any, reference: Any, rate: float) -> Records:
     """Return records of arrays or mappings by name."""
-    u, in_names = _signals(inputs, "inputs", "u")
-    y, out_names = _signals(outputs, "outputs", "y")
+    u, in_names = signals(inputs, "inputs", "u")
+    y, out_names = signals(outputs, "outputs", "y")
     sides = {"outputs": y}
     r = None
     if reference is not None:
-        r, _ = _signals(reference, "reference", "r")
+        r, _ = signals(reference, "reference", "r")
         sides["reference"] = r
         if r.shape[1] != u.shape[1]:
             raise ShapeError(
@@ -47,7 +47,8 @@ def records(inputs: Any, outputs: Any, reference: Any, rate: float) -> Records:
     return Records(u, y, r, in_names, out_names, rate)
 
 
-def _signals(value: Any, side: str, prefix: str) -> tuple[FloatArray, tuple[str, ...]]:
+def signals(value: Any, side: str, prefix: str) -> tuple[FloatArray, tuple[str, ...]]:
+    """Return records (n_exp, n_channel, n_time) and the names of their channels."""
     names: tuple[str, ...] = ()
     if isinstance(value, Mapping):
         names = tuple(str(name) for name in value)

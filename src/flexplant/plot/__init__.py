@@ -10,6 +10,7 @@ from .frequency import frf as frf
 from .frequency import sensitivity as sensitivity
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
+from .localisation import localisation as localisation
 from .nyquist import nyquist as nyquist
 from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed

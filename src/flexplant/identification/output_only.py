@@ -1,0 +1,228 @@
+"""Output-only identification: modes of a machine that shakes by itself, with their uncertainty."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import ModelError, SolverError
+from ..values import ComplexArray, FloatArray, positive, real_array, whole
+from .diagram import built_diagram
+from .identify import checked_orders
+from .measured import MeasuredModes
+from .plscf import OrderPoles
+from .records import signals
+
+#: periods of the lowest frequency over which covariances are used where no lags are given
+PERIODS = 2.0
+#: largest damping ratio of a pole
+HEAVY = 0.2
+#: frequencies of a mode in two parts of the record differ by less than this
+NEAR = 0.1
+#: and of a mode at two orders; its frequency's standard deviation is below this, its damping's
+#: below the latter part of it: poles of noise vary more
+SAME, LOOSE = 0.02, 0.6
+#: differences to the next order of a stable pole, and its MAC with it
+TOLERANCES = (0.01, 0.3, 0.9)
+
+
+def identify_output_only(
+    outputs: Any,
+    *,
+    rate: float,
+    band: tuple[float, float],
+    orders: Iterable[int] | None = None,
+    lags: int | None = None,
+    blocks: int = 20,
+) -> MeasuredModes:
+    r"""Return poles and shapes from responses alone, to excitation that nobody measured.
+
+    Covariance-driven stochastic subspace identification: with covariances
+    :math:`R_k = \frac{1}{N} \sum_t y_{t+k} y_t^T` of responses to white excitation,
+
+    .. math:: H = \begin{bmatrix} R_1 & R_2 & \cdots \\ R_2 & R_3 & \cdots \\ \vdots & & \ddots
+        \end{bmatrix} = O\,C, \quad O = [C;\ C A;\ C A^2;\ \ldots],
+
+    so that the leading singular vectors of H give O up to its basis, its shift A, and
+    :math:`\lambda = rate\,\ln \mu(A)`. Poles that stay over the orders are chosen, at the lowest
+    order that has most of them: more states add noise. White noise of the sensors is in
+    :math:`R_0` only, which is not used.
+
+    The record is cut into blocks; H without each of them (a jackknife) gives the covariance of
+    each pole, to first order in the errors of H. Poles whose frequency varies by more than 2 %, or
+    whose damping by more than 60 %, are noise and left out.
+
+    Parameters
+    ----------
+    outputs : (n_channel, n_time) array or mapping {name: (n_time,) array}
+        Displacements, velocities or accelerations, (n_exp, n_channel, n_time) of several records.
+    rate : float [Hz]
+        Of sampling; ten times the band's end at most, or covariances hold little: decimate first.
+    band : (low, high) [Hz]
+        Where modes are wanted.
+    orders : iterable of int, optional
+        Numbers of states; 4 to 40 in twos when not given.
+    lags : int, optional
+        Block rows and columns of H; two periods of the lowest frequency when not given.
+    blocks : int
+        In which the record is cut, from 8; each should be longer than the slowest decay.
+
+    Returns
+    -------
+    MeasuredModes
+        Sorted by frequency, without mode numbers; shapes at the channels, their largest entry 1
+        (the excitation is not known, so neither is their scale). The covariance is that of each
+        pole by itself.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When an argument is out of range, or the record is too short.
+    SolverError
+        When no pole stays over the orders and over the record.
+
+    Notes
+    -----
+    A rotating part or a mains hum appears as a mode of next to no damping; excitation that is not
+    white appears as modes of its own.
+
+    References
+    ----------
+    Peeters, De Roeck: Reference-based stochastic subspace identification for output-only modal
+    analysis, Mech. Syst. Signal Process. 13, 1999. Reynders, Pintelon, De Roeck: Uncertainty
+    bounds on modal parameters obtained from stochastic subspace identification, ibid. 22, 2008.
+    """
+    y, names = signals(outputs, "outputs", "y")
+    step = 1.0 / positive(rate, "rate")
+    low, high = real_array(band, "band", (2,)).tolist()
+    if not 0 < low < high < rate / 2:
+        raise ModelError(
+            f"band must be (low, high) in Hz between 0 and half the rate, {rate / 2:g} Hz, got "
+            f"{band!r:.60}."
+        )
+    listed = checked_orders(range(4, 41, 2) if orders is None else orders)
+    wanted = max(2.0, PERIODS * rate / low / 2)
+    count = int(np.ceil(wanted)) if lags is None else whole(lags, "lags", minimum=2)
+    count = max(count, int(np.ceil(listed[-1] / y.shape[1])) + 1)
+    parts = whole(blocks, "blocks", minimum=8)
+    long = y.shape[0] * y.shape[2] // parts
+    if long < 4 * count:
+        raise ModelError(
+            f"{parts} blocks of {long} samples are too short for {count} lags: measure longer, or "
+            "give fewer blocks= or lags=."
+        )
+    each = np.array([_hankel(block, count) for block in _blocks(y, parts)])
+    mean = each.mean(axis=0)
+    U, sizes, _ = la.svd(mean)
+    inside = (low, high)
+    results = [_poles(U, sizes, y.shape[1], order, step, inside) for order in listed]
+    chosen = built_diagram(results, np.array(inside), TOLERANCES).automatic().poles
+    bases = [la.svd((parts * mean - one) / (parts - 1)) for one in each]
+    best: tuple[OrderPoles, FloatArray, Any] | None = None
+    for result in results:
+        found = _those(result, chosen)
+        if found.poles.size <= (0 if best is None else best[2].size):
+            continue
+        again = (
+            _poles(left, values, y.shape[1], result.order, step, (0.0, np.inf))
+            for left, values, _ in bases
+        )
+        spread, kept = _spread(found, list(again))
+        if best is None or kept.size > best[2].size:
+            best = found, spread, kept
+    if best is None or not best[2].size:
+        raise SolverError(
+            f"no pole between {low:g} and {high:g} Hz is the same in all parts of the record. "
+            "Measure longer, or narrow the band to where resonances stand out of the noise."
+        )
+    found, spread, kept = best
+    covariance = np.zeros((2 * kept.size,) * 2)
+    for i, k in enumerate(kept.tolist()):
+        both = [i, i + kept.size]
+        covariance[np.ix_(both, both)] = spread[:, :, k] @ spread[:, :, k].T
+    shapes = found.shapes[:, kept]
+    shapes = shapes / shapes[np.argmax(np.abs(shapes), axis=0), np.arange(kept.size)]
+    return MeasuredModes(found.poles[kept], covariance=covariance, shapes=shapes, dofs=names)
+
+
+def _blocks(y: FloatArray, parts: int) -> list[FloatArray]:
+    """Return about `parts` pieces (n_channel, n_time) of the records."""
+    share = max(1, round(parts / y.shape[0]))
+    pieces = [piece for record in y for piece in np.array_split(record, share, axis=1)]
+    return [piece - piece.mean(axis=1, keepdims=True) for piece in pieces]
+
+
+def _hankel(y: FloatArray, count: int) -> FloatArray:
+    """Return H (count n, count n) of one piece."""
+    n, long = y.shape
+    size = 1 << int(np.ceil(np.log2(2 * long)))
+    Y = np.fft.rfft(y, size, axis=1)
+    R = np.fft.irfft(Y[:, None] * Y[None].conj(), size, axis=2)[:, :, : 2 * count]
+    R = R / (long - np.arange(2 * count))
+    rows = [np.hstack([R[:, :, i + j + 1] for j in range(count)]) for i in range(count)]
+    return np.vstack(rows).reshape(count * n, count * n)
+
+
+def _poles(
+    U: FloatArray,
+    sizes: FloatArray,
+    n: int,
+    order: int,
+    step: float,
+    band: tuple[float, float],
+) -> OrderPoles:
+    """Return the poles of one order inside the band."""
+    O = U[:, :order] * np.sqrt(sizes[:order])  # noqa: E741 - the observability matrix
+    A = la.lstsq(O[:-n], O[n:])[0]
+    mu, vectors = la.eig(A)
+    keep = np.abs(mu) > 0
+    poles = np.log(mu[keep]) / step
+    shapes = np.asarray(O[:n] @ vectors[:, keep], dtype=np.complex128)
+    freq = np.abs(poles) / (2 * np.pi)
+    right = (poles.imag > 0) & (poles.real < 0) & (-poles.real < HEAVY * np.abs(poles))
+    right &= (freq >= band[0]) & (freq <= band[1])
+    chosen = np.flatnonzero(right)[np.argsort(freq[right], kind="stable")]
+    shapes = shapes[:, chosen] / np.linalg.norm(shapes[:, chosen], axis=0)
+    return OrderPoles(order, poles[chosen], shapes, np.ones((1, chosen.size), complex))
+
+
+def _those(result: OrderPoles, chosen: ComplexArray) -> OrderPoles:
+    """Return those poles of an order that are near chosen ones, one for each."""
+    moved = np.abs(chosen[:, None] - result.poles) / np.abs(chosen)[:, None]
+    near = np.unique([int(np.argmin(row)) for row in moved if row.size and row.min() < SAME])
+    picked = near.astype(np.int64)
+    return OrderPoles(
+        result.order,
+        result.poles[picked],
+        result.shapes[:, picked],
+        result.participation[:, picked],
+    )
+
+
+def _spread(found: OrderPoles, again: list[OrderPoles]) -> tuple[FloatArray, Any]:
+    """Return deviations (2, parts, m) of Re and Im, squared their variance, and which are small."""
+    moved = np.array([_like(found, other) for other in again])
+    centred = moved - moved.mean(axis=0)
+    spread = np.array([centred.real, centred.imag]) * np.sqrt(1 - 1 / len(again))
+    std = np.sqrt(np.sum(spread**2, axis=1))
+    # not a number where one is lost
+    small = (std[1] < SAME * np.abs(found.poles)) & (std[0] < LOOSE * -found.poles.real)
+    return spread, np.flatnonzero(small)
+
+
+def _like(found: OrderPoles, other: OrderPoles) -> ComplexArray:
+    """Return the poles of another result that are those found, by frequency and shape, or NaN."""
+    from scipy.optimize import linear_sum_assignment
+
+    moved = np.full(found.poles.size, np.nan + 0j)
+    if not other.poles.size:
+        return moved
+    far = np.abs(other.poles - found.poles[:, None]) / np.abs(found.poles)[:, None]
+    unlike = 1 - np.abs(found.shapes.conj().T @ other.shapes) ** 2
+    for i, j in zip(*linear_sum_assignment(far / NEAR + unlike), strict=True):
+        if far[i, j] < NEAR:
+            moved[i] = other.poles[j]
+    return moved
