@@ -18,7 +18,7 @@ def case():
     names = [q.name for q in candidates]
     xyz = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, 2.0, 0.0]]
     found = Localisation(
-        candidates=names,
+        candidates=tuple(names),
         values=np.array([0.3, 0.2, np.nan, 0.1]),
         score=np.array([0.9, 0.895, 0.1, 0.4]),
         bic=np.array([10.0, 40.0, np.inf, 90.0]),
