@@ -8,12 +8,15 @@ from ..errors import FlexplantError, ModelError, SolverError
 from ..values import FloatArray, Rng
 from .approach import approached
 from .judgement.goodness import chance, chi_square, is_bad
+from .residuals.eigenvalues import Eigenvalues
 from .search import Objective, SearchEnd, UpdateMethod
 from .search.update_method import Trail
 from .starts import scattered
 
 #: part of the measured power that a minimum leaves which has little to do with the measurement
 ABSURD = 0.1
+#: relative distance of a pole from the measured one, beyond noise, that a wrong pairing may leave
+FAR = 1e-3
 #: other starts that are tried after such an end, for models of up to so many DOFs and larger ones
 RETRIES, SMALL, RETRIES_LARGE = 20, 100, 4
 
@@ -45,12 +48,14 @@ def from_one_start(
     """Return the best end, the objective being there, all starts that were tried and their ends.
 
     Where responses alone are fitted and the first end explains nothing of them (a peak of the
-    model lies on a wrong measured one), other starts are tried until one does.
+    model lies on a wrong measured one), other starts are tried until one does; so where poles
+    alone are fitted by several parameters and the end is far from them: modes may have been paired
+    wrongly, which shapes would have shown.
     """
     begins = [begin]
     best = _led(objective, begin, method, most, tolerance)
     ends: list[SearchEnd | None] = [best]
-    if objective.numbers or not _absurd(objective, best.p):
+    if not _improvable(objective, best):
         return best, begins, ends
     small = len(objective.family.V) <= SMALL
     for other in scattered(objective, RETRIES if small else RETRIES_LARGE, rng):
@@ -61,8 +66,11 @@ def from_one_start(
             ends.append(None)
             continue
         ends.append(found)
-        best = min(best, found, key=lambda one: one.cost)
-        if best is found and not _absurd(objective, best.p):
+        done = not _improvable(objective, found)
+        # poles are only paired anew where that explains them: an outlier is no wrong pairing
+        if done or (not objective.numbers and found.cost < best.cost):
+            best = found
+        if done:
             break
     objective.path = []
     objective.begin(best.trail.p[0])
@@ -86,6 +94,22 @@ def _led(
     if before is not None:
         found.trail = before.joined(found.trail)
     return found
+
+
+def _improvable(objective: Objective, end: SearchEnd) -> bool:
+    """Return whether another start may lead to a better end."""
+    if not objective.numbers:
+        return _absurd(objective, end.p)
+    poles = objective.poles_measured
+    alone = all(isinstance(residual, Eigenvalues) for residual in objective.residuals)
+    if poles is None or not alone or end.p.size < 2:
+        return False
+    point = objective.at(end.p)
+    found = point.eigen.poles[point.columns(poles.numbers)]
+    if np.max(np.abs(found - poles.target) / np.abs(poles.target)) < FAR:
+        return False
+    chi2, dof = chi_square(objective, point, np.ones(end.p.size, dtype=bool))
+    return dof > 0 and (chi2 is None or is_bad(chance(chi2, dof)))
 
 
 def _absurd(objective: Objective, p: FloatArray) -> bool:

@@ -81,9 +81,9 @@ def update(
         Values to begin with. When not given zeros, or the means of priors, inside the bounds; then
         complex responses are fitted by the logarithm of their magnitude first, all entries about
         equally weighted, and poles before shapes, since these converge from farther away. Where
-        responses alone are fitted and a tenth of their power is left, which noise does not
-        explain, up to 20 other starts are tried (`UpdateResult.starts`), 4 with a model of more
-        than 100 DOFs.
+        responses alone are fitted and a tenth of their power is left, or several parameters to
+        poles alone and a pole is 0.1 % off, which noise does not explain, up to 20 other starts
+        are tried (`UpdateResult.starts`), 4 with a model of more than 100 DOFs.
     starts : int or (s, q) array, optional
         Search from several starts, drawn between the bounds (or from the priors), and keep
         the best; `start` is one of them.
