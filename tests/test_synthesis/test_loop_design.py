@@ -104,10 +104,10 @@ def test_tuned_on_lines_verified_on_the_model():
         assert one.crossovers[0] > 1.5 * fx.servo_bandwidth(plant())
 
 
-def body(late):
-    """2 kg with a mode at 600 Hz of 0.1 %, sampled with some delay."""
-    w = 2 * np.pi * 600.0
-    A = la.block_diag([[0, 1], [0, 0]], [[0, 1], [-(w**2), -2e-3 * w]])
+def body(late, spring=0.0):
+    """2 kg with a mode at 600 Hz of 0.1 %, sampled with some delay; free, or on a spring [Hz]."""
+    w, s = 2 * np.pi * 600.0, 2 * np.pi * spring
+    A = la.block_diag([[0, 1], [-(s**2), -0.02 * s]], [[0, 1], [-(w**2), -2e-3 * w]])
     G = StateSpace(A, [[0], [0.5], [0], [0.5]], [[1, 0, -0.4, 0]], [[0]], inputs=["f"])
     return discretized(G, RATE, delay=late)
 
@@ -130,6 +130,23 @@ def test_less_delay_or_a_lower_margin_buys_bandwidth(sign):
         reached.append(one.crossovers[0])
     assert reached == sorted(reached)
     assert reached[1] > 1.2 * reached[0]
+
+
+def test_on_springs_within_the_lines():
+    """A suspension at 3 Hz: the model's own poles, or rigid=0 of an Frf; the same loop."""
+    G = body(1, spring=3.0)
+    free = tune_loops(body(1)).report["y1"].crossovers[0]
+    found = tune_loops(G)
+    lines = np.geomspace(0.3, 4900.0, 9000)
+    measured = tune_loops(frequency_response(G, lines), rate=RATE, hold=False, rigid=0)
+    for one in (found, measured):
+        g, K = G, one.system
+        A = np.block([[g.A + g.B @ K.D @ g.C, g.B @ K.C], [K.B @ g.C, K.A]])
+        assert np.abs(la.eigvals(A)).max() < 1.0
+        first = min(f for f in one.report["y1"].crossovers if f > 10.0)
+        assert first == pytest.approx(free, rel=0.1)
+    with pytest.raises(SolverError, match="rigid=0 when it is on springs"):
+        tune_loops(frequency_response(G, lines), rate=RATE, hold=False)
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ _INTEGRATOR = 0.1
 _TRIALS, _STEPS = 20, 20
 #: resonances that may be notched, and how far they rise above the line of the rigid body
 _RESONANCES, _RISE = 12, 2.0
+#: distance of a pole from zero frequency, beside the farthest, that counts as none
+_ZERO = 1e-6
 
 
 @one_thread()
@@ -59,8 +61,8 @@ def tune_loops(
     peak : float
         Bound on |S|; 2 is a modulus margin of 6 dB.
     rigid : int, optional
-        Rigid-body modes that the axes show; as many as axes unless given. 0 on springs whose modes
-        lie within the lines.
+        Rigid-body modes that the axes show; unless given as many as axes, of a model those that it
+        has. 0 on springs whose modes lie within the lines.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
 
@@ -80,8 +82,11 @@ def tune_loops(
     if positive(peak, "peak") <= 1.0:
         raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")
     axes = axes_of(plant, before, after, rate, delay, hold)
-    rigid = len(axes.names) if rigid is None else whole(rigid, "rigid", minimum=0)
-    frf = axes.plant if isinstance(axes.plant, Frf) else _response(axes.plant)
+    measured = isinstance(axes.plant, Frf)
+    if rigid is None:
+        rigid = len(axes.names) if measured else _free_modes(axes.plant)
+    rigid = whole(rigid, "rigid", minimum=0)
+    frf = axes.plant if measured else _response(axes.plant)
     found = {
         name: _Axis(name, frf.freq, frf.data[i, i], axes.rate, peak, rigid > 0).best()
         for i, name in enumerate(axes.names)
@@ -91,8 +96,9 @@ def tune_loops(
         report = report_loops((axes.plant, axes_controller(axes, laws)), at="y", rigid=rigid)
         if report.is_stable and all(one.modulus_margin >= 1.0 / peak for one in report.loops):
             return made(axes, laws, rigid, 0, None, larger)
+    slower = 100.0 * (1.0 - 0.97**_STEPS)
     raise SolverError(
-        f"each axis alone holds |S| below {peak:g}, all together do not, even {3 * _STEPS} % "
+        f"each axis alone holds |S| below {peak:g}, all together do not, even {slower:.0f} % "
         f"slower: {report.reason or 'they disturb each other'}. Decouple the axes better "
         "(before=, after=), or close them one after the other with design_loops."
     )
@@ -122,7 +128,7 @@ class _Axis:
         """
         # the line of the rigid body ends at the first resonance
         ends = [0.25 * self.freq[-1], *self._resonances, *([0.19 * self.rate] if self.rate else [])]
-        top, low = float(min(ends)), 4.0 * float(self.freq[0])
+        top, low = float(min(ends)), max(4.0 * float(self.freq[0]), 3.0 * self._suspension)
         best = replace(self, bandwidth=low)
         for lead, rolloff in _SHAPES:
             one = replace(best, lead=lead or best.lead, rolloff=rolloff or best.rolloff)
@@ -177,7 +183,7 @@ class _Axis:
         return sign / float(np.median(np.abs(turned))), max(late, 0.0)
 
     @cached_property
-    def _resonances(self) -> FloatArray:
+    def _peaks(self) -> FloatArray:
         """The frequencies [Hz] of the highest peaks above the line of the rigid body."""
         size = np.abs(self.G) * self.freq**2
         inner = (size[1:-1] >= size[:-2]) & (size[1:-1] > size[2:])
@@ -186,6 +192,15 @@ class _Axis:
             peaks = peaks[self.freq[peaks] < 0.45 * self.rate]
         order = np.argsort(-np.abs(self.G[peaks]), kind="stable")[:_RESONANCES]
         return self.freq[peaks[order]]
+
+    @property
+    def _suspension(self) -> float:
+        """The frequency [Hz] of the springs that hold the body; 0 when free."""
+        return 0.0 if self.free else float(self._peaks.min(initial=self.freq[-1]))
+
+    @property
+    def _resonances(self) -> FloatArray:
+        return self._peaks[self._peaks > self._suspension]
 
     def _is_stable(self, axis: Axis, inertia: float) -> bool:
         def respond(freq: FloatArray) -> ComplexArray:
@@ -202,6 +217,12 @@ def _rigid_peak(axis: Axis, late: float) -> float:
     freq = np.geomspace(1e-2 * axis.bandwidth, top, 300)
     s = 2j * np.pi * freq
     return float(np.max(1.0 / np.abs(1.0 + axis.response(freq) * np.exp(-s * late) / s**2)))
+
+
+def _free_modes(plant: StateSpace) -> int:
+    """Return the number of rigid-body modes: half the poles at zero frequency."""
+    distance = np.abs(plant.poles() - (1.0 if plant.dt else 0.0))
+    return int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
 
 
 def _response(plant: StateSpace) -> Frf:
