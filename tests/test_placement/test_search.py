@@ -59,6 +59,18 @@ def test_actuators_equal_every_subset_and_the_bound_bounds(make, seed, total, co
     assert found.value == pytest.approx(criterion(found.on(plant)), rel=1e-6, abs=0.0)
 
 
+def test_exchanges_score_only_what_a_bound_leaves(make, monkeypatch):
+    """The tangent at a choice excludes most of the exchanges; the answer is the same."""
+    plant, sensors, _ = make(5, count=36)
+    found = {}
+    for many in (24, 1000):
+        monkeypatch.setattr("flexplant.placement.exchange._MANY", many)
+        found[many] = place_sensors(plant, sensors, 4, method=Exchange(starts=2), rng=0)
+    assert found[24].chosen == found[1000].chosen
+    assert found[24].history == found[1000].history
+    assert found[24].evaluations < 0.7 * found[1000].evaluations
+
+
 def test_exhaustive_is_every_subset(make):
     plant, sensors, _ = make(11, count=9)
     layouts = layouts_of(plant, "y", sensors, PoiVariance())
