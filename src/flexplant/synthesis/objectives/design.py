@@ -29,6 +29,8 @@ _EXCESS = 1e-3
 _RATES = (0.1, 0.3, 1.0, 3.0)
 #: multiples of the back-off that are tried in turn, and multiples of the optimum after them
 _LOOSER, _FARTHER = (1.0, 2.0, 4.0, 8.0), (1.5, 2.5, 5.0, 12.0, 30.0)
+#: units in which the optimum is sought
+_UNITS = 7
 #: of the solver, tried in turn
 _TOLERANCES = (1e-8, 1e-6, 1e-5)
 _KINDS = (H2, Hinf, PeakGain)
@@ -278,22 +280,27 @@ class _Programs:
 
     def smallest(self, rate: float) -> float:
         """Return the smallest bound of what is minimised, sought again in its own unit."""
-        cp = modelling()
-
-        unit = self._guess()
-        for _ in range(4):
-            v, level = self.variables(), cp.Variable()
-            program = cp.Problem(
-                cp.Minimize(level + 1e-7 * (cp.trace(v.X) + cp.trace(v.Y))),
-                self.program(v, level, unit, rate),
-            )
-            self._solve(program)
-            square = max(float(level.value), 1e-12)
-            found = unit * (np.sqrt(square) if isinstance(self.minimize, H2) else square)
-            if 0.1 < found / unit < 10.0:
-                return float(found)
+        unit, failure = self._guess(), None
+        for step in range(_UNITS):
+            try:
+                found = self._optimum(unit, rate)
+            except SolverError as error:  # a unit far from the optimum spoils the numbers
+                failure, unit = error, 10.0 * unit
+                continue
+            if 0.1 < found / unit < 10.0 or step == _UNITS - 1:
+                return found
             unit = found
-        return float(found)
+        raise failure or SolverError("the unit of what is minimised did not settle. Report it.")
+
+    def _optimum(self, unit: float, rate: float) -> float:
+        """Return the smallest bound from one program, in some unit."""
+        cp = modelling()
+        v, level = self.variables(), cp.Variable()
+        little = 1e-7 * (cp.trace(v.X) + cp.trace(v.Y))
+        program = cp.Problem(cp.Minimize(level + little), self.program(v, level, unit, rate))
+        self._solve(program)
+        found = max(float(level.value), 1e-12)
+        return float(unit * (np.sqrt(found) if isinstance(self.minimize, H2) else found))
 
     def controller(self, bound: float, rate: float) -> StateSpace:
         """Return a moderate controller for a bound on what is minimised."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...lti.discretisation import tustin
-from ...lti.interconnection import lft
+from ...lti.interconnection import lft, series
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...plant.uncertainty.neglected import opened
@@ -35,8 +35,10 @@ def neglected_delta(loop: UncertainLoop, found: Perturbation, size: float) -> St
     own = [neglected.outputs.index(n.removesuffix(":neglected:w")) for n in loop.neglected_w]
     W = np.diag(neglected.weights.evaluated(1j * found.omega))[own]
     a, b = found.vectors[0]
+    # a sampled one begins with a delay of one sample, whose phase is made up for
+    ahead = 2.0 * np.arctan(0.5 * loop.dt * found.omega)
     turned = found._replace(
-        scalars=(), vectors=((a, b * np.exp(-1j * np.angle(W))),)
+        scalars=(), vectors=((a, b * np.exp(1j * (ahead - np.angle(W)))),)
     )  # fmt: skip
     one = realised(turned, [full])
     return one.replace(
@@ -61,7 +63,7 @@ def machine(
     if plant.dt:
         rate = 1.0 / plant.dt
         part = part.replace(weights=tustin(part.weights, rate))
-        delta = tustin(delta, rate)
+        delta = series(_delayed(delta, plant.dt), tustin(delta, rate)).replace(inputs=delta.inputs)
     system = opened(plant.system.replace(blocks=None), part, 0)
     starts = [f"{name}:neglected:z" for name in part.inputs]
     system = system.select(
@@ -77,3 +79,10 @@ def machine(
         closed.replace(units=plant.system.units),
         w=plant.w, u=plant.u, z=plant.z, y=plant.y, asd=plant.asd, noise_factor=factor,
     )  # fmt: skip
+
+
+def _delayed(delta: StateSpace, dt: float) -> StateSpace:
+    """Return a sample of delay for each input: no command acts within its own sample."""
+    n = len(delta.inputs)
+    return StateSpace(np.zeros((n, n)), np.eye(n), np.eye(n), np.zeros((n, n)), dt,
+                      inputs=delta.inputs, outputs=delta.inputs)  # fmt: skip

@@ -46,7 +46,7 @@ class RobustStability(Value):
     lower : float
         A machine with Deltas of ``1 / lower`` is not stable; 0 when none was found.
     freq : float [Hz]
-        Where mu is largest.
+        Where mu is largest; NaN where it is not resolved.
     values : mapping {str: float}
         The Deltas of that machine.
     machine : StandardPlant, optional
@@ -90,7 +90,8 @@ class RobustStability(Value):
         if self.lower >= 1.0:
             verdict = "a machine of the uncertainty is unstable"
         bounds = f"{self.lower:.4g} <= mu <= {self.upper:.4g}"
-        lines = [f"<RobustStability: {verdict}, {bounds}, largest at {self.freq:.5g} Hz"]
+        where = f", largest at {self.freq:.5g} Hz" if np.isfinite(self.freq) else ""
+        lines = [f"<RobustStability: {verdict}, {bounds}{where}"]
         if self.lower:
             most = sorted(self.values.items(), key=lambda one: -abs(one[1]))[:4]
             shown = ", ".join(f"{name} {value:+.3g}" for name, value in most)
@@ -166,7 +167,7 @@ def robust_stability(
     return RobustStability(
         upper,
         min(lower, upper),
-        loop.freq(found.omega),
+        loop.freq(found.omega) if upper > _RESOLVED else float("nan"),
         values,
         shown,
         np.array([loop.freq(one) for one in found.frequencies]),
