@@ -185,6 +185,27 @@ def test_gains_follow_the_place_of_the_poi():
     assert "3 places" in repr(along)
 
 
+def test_gains_along_a_path_take_the_error_of_a_poi_that_moves(model):
+    """Of the loop: at each place those of the loop there; near a corner the die bends away."""
+    steps = round(0.08 * RATE)
+    share = np.linspace(0.0, 1.0, steps)
+    path = np.stack([0.05 + 0.1 * share, 0.05 + 0.05 * share, 0.0 * share], axis=1)
+    along = design_feedforward(model, along=path)
+    there = fx.close_loop(model.plant.at(path[-1].tolist()), *model.blocks)
+    alone = design_feedforward(there).gains[0]
+    scale = np.where(np.any(alone, axis=0), np.abs(alone).max(axis=0), 1.0)
+    np.testing.assert_allclose(along.gains[-1] / scale, alone / scale, rtol=0, atol=1e-6)
+    loop, time = on(model.plant, model, known_forces(model.plant)), np.arange(steps) / RATE
+    move = fx.setpoint(100e-6, **BOUNDS, rest=0.01, rate=RATE)
+    peak = {}
+    for name, one in (("fixed", design_feedforward(model)), ("along", along)):
+        signals = {"die:ref": move, **one.forces(move, time)}
+        run = fx.simulate(loop, reference=signals, moving={"die": path}, duration=0.08, noise=False)
+        peak[name] = run.peak("die:error")
+    assert 30e-9 < peak["fixed"] < 60e-9
+    assert peak["along"] < 0.12 * peak["fixed"]
+
+
 def test_forces_known_in_advance_are_those_of_the_block(model):
     own = design_feedforward(model)
     plant = model.plant

@@ -166,7 +166,7 @@ def design_feedforward(
     order : int
         Highest derivative, 2 to 4: acceleration, jerk, snap.
     along : (p, 3) array [m], optional
-        Places of the POI: gains for each of them, for a POI that moves; of a plant only.
+        Places of the POI: gains for each of them, for a POI that moves (`simulate(moving=)`).
 
     Returns
     -------
@@ -191,12 +191,7 @@ def design_feedforward(
     plant, poi, name = tracked(given if loop is None else loop.plant, reference)
     highest = whole(order, "order", minimum=2, maximum=4)
     T, axes = force_axes(plant, poi)
-    if loop is None:
-        find = _of_plant(plant, poi, T, along)
-    elif along is not None:
-        raise ModelError("places along= are for the feedforward of a plant: pass loop.plant.")
-    else:
-        find = _of_loop(loop, poi, T, name)
+    find = _of_plant(plant, poi, T, along) if loop is None else _of_loop(loop, poi, T, name, along)
     gains = coefficients(find, plant.dt, axes)
     gains[:, :, highest + 1 :] = 0.0
     return Feedforward(name, axes, T, tuple(plant.u), gains, plant.dt)
@@ -273,19 +268,32 @@ def _of_plant(
     return found
 
 
-def _of_loop(loop: ClosedLoop, poi: Poi, T: FloatArray, name: str) -> Inverse:
-    """Return the function of s that gives F (1, r) in closed loop."""
+def _of_loop(
+    loop: ClosedLoop, poi: Poi, T: FloatArray, name: str, along: npt.ArrayLike | None
+) -> Inverse:
+    """Return the function of s that gives F (p, r) in closed loop, the POI at p places.
+
+    A place changes what is seen of the states and of u, which the feedback does not read.
+    """
     forced = close_loop(loop.plant, *loop.blocks, known_forces(loop.plant))
-    g = forced.monitored
-    inputs = g.input_index([force_name(u) for u in loop.plant.u])
+    g, plant, r = forced.monitored, forced.plant, len(poi.axes)
+    acts = np.zeros((len(plant.w), T.shape[1] + 1))
+    acts[g.input_index([force_name(u) for u in loop.plant.u]), :-1] = T
+    acts[g.input_index([name]), -1] = 1.0
     rows = g.output_index([poi.channel(axis) for axis in poi.axes])
-    to_poi = np.hstack([g.B[:, inputs] @ T, g.B[:, g.input_index([name])]])
-    D = np.hstack([g.D[np.ix_(rows, inputs)] @ T, g.D[np.ix_(rows, g.input_index([name]))]])
-    wanted = np.eye(rows.size)[:, :1]
+    C, D = g.C[rows][None], (g.D[rows] @ acts)[None]
+    if along is not None:
+        places = plant.along(poi.name, real_array(along, "along", (None, 3)))
+        own, u = places.D[:, :r], g.output_index(forced.driven)
+        by_u = own[:, :, plant.system.input_index(forced.driven)]
+        C = by_u @ g.C[u]
+        C[:, :, : plant.system.n_states] += places.C[:, :r]
+        D = (own[:, :, plant.system.input_index(plant.w)] + by_u @ g.D[u]) @ acts
+    wanted = np.eye(r)[:, :1]
 
     def found(s: complex) -> tuple[ComplexArray, ComplexArray]:
-        both = g.C[rows] @ _states(g, to_poi, s) + D
-        return both[None, :, :-1], wanted - both[:, -1:]
+        both = C @ _states(g, g.B @ acts, s) + D
+        return both[:, :, :-1], wanted - both[:, :, -1:]
 
     return found
 
@@ -301,7 +309,7 @@ def coefficients(find: Inverse, dt: float, axes: Sequence[str]) -> FloatArray:
     Parameters
     ----------
     find : function
-        Gives G (p, q, r) and the right side (q, 1) at s.
+        Gives G (p, q, r) and the right side (q, 1) or (p, q, 1) at s.
     dt : float [s]
         Sampling time; 0 when continuous.
     axes : sequence of str
@@ -343,7 +351,9 @@ def _on_circle(find: Inverse, radius: float, axes: Sequence[str]) -> FloatArray:
                 f"the forces along {', '.join(axes)} do not move these axes of the POI apart from "
                 "each other, so that there is no inverse. Choose other axes of the POI."
             )
-        values.append(np.linalg.solve(G, np.broadcast_to(wanted, (len(G), *wanted.shape)))[..., 0])
+        values.append(
+            np.linalg.solve(G, np.broadcast_to(wanted, (len(G), *wanted.shape[-2:])))[..., 0]
+        )
     F = np.array(values)[..., None] * (turns[:, None] ** -np.arange(5))[:, None, None, :]
     return np.asarray(2.0 / _SAMPLES * F.sum(axis=0).real / radius ** np.arange(5))
 
