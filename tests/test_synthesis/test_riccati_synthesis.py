@@ -17,9 +17,9 @@ from flexplant.errors import (
     ModelError,
     SolverError,
 )
-from flexplant.lti import StateSpace, lft, tustin
+from flexplant.lti import StateSpace, hinf_norm, lft, tustin
 from flexplant.lti.preparation import prepared
-from flexplant.synthesis import Lmi, Riccati, design_hinf
+from flexplant.synthesis import Lmi, Riccati, StructuredLmi, design_hinf
 from flexplant.synthesis.certificate import certified_norm
 from oracles_synthesis import (
     brute_norm,
@@ -480,9 +480,20 @@ def test_a_missing_channel_is_named(missing):
         design_hinf(P, u=u, y=y)
 
 
-def test_progress_shows_the_steps_of_the_bisection(capsys):
+@pytest.mark.parametrize(
+    ("method", "bar"),
+    [
+        (None, "steps of the bisection"),
+        (Riccati(), "steps of the bisection"),
+        (StructuredLmi(), "steps of the LMIs"),
+        (Lmi(), "programs of the LMIs"),
+    ],
+)
+def test_progress_shows_the_steps_of_each_method(method, bar, capsys):
     P, u, y = scalar(1.0)
-    design_hinf(P, u=u, y=y, progress=True)
-    assert "steps of the bisection" in capsys.readouterr().err
-    design_hinf(P, Riccati(), u=u, y=y, progress=False)
+    found = design_hinf(P, method, u=u, y=y, progress=True)
+    assert bar in capsys.readouterr().err
+    design_hinf(P, method, u=u, y=y, progress=False)
     assert not capsys.readouterr().err
+    hinf_norm(found.system, progress=True)
+    assert "levels of the norm" in capsys.readouterr().err

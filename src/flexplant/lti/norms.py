@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import CertificateError, SolverError
-from ..parallel import one_thread
+from ..parallel import Progress, one_thread
 from ..values import ComplexArray, FloatArray
 from .lyapunov import controllability_gramian, observability_gramian
 from .responses import continuous_poles, responder
@@ -85,7 +85,7 @@ def _trace(C: FloatArray, P: FloatArray) -> tuple[float, float]:
     return float(np.sum(C @ P * C)), float(np.sum(deviation**2))
 
 
-def hinf_norm(sys: System) -> float:
+def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     """Return the H-infinity norm: the largest gain over all frequencies and input directions.
 
     Relative accuracy 1e-8; see `peak_gain`.
@@ -94,6 +94,8 @@ def hinf_norm(sys: System) -> float:
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled, any numbers of channels.
+    progress : bool, optional
+        As for `peak_gain`.
 
     Returns
     -------
@@ -111,10 +113,10 @@ def hinf_norm(sys: System) -> float:
     >>> print(f"{hinf_norm(resonance):.4f}")  # 1 / (2 zeta sqrt(1 - zeta^2))
     50.0025
     """
-    return peak_gain(sys)[0]
+    return peak_gain(sys, progress=progress)[0]
 
 
-def peak_gain(sys: System) -> tuple[float, float]:
+def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, float]:
     """Return the largest gain over all frequencies, and the frequency of the peak.
 
     A local search from every resonance gives a gain; that no frequency exceeds it by 1e-9 is
@@ -126,6 +128,9 @@ def peak_gain(sys: System) -> tuple[float, float]:
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled, any numbers of channels.
+    progress : bool, optional
+        True shows a bar of the search and its levels at once, False never; None after two seconds
+        on a terminal.
 
     Returns
     -------
@@ -150,8 +155,9 @@ def peak_gain(sys: System) -> tuple[float, float]:
     function matrix, Syst. Control Lett. 14, 1990.
     """
     g = as_statespace(sys)
-    problem = obstacle(g)
-    return (float("inf"), problem.freq) if problem else _peak(g)
+    with Progress(LEVELS, "levels of the norm", progress=progress) as bar:
+        problem = obstacle(g)
+        return (float("inf"), problem.freq) if problem else _peak(g, bar)
 
 
 def linf_norm(sys: System) -> float:
@@ -189,11 +195,11 @@ def linf_norm(sys: System) -> float:
 def axis_peak(g: StateSpace) -> tuple[float, float]:
     """Return the largest gain on the frequency axis and its frequency [Hz], stable or not."""
     problem = obstacle(g, axis_only=True)
-    return (float("inf"), problem.freq) if problem else _peak(g)
+    return (float("inf"), problem.freq) if problem else _peak(g, Progress(0, "", progress=False))
 
 
 @one_thread()
-def _peak(g: StateSpace) -> tuple[float, float]:
+def _peak(g: StateSpace, bar: Progress) -> tuple[float, float]:
     """Return gain and frequency of a system without poles on the axis."""
     if not g.D.size:
         return 0.0, 0.0
@@ -206,6 +212,7 @@ def _peak(g: StateSpace) -> tuple[float, float]:
         return 0.0, 0.0
     level = _Level(g)
     for _ in range(LEVELS):
+        bar.advance()
         # just above the feedthrough the Hamiltonian matrix is nearly singular: a level more
         close = gain <= (1 + CLEAR) * level.through
         levels = (TOLERANCE, CLEAR) if close else (TOLERANCE,)

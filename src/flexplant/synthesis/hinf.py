@@ -15,6 +15,7 @@ from .attempts import Answer, answered, best_answer
 from .central import require_shown
 from .certificate import reached_norms
 from .controller import Controller
+from .lmi import Lmi
 from .method import SynthesisMethod
 from .reach import require_reach
 from .riccati import Riccati
@@ -59,7 +60,7 @@ def design_hinf(
         model still has.
     progress : bool, optional
         True shows a bar of the method's steps at once, False never; None after two seconds on a
-        terminal. `Lmi()` shows none.
+        terminal.
 
     Returns
     -------
@@ -113,7 +114,7 @@ def design_hinf(
         if method is None:
             answer = best_answer(plant, problem, progress)
         else:
-            if progress is not None and isinstance(method, (Riccati, StructuredLmi)):
+            if progress is not None and isinstance(method, (Riccati, StructuredLmi, Lmi)):
                 method = method.replace(progress=progress)
             answer = answered(plant, problem, method)
         _require_known(problem, answer)

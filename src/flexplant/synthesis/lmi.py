@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
 
 from ..errors import FlexplantError, InfeasibleError, SolverError
 from ..lti.preparation import Prepared
+from ..parallel import Progress
 from ..values import Value
 from .lmi_method import LOOSER, Candidate, check_cost, check_size, checked_settings, first_verified
 from .lmi_plant import Plant, lqg_states, same_states
@@ -20,6 +21,8 @@ _GAP = 5e-4
 _COARSER = 10.0
 #: programs from one choice of states
 _ROUNDS = 4
+#: choices of states and tolerance
+_STARTS = 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +44,9 @@ class Lmi(Value):
         Larger problems are refused.
     time_limit : float [s]
         For each of the few semidefinite programs.
+    progress : bool, optional
+        True shows a bar of these programs at once, False never; None after two seconds on a
+        terminal.
 
     Raises
     ------
@@ -59,6 +65,7 @@ class Lmi(Value):
     tolerance: float = 1e-9
     max_states: int = 30
     time_limit: float = 60.0
+    progress: bool | None = None
 
     def __post_init__(self) -> None:
         self._set(**checked_settings(self))
@@ -79,7 +86,8 @@ class Lmi(Value):
             When the solver stops early, or no controller keeps what the LMIs promise.
         """
         check_size(self, problem)
-        found = self._smallest(Plant.of(problem))
+        with Progress(_STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress) as bar:
+            found = self._smallest(Plant.of(problem), bar.advance)
         settings = self._settings(self.tolerance)
         candidates = [
             Candidate(
@@ -99,7 +107,7 @@ class Lmi(Value):
             "time_limit": self.time_limit,
         }
 
-    def _smallest(self, plant: Plant) -> Optimum:
+    def _smallest(self, plant: Plant, count: Callable[[], None]) -> Optimum:
         """Return the smallest gamma, from other states and a coarser tolerance while not sure."""
         found: list[Optimum] = []
         failures: list[FlexplantError] = []
@@ -116,7 +124,9 @@ class Lmi(Value):
             try:
                 scale = found[-1].value if found and not coarser else guess
                 # what was found before an error stays
-                found.extend(self._rounds(start(plant), scale, self._settings(tolerance)))
+                for one in self._rounds(start(plant), scale, self._settings(tolerance)):
+                    found.append(one)
+                    count()
             except (SolverError, InfeasibleError) as error:
                 failures.append(error)
             if found and _settled(_tightest(found)):

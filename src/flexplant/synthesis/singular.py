@@ -29,6 +29,8 @@ _COST = 1e-3
 _SAME = 1e-6
 #: gamma falls by so much from level to level where its infimum is zero
 _FALL = 0.5
+#: and by so much in all
+_SMALL = 1e-2
 #: a gamma that grows by less from one level to the next has settled, by more it is rounding
 _SETTLED = 1.2
 #: a fastest pole that grows so much when the level is a tenth has no limit
@@ -205,8 +207,8 @@ def _require_positive_infimum(
     least = int(np.argmin(gammas))
     settled = any(later < _SETTLED * gammas[least] for later in gammas[least + 1 :])
     gammas = gammas[: least + 1]
-    falls = all(b < _FALL * a for a, b in pairwise(gammas))
-    if len(gammas) < 3 or settled or not falls:
+    falls = all(b < _FALL * a for a, b in pairwise(gammas[-3:]))
+    if len(gammas) < 3 or settled or not falls or gammas[-1] > _SMALL * gammas[0]:
         return
     raise InfeasibleError(
         f"there is no smallest gamma: the infimum is 0. With noise and effort of "
