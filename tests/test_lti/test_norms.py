@@ -250,3 +250,19 @@ def test_static_gains_and_feedthrough():
 def test_bad_input(norm):
     with pytest.raises(ModelError, match="StateSpace"):
         norm("plant")
+
+
+@pytest.mark.parametrize("zeta", [1e-3, 1e-6, 1e-9, 1e-12])
+def test_the_accuracy_that_is_claimed_at_light_damping(zeta):
+    """Modes at 1 and 40 rad/s, the first one alone seen: |H| = 1 / (2 zeta (1 - zeta^2)^(1/2))."""
+    block = [np.array([[0, w], [-w, -2 * zeta * w]]) for w in (1.0, 40.0)]
+    A = la.block_diag(*block)
+    B, C = np.array([[0.0], [1], [0], [1]]), np.array([[1.0, 0, 0, 0]])
+    exact = 1.0 / (2.0 * zeta * np.sqrt(1.0 - zeta**2))
+    inblocks = StateSpace(A, B, C, [[0.0]], blocks=(2, 2))
+    assert hinf_norm(inblocks) == pytest.approx(exact, rel=1e-8)
+    T = np.array([[1.0, 2, 0, 1], [0, 1, 1, 0], [1, 0, 1, 2], [0, 1, 0, 2]])
+    dense = StateSpace(T @ A @ la.inv(T), T @ B, C @ la.inv(T), [[0.0]])
+    claimed = max(1e-8, np.finfo(float).eps * np.linalg.norm(dense.A) / zeta)
+    if claimed < 0.1:
+        assert hinf_norm(dense) == pytest.approx(exact, rel=claimed)
