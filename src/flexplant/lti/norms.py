@@ -11,8 +11,8 @@ from ..errors import CertificateError, SolverError
 from ..parallel import Progress, one_thread
 from ..values import ComplexArray, FloatArray
 from .lyapunov import controllability_gramian, observability_gramian
-from .responses import continuous_poles, responder
-from .scaling import balanced_matrix
+from .responses import Responder, continuous_poles, points, responder
+from .scaling import balanced_matrix, state_scale
 from .stability import obstacle
 from .statespace import StateSpace, System, as_statespace
 
@@ -23,6 +23,9 @@ AGREEMENT, ROUNDING = 2e-8, 1e-13
 LEVELS = 30
 #: how far above the largest gain of the feedthrough a level set is not lost in rounding
 CLEAR = 1e-7
+#: dense systems of so many states are searched by their eigenvectors, unless their condition is
+#: larger; frequencies of a batch of eliminations
+QUICK, POOR, STEP = 100, 1e7, 64
 #: points across each resonance at first; parabolas from there on, each on an interval so much
 #: narrower: the last one is 1e-3 of a resonance wide, its error in the gain below 1e-10
 ACROSS, PARABOLAS, NARROWER = 9, 3, 8.0
@@ -208,8 +211,12 @@ def _peak(g: StateSpace, bar: Progress) -> tuple[float, float]:
     top = 0.5 / g.dt if g.dt else np.inf
     if not g.n_states:
         return float(np.linalg.norm(g.D, 2)), 0.0
-    find = _gains(g)
-    gain, freq = _searched(g, find, top)
+    small = g.blocks is None and g.n_states <= QUICK
+    find = _largest(_solved(g)) if small else _largest(responder(g))
+    rough = _eigenvectors(g) if small else None
+    gain, freq = _searched(g, find if rough is None else _largest(rough), top)
+    if rough is not None and np.isfinite(freq):
+        gain = float(find(np.array([freq]))[0])
     if not gain:
         return 0.0, 0.0
     level = _Level(g)
@@ -294,9 +301,8 @@ def _vertex(freq: FloatArray, gains: FloatArray, i: int) -> float:
     return float(freq[i] + min(max(step, -left), right))
 
 
-def _gains(g: StateSpace) -> Callable[[FloatArray], FloatArray]:
+def _largest(respond: Responder) -> Callable[[FloatArray], FloatArray]:
     """Return the function of frequency [Hz] that gives the largest singular values (n_freq,)."""
-    respond = responder(g)
 
     def find(freq: FloatArray) -> FloatArray:
         if not freq.size:
@@ -307,6 +313,43 @@ def _gains(g: StateSpace) -> Callable[[FloatArray], FloatArray]:
         return np.asarray(np.linalg.svd(H, compute_uv=False)[:, 0])
 
     return find
+
+
+def _solved(g: StateSpace) -> Responder:
+    """Return the responses of a small system at few frequencies, by elimination at each."""
+    d = state_scale(g.A, g.B, g.C)
+    A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
+
+    def respond(freq: FloatArray) -> ComplexArray:
+        found = [
+            C @ np.linalg.solve(s[:, None, None] * np.eye(d.size) - A, B)
+            for s in np.array_split(points(g, freq), 1 + freq.size // STEP)
+        ]
+        return np.asarray(np.moveaxis(np.concatenate(found) + g.D, 0, 2))
+
+    return respond
+
+
+def _eigenvectors(g: StateSpace) -> Responder | None:
+    """Return the responses of a small system from its eigenvectors, None where these are poor.
+
+    Good enough to search with, and many times as quick.
+    """
+    d = state_scale(g.A, g.B, g.C)
+    poles, V = np.linalg.eig(g.A * d / d[:, None])
+    try:
+        inverse = np.linalg.inv(V)
+    except np.linalg.LinAlgError:
+        return None
+    if not np.linalg.norm(V) * np.linalg.norm(inverse) < POOR:
+        return None
+    B, C = inverse @ (g.B / d[:, None]), (g.C * d) @ V
+
+    def respond(freq: FloatArray) -> ComplexArray:
+        parts = 1.0 / (points(g, freq)[:, None] - poles)
+        return np.asarray(np.moveaxis((C * parts[:, None, :]) @ B + g.D, 0, 2))
+
+    return respond
 
 
 class _Level:

@@ -43,7 +43,7 @@ def responder(g: StateSpace) -> Responder:
 
         @one_thread()
         def by_modes(freq: FloatArray) -> ComplexArray:
-            data, tame = modal(_points(g, freq))
+            data, tame = modal(points(g, freq))
             return data if tame else _finite(data, freq)
 
         return by_modes
@@ -52,7 +52,7 @@ def responder(g: StateSpace) -> Responder:
 
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
-        s = _points(g, freq)
+        s = points(g, freq)
         out = np.empty((*shape, freq.size), dtype=np.complex128)
         out[:] = g.D[:, :, None]
         for start in range(0, freq.size, step):
@@ -80,7 +80,8 @@ def remembered(find: Responder) -> Responder:
     return found
 
 
-def _points(g: StateSpace, freq: FloatArray) -> ComplexArray:
+def points(g: StateSpace, freq: FloatArray) -> ComplexArray:
+    """Return the points s, or z, of frequencies [Hz]."""
     omega = 2 * np.pi * freq
     return np.asarray(np.exp(1j * omega * g.dt) if g.dt else 1j * omega)
 

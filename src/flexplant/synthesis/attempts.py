@@ -25,7 +25,7 @@ _SAME = 1.02
 #: problems of at most so many states go to the LMIs where no answer is close
 _SMALL = 40
 #: and have so long [s] where there is an answer already, and where there is none
-_SECONDS, _LONG = 10.0, 60.0
+_SECONDS, _LONG = 5.0, 60.0
 
 
 class Answer(NamedTuple):
