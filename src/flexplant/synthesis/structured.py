@@ -13,7 +13,7 @@ from ..lti.interconnection import lft
 from ..lti.preparation import Prepared, prepared
 from ..lti.responses import responder
 from ..lti.statespace import System
-from ..parallel import one_thread
+from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import FloatArray, Rng, generator, positive, whole
 from .certificate import certified_norm, reached_norms
@@ -46,6 +46,7 @@ def design_structured(
     rng: Rng = 0,
     time_limit: float = 60.0,
     larger: Any = None,
+    progress: bool | None = None,
 ) -> Controller:
     """Return the controller of a structure with the least H-infinity norm found from w to z.
 
@@ -72,6 +73,8 @@ def design_structured(
         The search ends then with the best that it has.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the (first) plant left out, as for `larger_plant`.
+    progress : bool, optional
+        Show a bar; unless given, on a terminal after a while.
 
     Returns
     -------
@@ -114,9 +117,12 @@ def design_structured(
     search = _StructureSearch(
         family, [ScaledLoop(p, family.order) for p in problems], problems, begun + _SHARE * limit
     )
-    x, value = search.best(starts, random)
-    search.end = begun + limit
-    found = search.finished(x, value, random)
+    with Progress(starts + 1, "starts of the search", progress=progress) as bar:
+        x, value = search.best(starts, random, bar)
+        search.end = begun + limit
+        found = search.finished(x, value, random)
+        bar.advance()
+    final = family.structure(found.x)
     K = as_system(family.matrices(found.x), (plants[0].y, plants[0].u), plants[0].dt)
     K = K.replace(name="structured", units=plants[0].units)
     closed = [lft(one.system, K) for one in plants]
@@ -139,13 +145,13 @@ def design_structured(
     left_out = spill_over(plants[0], [K], larger)
     return Controller(
         K,
-        f"H-infinity of structure {structure!r}",
+        f"H-infinity of structure {(structure if final is None else final)!r}",
         gamma=each[worst]["norm"],
         certificate=certificate | (left_out.certificate if left_out is not None else {}),
         reached=reached_norms(plants[worst], closed[worst], responder(closed[worst])),
         left_out=left_out,
         notes=(*search.notes, *(() if left_out is not None else unchecked(plants[0]))),
-        structure=family.structure(found.x),
+        structure=final,
     )
 
 
@@ -172,7 +178,9 @@ def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> lis
                 f"synthesis needs channels w, z, u and y, got {one!r}. Name those of a StateSpace "
                 "by u= and y=."
             )
-        if (one.u, one.y) != (first.u, first.y) or not np.isclose(one.dt, first.dt, rtol=1e-9):
+        if (one.u, one.y) != (first.u, first.y) or not np.isclose(
+            one.dt, first.dt, rtol=1e-9, atol=0.0
+        ):
             raise ModelError(
                 f"plant {i} has other u, y or rate than the first: one controller cannot serve "
                 "both. Assemble all with the same ports and rate."
@@ -224,7 +232,9 @@ class _StructureSearch:
         slope = (1.0 + _SMALL * size) * self.family.slope(theta, best[1])
         return (1.0 + _SMALL * size) * best[0], slope + _SMALL * best[0] / size * theta
 
-    def best(self, starts: int, rng: np.random.Generator) -> tuple[FloatArray, float]:
+    def best(
+        self, starts: int, rng: np.random.Generator, bar: Progress
+    ) -> tuple[FloatArray, float]:
         """Return the best parameters from all starts and the norm there.
 
         Raises
@@ -239,6 +249,7 @@ class _StructureSearch:
             if done and self.out_of_time():
                 break
             done += 1
+            bar.advance()
             theta = self.family.first
             if i:
                 theta = theta + self.family.spread * rng.standard_normal(theta.size)
