@@ -60,7 +60,7 @@ def place_sensors(
         Candidates that any choice includes.
     constraints : sequence of Constraint, optional
         What every choice satisfies: Excluded, OffPoi, Within, MinimumDistance, Together, Mirrored,
-        Budget. No sensor is placed on a POI unless OffPoi(-1) is among them.
+        Among, Budget. No sensor is placed on a POI unless OffPoi(-1) is among them.
     method : Search, optional
         Exchange, BranchAndBound, Exhaustive or ByRows. Every subset where there are at most 1500,
         else `Exchange()`, when not given.
@@ -128,7 +128,7 @@ def place_actuators(
         Candidates that any choice includes.
     constraints : sequence of Constraint, optional
         What every choice satisfies: Excluded, OffPoi, Within, MinimumDistance, Together, Mirrored,
-        Budget.
+        Among, Budget.
     method : Search, optional
         Exchange, BranchAndBound, Exhaustive or ByRows. Every subset where there are at most 1500,
         else `Exchange()`, when not given.
