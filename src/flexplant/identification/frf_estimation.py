@@ -8,6 +8,7 @@ from typing import Any
 from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
 from ..values import FloatArray, positive
+from .dropouts import dropouts_warned
 from .periodic import Periodic, periodic_frf
 from .records import records
 from .spectra import H1Estimator, SpectralMethod, spectral_frf
@@ -65,7 +66,8 @@ def estimate_frf(
     Warns
     -----
     FlexplantWarning
-        With `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
+        When an output keeps one value for longer than quantisation explains: a drop-out. With
+        `Periodic`: when the inputs do not repeat after the stated period (it or the rate is
         wrong), or when a transient has not died away, with the periods to discard.
 
     Raises
@@ -90,6 +92,7 @@ def estimate_frf(
     data = records(inputs, outputs, reference, positive(rate, "rate"))
     if quantity not in (None, "displacement", "velocity", "acceleration"):
         raise unknown_label("quantity", quantity, ["displacement", "velocity", "acceleration"])
+    dropouts_warned(data)
     method = H1Estimator() if method is None else method
     if isinstance(method, Periodic):
         return periodic_frf(data, method, quantity)
