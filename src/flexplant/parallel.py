@@ -86,6 +86,8 @@ class Progress:
 
     def __init__(self, total: int, description: str, *, progress: bool | None = None) -> None:
         self.bar: Any = None
+        #: items counted
+        self.done = 0
         if progress or (progress is None and sys.stderr.isatty()):
             from tqdm import tqdm
 
@@ -106,6 +108,7 @@ class Progress:
 
     def advance(self, items: int = 1) -> None:
         """Count some items as done."""
+        self.done += items
         if self.bar is not None:
             self.bar.update(items)
 

@@ -1,6 +1,7 @@
 """The numbers of updating, beside a peer where there is one; run with ``-m benchmark -s``."""
 
 import time
+import warnings
 
 import numpy as np
 import pytest
@@ -8,10 +9,13 @@ import scipy.optimize as so
 
 import oracles_updating as oracle
 from bridges import FILE, Bridge, ends, noisy_fits
+from flexplant.errors import FlexplantWarning
 from flexplant.identification import MeasuredModes
-from flexplant.updating import AddedMass, Eigenvalues
+from flexplant.updating import AddedMass, Eigenvalues, update
 from flexplant.updating.search import Objective
 from noisy_plate import Campaign, judged
+from other_plate import TRUTH as OTHER_TRUTH
+from other_plate import OtherPlate
 from stages import fitted, reduced
 
 pytestmark = pytest.mark.benchmark
@@ -130,3 +134,23 @@ def test_the_bridge_with_noise(bridge):
     )
     assert error <= 0.11
     assert 0.8 <= score <= 1.25
+
+
+def test_defect_correction_covers_the_truth():
+    """200 machines of another kind, five unknowns: how often 95 % intervals hold them."""
+    machine = OtherPlate()
+    for kind in ("responses", "modes"):
+        for rounds in (0, 2):
+            held, begun = [], time.process_time()
+            for seed in range(200):
+                data = getattr(machine, kind)(np.random.default_rng(seed))
+                more = {"full": machine.full, "rounds": rounds} if rounds else {}
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", FlexplantWarning)
+                    low, high = update(machine.rom, machine.unknowns, data, **more).interval().T
+                held.append((low <= OTHER_TRUTH) & (high >= OTHER_TRUTH))
+            taken = (time.process_time() - begun) / 200
+            share = np.mean(held, axis=0)
+            print(f"\n{kind}, {rounds} rounds: held {share}, {taken:.2f} s each", end="")
+            if rounds:
+                assert np.all(np.abs(share - 0.95) <= 0.035)

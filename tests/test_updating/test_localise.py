@@ -75,3 +75,13 @@ def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
         found = localise(uneven, data, few, most=2)
     assert found.p_value < 1e-4
     assert "MORE THAN NOISE IS LEFT" in repr(found)
+
+
+def test_long_work_shows_a_bar(uneven, capsys):
+    data = measured(uneven, {uneven.dofs.labels[3]: 0.3}, 0)
+    localise(
+        uneven, data, [AddedMass(label) for label in uneven.dofs.labels], most=1, progress=True
+    )
+    assert "candidates: 100%" in capsys.readouterr().err
+    localise(uneven, data, [AddedMass(uneven.dofs.labels[3])], most=1)
+    assert capsys.readouterr().err == ""

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import LabelError, ModelError, ShapeError, SolverError, unknown_label
 from ..lti.frequency import Frf
-from ..parallel import one_thread
+from ..parallel import Progress, one_thread
 from ..values import instance, positive, real_array, short, whole
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
@@ -25,6 +25,8 @@ from .windows import diagram_of, weighted_by_remainder, windows
 
 #: numbers of residual terms of modes above the band that are tried
 UPPER = (3, 5, 7, 9)
+#: of an identification, for its bar: the diagram, twice fit and completion, the answer
+STAGES = 6
 
 
 def stabilisation_diagram(
@@ -98,6 +100,7 @@ def identify_modes(
     hold: float | None = None,
     dofs: Mapping[str, str] | None = None,
     max_iterations: int = 150,
+    progress: bool | None = None,
 ) -> IdentifiedModes:
     r"""Return poles, mode shapes and their covariance from measured FRFs.
 
@@ -141,6 +144,8 @@ def identify_modes(
         input and an output share a DOF.
     max_iterations : int
         Of the fit.
+    progress : bool, optional
+        A bar of the stages: None shows one on a terminal for work of more than two seconds.
 
     Returns
     -------
@@ -169,8 +174,10 @@ def identify_modes(
     Pintelon, Guillaume, Schoukens, "Uncertainty calculation in (operational) modal analysis",
     Mechanical Systems and Signal Processing 21 (2007) 2359-2373.
     """
-    with one_thread():
-        return _identified(frf, band, orders, start, lower, upper, hold, dofs, max_iterations)
+    with one_thread(), Progress(STAGES, "modes", progress=progress) as bar:
+        found = _identified(frf, band, orders, start, lower, upper, hold, dofs, max_iterations, bar)
+        bar.advance(STAGES - bar.done)
+        return found
 
 
 def _identified(
@@ -183,6 +190,7 @@ def _identified(
     hold: float | None,
     dofs: Mapping[str, str] | None,
     max_iterations: int,
+    bar: Progress,
 ) -> IdentifiedModes:
     ready = prepared(frf, band)
     low, high = float(ready.freq[0]), float(ready.freq[-1])
@@ -213,6 +221,7 @@ def _identified(
     else:
         chosen = start
     poles, part = chosen.poles, chosen.participation
+    bar.advance()
     for _ in range(1 if ready.known else 2):
         # with all residual terms, so that no pole is kept or moved to stand in for one
         lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
@@ -231,6 +240,7 @@ def _identified(
             if fewer.size < fit.poles.size:
                 fit = refined(lines, fewer, part, steps=max_iterations, strict=False)
         lines, fit = fewest_terms(lines, fit, tried[:-1], steps=max_iterations)
+        bar.advance()
         if start is None:
             fit, _ = completed(lines, fit, steps=max_iterations)
             if not exact(lines, fit.model):
@@ -238,6 +248,7 @@ def _identified(
                     lines, fit = backed(lines, fit, steps=max_iterations)
                 fit = separated(lines, fit, steps=max_iterations)
                 fit = relocated(lines, fit, steps=max_iterations)
+            bar.advance()
             fit, left = completed(lines, fit, steps=max_iterations)
         else:
             left = unexplained(lines, fit)

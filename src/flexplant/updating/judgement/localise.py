@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import FlexplantWarning, ModelError
+from ...parallel import Progress
 from ...structure.model import FEModel
 from ...values import FloatArray
 from ...values import whole as counted
@@ -35,6 +36,7 @@ def localise(
     nuisance: Sequence[Parameter] = (),
     most: int = 3,
     screen: int = 40,
+    progress: bool | None = None,
 ) -> Localisation:
     """Find which of many candidate changes explains a measurement.
 
@@ -68,6 +70,8 @@ def localise(
     screen : int
         How many are fitted exactly, at most: those that explain, to first order, a quarter of what
         the best one does, and ten in any case.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
 
     Returns
     -------
@@ -109,7 +113,7 @@ def localise(
             f"{fits.rows} data do not determine {len(beside)} nuisance parameters, let alone a "
             "candidate beside them: measure more modes or lines."
         )
-    values, score, criterion = _singles(fits, screen)
+    values, score, criterion = _singles(fits, screen, progress)
     ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
     best = fits.best(ranked, most)
     fits.polish(best)
@@ -145,7 +149,9 @@ def localise(
     return found
 
 
-def _singles(fits: Subsets, screen: int) -> tuple[FloatArray, FloatArray, FloatArray]:
+def _singles(
+    fits: Subsets, screen: int, progress: bool | None
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return value, share explained and criterion of each candidate alone."""
     nothing = fits.fit(())
     error = 0.0 if nothing is None else nothing.error
@@ -155,12 +161,14 @@ def _singles(fits: Subsets, screen: int) -> tuple[FloatArray, FloatArray, FloatA
     order = np.argsort(-explained)
     worth = int(np.sum(explained >= WORTH * np.max(explained)))
     tried = order[: min(screen, max(worth, FEWEST))]
-    for i in tried.tolist():
-        found = fits.fit((i,))
-        score[i] = 0.0
-        if found is not None:
-            values[i], score[i] = found.p[0], 1 - found.error / error
-            criterion[i] = fits.score((i,))
+    with Progress(tried.size, "candidates", progress=progress) as bar:
+        for i in tried.tolist():
+            found = fits.fit((i,))
+            score[i] = 0.0
+            if found is not None:
+                values[i], score[i] = found.p[0], 1 - found.error / error
+                criterion[i] = fits.score((i,))
+            bar.advance()
     for i in order[tried.size :].tolist():
         # known to first order only: never better than what was fitted exactly
         score[i] = min(score[i], float(np.nanmin(score[np.isfinite(criterion)], initial=1.0)))

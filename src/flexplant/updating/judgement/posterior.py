@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError
+from ...parallel import Progress
 from ...values import FloatArray, Rng, Value, generator
 from ..parameters.added import Parameter
 from ..search import Objective, checked_residuals
@@ -87,6 +88,7 @@ def sample_posterior(
     walkers: int | None = None,
     discard: float = 0.3,
     rng: Rng = 0,
+    progress: bool | None = None,
 ) -> Posterior:
     """Draw from the posterior ``exp(-1/2 |r(p)|^2)`` (with priors, inside bounds).
 
@@ -107,6 +109,8 @@ def sample_posterior(
         Share of the first steps left out.
     rng : int, SeedSequence or Generator
         Of all random numbers.
+    progress : bool, optional
+        A bar: None shows one on a terminal for work of more than two seconds.
 
     Returns
     -------
@@ -155,20 +159,22 @@ def sample_posterior(
     height = np.array([density(p) for p in begin])
     kept, accepted = [], 0
     half = count // 2
-    for step in range(steps):
-        for move in (np.arange(half), np.arange(half, count)):
-            other = np.setdiff1d(np.arange(count), move)
-            z = ((STRETCH - 1) * draws.random(half) + 1) ** 2 / STRETCH
-            partner = begin[draws.choice(other, half)]
-            trial = partner + z[:, None] * (begin[move] - partner)
-            reached = np.array([density(p) for p in trial])
-            with np.errstate(invalid="ignore"):
-                odds = (q - 1) * np.log(z) + reached - height[move]
-            take = np.log(draws.random(half)) < odds
-            begin[move[take]], height[move[take]] = trial[take], reached[take]
-            accepted += int(take.sum())
-        if step >= discard * steps:
-            kept.append(begin.copy())
+    with Progress(steps, "posterior", progress=progress) as bar:
+        for step in range(steps):
+            for move in (np.arange(half), np.arange(half, count)):
+                other = np.setdiff1d(np.arange(count), move)
+                z = ((STRETCH - 1) * draws.random(half) + 1) ** 2 / STRETCH
+                partner = begin[draws.choice(other, half)]
+                trial = partner + z[:, None] * (begin[move] - partner)
+                reached = np.array([density(p) for p in trial])
+                with np.errstate(invalid="ignore"):
+                    odds = (q - 1) * np.log(z) + reached - height[move]
+                take = np.log(draws.random(half)) < odds
+                begin[move[take]], height[move[take]] = trial[take], reached[take]
+                accepted += int(take.sum())
+            if step >= discard * steps:
+                kept.append(begin.copy())
+            bar.advance()
     return Posterior(
         parameters=tuple(p.name for p in listed),
         draws=np.concatenate(kept),
