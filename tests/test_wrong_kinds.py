@@ -98,7 +98,18 @@ def machine_frf(**options):
 
 
 #: (name, call of one argument, kinds that are allowed there)
+NUMBERS = ("bool", "fraction", "negative")  # static gains
 CALLS = [
+    ("mu", lambda x: fx.synthesis.mu(x, [fx.synthesis.FullBlock()]), NUMBERS),
+    ("mu blocks", lambda x: fx.synthesis.mu([[1.0]], x), ()),
+    ("RepeatedScalar", lambda x: fx.synthesis.RepeatedScalar(x), ()),
+    ("robust_stability", lambda x: fx.synthesis.robust_stability(x, servo()), ()),
+    ("design_mu", lambda x: fx.synthesis.design_mu(x, w=["amp1"], z=["die:z"]), ()),
+    ("design_lmi minimize", lambda x: fx.synthesis.design_lmi(plant(), minimize=x), ()),
+    ("H2 below", lambda x: fx.synthesis.H2(below=x), ("none", "fraction")),
+    ("reduce_controller", lambda x: fx.synthesis.reduce_controller(x, servo()), ()),
+    ("anti_windup_form", lambda x: fx.synthesis.anti_windup_form(x), NUMBERS),
+    ("write_c", lambda x: fx.synthesis.write_c(servo(), x), ()),
     ("design_kalman", lambda x: fx.design_kalman(x), ()),
     ("design_hinf_filter", lambda x: fx.estimation.design_hinf_filter(x), ()),
     ("hinf_filter accuracy", lambda x: fx.estimation.design_hinf_filter(plant(), accuracy=x), ()),
@@ -152,10 +163,10 @@ CALLS = [
     ("design_servo poi", lambda x: servo(poi=x), ("none",)),
     ("design_h2", lambda x: fx.design_h2(x), ()),
     ("design_h2 u", lambda x: fx.design_h2(plant().system, u=x, y=plant().y), ()),
-    ("design_ncf", lambda x: fx.design_ncf(x), ("bool", "fraction", "negative")),
+    ("design_ncf", lambda x: fx.design_ncf(x), NUMBERS),
     ("design_ncf before", lambda x: fx.design_ncf(plant(), before=x), ("none",)),
     ("design_ncf bandwidth", lambda x: fx.design_ncf(plant(), bandwidth=x), ("none",)),
-    ("design_loops", lambda x: fx.design_loops(x, fx.Pid(1.0)), ("bool", "fraction", "negative")),
+    ("design_loops", lambda x: fx.design_loops(x, fx.Pid(1.0)), NUMBERS),
     ("design_loops laws", lambda x: fx.design_loops(plant(), x), ()),
     ("design_loops before", lambda x: fx.design_loops(plant(), fx.Pid(1.0), before=x), ("none",)),
     ("tune_loops", lambda x: fx.tune_loops(x), ()),
@@ -180,7 +191,7 @@ CALLS = [
     ("TunedLaws", lambda x: design_structured(plant(), fx.synthesis.TunedLaws(x)), ()),
     ("TunedLaws free", lambda x: fx.synthesis.TunedLaws(fx.Pid(1.0), free=x), ("dict",)),
     ("Parametrised", lambda x: fx.synthesis.Parametrised(x, [1.0]), ()),
-    ("shape_loop", lambda x: shape_loop(x, bandwidth=50.0), ("bool", "fraction", "negative")),
+    ("shape_loop", lambda x: shape_loop(x, bandwidth=50.0), NUMBERS),
     ("shape_loop bandwidth", lambda x: shape_loop(plant(), bandwidth=x), ("fraction",)),
     ("shape_loop model", lambda x: shape_loop(plant(), bandwidth=50.0, model=x),
      ("none", "fraction")),

@@ -122,10 +122,12 @@ def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Pat
         source = Path(path)
     except TypeError as error:
         raise ModelError(
-            f"path must be a file name, got {short(path)}. Such as 'stage.c'."
+            f"path must be a file name, got {short(path)}. Pass one such as 'stage.c'."
         ) from error
     if source.suffix != ".c":
-        raise ModelError(f"path must end in .c, got {short(str(path))}. The header goes beside it.")
+        raise ModelError(
+            f"path must end in .c, got {short(str(path))}. Pass a name such as 'stage.c'."
+        )
     prefix = source.stem if name is None else name
     valid = isinstance(prefix, str) and re.fullmatch(r"[A-Za-z_][A-Za-z0-9_]*", prefix)
     if not valid or prefix in _RESERVED:

@@ -154,7 +154,7 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
     if not isinstance(minimize, _KINDS) or minimize.below is not None:
         raise ModelError(
             f"minimize takes H2(...), Hinf(...) or PeakGain(...) without below, got "
-            f"{short(minimize)}."
+            f"{short(minimize)}. Pass one norm; its bound is what is found."
         )
     if not isinstance(subject_to, Sequence) or isinstance(subject_to, str):
         raise ModelError(f"subject_to must be a list of specifications, got {short(subject_to)}.")
@@ -169,7 +169,7 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
         if not isinstance(one, _KINDS) or (one is not minimize and one.below is None):
             raise ModelError(
                 f"subject_to takes H2, Hinf and PeakGain with below=, and PoleRegion, got "
-                f"{short(one)}."
+                f"{short(one)}. Give it the bound that has to hold."
             )
         w, z = one.chosen(plant)
         direct = plant.system[list(z), list(w)].D

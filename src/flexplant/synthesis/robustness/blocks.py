@@ -82,7 +82,8 @@ def checked_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
         not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
     ):  # fmt: skip
         raise ModelError(
-            f"blocks must be a list of RepeatedScalar(...) and FullBlock(...), got {short(blocks)}."
+            "blocks must be a list of RepeatedScalar(...) and FullBlock(...), got "
+            f"{short(blocks)}. Pass one for each uncertainty, in the order of the channels."
         )
     found = sum(block.w for block in blocks), sum(block.z for block in blocks)
     if found != (w, z):

@@ -131,6 +131,8 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
             )
         return _of_matrix(gain.astype(np.complex128), blocks, chance)
     g = as_statespace(M)
+    if not g.n_states:
+        return _of_matrix(g.D.astype(np.complex128), blocks, chance)
     listed = checked_blocks(blocks, len(g.inputs), len(g.outputs))
     problem = obstacle(g)
     if problem is not None:
