@@ -107,7 +107,8 @@ class _Search:
 
     @property
     def has_added(self) -> bool:
-        return any(ADDED in one.found.certificate for one in self.answers)
+        found = [one.found for one in self.answers] + [one for _, one in self.broken]
+        return any(ADDED in one.certificate for one in found)
 
     def attempt(
         self,

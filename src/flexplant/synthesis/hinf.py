@@ -48,10 +48,10 @@ def design_hinf(
         Usually weighted; continuous or sampled. A labelled StateSpace (ours or python-control's)
         serves too: by the names of its channels, or with u and y named.
     method : Riccati, StructuredLmi or Lmi, optional
-        Unless given they are tried in turn until one is verified close to its lower bound:
-        `Riccati()`, which adds a little noise and effort where D12 or D21 is singular;
-        `Riccati(regularised=True)`, which adds them anyway; `StructuredLmi()`, which needs none,
-        up to 40 states. `Lmi()` is its readable form for less than 30.
+        Unless given they are tried in turn until one is verified close to its lower bound, else
+        the best one is taken: `Riccati()`, which adds a little noise and effort where D12 or D21
+        is singular; `Riccati(regularised=True)`, which adds them anyway; `StructuredLmi()`, which
+        needs none, up to 40 states. `Lmi()` is its readable form for less than 30.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
