@@ -18,8 +18,9 @@ from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...values import ComplexArray, FloatArray, Value, generator
 from .blocks import FullBlock, places
-from .lower import Perturbation, matrix_of, power_iteration
+from .lower import power_iteration
 from .machine import machine, neglected_delta, values_of
+from .perturbation import Perturbation, matrix_of
 from .sweep import Covered, covered
 from .uncertain_loop import UncertainLoop, uncertain_loop
 

@@ -13,7 +13,7 @@ from ...plant import StandardPlant
 from ...plant.uncertainty.neglected import opened
 from ...values import FloatArray
 from .blocks import FullBlock
-from .lower import Perturbation, realised
+from .perturbation import Perturbation, realised
 from .uncertain_loop import UncertainLoop
 
 

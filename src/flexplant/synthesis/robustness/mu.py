@@ -15,13 +15,8 @@ from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...values import ComplexArray, Value, generator
 from .blocks import Block, RepeatedScalar, Scalings, checked_blocks, places
-from .lower import (
-    Perturbation,
-    crossing_multiple,
-    destabilising,
-    matrix_of,
-    power_iteration,
-)
+from .lower import crossing_multiple, destabilising, power_iteration
+from .perturbation import Perturbation, matrix_of
 from .sweep import covered
 from .upper import upper_level
 
