@@ -221,8 +221,8 @@ def loaded(g):
 @pytest.mark.parametrize(
     ("module", "inner", "call"),
     [
-        (responses, "_points", lambda g: flexplant.frequency_response(g, [1.0])),
-        (responses, "_points", lambda g: flexplant.frequency_response(g.replace(blocks=None), [1])),
+        (responses, "points", lambda g: flexplant.frequency_response(g, [1.0])),
+        (responses, "points", lambda g: flexplant.frequency_response(g.replace(blocks=None), [1])),
         (norms, "_searched", flexplant.hinf_norm),
         (norms, "controllability_gramian", flexplant.h2_norm),
         (doubling, "_doubling", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
