@@ -171,6 +171,14 @@ def block_eigenvalues(A: FloatArray, blocks: Sequence[int]) -> ComplexArray:
     return poles
 
 
+def is_block_diagonal(g: Any) -> bool:
+    """Return whether A is known to be made of 1 x 1 and 2 x 2 diagonal blocks alone."""
+    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+        return False
+    owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
+    return not np.any(g.A[owner[:, None] != owner[None, :]])
+
+
 def checked_blocks(A: FloatArray, blocks: Sequence[int]) -> tuple[int, ...]:
     """Return block sizes as a tuple; ShapeError unless A is block upper triangular with them."""
     sizes = tuple(int(size) for size in blocks)

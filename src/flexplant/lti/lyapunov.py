@@ -8,8 +8,9 @@ import scipy.linalg as la
 from ..errors import ModelError, SolverError
 from ..parallel import one_thread
 from ..values import FloatArray, real_array
+from .joining import is_block_diagonal
 from .scaling import even_scale
-from .statespace import StateSpace, System, as_statespace, is_block_diagonal
+from .statespace import StateSpace, System, as_statespace
 
 #: doublings: 2^60 terms of the series; a slower decay is not distinguished from none
 DOUBLINGS = 60

@@ -8,10 +8,11 @@ from ..errors import ModelError
 from ..values import FloatArray, positive
 from .factors import controllability_factor, observability_factor
 from .interconnection import parallel
+from .joining import is_block_diagonal
 from .modal import modal_form
 from .scaling import state_scale
 from .splitting import split_stable
-from .statespace import StateSpace, System, as_statespace, is_block_diagonal
+from .statespace import StateSpace, System, as_statespace
 
 #: Hankel singular values below this of the sizes of the two factors are rounding: a part that is
 #: not reached where it is seen has no others

@@ -8,8 +8,9 @@ import numpy as np
 import scipy.linalg as la
 
 from ..values import ComplexArray, FloatArray, Value, positive
+from .joining import is_block_diagonal
 from .scaling import state_scale
-from .statespace import StateSpace, System, as_statespace, is_block_diagonal
+from .statespace import StateSpace, System, as_statespace
 
 #: poles this close to an integrator, relative to A, are tried as rigid-body modes
 RIGID = 1e-6

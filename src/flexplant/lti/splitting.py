@@ -9,14 +9,13 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..values import FloatArray, Value
-from .joining import block_eigenvalues
+from .joining import block_eigenvalues, is_block_diagonal
 from .scaling import state_scale
 from .stability import uncertain_poles
 from .statespace import (
     StateSpace,
     System,
     as_statespace,
-    is_block_diagonal,
 )
 
 

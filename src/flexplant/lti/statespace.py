@@ -397,11 +397,3 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
             )
         return inner
     return StateSpace.from_control(sys)
-
-
-def is_block_diagonal(g: StateSpace) -> bool:
-    """Return whether A is known to be made of 1 x 1 and 2 x 2 diagonal blocks alone."""
-    if g.blocks is None or not set(g.blocks) <= {1, 2}:
-        return False
-    owner = np.repeat(np.arange(len(g.blocks)), g.blocks)
-    return not np.any(g.A[owner[:, None] != owner[None, :]])
