@@ -1,12 +1,12 @@
 """Scores, gradients, proofs: ours beside SciPy's Riccati solver per set and every subset."""
 
-import time
 from itertools import combinations
 from math import comb
 
 import numpy as np
 import pytest
 import scipy.linalg as la
+from timing import best
 
 import flexplant as fx
 from flexplant.parallel import one_thread
@@ -38,16 +38,6 @@ def stage(side=SIDE, count=24):
     modes = fx.solve_modes(plate, count=count, damping=fx.ModalDamping(0.01))
     own = ports(y=sensors[:4], die=(0.31, 0.26, 0.0), references=[])
     return fx.assemble_plant(modes, own).discretized(RATE, delay=1), sensors, plate
-
-
-def best(call, repeats=5):
-    """Return what a call gave, and its shortest time [s]."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        result = call()
-        times.append(time.perf_counter() - start)
-    return result, min(times)
 
 
 def drawn(total, size, count, seed=0):
