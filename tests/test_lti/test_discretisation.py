@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, frequency_response, tustin
-from flexplant.lti.discretisation import discretized, pair_expm, pair_exponential
+from flexplant.lti.discretisation import bilinear, discretized, pair_expm, pair_exponential
 from oracles_plant import delayed_run, hold
 
 RATE = 200.0
@@ -233,3 +233,19 @@ def test_a_period_for_a_rate_and_seconds_for_samples_are_refused(rate, delay, sa
         discretized(mode, 500.0)
     slow = StateSpace([[-3e3]], [[3e3]], [[1]], [[0]])  # a filter: sampled at any rate
     assert discretized(slow, 10.0).dt == 0.1
+
+
+def test_the_bilinear_maps_do_not_depend_on_the_units_of_the_states():
+    """A filter at 2 kHz whose states differ by 1e12, there and back; a pole at 2 rate is none."""
+    w = 2 * np.pi * np.array([3.0, 120.0])
+    A = np.array([[-w[0], 1e12], [0.0, -w[1]]])
+    G = StateSpace(A, [[0.0], [1.0]], [[1e-9, 0.0]], [[0.0]])
+    sampled = tustin(G, 2000.0)
+    back = bilinear(sampled, 2000.0)
+    freq = np.array([1.0, 20.0, 300.0])
+    given, found = (frequency_response(g, freq).data for g in (G, back))
+    np.testing.assert_allclose(found, given, rtol=1e-9)
+    with pytest.raises(ModelError, match="Tustin maps to infinity"):
+        tustin(G.replace(A=np.array([[4000.0, 1e12], [0.0, -w[1]]])), 2000.0)
+    with pytest.raises(ModelError, match="z = -1"):
+        bilinear(sampled.replace(A=np.array([[-1.0, 1e12], [0.0, 0.5]])), 2000.0)

@@ -18,7 +18,7 @@ def w(freq):
 
 #: element, its transfer function written out, order
 ELEMENTS = [
-    (Pid(2.0), lambda s: 2.0 + 0 * s, 1),
+    (Pid(2.0), lambda s: 2.0 + 0 * s, 0),
     (Pid(2.0, 3.0), lambda s: 2.0 + 3.0 / s, 1),
     (Pid(2.0, d=0.1, pole=50.0), lambda s: 2.0 + 0.1 * s / (1 + s / w(50)), 1),
     (Pid(2.0, 3.0, 0.1, 50.0), lambda s: 2.0 + 3.0 / s + 0.1 * s / (1 + s / w(50)), 2),

@@ -9,7 +9,7 @@ from test_ncf import BODY, brute
 from test_spill_over import many, small
 
 import flexplant as fx
-from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverError
+from flexplant.errors import CertificateError, FlexplantWarning, LabelError, ModelError, SolverError
 from flexplant.lti import StateSpace, discretized, frequency_response
 from flexplant.plant import assemble_plant
 from flexplant.synthesis import ncf_margin, shape_loop
@@ -153,5 +153,8 @@ def test_what_does_not_go_together_is_refused():
         shape_loop(G, bandwidth=50.0, model=StateSpace([[1.0]], [[1.0]], [[1.0]], [[0.0]]))
     with pytest.raises(LabelError, match="no axis 'y2'"):
         shape_loop(G, bandwidth=50.0, references={"y2": "r"})
-    with pytest.raises((SolverError, ModelError)):
+    with pytest.raises((SolverError, CertificateError), match=r"delay or .*resonances"):
         shape_loop(discretized(mechanism(), 2e4, delay=40), bandwidth=900.0)
+    for name in ("bandwidth", "rolloff"):
+        with pytest.raises(ModelError, match=f"{name} must be below half the rate, 10000 Hz"):
+            shape_loop(G, **({"bandwidth": 50.0} | {name: 12e3}))

@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import ModelError, ShapeError
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
-from ..values import FloatArray, flag, instance, positive
+from ..values import ComplexArray, FloatArray, flag, instance, positive
 
 
 def in_axes(
@@ -24,8 +24,8 @@ def in_axes(
     """Return the measured plant from the axes of `before` to those of `after`.
 
     ``after G before``; where a rate is given, times the delay of a sampled controller and its
-    zero-order hold, ``exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)`` (what aliasing adds is
-    left out).
+    zero-order hold, ``H(f) = exp(-2 pi i f (delay + 1/2) / rate) sinc(f / rate)``. Lines above half
+    the rate are seen at lower frequencies: ``sum_k (G H)(f + k rate)``, as far as they go.
 
     Parameters
     ----------
@@ -35,7 +35,7 @@ def in_axes(
         Static transformations: of a `decouple` the `accelerations` (or `to_actuators`) and
         `to_motions`. Names of a StateSpace pick the channels of the Frf.
     rate : float [Hz], optional
-        Of the controller; lines above half of it are left out.
+        Of the controller; the result ends below half of it.
     delay : float
         Samples between a measurement and its command, of which the Frf shows nothing.
     hold : bool
@@ -57,15 +57,47 @@ def in_axes(
     chosen = frf.select(outputs=last.inputs, inputs=first.outputs)
     data = np.einsum("ay,yuf,ub->abf", last.D, chosen.data, first.D)
     freq, late = frf.freq, positive(delay, "delay", zero=True)
+    held = flag(hold, "hold")
     if rate is None and late:
         raise ModelError("delay is counted in samples: give rate= too.")
     if rate is not None:
         freq = freq[freq < 0.5 * positive(rate, "rate")]
-        half, shape = (0.5, np.sinc(freq / rate)) if flag(hold, "hold") else (0.0, 1.0)
-        late_by = np.exp(-2j * np.pi * freq * (half + late) / rate)
-        data = data[:, :, : freq.size] * shape * late_by
+        if not freq.size:
+            raise ModelError(
+                f"all lines, from {frf.freq[0]:.4g} Hz, lie above half the rate, {0.5 * rate:g} "
+                "Hz: a loop cannot be judged there. Check that rate is in Hz, or measure lower."
+            )
+        data = _sampled(frf.freq, data, freq, rate, late, held)
     units = {**chosen.channel_units, **first.units, **last.units}
     return Frf(freq, data, first.inputs, last.outputs, quantity=frf.quantity, units=units)
+
+
+def _sampled(
+    lines: FloatArray, data: ComplexArray, freq: FloatArray, rate: float, late: float, held: bool
+) -> ComplexArray:
+    """Return a measured plant as its samples show it, with delay and, unless held=False, aliases.
+
+    Parameters
+    ----------
+    lines, data : (n_lines,) and (n_out, n_in, n_lines) arrays
+        The measurement; zero beyond its lines, and conjugate at negative frequencies.
+    freq : (n_freq,) array [Hz]
+        Lines below half the rate.
+    """
+    if not held:
+        turned = np.exp(-2j * np.pi * freq * late / rate)
+        return np.asarray(data[:, :, : freq.size] * turned)
+    reach = int(np.ceil(lines[-1] / rate))
+    total = np.zeros((*data.shape[:2], freq.size), dtype=complex)
+    for k in range(-reach, reach + 1):
+        moved = freq + k * rate
+        at = np.abs(moved)
+        G = np.array(
+            [[np.interp(at, lines, one, left=0.0, right=0.0) for one in row] for row in data]
+        )
+        hold = np.sinc(moved / rate) * np.exp(-2j * np.pi * moved * (0.5 + late) / rate)
+        total += np.where(moved < 0.0, G.conj(), G) * hold
+    return total
 
 
 def _static(given: System | FloatArray | None, names: Sequence[str], side: str) -> StateSpace:

@@ -18,6 +18,8 @@ from ..values import ComplexArray, FloatArray, short
 Side = Literal["u", "y"]
 #: loop gain below which |S| is within 1 / (1 - 0.05)
 _SMALL = 0.05
+#: change of a loop gain of 1, relative to it, that makes I - L regular
+_BESIDE = 1e-15
 
 
 @dataclass(frozen=True)
@@ -100,8 +102,12 @@ class BrokenLoop:
 
 
 def inverted(L: ComplexArray) -> ComplexArray:
-    """Return (I - L)^-1, frequency first."""
-    return np.asarray(np.linalg.inv(np.eye(L.shape[-1]) - L))
+    """Return (I - L)^-1, frequency first; on the critical point that of a gain next to it."""
+    eye = np.eye(L.shape[-1])
+    try:
+        return np.asarray(np.linalg.inv(eye - L))
+    except np.linalg.LinAlgError:  # a marginal loop at the frequency of its pole
+        return np.asarray(np.linalg.inv(eye - (1.0 - _BESIDE) * L))
 
 
 def largest(S: ComplexArray) -> FloatArray:

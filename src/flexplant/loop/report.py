@@ -18,6 +18,8 @@ from .sensitivity import Loop, taken_apart
 _INTEGRATES = 1e-9
 #: a loop gain at the first or last line that counts as real
 _REAL = 0.05
+#: slope of its size over frequency at the first line below which it is taken to be level
+_LEVEL = 0.5
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -34,7 +36,8 @@ class LoopMargins(Value):
         Factors on the gain, above and below 1, at which the loop reaches the critical point;
         infinite and 0 where none does.
     phase_margin : float [deg]
-        The least at the crossovers; 180 without one.
+        The least at the crossovers, lead or lag; 180 without one. Of an unstable loop this and the
+        others are distances to the critical point, no margins.
     modulus_margin : float
         Least distance to the critical point, 1 / max |S|.
     freq : float [Hz]
@@ -55,10 +58,12 @@ class LoopMargins(Value):
     def __repr__(self) -> str:
         first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4]) or "none"
         more = ", ..." if len(self.crossovers) > 4 else ""
-        decibel = 20.0 * np.log10(self.gain_margin)
+        decibel = f"{20.0 * np.log10(self.gain_margin):.1f}"
+        if self.gain_reduction:
+            decibel += f" and {20.0 * np.log10(self.gain_reduction):.1f}"
         return (
-            f"{self.name}: crosses 1 at {first}{more} Hz, gain margin {decibel:.1f} dB, phase "
-            f"margin {self.phase_margin:.0f} deg, modulus margin {self.modulus_margin:.3f} "
+            f"{self.name}: crosses 1 at {first}{more} Hz, gain margin {decibel} dB, phase margin "
+            f"{self.phase_margin:.0f} deg, modulus margin {self.modulus_margin:.3f} "
             f"({self.freq:.4g} Hz)"
         )
 
@@ -92,6 +97,11 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         """Whether the closed loop is stable; None where it cannot be judged."""
         return None if self.unstable is None else self.unstable == 0
 
+    @property
+    def poles(self) -> str:
+        """The number of unstable poles, in words."""
+        return "1 pole" if self.unstable == 1 else f"{self.unstable} poles"
+
     def __getitem__(self, name: str) -> LoopMargins:
         for loop in self.loops:
             if loop.name == name:
@@ -105,8 +115,9 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         return len(self.loops)
 
     def __repr__(self) -> str:
-        state = {True: "stable", False: f"unstable, {self.unstable} poles", None: "not judged"}
-        margin = f"modulus margin {self.modulus_margin:.3f} of {len(self)} loops together"
+        state = {True: "stable", False: f"unstable, {self.poles}", None: "stability not judged"}
+        together = f" of {len(self)} loops together" if len(self) > 1 else ""
+        margin = f"modulus margin {self.modulus_margin:.3f}{together}"
         lines = [f"<LoopReport: {state[self.is_stable]}, {margin}>"]
         lines += [f"  {loop!r}" for loop in self.loops[:4]]
         lines += [f"  and {len(self) - 4} more"] if len(self) > 4 else []
@@ -220,26 +231,35 @@ def loop_margins(
     def between(f: float) -> complex:
         return complex(np.interp(f, freq, L.real) + 1j * np.interp(f, freq, L.imag))
 
+    from scipy.optimize import minimize_scalar
+
     find = between if exact is None else exact
     crossovers = _roots(freq, np.abs(L) - 1.0, lambda f: abs(find(f)) - 1.0)
     phases = [abs(np.degrees(np.angle(find(f)))) for f in crossovers]
     # L is real where the imaginary part changes sign; positive: towards the critical point
     reals = [find(f).real for f in _roots(freq, L.imag, lambda f: find(f).imag)]
-    # and at its ends, zero frequency and half the rate, where it comes to lie on the real axis
-    ends = L[[0, -1]] if sampled else L[:1]
+    # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
+    slope = np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0]) if freq.size > 1 else 0.0
+    ends = [*([L[0]] if abs(slope) < _LEVEL else []), *([L[-1]] if sampled else [])]
     reals += [end.real for end in ends if abs(end.imag) < _REAL * abs(end.real)]
     below = [float(x) for x in reals if 0.0 < x < 1.0]
     above = [float(x) for x in reals if x > 1.0]
     size = np.abs(1.0 - L)
     least = int(np.argmin(size))
+    where, margin = float(freq[least]), float(size[least])
+    if exact is not None and 0 < least < freq.size - 1:
+        low, high = float(freq[least - 1]), float(freq[least + 1])
+        closer = minimize_scalar(lambda f: abs(1 - find(f)), bounds=(low, high), method="bounded")
+        if closer.fun < margin:
+            where, margin = float(closer.x), float(closer.fun)
     return LoopMargins(
         name,
         tuple(crossovers),
         1.0 / max(below) if below else float("inf"),
         1.0 / min(above) if above else 0.0,
         float(min(phases, default=180.0)),
-        float(size[least]),
-        float(freq[least]),
+        margin,
+        where,
     )
 
 

@@ -14,6 +14,9 @@ from .joining import Matrices
 from .rate_check import check_rate, light_modes
 from .statespace import StateSpace, System, as_statespace
 
+#: distance of a pole from where a map is singular, relative to it, that counts as none
+_SAME = 1e-12
+
 
 def discretized(
     sys: System,
@@ -243,10 +246,16 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
             raise ModelError(f"prewarp must lie between 0 and {0.5 * rate:g} Hz, got {prewarp:g}.")
         w = 2.0 * np.pi * prewarp
         a = w / np.tan(w / a)
-    if g.n_states and np.linalg.cond(a * np.eye(g.n_states) - g.A) > 1e14:
+    if _has_pole_at(a, g.A):
         raise ModelError(f"{g!r} has a pole at {a:g} rad/s, which Tustin maps to infinity.")
     A, B, C, D = trapezoidal((g.A, g.B, g.C, g.D), a)
     return g.replace(A=A, B=B, C=C, D=D, dt=1.0 / rate)
+
+
+def _has_pole_at(place: float, A: FloatArray) -> bool:
+    """Return whether an eigenvalue lies there; a condition number would see the states' units."""
+    distance = np.abs(np.linalg.eigvals(A) - place)
+    return bool(np.min(distance, initial=np.inf) <= _SAME * abs(place))
 
 
 def trapezoidal(matrices: Matrices, a: float) -> Matrices:
@@ -273,7 +282,7 @@ def bilinear(sys: System, rate: float) -> StateSpace:
     g = as_statespace(sys)
     a = 2.0 * positive(rate, "rate")
     plus = np.eye(g.n_states) + g.A
-    if g.n_states and np.linalg.cond(plus) > 1e14:
+    if _has_pole_at(-1.0, g.A):
         raise ModelError(f"{g!r} has a pole at z = -1, which the bilinear map sends to infinity.")
     inverse = np.linalg.inv(plus)
     root = np.sqrt(2.0 * a)

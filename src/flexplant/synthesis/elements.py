@@ -81,6 +81,8 @@ class Pid(SingleElement):
     @property
     def section(self) -> Section:
         """Its transfer function."""
+        if self.pole is None and not self.i:
+            return Section((0.0, 0.0, self.p), (0.0, 0.0, 1.0), 1.0)
         if self.pole is None:
             return Section((0.0, self.p, self.i), (0.0, 1.0, 0.0), 1.0)
         w = 2.0 * np.pi * self.pole

@@ -19,7 +19,9 @@ from ..values import ComplexArray, FloatArray, Value, flag, instance, positive, 
 
 
 class Section(NamedTuple):
-    """``(b2 p^2 + b1 p + b0) / (a2 p^2 + a1 p + a0)``, p = s / omega; order 2, or 1 with a2 = 0.
+    """``(b2 p^2 + b1 p + b0) / (a2 p^2 + a1 p + a0)``, p = s / omega.
+
+    Of order 2; 1 where a2 is 0, and 0 where a1 is too.
 
     Parameters
     ----------
@@ -50,9 +52,16 @@ class Section(NamedTuple):
         return np.asarray(((b2 * p + b1) * p + b0) / ((a2 * p + a1) * p + a0))
 
     @property
+    def order(self) -> int:
+        """The number of its states."""
+        return 2 if self.a[0] else 1 if self.a[1] else 0
+
+    @property
     def matrices(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
         """A, B, C and D of the continuous section."""
         (b2, b1, b0), (a2, a1, a0), w = self.b, self.a, self.omega
+        if not a2 and not a1:  # a gain: a state would be one that nothing sees
+            return np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.array([[b0 / a0]])
         if not a2:
             b1, b0, a0 = b1 / a1, b0 / a1, a0 / a1
             one = np.array([[-a0 * w]]), np.array([[w]]), np.array([[b0 - b1 * a0]])
@@ -226,7 +235,7 @@ class Law(Element):
             # sampled each on its own: states of one size
             joined = cascaded(joined, trapezoidal(part, a) if a else part)
         A, B, C, D = joined
-        sizes = [2 if section.a[0] else 1 for section in self._sections]
+        sizes = [section.order for section in self._sections if section.order]
         return StateSpace(
             A,
             B,

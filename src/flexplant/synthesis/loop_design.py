@@ -11,12 +11,13 @@ import numpy as np
 
 from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import LoopReport, SpillOver, in_axes, report_loops
+from ..loop.sensitivity import taken_apart
 from ..lti.frequency import Frf
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..parallel import one_thread
 from ..plant import StandardPlant, decouple
-from ..values import FloatArray, Value, name_list
+from ..values import FloatArray, Value, name_list, short
 from .law import Element, Law
 from .spill_over import spill_over, unchecked
 
@@ -51,7 +52,8 @@ class LoopDesign(Value):
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
         lines = [f"<LoopDesign of {axes}: {self.system.n_states} states>"]
-        lines += [f"  {line.strip()}" for line in repr(self.report).splitlines()]
+        lines += [f"  {line}" for line in repr(self.report).splitlines()]
+        lines += [f"  law of {axis}: {law!r}" for axis, law in list(self.laws.items())[:4]]
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         return "\n".join([*lines, *(f"  {note}" for note in self.notes)])
@@ -117,7 +119,10 @@ def axes_of(
     else:
         plant = as_statespace(plant)
         if rate is not None or delay:
-            raise ModelError("a model has its rate and delay in it: plant.discretized(rate, delay)")
+            raise ModelError(
+                "rate and delay are those of a measured Frf; a model has them in it: pass "
+                "discretized(plant, rate, delay=)."
+            )
         rate, inputs, outputs = (1.0 / plant.dt if plant.dt else None), plant.inputs, plant.outputs
     first = as_statespace(np.eye(len(inputs)) if before is None else before)
     last = as_statespace(np.eye(len(outputs)) if after is None else after)
@@ -212,15 +217,25 @@ def design_loops(
     axes = axes_of(plant, before, after, rate, delay, hold)
     found = made(axes, checked_laws(axes, laws), rigid, unstable, references, larger)
     if found.report.is_stable is False:
-        closest = min(found.report.loops, key=lambda loop: loop.modulus_margin)
         warnings.warn(
-            f"the loops are unstable ({found.report.unstable} poles); closest to the critical "
-            f"point is {closest.name} at {closest.freq:.4g} Hz. Notch what resonates there, add "
-            "lead, or lower the gain.",
+            f"the loops are unstable ({found.report.poles}){_where(axes, found)}. Check sign "
+            "and unit of the laws against the crossovers, notch what resonates there, add "
+            "lead, or change the gain.",
             FlexplantWarning,
             stacklevel=3,
         )
     return found
+
+
+def _where(axes: Axes, found: LoopDesign) -> str:
+    """Return where a loop is unstable: the frequencies of a model's poles, lines of an Frf."""
+    if isinstance(axes.plant, Frf):
+        closest = min(found.report.loops, key=lambda loop: loop.modulus_margin)
+        return f"; closest to the critical point is {closest.name} at {closest.freq:.4g} Hz"
+    poles = taken_apart((axes.plant, axes_controller(axes, found.laws))).poles()
+    speed = np.log(poles[np.abs(poles) >= 1.0]) / axes.plant.dt if axes.rate else poles
+    freq = np.unique(np.round(np.abs(speed[speed.real >= 0.0]) / (2.0 * np.pi), 6))
+    return " at " + ", ".join(f"{f:.4g}" for f in freq[:4]) + " Hz"
 
 
 def made(
@@ -290,7 +305,7 @@ def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str,
     if not isinstance(each, Mapping):
         raise ModelError(
             f"laws must be a law or a mapping {{axis: law}}, got {type(laws).__name__}. Pass a "
-            "product of Pid, Lead, Notch and LowPass."
+            "product of Pid, Lead, Notch and LowPass; a gain alone is Pid(gain)."
         )
     for name in each:
         if name not in axes.names:
@@ -302,13 +317,15 @@ def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str,
         element = each[name]
         if not isinstance(element, Element):
             raise ModelError(
-                f"the law of {name!r} is no product of elements: {element!r}. Pass one."
+                f"the law of {name!r} is no product of elements: {short(element)}. Pass a product "
+                "of Pid, Lead, Notch and LowPass; a gain alone is Pid(gain)."
             )
         law = element.law
         if law.rate and law.rate != axes.rate:
+            runs = f"runs at {axes.rate:g} Hz" if axes.rate else "is continuous"
             raise ModelError(
-                f"the law of {name!r} runs at {law.rate:g} Hz, the plant at {axes.rate:g} Hz "
-                "(0: continuous). Pass it continuous: it is sampled here."
+                f"the law of {name!r} runs at {law.rate:g} Hz, the plant {runs}. Pass the law "
+                "continuous: it is sampled here at the rate of the plant (rate= of an Frf)."
             )
         found[name] = law.sampled(axes.rate) if axes.rate else law
     return found

@@ -27,6 +27,8 @@ from .spill_over import spill_over, unchecked
 _INTEGRAL = 0.1
 #: claim and margin, and the smallest gamma by two computations, agree to this
 AGREEMENT = 1e-4
+#: smallest gamma of a shaped plant above which its bandwidth is out of reach
+_HOPELESS = 1e3
 
 
 @one_thread()
@@ -214,12 +216,17 @@ def verified_controller(
     if not margin:
         raise hidden_mode(shaped, K)
     if not abs(other - least) <= AGREEMENT * least or not margin * gamma >= 1.0 - AGREEMENT:
+        cause = (
+            "the shaped plant is too badly conditioned to trust. Bring its gains at u and y to "
+            "size 1, and leave out states that are hardly reached or seen"
+            if least < _HOPELESS
+            else "no controller has more than a tiny margin. The delay or the resonances allow no "
+            "loop of that bandwidth: lower it"
+        )
         raise CertificateError(
             f"the loop of the shaped plant has the margin {margin:.6g} where {1.0 / gamma:.6g} was "
             f"claimed, the smallest gamma is {least:.6g} by the Riccati equations and {other:.6g} "
-            "by the Hankel norm of the factors: the shaped plant is too badly conditioned to "
-            "trust. Bring its gains at u and y to size 1, and leave out states that are hardly "
-            "reached or seen."
+            f"by the Hankel norm of the factors: {cause}."
         )
     found = {
         "margin": margin,
@@ -289,20 +296,38 @@ def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, flo
     return (tustin(K, 1.0 / shaped.dt) if shaped.dt else K), gamma, least
 
 
+def below_half_rate(freq: float, name: str, dt: float) -> float:
+    """Return a frequency [Hz] that a sampled loop can have.
+
+    Raises
+    ------
+    ModelError
+        When it is not positive, or not below half the rate.
+    """
+    if dt and positive(freq, name) >= 0.5 / dt:
+        raise ModelError(
+            f"{name} must be below half the rate, {0.5 / dt:g} Hz, got {freq:g} Hz. Lower it (to a "
+            "tenth of the rate or less), or raise the rate."
+        )
+    return positive(freq, name)
+
+
 def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
     """Return ``k_i (1 + w / (10 s))`` for each channel, of gain 1 with the plant's at bandwidth.
 
     Raises
     ------
     ModelError
-        When the shaped plant is not square, or has no gain there.
+        When the shaped plant is not square or has no gain there, or bandwidth is above half the
+        rate.
     """
     count = len(shaped.inputs)
-    if len(shaped.outputs) != count or (shaped.dt and bandwidth >= 0.5 / shaped.dt):
+    if len(shaped.outputs) != count:
         raise ModelError(
-            f"bandwidth needs as many y as u (got {len(shaped.outputs)} and {count}) and to lie "
-            f"below half the rate, got {bandwidth:g} Hz: pass before= and after= that decouple."
+            f"bandwidth needs as many y as u, got {len(shaped.outputs)} and {count}: pass before= "
+            "and after= that decouple."
         )
+    below_half_rate(bandwidth, "bandwidth", shaped.dt)
     gains = np.abs(frequency_response(shaped, np.array([bandwidth])).data[:, :, 0].diagonal())
     if not np.all(gains > 0):
         raise ModelError(

@@ -21,7 +21,7 @@ from ..plant import StandardPlant
 from ..values import FloatArray, Value, positive
 from .controller import Controller
 from .loop_design import Axes, axes_of, connected
-from .ncf import integral_action, loop_margin, verified_controller
+from .ncf import below_half_rate, integral_action, loop_margin, verified_controller
 from .ncf_following import following
 from .spill_over import spill_over, unchecked
 
@@ -54,7 +54,7 @@ class ShapedLoop(Value):
 
     def __repr__(self) -> str:
         first, *rest = repr(self.report).splitlines()
-        return "\n".join([f"<ShapedLoop: {first[1:-1]}>", *rest, repr(self.controller)])
+        return "\n".join([first.replace("LoopReport", "ShapedLoop"), *rest, repr(self.controller)])
 
 
 @one_thread()
@@ -139,6 +139,10 @@ def shape_loop(
             "laws on the Frf by tune_loops."
         )
     axes = axes_of(plant, before, after, None, 0.0, True)
+    dt = axes.plant.dt
+    below_half_rate(target, "bandwidth", dt)
+    if rolloff is not None:
+        below_half_rate(rolloff, "rolloff", dt)
     T_ref = None if model is None else _model(model, axes)
     freq = target
     for _ in range(_STEPS):
@@ -153,7 +157,9 @@ def shape_loop(
         if reached and abs(min(reached) / target - 1.0) <= _NEAR:
             break
         freq *= target / min(reached) if reached else 2.0
-    else:
+        if dt and freq >= 0.5 / dt:
+            break
+    if not reached or abs(min(reached) / target - 1.0) > _NEAR:
         raise SolverError(
             f"the slowest axis crosses 1 at {min(reached, default=np.nan):.4g} Hz, not at "
             f"{target:g} Hz, whatever the gain: the plant's delay or resonances leave no loop of "
@@ -241,7 +247,7 @@ def _shaping(axes: Axes, freq: float, rolloff: float | None) -> StateSpace:
     if rolloff is None:
         return integral_action(axes.plant, freq)
     names = axes.before.inputs
-    one = lowpass(positive(rolloff, "rolloff"), order=2)
+    one = lowpass(rolloff, order=2)
     filters = append(
         *(
             one.replace(inputs=[f"{n}|in"], outputs=[n], states=[f"{n}|{s}" for s in one.states])

@@ -15,7 +15,7 @@ from ..lti.responses import responder
 from ..lti.statespace import System
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
-from ..values import FloatArray, Rng, generator, positive, whole
+from ..values import FloatArray, Rng, generator, positive, short, whole
 from .certificate import certified_norm, reached_norms
 from .controller import Controller
 from .nonsmooth import Minimum, bfgs, sampled_minimum
@@ -33,6 +33,8 @@ _ROUNDS, _ROUND_GAIN = 10, 1e-4
 _SHARE = 0.7
 #: the norm that the search claims and the one verified on the plant as given agree to this
 _AGREEMENT = 1e-3
+#: relative decrease that is left above which the end is said to be no local minimum
+_SHORT = 1e-2
 
 
 @one_thread()
@@ -105,10 +107,10 @@ def design_structured(
     Henrion, Lewis, Overton, HIFOO, IFAC Symposium on Robust Control Design, 2006.
     """
     plants = _plants(plant, u, y)
-    if not hasattr(structure, "family"):
+    if isinstance(structure, type) or not hasattr(structure, "family"):
         raise ModelError(
-            f"structure must be FixedOrder, TunedLaws, ObserverGains or Parametrised, got "
-            f"{type(structure).__name__}. Pass one of them."
+            "structure must be FixedOrder, TunedLaws, ObserverGains or Parametrised, got "
+            f"{short(structure)}. Pass one of them, such as TunedLaws(law) or FixedOrder(2)."
         )
     starts, random = whole(starts, "starts"), generator(rng)
     limit, begun = positive(time_limit, "time_limit"), time.perf_counter()
@@ -142,6 +144,9 @@ def design_structured(
     }
     if len(plants) > 1:
         certificate |= {f"norm of plant {i}": one["norm"] for i, one in enumerate(each, 1)}
+    notes = search.notes
+    if found.decrease > _SHORT:
+        notes += ("not yet a local minimum (decrease left): more starts, time or another order",)
     left_out = spill_over(plants[0], [K], larger)
     return Controller(
         K,
@@ -150,7 +155,7 @@ def design_structured(
         certificate=certificate | (left_out.certificate if left_out is not None else {}),
         reached=reached_norms(plants[worst], closed[worst], responder(closed[worst])),
         left_out=left_out,
-        notes=(*search.notes, *(() if left_out is not None else unchecked(plants[0]))),
+        notes=(*notes, *(() if left_out is not None else unchecked(plants[0]))),
         structure=final,
     )
 
@@ -297,5 +302,6 @@ class _StructureSearch:
             f"no controller of this structure was found that stabilises plant {worst + 1}: of "
             f"{starts} starts the best leaves a pole at {freq:.4g} Hz (size {size:.4g} Hz, real "
             f"part {value:.3g} of the plant's speed). Give the structure more freedom (a higher "
-            "order, a lead), a start that stabilises, or more starts and time."
+            "order, a lead), the gain of a law the other sign, a start that stabilises, or more "
+            "starts and time."
         )
