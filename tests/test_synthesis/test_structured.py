@@ -172,7 +172,7 @@ def test_laws_are_tuned_to_a_local_minimum():
     """PID with roll-off and notch, sampled and late: every draw nearby is worse."""
     plant = machine()
     first = design_loops(plant, law())
-    found = design_structured(plant, TunedLaws(law()), starts=2, time_limit=10.0)
+    found = design_structured(plant, TunedLaws(law()), starts=2, time_limit=300.0)
     assert found.gamma < 0.75 * judged(plant, first)
     assert judged(plant, found) == pytest.approx(found.gamma, rel=2e-3)
     same = design_loops(plant, found.structure.laws).system
@@ -194,11 +194,11 @@ def test_laws_are_tuned_to_a_local_minimum():
 def test_one_controller_for_several_machines():
     """Modes at 26 and 36 Hz: one law holds both, a law for one is worse on the other."""
     plants = [machine(26.0), machine(36.0)]
-    one = design_structured(plants, TunedLaws(law(30.0)), starts=1, time_limit=8.0)
+    one = design_structured(plants, TunedLaws(law(30.0)), starts=1, time_limit=300.0)
     norms = [judged(plant, one) for plant in plants]
     assert one.gamma == pytest.approx(max(norms), rel=2e-3)
     assert one.certificate["norm of plant 1"] == pytest.approx(norms[0], rel=2e-3)
-    alone = design_structured(plants[0], TunedLaws(law(26.0)), starts=1, time_limit=8.0)
+    alone = design_structured(plants[0], TunedLaws(law(26.0)), starts=1, time_limit=300.0)
     assert alone.gamma <= one.gamma * (1 + 1e-2)
     g, K = plants[1].system, alone.system
     other = oracle.closed_loop(oracle.split(g.A, g.B, g.C, g.D, 1, 1), K.A, K.B, K.C, K.D)
