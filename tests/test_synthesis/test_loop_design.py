@@ -8,7 +8,7 @@ import scipy.linalg as la
 from test_spill_over import many, small
 
 import flexplant as fx
-from flexplant.errors import FlexplantWarning, LabelError, ModelError, SolverError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError, SolverError
 from flexplant.lti import StateSpace, discretized, frequency_response
 from flexplant.plant import assemble_plant, decouple
 from flexplant.synthesis import Law, Lead, LowPass, Notch, Pid, design_loops, tune_loops
@@ -180,6 +180,15 @@ def test_what_does_not_go_together_is_refused():
     mass = StateSpace([[0, 1.0], [0, 0]], [[0], [1.0]], [[1.0, 0]], [[0]], inputs=["f"])
     with pytest.warns(FlexplantWarning, match=r"\(2 poles\) at 0.1592 Hz. Check sign"):
         design_loops(mass, Pid(1.0))
+    assert "not |S| but" in repr(tune_loops(mass))  # nothing limits it
+    with pytest.raises(ModelError, match="after has states"):
+        design_loops(mass, Pid(40.0), after=LowPass(9.0).system.replace(inputs=["y1"]))
+    with pytest.raises(ShapeError, match="before has 2 channels at the plant, which has 1"):
+        tune_loops(mass, before=np.eye(2))
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        assert "does not cross 1" in repr(design_loops(mass, Pid(0.0)))
+    few = design_loops(fx.Frf([10.0, 20.0], np.ones((1, 1, 2))), Pid(1.0), rate=100.0).report
+    assert "2 lines show no stability" in few.reason
     held = design_loops(mass, Pid(40.0) * Lead(1.0)).report  # no hidden integrator
     assert held.is_stable
     assert held["y1"].gain_reduction == 0.0

@@ -52,8 +52,8 @@ def in_axes(
         When frf is none, a transformation is not static or does not fit, or a number is wrong.
     """
     frf = instance(frf, Frf, "frf", "Pass a measured one.")
-    first = _static(before, frf.inputs, "before")
-    last = _static(after, frf.outputs, "after")
+    first = static_map(before, frf.inputs, "before")
+    last = static_map(after, frf.outputs, "after")
     chosen = frf.select(outputs=last.inputs, inputs=first.outputs)
     data = np.einsum("ay,yuf,ub->abf", last.D, chosen.data, first.D)
     freq, late = frf.freq, positive(delay, "delay", zero=True)
@@ -100,8 +100,8 @@ def _sampled(
     return total
 
 
-def _static(given: System | FloatArray | None, names: Sequence[str], side: str) -> StateSpace:
-    """Return a transformation from or to named channels of the Frf.
+def static_map(given: System | FloatArray | None, names: Sequence[str], side: str) -> StateSpace:
+    """Return a transformation from or to named channels of the plant.
 
     Raises
     ------
@@ -118,7 +118,7 @@ def _static(given: System | FloatArray | None, names: Sequence[str], side: str) 
         ends = T.outputs if side == "before" else T.inputs
         if len(ends) != len(names):
             raise ShapeError(
-                f"{side} has {len(ends)} channels at the plant, the Frf {len(names)}: give one "
+                f"{side} has {len(ends)} channels at the plant, which has {len(names)}: give one "
                 "row (of before) or column (of after) for each."
             )
         return T.replace(outputs=names) if side == "before" else T.replace(inputs=names)

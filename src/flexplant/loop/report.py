@@ -56,13 +56,14 @@ class LoopMargins(Value):
         self._set(crossovers=tuple(float(f) for f in self.crossovers))
 
     def __repr__(self) -> str:
-        first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4]) or "none"
+        first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4])
         more = ", ..." if len(self.crossovers) > 4 else ""
+        crosses = f"crosses 1 at {first}{more} Hz" if first else "does not cross 1"
         decibel = f"{20.0 * np.log10(self.gain_margin):.1f}"
         if self.gain_reduction:
             decibel += f" and {20.0 * np.log10(self.gain_reduction):.1f}"
         return (
-            f"{self.name}: crosses 1 at {first}{more} Hz, gain margin {decibel} dB, phase margin "
+            f"{self.name}: {crosses}, gain margin {decibel} dB, phase margin "
             f"{self.phase_margin:.0f} deg, modulus margin {self.modulus_margin:.3f} "
             f"({self.freq:.4g} Hz)"
         )
@@ -186,6 +187,8 @@ def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> Ny
     scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=1e-300)
     if parts.measured is None:
         return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
+    if grid.size < 3:
+        return NyquistCount(None, f"{grid.size} lines show no stability: measure more")
     zero = np.abs(distance) <= _INTEGRATES * scale
     own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
     at_zero = 2 * rigid + int(np.count_nonzero(zero))
@@ -239,7 +242,11 @@ def loop_margins(
     # L is real where the imaginary part changes sign; positive: towards the critical point
     reals = [find(f).real for f in _roots(freq, L.imag, lambda f: find(f).imag)]
     # and at its ends, half the rate and zero frequency (unless it integrates), where it is real
-    slope = np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0]) if freq.size > 1 else 0.0
+    slope = (
+        np.log(abs(L[1] / L[0])) / np.log(freq[1] / freq[0])
+        if freq.size > 1 and np.all(L[:2])
+        else 0.0
+    )
     ends = [*([L[0]] if abs(slope) < _LEVEL else []), *([L[-1]] if sampled else [])]
     reals += [end.real for end in ends if abs(end.imag) < _REAL * abs(end.real)]
     below = [float(x) for x in reals if 0.0 < x < 1.0]

@@ -11,6 +11,7 @@ import numpy as np
 
 from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import LoopReport, SpillOver, in_axes, report_loops
+from ..loop.axes import static_map
 from ..loop.sensitivity import taken_apart
 from ..lti.frequency import Frf
 from ..lti.interconnection import append, series
@@ -99,8 +100,9 @@ def axes_of(
 
     Raises
     ------
-    ModelError
-        When there are not as many commands as motions, or rate and plant do not go together.
+    ModelError, ShapeError
+        When there are not as many commands as motions, a transformation is not static or does not
+        fit, or rate and plant do not go together.
     """
     given = plant if isinstance(plant, StandardPlant) else None
     if hasattr(plant, "frdata"):
@@ -124,13 +126,7 @@ def axes_of(
                 "discretized(plant, rate, delay=)."
             )
         rate, inputs, outputs = (1.0 / plant.dt if plant.dt else None), plant.inputs, plant.outputs
-    first = as_statespace(np.eye(len(inputs)) if before is None else before)
-    last = as_statespace(np.eye(len(outputs)) if after is None else after)
-    if before is None or isinstance(before, np.ndarray | list | tuple):
-        named = inputs if before is None else first.inputs
-        first = first.replace(inputs=named, outputs=inputs)
-    if after is None or isinstance(after, np.ndarray | list | tuple):
-        last = last.replace(inputs=outputs, outputs=outputs if after is None else last.outputs)
+    first, last = static_map(before, inputs, "before"), static_map(after, outputs, "after")
     if not isinstance(plant, Frf):
         static = [s.replace(dt=plant.dt) for s in (first, last)]
         inside = series(series(static[0], plant.select(last.inputs, first.outputs)), static[1])

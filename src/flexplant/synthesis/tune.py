@@ -96,7 +96,9 @@ def tune_loops(
         laws = {name: one.law(one.bandwidth * 0.97**step) for name, one in found.items()}
         report = report_loops((axes.plant, axes_controller(axes, laws)), at="y", rigid=rigid)
         if report.is_stable and all(one.modulus_margin >= 1.0 / peak for one in report.loops):
-            return made(axes, laws, rigid, 0, None, larger)
+            design = made(axes, laws, rigid, 0, None, larger)
+            ended = [one.ended for one in found.values() if one.bandwidth >= 0.95 * one.top]
+            return design.replace(notes=(*design.notes, *ended))
     slower = 100.0 * (1.0 - 0.97**_STEPS)
     raise SolverError(
         f"each axis alone holds |S| below {peak:g}, all together do not, even {slower:.0f} % "
@@ -119,6 +121,20 @@ class _Axis:
     rolloff: float = 8.0
     bandwidth: float = 0.0
 
+    @cached_property
+    def top(self) -> float:
+        """The highest bandwidth [Hz]: the line of the rigid body ends at the first resonance."""
+        ends = [0.25 * self.freq[-1], *self._resonances, *([0.19 * self.rate] if self.rate else [])]
+        return float(min(ends))
+
+    @property
+    def ended(self) -> str:
+        """A note for a bandwidth that the top ends, not the peak."""
+        return (
+            f"{self.name}: not |S| but the first resonance, the rate or the last line "
+            f"({self.freq[-1]:.4g} Hz) ended the search, at {self.top:.4g} Hz"
+        )
+
     def best(self) -> _Axis:
         """Return the axis with the shape and bandwidth that hold the peak.
 
@@ -127,9 +143,7 @@ class _Axis:
         SolverError
             When none does.
         """
-        # the line of the rigid body ends at the first resonance
-        ends = [0.25 * self.freq[-1], *self._resonances, *([0.19 * self.rate] if self.rate else [])]
-        top, low = float(min(ends)), max(4.0 * float(self.freq[0]), 3.0 * self._suspension)
+        top, low = self.top, max(4.0 * float(self.freq[0]), 3.0 * self._suspension)
         best = replace(self, bandwidth=low)
         for lead, rolloff in _SHAPES:
             one = replace(best, lead=lead or best.lead, rolloff=rolloff or best.rolloff)
