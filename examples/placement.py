@@ -79,7 +79,7 @@ def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[s
     )
     return {
         "the die's error": best(goal),
-        "within 12 %, proven": best(
+        "variance within 12 %, proven": best(
             goal, method=BranchAndBound(gap=0.12, time_limit=10.0, starts=1)
         ),
         "0.25 m apart": best(goal, constraints=[MinimumDistance(0.25)]),

@@ -21,7 +21,7 @@ def test_the_story_of_placement(tmp_path):
     goal = fx.PoiVariance("die", example.AXES, own_modes=True)
     value = {k: goal(found.on(result["plant"])) for k, found in result["sensors"].items()}
     best = value["the die's error"]
-    proven = result["sensors"]["within 12 %, proven"]
+    proven = result["sensors"]["variance within 12 %, proven"]
     assert proven.gap <= 0.12 or proven.stopped
     assert proven.bound <= min(v for k, v in value.items() if not k.startswith("25"))
     for name in ("0.25 m apart", "none at the cable", "worst machine of three", "one may fail"):

@@ -13,6 +13,7 @@ from flexplant.placement import (
     BranchAndBound,
     Exchange,
     OffPoi,
+    Placement,
     PoiLqr,
     PoiVariance,
     place_actuators,
@@ -197,3 +198,11 @@ def test_four_of_36_are_proven_with_few_scores(make):
     layouts = layouts_of(plant, "y", sensors, PoiVariance())
     some = [sorted(rng.choice(36, 4, replace=False)) for _ in range(500)]
     assert np.min(layouts.score(some)) >= found.value
+
+
+def test_a_bound_is_said_in_the_unit_of_the_value():
+    """37 % of a variance are 21 % of an rms: beside an rms stands an rms."""
+    found = Placement(("a",), 4e-18, 1e-18, 3, ((4e-18,),), "the POI", (), "y", unit="m")
+    assert "2 nm rms by the POI, no choice below 1 nm rms" in repr(found)
+    assert "no bound" in repr(found.replace(bound=0.0))
+    assert "none is more than 75 % better" in repr(found.replace(unit=""))

@@ -37,8 +37,8 @@ class BranchAndBound(Search):
     Parameters
     ----------
     gap : float
-        It ends when no choice can be better by more than this part of the value; 0 for the
-        optimum.
+        It ends when no choice can be better by more than this part of the value (a variance: of
+        its root about half as much); 0 for the optimum.
     time_limit : float [s]
         It ends after this time, with the gap that was reached and a warning. The exchanges at the
         start are not cut short.
@@ -105,8 +105,8 @@ class BranchAndBound(Search):
             stopped = f"the time limit of {self.time_limit:.3g} s was reached"
             warnings.warn(
                 f"{stopped}: no choice is more than {100 * (1 - bound / tree.value):.2g} % better "
-                f"than the one found, but {100 * self.gap:.2g} % was wanted. Raise time_limit, or "
-                "accept a larger gap.",
+                f"in value than the one found, but {100 * self.gap:.2g} % was wanted. Raise "
+                "time_limit, or accept a larger gap.",
                 FlexplantWarning,
                 stacklevel=4,
             )

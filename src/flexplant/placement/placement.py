@@ -60,10 +60,12 @@ class Placement(Value):
         agree = sum(end <= self.value + 1e-9 * abs(self.value) for end in ends)
         if self.proven:
             proof = "the optimum, proven"
-        elif np.isfinite(self.bound):
-            proof = f"none is more than {100 * self.gap:.2g} % better"
-        else:
+        elif not np.isfinite(self.bound) or (self.unit and self.bound <= 0.0):
             proof = "no bound"
+        elif self.unit:
+            proof = f"no choice below {in_words(self.bound, self.unit)}"
+        else:
+            proof = f"none is more than {100 * self.gap:.2g} % better"
         return (
             f"<Placement {' '.join(self.chosen):.120}: {in_words(self.value, self.unit)} by "
             f"{self.criterion}, {proof}; {agree} of {len(ends)} starts agree, "
@@ -83,7 +85,10 @@ class Placement(Value):
 
     @property
     def gap(self) -> float:
-        """The part of the value by which any choice could be better; infinite without a bound."""
+        """The part of the value by which any choice could be better; infinite without a bound.
+
+        Of a mean square: an rms could be better by about half of it.
+        """
         if not np.isfinite(self.bound):
             return np.inf
         return (self.value - self.bound) / abs(self.value) if self.value else 0.0

@@ -70,6 +70,8 @@ def problem_of(
 
 def _listed(plant: StandardPlant, side: str, given: Sequence[Any]) -> tuple[Port, ...]:
     ports = tuple(known_candidates(plant, side, given).values())
+    if not ports:
+        raise ModelError("there are no candidates: pass a list of at least one to choose from.")
     if len(ports) != len(tuple(given)):
         raise LabelError("a candidate is listed twice: each may be chosen once.")
     return ports
