@@ -19,6 +19,7 @@ from flexplant.synthesis import (
     Parametrised,
     Pid,
     TunedLaws,
+    design_hinf,
     design_loops,
     design_structured,
 )
@@ -268,3 +269,18 @@ def test_a_nonsmooth_minimum_and_its_report():
     np.testing.assert_allclose(
         smallest_combination(np.array([[2.0, -1.0], [2.0, 3.0]])), [2.0, 0.0], atol=1e-10
     )
+
+
+@pytest.mark.slow
+def test_a_low_order_comes_near_the_full_one_by_growing_from_lower_ones():
+    """A free mass with a resonance of 0.1 %, in SI units: from the reduced full order it is 2.4."""
+    w = 2 * np.pi * 200.0
+    A = [[0, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 1], [0, 0, -(w**2), -2e-3 * w]]
+    b, c = np.array([[0, 0.1, 0, 0.1]]).T, np.array([[1.0, 0, 0.5, 0]])
+    D = np.zeros((3, 3))
+    D[1, 2], D[2, 1] = 0.1, 1e-8
+    P = StateSpace(A, np.hstack([0.1 * b, 0 * b, b]), np.vstack([1e6 * c, 0 * c, c]), D,
+                   inputs=["d", "n", "f"], outputs=["e", "effort", "x"])  # fmt: skip
+    full = design_hinf(P, u=["f"], y=["x"])
+    found = design_structured(P, FixedOrder(3), u=["f"], y=["x"], time_limit=300.0)
+    assert full.gamma < found.gamma < 1.15 * full.gamma

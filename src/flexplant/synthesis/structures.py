@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,12 @@ _STEP = 1e-3
 DIFFERENCES = tuple(
     (k * _STEP, w / (12.0 * _STEP)) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0))
 )
+
+#: entries of B and C of a state that is added to a controller of lower order
+_COUPLING = 0.1
+
+#: returns the best parameters of a structure; None where it is not stabilised
+Minimise: TypeAlias = "Callable[[ControllerFamily], FloatArray | None]"
 
 
 class ControllerFamily(Protocol):
@@ -53,6 +59,10 @@ class ControllerFamily(Protocol):
     def structure(self, theta: FloatArray) -> Value | None:
         """Return the structure with these parameters as its own, where it is a value."""
 
+    def nested(self, minimise: Minimise) -> FloatArray | None:
+        """Return a start that comes from smaller structures, each minimised; None without."""
+        return None
+
 
 class ControllerStructure(Protocol):
     """What `design_structured` takes: a value that makes itself ready for a plant."""
@@ -64,6 +74,9 @@ class ControllerStructure(Protocol):
 @dataclass(frozen=True, eq=False, repr=False)
 class FixedOrder(Value):
     """A controller of given order, all entries of A, B, C and D free.
+
+    Starts are the controller of full order, reduced, and the best of each lower order in turn,
+    one state added at a time.
 
     Parameters
     ----------
@@ -106,16 +119,10 @@ class FixedOrder(Value):
             raise ShapeError(
                 f"pattern must have shape ({nu}, {ny}) of (u, y), got {pattern.shape}."
             )
-        entries = _Entries(self.order, pattern, prepared, np.zeros(0))
+        entries = _Entries(self.order, pattern, prepared, nests=self.start is None)
         known = self.start if self.start is not None else _reduced(plant, self.order)
         if known is None:
-            rest = Matrices(
-                -prepared.speed * np.eye(self.order),
-                np.zeros((self.order, ny)),
-                np.zeros((nu, self.order)),
-                np.zeros((nu, ny)),
-            )
-            return entries.starting(rest)
+            return entries
         if known.n_states != self.order or known.D.shape != (nu, ny):
             raise ModelError(f"start is {known!r}: pass {self.order} states, {ny} y and {nu} u.")
         g = bilinear(known, 1.0 / plant.dt) if plant.dt else known
@@ -133,22 +140,51 @@ def _reduced(plant: StandardPlant, order: int) -> StateSpace | None:
         return None
 
 
-class _Entries:
-    """Entries in units of the plant's speed and of its u and y."""
+class _Entries(ControllerFamily):
+    """Entries in units of the plant's speed and of its u and y; all zero but for decay, first."""
 
     spread = 1.0
 
     def __init__(
-        self, order: int, pattern: npt.NDArray[np.bool_], p: Prepared, first: FloatArray
+        self, order: int, pattern: npt.NDArray[np.bool_], p: Prepared, *, nests: bool
     ) -> None:
-        self.order, self.first, self.pattern, self.dt = order, first, pattern, p.dt
-        self.names = (p.y, p.u)
+        self.order, self.pattern, self.dt = order, pattern, p.dt
+        self.names, self._p, self._nests = (p.y, p.u), p, nests
         root = np.full(order, np.sqrt(p.speed))
         rows = np.concatenate([root, np.linalg.norm(p.u_scale, axis=1)])
         columns = np.concatenate([root, np.linalg.norm(p.y_scale, axis=0)])
         free = np.ones((rows.size, columns.size), dtype=bool)
         free[order:, order:] = pattern
         self.scale, self.free = np.outer(rows, columns), free
+        rest = np.zeros(free.shape)
+        rest[range(order), range(order)] = -1.0
+        self.first: FloatArray = rest[free]
+
+    def nested(self, minimise: Minimise) -> FloatArray | None:
+        """Return the best controller of each order in turn, with one state more that acts little.
+
+        The norm of a controller of low order has fewer local minima.
+        """
+        found: FloatArray | None = None
+        for order in range(self.order if self._nests else 0):
+            lower = _Entries(order, self.pattern, self._p, nests=False)
+            if found is not None:
+                lower.first = lower._grown(found)
+            found = minimise(lower)
+        return None if found is None else self._grown(found)
+
+    def _grown(self, lower: FloatArray) -> FloatArray:
+        """Return the parameters of a controller of one state fewer, and a state to begin with."""
+        k = self.order
+        entries = np.zeros(self.scale.shape)
+        others = np.delete(np.arange(k + len(self.names[1])), k - 1)
+        columns = np.delete(np.arange(k + len(self.names[0])), k - 1)
+        entries[np.ix_(others, columns)] = lower.reshape(others.size, columns.size)
+        rng = np.random.default_rng(k)
+        entries[k - 1, k:] = _COUPLING * rng.standard_normal(len(self.names[0]))
+        entries[k:, k - 1] = _COUPLING * rng.standard_normal(len(self.names[1]))
+        entries[k - 1, k - 1] = -1.0
+        return np.asarray(entries[self.free])
 
     def starting(self, K: Matrices) -> _Entries:
         """Return itself with the parameters of a controller as its first ones."""
@@ -208,7 +244,7 @@ class ObserverGains(Value):
         return _Gains(prepared, self)
 
 
-class _Gains:
+class _Gains(ControllerFamily):
     spread = 0.1
 
     def __init__(self, p: Prepared, structure: ObserverGains) -> None:
@@ -308,6 +344,10 @@ class Differenced:
     ) -> None:
         self.matrices, self.first, self.spread = matrices, first, spread
         self.order = matrices(first).A.shape[0]
+
+    def nested(self, minimise: Minimise) -> FloatArray | None:
+        """Return None: there are no smaller structures."""
+        return None
 
     def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
         """Return the gradient by the parameters from that by the matrices."""

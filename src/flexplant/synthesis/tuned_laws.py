@@ -17,7 +17,7 @@ from ..values import FloatArray, Value, name_list, rebuild
 from .law import Element, Law, Section, SingleElement
 from .loop_design import axes_of, checked_laws
 from .structured_loop import Matrices
-from .structures import DIFFERENCES
+from .structures import DIFFERENCES, ControllerFamily
 
 #: what an element may have free; the depth of a notch is not, unless it is named
 _NUMBERS = ("p", "i", "d", "pole", "freq", "ratio", "width", "damping", "depth")
@@ -91,7 +91,7 @@ class _Number(NamedTuple):
     name: str
 
 
-class _Laws:
+class _Laws(ControllerFamily):
     """Laws whose numbers are ``value exp(theta)``."""
 
     spread = 0.3
