@@ -114,6 +114,7 @@ def test_a_generator_is_spawned_from_not_drawn_from():
     assert mapped(drawn, range(4), rng=np.random.default_rng(3)) == first
 
 
+@pytest.mark.slow
 def test_threads_give_the_same_to_the_bit():
     serial = mapped(slow_draw, range(40), rng=11)
     with ThreadPoolExecutor(3) as pool:

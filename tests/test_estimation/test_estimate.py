@@ -210,6 +210,7 @@ def test_blocks_and_the_time_varying_filter_agree_around_gaps(method, monkeypatc
     assert gap > 1.2 * usual
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [Predictor(), Filter()])
 def test_a_start_that_lasts_for_long_goes_in_blocks_and_is_that_of_single_samples(
     method, monkeypatch
@@ -327,6 +328,7 @@ def test_step_is_the_stationary_filter_sample_by_sample():
             kalman.step(*wrong)
 
 
+@pytest.mark.slow
 def test_the_report_by_lag_is_that_of_the_estimates():
     """Stationary rms of predictor, filter, lags, smoother: those in the middle of a record."""
     kalman = observer()

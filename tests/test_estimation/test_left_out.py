@@ -246,6 +246,7 @@ def test_filters_delays_and_shapes_act_on_the_modes_left_out(kind):
     assert knowing.rms("die", on=whole) == pytest.approx(knowing.rms("die"), rel=1e-9, abs=0)
 
 
+@pytest.mark.slow
 def test_damping_that_couples_the_modes_of_the_larger_plant():
     """The dense form: internal damper, one pair of modes overdamped."""
     bare = make_plate(elements=(4, 4)).with_damping(ModalDamping(0.01))

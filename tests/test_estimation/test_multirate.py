@@ -55,6 +55,7 @@ def test_a_sensor_read_seldom_is_the_filter_of_the_slow_process():
     assert found.rms("die") == pytest.approx(np.sqrt(np.mean(wanted)), rel=1e-10, abs=0)
 
 
+@pytest.mark.slow
 def test_a_record():
     plant = one_state(0.9)
     found = design_multirate(plant, {"y1": (3, 1)})

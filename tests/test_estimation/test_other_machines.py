@@ -123,6 +123,7 @@ def scattered(part, count=12):
     return light().uncertain(measured).sample(1, count)
 
 
+@pytest.mark.slow
 def test_half_a_percent_of_frequency_doubles_the_error_and_the_table_shows_it():
     kalman = fx.design_kalman(light(), light())
     named = {"Kalman": kalman, "static": design_static(light(), light())}

@@ -306,6 +306,7 @@ def test_poles_by_hand_give_the_same_fit(tmp_path):
     assert "array" not in repr(diagram) + repr(picked) + repr(base)
 
 
+@pytest.mark.slow
 def test_flags_say_what_stays():
     diagram = stabilisation_diagram(measured(), orders=ORDERS)
     near = np.abs(diagram.freq - 160.0) < 0.05

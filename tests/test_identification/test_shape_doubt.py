@@ -81,6 +81,7 @@ def sums(force, *, known):
     return np.mean(found), np.mean(blind)
 
 
+@pytest.mark.slow
 def test_whitened_shape_residuals_are_chi_square():
     """Forces' noise moves all sensors along the shape at a resonance: correlation must count."""
     found, blind = sums(0.05, known=True)

@@ -44,6 +44,7 @@ class TestSample:
         np.testing.assert_allclose(np.ptp(found.dofs.xyz, axis=0), [1, 1, 4.75], atol=0.26)
         np.testing.assert_allclose(report.center[:2], [0.5, 0.5], atol=1e-9)
 
+    @pytest.mark.slow
     def test_results_are_no_matrices(self, tmp_path):
         examples = pytest.importorskip("ansys.mapdl.reader.examples")
         with pytest.raises(FlexplantError, match=r"not a \.full file"):

@@ -34,6 +34,7 @@ def dense(loop, freq):
     return np.array([abs(oracle.gain(g.A, g.B, g.C, g.D, point)[0, 0]) for point in z])
 
 
+@pytest.mark.slow
 def test_figures_are_those_of_a_dense_sweep(loops, found):
     for name, loop in loops.items():
         row = found[name]

@@ -36,6 +36,7 @@ def frf_of(loop, freq):
     return frequency_response(loop.plant.system.select(loop.fed_back, loop.driven), freq)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_an_frf_of_the_model_gives_what_the_model_gives(quantity):
     loop, freq = loop_of(), np.geomspace(2.0, 2000.0, 60)

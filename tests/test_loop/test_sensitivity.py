@@ -94,6 +94,7 @@ def test_plant_and_controller_may_come_as_a_pair(loop):
     assert modulus_margin(pair) == pytest.approx(loop.modulus_margin, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_modulus_margin_is_the_peak_of_a_brute_force_grid(loop):
     grid = np.concatenate(
         [np.linspace(a, b, 4000) for a, b in ((1, 50), (50, 70), (140, 160), (380, 420))]

@@ -182,6 +182,7 @@ def test_lumped_masses_with_next_to_no_rotary_inertia(elements, inertia):
     np.testing.assert_allclose(modes.omega[3:], expected, rtol=1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("elements", [(8, 6), (24, 22)])
 def test_every_body_has_its_own_rigid_body_motions(elements):
     """Short stroke, long stroke: dense and sparse; elastic modes are those of each by itself."""
@@ -207,6 +208,7 @@ def test_every_body_has_its_own_rigid_body_motions(elements):
     assert np.all(np.abs(found.omega[3:6] / by_hand - 1) < 1e-3 + found.rounding[3:6])
 
 
+@pytest.mark.slow
 def test_a_soft_spring_between_two_bodies_leaves_the_motions_of_both():
     one = plate((24, 20))
     model = joined(one, one, apart=0.0)

@@ -334,6 +334,7 @@ def test_what_is_no_place_is_refused(plate, at):
         solve_modes(plate, count=8, compliance_at=at)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [20.0, 1000.0])
 def test_a_fine_mesh_on_soft_springs_has_suspension_modes(stiffness):
     """The sum of the plate's stiffnesses is 1e11 times the springs': nothing is called rounding."""

@@ -98,6 +98,7 @@ def test_pairs_equal_every_pair_and_the_bound_bounds(make, delay):
     assert gaps.min() >= 0.05
 
 
+@pytest.mark.slow
 def test_one_side_of_the_loop_has_a_proof(make):
     """Beside given sensors (actuators) the cost is a convex one of the actuators (sensors)."""
     plant, sensors, actuators = make(44, count=8)
@@ -109,6 +110,7 @@ def test_one_side_of_the_loop_has_a_proof(make):
         assert 0.7 * every.value < start.bound <= every.value
 
 
+@pytest.mark.slow
 def test_more_and_fewer_actuators_than_motions(make):
     """Over-actuated, five for three rigid-body motions; on a held beam one for two."""
     plant, sensors, actuators = make(44, count=7)

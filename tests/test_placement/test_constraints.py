@@ -149,6 +149,7 @@ def test_places_of_ports_with_several_points(machine):
     assert not {"across", "c0"} <= set(near.chosen)
 
 
+@pytest.mark.slow
 def test_several_types_of_devices_at_one_place(machine):
     """A cheap encoder, a good one and a velocity sensor at each place: one of them at most."""
     plant, sensors, _ = machine

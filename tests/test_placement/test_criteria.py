@@ -93,6 +93,7 @@ def test_criteria_are_values(criterion, tmp_path):
     assert repr(load(tmp_path / "c.npz")) == repr(criterion)
 
 
+@pytest.mark.slow
 def test_modes_left_out_count_as_in_the_filter():
     """The score of a choice is the claim of the filter on a plant assembled with these sensors."""
     many = some_modes(count=40, attached=False)

@@ -86,6 +86,7 @@ def best_of(make, seed, side, criterion):
     return sets[int(np.argmin(values))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS)
 def test_sensors(make, name):
     seed, one, other = SENSORS[name]
@@ -98,6 +99,7 @@ def test_actuators(make, name):
     assert best_of(make, seed, "u", one) != best_of(make, seed, "u", other)
 
 
+@pytest.mark.slow
 def test_several_pois_are_summed_with_their_weights(make):
     plant, sensors, _ = make(48)
     lens = Poi("lens", at=(0.02, 0.02, 0.0), axes=("z",))
@@ -155,6 +157,7 @@ def test_over_machines(make):
     assert robust.value < worst(alone.on(plant))
 
 
+@pytest.mark.slow
 def test_after_the_loss_of_one_the_others_suffice(make):
     plant, sensors, actuators = make(48)
     layout = [s.name for s in sensors[:4]]

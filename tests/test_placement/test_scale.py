@@ -139,6 +139,7 @@ def test_a_worker_that_dies_is_survived_once(tmp_path, monkeypatch):
         mapped(ends, range(12), executor=pool)
 
 
+@pytest.mark.slow
 def test_a_criterion_whose_worker_dies_leaves_the_search_as_it_was(make, tmp_path, send_everything):
     plant, sensors, _ = make(12)
     method = Exhaustive()

@@ -56,6 +56,7 @@ def test_sensor_scores_are_those_of_the_recursion(make, seed):
     assert scores.best == tuple(s.name for s in sensors)  # more sensors are never worse
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("delay", [0.0, 1.0, 0.4, 1.6])
 def test_actuator_scores_are_those_of_the_recursion(make, delay):
     """The short cut of the delay, against states for every delay line."""

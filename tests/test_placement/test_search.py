@@ -24,6 +24,7 @@ from oracles_placement import best_subset
 CASES = [(seed, n, k) for seed, n, k in ((11, 9, 3), (12, 9, 5), (13, 10, 4), (14, 12, 4))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "total", "count"), CASES)
 def test_sensors_equal_every_subset_and_the_bound_bounds(make, seed, total, count):
     plant, sensors, _ = make(seed, count=total)
@@ -114,6 +115,7 @@ def test_the_slope_of_the_relaxation_is_its_derivative(make):
         assert gradient[i] == pytest.approx(slope, rel=1e-5, abs=0.0)
 
 
+@pytest.mark.slow
 def test_a_plain_callable(make):
     plant, sensors, _ = make(11)
 
@@ -176,6 +178,7 @@ def test_few_subsets_are_all_scored_unless_told_otherwise(make):
     assert found.bound == found.value
 
 
+@pytest.mark.slow
 def test_seeds_repeat(make):
     plant, sensors, _ = make(12)
     first, again, other = (
@@ -186,6 +189,7 @@ def test_seeds_repeat(make):
     assert first != other
 
 
+@pytest.mark.slow
 def test_placements_are_saved(make, tmp_path):
     plant, sensors, _ = make(12)
     found = place_sensors(plant, sensors, 4, lambda p: float(p.assembled.ports.y[0].at[0]), rng=3)

@@ -97,6 +97,7 @@ def test_some_axes():
         decouple(assemble_plant(some_modes(), ports(y=off, references=[])), axes=["z", "rx"])
 
 
+@pytest.mark.slow
 def test_what_held_dofs_prevent_is_no_axis():
     hinged = full().fixed(full().dofs.where(directions="z", box=((0, 0, 0), (L, 0, 0))))
     with pytest.raises(AssumptionError, match=r"part in z, ry, against which DOFs .* are held"):

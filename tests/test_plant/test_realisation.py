@@ -39,6 +39,7 @@ def close(found, wanted, tolerance):
     return bool(np.all(np.abs(found - wanted) <= tolerance * (np.abs(wanted) + 1e-3 * size)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("changes", [{}, {"mass": 0.5, "damper": 200.0}])
 def test_a_full_model_is_the_dense_receptance(changes):
     # oracle: dense solves; with mass or damper the damping is not proportional (complex modes)
@@ -130,6 +131,7 @@ def test_poles_after_the_update_are_the_measured_ones():
     assert abs(thick.values[0] - fit.values[0]) > 0.05
 
 
+@pytest.mark.slow
 def test_two_poles_of_the_machine():
     # notes.md: with 0.5 kg at (L/2, L/4) and 1 % damping
     found = assemble_plant(full(mass=0.5), ports()).system.poles()

@@ -191,6 +191,7 @@ def test_feedthrough_is_the_static_gain_of_the_fast_states():
         np.testing.assert_allclose(a, b + fast_part - slow.D22[0], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_static_modes_keep_the_compliance_of_all():
     """Above 2 kHz the modes of the full plate become static: at 30 Hz nothing is missed."""
     model = suspend(full(), springs())

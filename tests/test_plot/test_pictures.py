@@ -44,6 +44,7 @@ def some_frf(scale=1.0):
     return Frf(freq, data[None, None], inputs=["u1"], outputs=["y1"])
 
 
+@pytest.mark.slow
 def test_frf():
     ax = fx.plot.frf({"one": some_frf(), "two": some_frf(10.0)}, "y1", "u1", unit="m/N")
     first, second = ax.get_lines()
@@ -195,6 +196,7 @@ def test_layout_shows_every_port_where_it_is():
         fx.plot.layout(dofs, desired=["0:z"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["full", "reduced", "complex"])
 def test_mode_shapes(kind):
     modes = {

@@ -70,6 +70,7 @@ def test_blocks_that_lose_digits_are_not_taken(monkeypatch):
     np.testing.assert_allclose(shown(runner, loop, given) / scale, wanted / scale, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_thousands_of_modes_go_mode_by_mode():
     """2000 states of which two are driven: the ring-down is that of the modes in closed form."""
     modes, dt = 1000, 1e-4

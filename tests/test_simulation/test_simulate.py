@@ -177,6 +177,7 @@ def test_set_point_is_followed(loop):
     assert np.abs(run.moving_average("die:error")[-200:]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_big_machine_is_fast():
     """10 000 samples of 488 states, 5 runs: each step is O(n)."""
     rng = np.random.default_rng(0)

@@ -41,6 +41,7 @@ def check_order(A, dissection):
     assert seen == n
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(
     seed=st.integers(0, 10**6),

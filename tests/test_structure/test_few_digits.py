@@ -84,6 +84,7 @@ def test_what_a_soft_spring_holds_is_not_freed():
     assert low == pytest.approx(by_hand, rel=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("stiffness", [1e2, 1e3])
 def test_a_large_structure_on_soft_springs_is_not_free(stiffness):
     """Suspended at 0.4 to 4 Hz, 1e-12 of the stiffness of its elements."""

@@ -72,6 +72,7 @@ def test_static_loops_have_the_norm_of_their_gain():
     assert sampled["swept norm"] == pytest.approx(2.0)
 
 
+@pytest.mark.slow
 @given(
     seed=st.integers(0, 10**6),
     zeta=st.floats(1e-5, 0.5),

@@ -76,6 +76,7 @@ def test_the_stage_keeps_its_claim(delay):
     assert (found.system.inputs, found.system.outputs) == (problem.y, problem.u)
 
 
+@pytest.mark.slow
 def test_doing_nothing_is_twice_as_bad():
     """Without control the rigid body integrates: no norm at all."""
     _, _, problem, found = stage()
@@ -212,6 +213,7 @@ def test_what_the_weights_leave_out_is_named(rate, side, names, message):
         design_hinf(plant.through(reference_errors(plant)).weighted(**sides))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("rate", "side", "names", "note"),
     [

@@ -414,6 +414,7 @@ def test_a_disturbance_that_u_cancels_entirely():
         Lmi().solve(problem(parts))
 
 
+@pytest.mark.slow
 def test_value_prints_saves_and_stays_light(tmp_path):
     assert repr(Lmi(back_off=0.1)).startswith("Lmi(back_off=0.1")
     Lmi(back_off=0.1).save(tmp_path / "lmi.npz")

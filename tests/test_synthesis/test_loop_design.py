@@ -60,6 +60,7 @@ def test_a_law_for_each_decoupled_axis():
     assert crossings == pytest.approx([40.3, 45.3, 50.4], rel=0.02)
 
 
+@pytest.mark.slow
 def test_the_measured_plant_gives_the_same_report():
     """Lines of 0.5 Hz with the hold and the delay put on: what the model says, count included."""
     frf, axes = measured()
@@ -78,6 +79,7 @@ def test_the_measured_plant_gives_the_same_report():
         assert design_loops(plant(), law(gain=8.0)).report.unstable == fast.unstable
 
 
+@pytest.mark.slow
 def test_modes_left_out_are_checked():
     """Tuned on 12 modes up to 1.3 kHz: the loop reaches those above."""
     P = sampled(small(12), ports(references=[]))
@@ -132,6 +134,7 @@ def test_less_delay_or_a_lower_margin_buys_bandwidth(sign):
     assert reached[1] > 1.2 * reached[0]
 
 
+@pytest.mark.slow
 def test_on_springs_within_the_lines():
     """A suspension at 3 Hz: the model's own poles, or rigid=0 of an Frf; the same loop."""
     G = body(1, spring=3.0)
@@ -163,6 +166,7 @@ def test_tuned_on_the_measured_machine_stable_on_the_truth():
     assert min(one.crossovers[0] for one in found.report.loops) > 90.0
 
 
+@pytest.mark.slow
 def test_what_does_not_go_together_is_refused():
     frf, axes = measured()
     with pytest.raises(LabelError, match="axis 'cog:ry' has no law"):

@@ -186,6 +186,7 @@ def test_sensitivities_of_random_plants_are_those_of_the_lmis(seed, dt):
     assert found.gamma == pytest.approx(other.gamma, rel=0.08)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("method", [Riccati(), Lmi()], ids=["Riccati", "Lmi"])
 @pytest.mark.parametrize("dt", [0.0, 0.1])
 def test_a_sensitivity_that_infinite_gain_makes_zero_has_no_smallest_gamma(method, dt):

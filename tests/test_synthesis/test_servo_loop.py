@@ -60,6 +60,7 @@ def peak_at_u(plant, observer, servo, freq):
     return top
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [1, 2], ids=["static", "kalman"])
 def test_the_certificate_is_of_the_loop_that_runs(which):
     plant, observer = updated()[0], updated()[which]
@@ -93,6 +94,7 @@ def test_without_an_observer_the_loop_is_on_the_poi_itself():
     assert nz and servo.certificate["spectral radius"] == pytest.approx(radius, abs=1e-7)
 
 
+@pytest.mark.slow
 def test_notches_are_placed_where_they_serve():
     """The Kalman estimate brings the bowl mode back: unstable without a notch, 5 dB with."""
     plant, static, kalman = updated()

@@ -70,6 +70,7 @@ def closed(found, freq):
     return np.array(out)
 
 
+@pytest.mark.slow
 def test_two_degrees_of_freedom_follow_a_model():
     """T_ref = 1 / (p^2 + sqrt(2) p + 1): exact at zero, closer with more weight, less robust."""
     freq = np.geomspace(0.05, 2000.0, 400)
@@ -118,6 +119,7 @@ def dense_radius(plant, K):
     return np.abs(la.eigvals(A)).max()
 
 
+@pytest.mark.slow
 def test_the_stage_with_the_modes_left_out():
     """24 of 60 modes in the design: held at 25 Hz with all of them; eigenvalues of the whole."""
     P = sampled(small(), ports())

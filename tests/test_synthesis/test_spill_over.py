@@ -90,6 +90,7 @@ def dense(plant, errors, K, kept=None):
     return closed_loop(P, K.A, K.B, K.C, K.D)
 
 
+@pytest.mark.slow
 def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
     errors, _, found, messages = design()
     assert found.certificate["stability"] < 1
@@ -137,6 +138,7 @@ def test_the_default_weights_are_stable_with_the_modes_left_out():
     assert 1 / max(peaks) == pytest.approx(margin, rel=0.02)
 
 
+@pytest.mark.slow
 def test_one_flipped_sign_fails_the_check():
     _, problem, found, _ = design(80.0, ())
     K = found.system

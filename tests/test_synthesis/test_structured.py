@@ -96,6 +96,7 @@ STRUCTURES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_gradients_are_exact(name):
     """Of the norm at its peak and of the least stable pole, in parameters, by differences."""
@@ -134,6 +135,7 @@ def test_gradients_are_exact(name):
             assert change == pytest.approx(slope @ step, rel=2e-4, abs=2e-6 * size * 1e-5 + 1e-13)
 
 
+@pytest.mark.slow
 def test_the_static_gain_at_a_kink():
     """(1 + k^2) max(1, 1/k^2) is least at k = -1: gamma sqrt(2), where no gradient is small."""
     plant, best = coprime(np.zeros((1, 1)), np.ones((1, 1)), np.ones((1, 1)))
@@ -145,6 +147,7 @@ def test_the_static_gain_at_a_kink():
     assert judged(plant, found) == pytest.approx(found.gamma, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_order_n_minus_1_reaches_the_optimum_of_any_order():
     """The double integrator: one state is enough for (4 + 2 sqrt(2))^(1/2)."""
     plant, best = coprime(np.array([[0.0, 1], [0, 0]]), np.array([[0.0], [1]]), np.eye(2)[:1])
@@ -154,6 +157,7 @@ def test_order_n_minus_1_reaches_the_optimum_of_any_order():
     assert judged(plant, found) == pytest.approx(found.gamma, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_pattern_keeps_its_zeros_and_an_earlier_design_is_a_start():
     A = np.array([[0.0, 1, 0, 0], [-2, -0.1, 1, 0], [0, 0, 0, 1], [1, 0, -2, -0.1]])
     B, C = np.eye(4)[:, [1, 3]], np.eye(4)[[1, 3]]

@@ -311,6 +311,7 @@ def test_sensitivity_is_below_6_db_by_a_dense_sweep(zeta):
     assert peak > 0.97 / margin
 
 
+@pytest.mark.slow
 def test_a_run_follows_a_set_point():
     observer, servo = servo_on(0.01)
     move = setpoint(100e-6, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.02)
@@ -361,6 +362,7 @@ def test_repr_hides_what_it_is():
     assert isinstance(stage(0.01), WaferStage)
 
 
+@pytest.mark.slow
 def test_refusals():
     with pytest.raises(LabelError, match="no elastic mode 3"):
         stage(0.01).poles([3])

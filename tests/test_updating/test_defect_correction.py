@@ -41,6 +41,7 @@ def distances(machine, data, estimates):
     return np.abs((estimates - full) / std).max(axis=1)
 
 
+@pytest.mark.slow
 def test_responses_end_at_the_estimate_of_the_full_model(machine):
     """64 standard deviations off on the reduced model alone."""
     [data] = machine.responses(np.random.default_rng(0))

@@ -284,6 +284,7 @@ def test_several_starts_keep_the_best(chain):
 # ---- other methods
 
 
+@pytest.mark.slow
 def test_a_robust_loss_shrugs_off_an_outlier(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     poles = measured(parts, 1e-3)

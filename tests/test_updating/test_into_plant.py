@@ -136,6 +136,7 @@ def test_a_slightly_negative_drag_is_no_obstacle(zeta):
         fit.replace(values=np.array([0.5, -5.0])).applied_to(full(zeta))
 
 
+@pytest.mark.slow
 def test_a_large_model_stays_sparse_and_a_model_without_damping_is_remarked_on():
     """1587 DOFs: masses, springs and the damping of a mode; dampers beside no D of its own warn."""
     model = kirchhoff_plate(

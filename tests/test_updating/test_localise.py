@@ -77,6 +77,7 @@ def test_misfit_that_no_candidate_explains_is_said(plate, uneven):
     assert "MORE THAN NOISE IS LEFT" in repr(found)
 
 
+@pytest.mark.slow
 def test_long_work_shows_a_bar(uneven, capsys):
     data = measured(uneven, {uneven.dofs.labels[3]: 0.3}, 0)
     localise(

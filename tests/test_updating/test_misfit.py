@@ -89,6 +89,7 @@ def test_a_mass_looked_for_in_the_wrong_place():
     assert found.chosen_values[0] == pytest.approx(0.5, rel=1e-3)
 
 
+@pytest.mark.slow
 def test_a_full_model_from_its_default_start():
     """Responses of all DOFs, 1.5 kg and 8 % away from them: found from zeros, up to noise."""
     shape = {"size": (0.6, 0.45), "thickness": 0.02, "elements": (4, 4), "density": 2702}

@@ -24,6 +24,7 @@ from flexplant.updating.search import SearchEnd
 from flexplant.updating.search.update_method import Trail
 
 
+@pytest.mark.slow
 def test_scattered_poles_converge_with_every_gauss_newton(plate):
     """Poles scattered by 1e-6: full steps at rounding level are neither refused nor repeated."""
     rom, target = plate.reduced(0.01, True), oracle.truth(0.01)
@@ -87,6 +88,7 @@ def test_a_new_method_is_a_value_with_a_search(make):
     assert own.values[0] == pytest.approx(best.values[0], abs=1e-6)
 
 
+@pytest.mark.slow
 def test_poles_that_are_paired_wrongly_are_fitted_from_elsewhere(plate):
     """Three masses and poles alone: five of these machines end in a wrong minimum from zero."""
     modes = solve_modes(plate.model, count=25, damping=ModalDamping(0.01))
