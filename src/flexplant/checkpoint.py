@@ -50,6 +50,11 @@ class Checkpoint:
         self.rows: dict[int, Any] = {}
         if self.path is None:
             return
+        if not self.path.parent.is_dir():
+            raise ModelError(
+                f"the folder {self.path.parent} of the checkpoint does not exist, so that nothing "
+                "could be kept. Make it, or give another path."
+            )
         if self.path.exists() and self.path.stat().st_size:
             self._resume(self.path, kind, set(free))
         else:

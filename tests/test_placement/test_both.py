@@ -5,7 +5,7 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from flexplant.errors import InfeasibleError, ModelError
+from flexplant.errors import AssumptionError, InfeasibleError, ModelError
 from flexplant.labels import DofSet
 from flexplant.lti import StateSpace
 from flexplant.modes import solve_modes
@@ -13,6 +13,7 @@ from flexplant.placement import (
     BranchAndBound,
     ClosedLoopH2,
     Exchange,
+    Excluded,
     Exhaustive,
     MinimumDistance,
     OffPoi,
@@ -38,7 +39,7 @@ from flexplant.plant import (
     assemble_plant,
 )
 from flexplant.store import load
-from flexplant.structure import FEModel, ModalDamping
+from flexplant.structure import Disc, FEModel, ModalDamping
 from flexplant.synthesis import design_h2
 from placement_plate import plate_modes
 
@@ -238,3 +239,27 @@ def test_a_plant_made_elsewhere(make, kind):
     assert left.u == (sides[1].actuators if "u" in kind else other.u)
     with pytest.raises(ModelError, match="was made elsewhere"):
         place_sensors(other, list(other.y), 3, constraints=[MinimumDistance(0.1)])
+
+
+def test_an_actuator_choice_needs_sensors_that_see_the_body(make):
+    """Sensors on a line miss the rotation about it, whatever the actuators are."""
+    plant, _, actuators = make(44, count=6)
+    line = [Sensor(f"l{i}", at=(0.1 * i, 0.3, 0.0), asd=1e-11) for i in (1, 2, 4)]
+    poor = plant.with_ports(plant.assembled.ports.replace(y=line))
+    with pytest.raises(AssumptionError, match="rigid-body"):
+        place_actuators(poor, actuators, 4, COST)
+
+
+def test_what_there_is_no_choice_of_is_said(make, tmp_path):
+    plant, sensors, _ = make(44, count=6)
+    with pytest.raises(ModelError, match="no candidates: pass a list"):
+        place_sensors(plant, [], 3)
+    with pytest.raises(InfeasibleError, match=rf"together with the required {sensors[0].name}\."):
+        place_sensors(
+            plant, sensors, 3, required=[sensors[0].name],
+            constraints=[Excluded(Disc(sensors[0].at[:2], 0.01))],
+        )  # fmt: skip
+    with pytest.raises(ModelError, match=r"folder .*nowhere of the checkpoint does not exist"):
+        place_sensors(plant, sensors, 3, checkpoint=tmp_path / "nowhere" / "search.jsonl")
+    curve = pareto_curve(plant, sensors, [4, 40], PoiVariance("die"), rng=0)
+    assert curve.amounts.tolist() == [4.0]

@@ -111,7 +111,7 @@ def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> d
         if isinstance(item, str):
             port = found.get(item) or own.get(item)
             if port is None:
-                raise unknown_label(_NAME[side].lower(), item, [*own, *found])
+                raise unknown_label(_NAME[side].lower(), item, list(dict.fromkeys([*own, *found])))
         if not plant.is_assembled and not isinstance(port, PlantChannel):
             raise ModelError(
                 f"the plant was not assembled from a structure, which would be needed for "

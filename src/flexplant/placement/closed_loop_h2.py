@@ -129,6 +129,10 @@ class ClosedLoopH2(Criterion):
         """Raise AssumptionError when a rigid-body mode is missed or a candidate fits no filter."""
         require_control(plant, self._factors(plant), repr(self))
         sensors = [port for port in candidates if side_of(port) == "y"]
+        if candidates and not sensors:  # the plant's own are those of the loop
+            plant.check().require(("detectable",), "a stationary controller")
+        if candidates and len(sensors) == len(candidates):
+            plant.check().require(("stabilisable",), "a stationary controller")
         PoiVariance(self.poi).check(plant, sensors)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:

@@ -60,6 +60,8 @@ class ParetoCurve(Value):
                 f"  {amount:<6g} {in_words(best.value, self.unit)}{low}: "
                 f"{' '.join(best.chosen):.60}"
             )
+        if len(self.placements) > 6:
+            lines.append(f"  and {len(self.placements) - 6} more")
         return "\n".join(lines)
 
     @property
@@ -152,7 +154,9 @@ def pareto_curve(
     rows: list[tuple[float, Placement, float]] = []
     for amount in sorted(amounts):
         if costs is None:
-            tried = [best(amount, ())]  # type: ignore[arg-type]
+            number = isinstance(amount, int | np.integer)  # others are refused by the search
+            enough = not (number and listed and candidates) or amount <= len(candidates)
+            tried = [best(amount, ())] if enough else []  # type: ignore[arg-type]
         else:
             limit = Budget(positive(amount, "a budget"), dict(costs))
             names = [c if isinstance(c, str) else c.name for c in candidates]

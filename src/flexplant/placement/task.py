@@ -64,7 +64,7 @@ def problem_of(
             numbers = (counts["y"], counts["u"])
             layouts = replace(layouts, scorer=replace(layouts.scorer, counts=numbers))
     problem = Problem(layouts, sum(counts.values()), rows.with_partners(kept), rows)
-    _require_start(problem, constraints)
+    _require_start(problem, constraints, [names[i] for i in kept])
     return problem
 
 
@@ -91,17 +91,19 @@ def _shares(ports: Sequence[Port], counts: Mapping[str, int]) -> LinearRows:
     return LinearRows(A, exact, exact)
 
 
-def _require_start(problem: Problem, constraints: Sequence[Constraint]) -> None:
+def _require_start(
+    problem: Problem, constraints: Sequence[Constraint], required: Sequence[str]
+) -> None:
     """Raise InfeasibleError when there is no choice to begin with."""
     layouts = problem.layouts
     first = problem.start(None) if len(problem.required) <= problem.count else ()
     what = f"no choice of {problem.count} of the {problem.total} candidates"
     if not first and problem.rows.A.size:
         given = ", ".join(map(repr, constraints)) or "OffPoi()"
+        together = f" together with the required {', '.join(required)}" if required else ""
         raise InfeasibleError(
-            f"{what} satisfies the constraints {given:.300}: {len(problem.free)} candidates are "
-            f"free and {len(problem.required)} required. Relax a constraint, or give more "
-            "candidates."
+            f"{what} satisfies the constraints {given:.300}{together:.200}. Relax a constraint, "
+            "require others, or give more candidates."
         )
     if layouts.missing(first):
         raise InfeasibleError(

@@ -16,6 +16,9 @@ from .criterion import Criterion, in_words
 from .layouts import layouts_of
 from .placement import Placement
 
+#: devices in the printed table
+_SHOWN = 6
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DeviceWorth(Value):
@@ -43,10 +46,13 @@ class DeviceWorth(Value):
 
     def __repr__(self) -> str:
         lines = [f"<DeviceWorth: {in_words(self.value, self.unit)} with all>"]
-        for i in np.argsort(-self.without, kind="stable")[:6].tolist():
+        order = np.argsort(-self.without, kind="stable").tolist()
+        for i in order[:_SHOWN]:
             lost = self.without[i]
             what = in_words(lost, self.unit) if np.isfinite(lost) else "the others do not suffice"
             lines.append(f"  without {self.names[i]}: {what}")
+        if len(order) > _SHOWN:
+            lines.append(f"  and {len(order) - _SHOWN} that matter less")
         return "\n".join(lines)
 
     def __getitem__(self, name: str) -> float:
