@@ -105,6 +105,25 @@ def test_a_missed_mode_is_warned_of_and_a_merged_one_added():
     assert np.abs(np.sort_complex(fit.poles) - np.sort_complex(found.poles)).max() < 1e-3
 
 
+def test_a_disturbance_of_one_frequency_is_warned_of_and_gives_no_pole():
+    """Variances from few runs are several times too small at some line: that is no warning."""
+    truth, freq, freedom = pole([47.5, 66.0], [4e-3, 5e-3]), np.arange(30.0, 90.0, 0.1), 4
+    frf = measured(truth, PHI[:, :2], n_in=2, level=1e-2, freq=freq, rigid=False)
+    few = np.random.default_rng(4).gamma(freedom, 1.0 / freedom, freq.size)
+    few[100] = 0.05  # one of 15 000 is smaller
+    estimated = frf.replace(variance=frf.variance * few, freedom=freedom)
+    assert len(identify_modes(estimated, orders=range(2, 11))) == 2
+    with pytest.warns(FlexplantWarning, match="single lines hold more than noise"):
+        identify_modes(estimated.replace(freedom=None), orders=range(2, 11))  # called exact
+    disturbed = frf.data.copy()
+    disturbed[:, :, 250] += 30.0 * np.sqrt(frf.variance[:, :, 250])  # mains of 55 Hz
+    for kept in (frf, estimated):
+        with pytest.warns(FlexplantWarning, match=r"single lines .* 55 Hz .*No pole was fitted"):
+            found = identify_modes(kept.replace(data=disturbed), orders=range(2, 11))
+        assert len(found) == 2
+        assert np.abs(found.freq - np.abs(truth) / 2 / np.pi).max() < 0.01
+
+
 PAIRS = pole([47.5, 48.2, 90.0, 90.5, 120.0, 120.0], [4e-3, 4e-3, 2e-3, 2e-3, 3e-3, 3e-3])
 
 

@@ -225,7 +225,7 @@ def _identified(
     for _ in range(1 if ready.known else 2):
         # with all residual terms, so that no pole is kept or moved to stand in for one
         lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
-        lines = replace(lines, inflation=ready.inflation)
+        lines = replace(lines, inflation=ready.inflation, variance_freedom=frf.freedom)
         if start is None:
             poles, part = supported(lines, poles, part)
             if not poles.size:

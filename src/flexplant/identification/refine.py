@@ -37,6 +37,8 @@ class Lines:
     known: bool = True  # whether the weights are those of a known variance
     #: variance of a mean over many lines, relative to independent ones
     inflation: float = 1.0
+    #: complex degrees of freedom of an estimated variance, None where it is exact or the fit's own
+    variance_freedom: float | None = None
 
     @cached_property
     def smooth(self) -> ComplexArray:

@@ -11,7 +11,7 @@ import scipy.linalg as la
 
 from ..errors import FlexplantWarning, SolverError
 from ..values import ComplexArray, FloatArray
-from .pole_test import corroborated, freedom, price
+from .pole_test import CHANCE, corroborated, freedom, price
 from .refine import Fit, Lines, projected_cost, refined
 
 #: lengths [lines] of the stretches that are examined
@@ -39,6 +39,7 @@ class Peak:
     freq: float
     width: float
     height: float
+    isolated: bool = False  # one or two lines, and noise alone around them
 
 
 def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
@@ -79,26 +80,46 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
             share = total / np.convolve(measured, np.ones(length), mode="valid")
             height = np.where(share > SHARE**2, height, 0.0)
         best = int(np.argmax(height))
-        if height[best] > LIMIT and not _outlier(power, best, length, middle, spread):
+        if height[best] > LIMIT:
             seen = lines.freq[best : best + length]
             weight = power[best : best + length]
             step = float(lines.freq[1] - lines.freq[0])
             middle_freq = float(seen @ weight / weight.sum())
-            found.append(Peak(middle_freq, step * length, float(height[best])))
+            alone = _isolated(power, best, length, middle, spread)
+            if alone:
+                if not _surpassing(lines, model, slice(best, best + length)):
+                    continue
+                middle_freq = float(seen[np.argmax(weight)])
+            found.append(Peak(middle_freq, step * length, float(height[best]), alone))
     return sorted(found, key=lambda peak: -peak.height)
 
 
-def _outlier(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
+def _isolated(power: FloatArray, first: int, length: int, middle: float, spread: float) -> bool:
     """Return whether a peak is one or two lines and nothing around them.
 
-    A disturbance of one frequency, or a variance that came out too small there; a mode is seen at
-    its neighbours too.
+    A disturbance of one frequency, a variance that came out too small there, or a mode narrower
+    than the lines are apart; one that they resolve is seen at the neighbours too.
     """
     aside = max(0, (AROUND - length + 1) // 2)
     near = np.sort(power[max(0, first - aside) : first + length + aside])[:-2]
     share = near.size / length
     rest, wide = middle * share, spread * np.sqrt(share)
     return bool(3.0 * rest / wide * (np.cbrt(np.sum(near) / rest) - 1.0) < NEARBY)
+
+
+def _surpassing(lines: Lines, model: ComplexArray, where: slice) -> bool:
+    r"""Whether a response at single lines is off by more than its estimated variance explains.
+
+    With nu complex degrees of freedom :math:`|e|^2/\sigma^2` exceeds x by chance with probability
+    :math:`(1 + x/\nu)^{-\nu}` (F distribution of 2 and 2 nu degrees), which chi-square, nu without
+    limit, understates: one variance in hundreds comes out several times too small.
+    """
+    nu = lines.variance_freedom
+    if nu is None:
+        return True
+    error = (lines.data[..., where] - model[..., where]) * lines.weight[..., where]
+    x = float(np.max(np.abs(error))) ** 2 / 2.0
+    return bool(-nu * np.log1p(x / nu) < np.log(CHANCE / lines.data.size))
 
 
 def exact(lines: Lines, model: ComplexArray) -> bool:
@@ -163,7 +184,8 @@ def completed(lines: Lines, fit: Fit, *, steps: int) -> tuple[Fit, list[Peak]]:
     """Return the fit with the poles added that its residual requires, and the peaks still left."""
     left = unexplained(lines, fit)
     for _ in range(MOST):
-        better = next(filter(None, (_added(lines, fit, peak, steps) for peak in left[:2])), None)
+        resolved = [peak for peak in left if not peak.isolated][:2]
+        better = next(filter(None, (_added(lines, fit, peak, steps) for peak in resolved)), None)
         if better is None:
             break
         fit = better
@@ -199,14 +221,28 @@ def unexplained(lines: Lines, fit: Fit) -> list[Peak]:
 
 
 def warned(left: list[Peak]) -> None:
-    """Warn of stretches that no pole explains."""
-    if not left:
-        return
-    listed = ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])
-    warnings.warn(
-        f"more than noise is left near {listed}: a mode may be missed or merged there, and its "
-        "neighbours be off by more than their stated deviation. Look at plot.identified and "
-        "plot.stabilisation, choose poles by hand (start=), or narrow the band.",
-        FlexplantWarning,
-        4,
-    )
+    """Warn of stretches that no pole explains, and of single lines."""
+    stretches = [peak for peak in left if not peak.isolated]
+    if stretches:
+        warnings.warn(
+            f"more than noise is left near {_listed(stretches)}: a mode may be missed or merged "
+            "there, and its neighbours be off by more than their stated deviation. Look at "
+            "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
+            "band.",
+            FlexplantWarning,
+            4,
+        )
+    single = [peak for peak in left if peak.isolated]
+    if single:
+        warnings.warn(
+            f"single lines hold more than noise, with noise alone around them: {_listed(single)}. "
+            "No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
+            "variance from few segments looks so, and so does a mode narrower than the lines are "
+            "apart. Measure with longer segments to distinguish them, or average more.",
+            FlexplantWarning,
+            4,
+        )
+
+
+def _listed(left: list[Peak]) -> str:
+    return ", ".join(f"{peak.freq:.4g} Hz ({peak.height:.0f} sigma)" for peak in left[:4])
