@@ -131,6 +131,7 @@ def picture(result: dict[str, Any], folder: Path = stage.OUT) -> Path:
     return folder / "feedforward.png"
 
 
+# %% Run it
 if __name__ == "__main__":
     import matplotlib as mpl
 

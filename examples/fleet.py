@@ -36,7 +36,7 @@ import numpy as np
 
 import flexplant as fx
 
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 L, RATE, DELAY, DAMPING = 0.6, 10e3, 1, 0.002
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
@@ -220,9 +220,11 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     return folder / "fleet.png"
 
 
+# %% Run it
 if __name__ == "__main__":
     import matplotlib as mpl
 
     mpl.use("Agg")
-    outcome = main(int(sys.argv[1]) if len(sys.argv) > 1 else 200)
+    counts = [int(word) for word in sys.argv[1:] if word.isdigit()]
+    outcome = main(*counts[:1])
     print(table(outcome), picture(outcome), sep="\n\npicture: ")

@@ -18,6 +18,7 @@ import flexplant as fx
 from flexplant.lti import highpass
 from flexplant.plant import BaseAcceleration, GroundSpring, decouple, suspend
 
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 SIZE, ELEMENTS = (0.4, 0.3, 0.05), (8, 6, 2)  # m
 LX, LY, LZ = SIZE
 RATE, DELAY = 10e3, 1  # Hz, samples
@@ -173,7 +174,7 @@ def table(found: dict[str, Any]) -> str:
 
 
 # %% Pictures
-def picture(found: dict[str, Any], folder: Path) -> Path:
+def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
     """Draw the budgets, the margins and the errors along the path."""
     import matplotlib.pyplot as plt
 
@@ -199,9 +200,10 @@ def picture(found: dict[str, Any], folder: Path) -> Path:
     return folder / "maglev.png"
 
 
+# %% Run it
 if __name__ == "__main__":
     import matplotlib as mpl
 
     mpl.use("Agg")
     outcome = main()
-    print(table(outcome), picture(outcome, Path("pictures")), sep="\n\npicture: ")
+    print(table(outcome), picture(outcome), sep="\n\npicture: ")

@@ -18,7 +18,7 @@ import numpy as np
 import flexplant as fx
 from wafer_stage import CORNERS, DELAY, RATE, grid, plate, ports, reduced, updated, z8
 
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 DAMPING = 0.01
 CORNER = plate.dofs.nearest(CORNERS[0], "z")
 #: what the paper prints
@@ -143,6 +143,7 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
     return drawn
 
 
+# %% Run it
 if __name__ == "__main__":
     import matplotlib as mpl
 

@@ -33,7 +33,7 @@ from flexplant.placement import (
 )
 from wafer_stage import DELAY, RATE, L, ports, reduced, updated
 
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 ENCODER = 5e-12  # m/sqrt(Hz)
 GRID = [(x, y, 0.0) for x in np.linspace(0.0, L, 7) for y in np.linspace(0.0, L, 7)]
 SENSORS = [fx.Sensor(f"s{i}", at=place, asd=ENCODER) for i, place in enumerate(GRID)]

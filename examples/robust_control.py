@@ -23,7 +23,7 @@ from flexplant.synthesis import (
     write_c,
 )
 
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 L, RATE, DELAY = 0.6, 10e3, 1  # m, Hz, samples
 BANDWIDTH, MORE = 60.0, 80.0  # Hz, of the servo and of H-infinity
 DAMPING, ERROR = 0.001, 20.0  # ratio; rad/s, standard deviation of each measured pole
@@ -197,6 +197,7 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
     return folder / "robust_control.png"
 
 
+# %% Run it
 if __name__ == "__main__":
     import matplotlib as mpl
 

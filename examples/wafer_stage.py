@@ -21,7 +21,7 @@ import numpy as np
 
 import flexplant as fx
 
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 L = 0.6  # m
 RATE, DELAY = 10e3, 1  # Hz, samples
 NOISE = 0.1e-9 / np.sqrt(RATE / 2)  # m/sqrt(Hz): sensors of 0.1 nm rms per sample
@@ -242,9 +242,9 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     return folder / "wafer_stage.png"
 
 
+# %% Run it
 if __name__ == "__main__":
     import matplotlib as mpl
 
     mpl.use("Agg")
-    outcome = main()
-    print(table(outcome), picture(outcome), sep="\n\npicture: ")
+    print(table(outcome := main()), picture(outcome), sep="\n\npicture: ")

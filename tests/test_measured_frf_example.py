@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 from matplotlib import image
 
+from bridges import DATA
+
 FILE = Path(__file__).parents[1] / "examples" / "measured_frf.py"
 
 pytestmark = pytest.mark.slow
@@ -16,6 +18,7 @@ pytestmark = pytest.mark.slow
 def example():
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(FILE.parent))
+        patch.setenv("FLEXPLANT_DATA", str(DATA))
         yield importlib.import_module("measured_frf")
 
 
@@ -80,8 +83,8 @@ def test_real_structures_are_shown_or_said_to_be_absent(example, result, monkeyp
     monkeypatch.setattr(example, "BRIDGE", tmp_path / "bridge.mat")
     monkeypatch.setattr(example, "SHAKEN", tmp_path / "shaken.uff")
     assert example.real_structures() == [
-        "bridge: its data (bridge.mat) are not here",
-        "universal file: shaken.uff is not here",
+        f"bridge: {tmp_path / 'bridge.mat'} is not here; it is at {example.BRIDGE_FROM}",
+        f"a mode: {tmp_path / 'shaken.uff'} is not here; it is at {example.SHAKEN_FROM}",
     ]
 
 
