@@ -14,7 +14,8 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "values", "store", "surviving", "parallel", "checkpoint", "work"),
+        *("errors", "values", "notebook", "store", "certificates", "versions"),
+        *("surviving", "parallel", "checkpoint", "work"),
         *("places", "dof_columns", "dof_index", "labels"),
     ),
     "lti",

@@ -37,6 +37,7 @@ score_sensors score_actuators place_sensors place_actuators place_both PoiVarian
 sensor_map
 close_loop ClosedLoop compare_loops modulus_margin reading_along
 setpoint scan simulate Response Specification study design_feedforward compare_estimators
+show_versions
 """
 ROOMS = {
     *("lti", "sparse", "structure", "modes", "reduction", "identification", "updating", "plant"),

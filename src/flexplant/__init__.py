@@ -136,6 +136,7 @@ from .updating import localise as localise
 from .updating import sample_posterior as sample_posterior
 from .updating import update as update
 from .updating import validate as validate
+from .versions import show_versions as show_versions
 
 __version__ = "0.1.0"
 

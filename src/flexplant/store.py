@@ -17,6 +17,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from .errors import FlexplantError
+from .notebook import as_html
 
 _HEADER = "__flexplant__"
 
@@ -49,6 +50,10 @@ class Value:
         """Return what is for use: fields, properties and methods, no private or inherited ones."""
         public = {n for cls in type(self).__mro__ for n in vars(cls)} - {"registry"}
         return sorted(n for n in public | set(self._fields()) if not n.startswith("_"))
+
+    def _repr_html_(self) -> str:
+        """Return what notebooks show: the repr, laid out."""
+        return as_html(repr(self))
 
     def replace(self, **changes: Any) -> Self:
         """Return a copy with some fields changed, checked like a new one."""

@@ -1,11 +1,13 @@
 """Every public value goes through a file: all fields equal, arrays read-only, facts the same."""
 
 import pickle
+import re
 import sys
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
 from functools import cache
 from inspect import get_annotations
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -321,6 +323,8 @@ def test_goes_through_a_file(name, tmp_path):
     found = load(tmp_path / "value")
     same(value, found, name)
     assert repr(found) == repr(value)
+    in_notebook = "".join(ET.fromstring(value._repr_html_()).itertext())  # well-formed, complete
+    assert re.sub(r"\W", "", in_notebook) == re.sub(r"\W", "", repr(value))
     same(value, pickle.loads(pickle.dumps(value)), name)
 
 

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..certificates import Certificate
 from ..errors import CertificateError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, real_array
+from ..values import FloatArray, real_array
 from .channels import sensors
 from .filter_model import FilterModel, filter_model
 
@@ -17,8 +18,8 @@ from .filter_model import FilterModel, filter_model
 AGREEMENT = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class KalmanCertificate(Value):
+@dataclass(frozen=True, eq=False, repr=False)
+class KalmanCertificate(Certificate):
     """What was checked about a Kalman filter after it was computed.
 
     Parameters

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..certificates import Certificate
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, sizes_of
@@ -13,8 +14,8 @@ from .channels import poi_channels, row_of
 from .invertibility import Invertibility
 
 
-@dataclass(frozen=True, eq=False)
-class InputCertificate(Value):
+@dataclass(frozen=True, eq=False, repr=False)
+class InputCertificate(Certificate):
     """What was checked about an estimator of unknown inputs after it was computed.
 
     Parameters

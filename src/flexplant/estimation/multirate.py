@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..certificates import Certificate
 from ..errors import CertificateError, LabelError, ModelError, ShapeError, unknown_label
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
@@ -24,8 +25,8 @@ from .records import recorded
 _LONGEST, _MOST = 1000, 2000
 
 
-@dataclass(frozen=True, eq=False)
-class PeriodicCertificate(Value):
+@dataclass(frozen=True, eq=False, repr=False)
+class PeriodicCertificate(Certificate):
     """What was checked about a periodic filter after it was computed.
 
     Parameters

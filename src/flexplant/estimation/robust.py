@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..certificates import Certificate
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, sizes_of
@@ -13,8 +14,8 @@ from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
 
 
-@dataclass(frozen=True, eq=False)
-class HinfFilterCertificate(Value):
+@dataclass(frozen=True, eq=False, repr=False)
+class HinfFilterCertificate(Certificate):
     """What was checked about an H-infinity filter after it was computed.
 
     Parameters
@@ -35,8 +36,8 @@ class HinfFilterCertificate(Value):
     kalman: float
 
 
-@dataclass(frozen=True, eq=False)
-class MinimaxCertificate(Value):
+@dataclass(frozen=True, eq=False, repr=False)
+class MinimaxCertificate(Certificate):
     """What was checked about a filter for several machines.
 
     Parameters

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..certificates import in_words, stability_name
 from ..errors import ModelError
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, IntArray, Value
@@ -97,7 +98,7 @@ class SpillOver(Value):
 
     @property
     def _measure(self) -> str:
-        return "spectral radius" if self.sampled else "largest real part"
+        return stability_name(self.sampled)
 
     @property
     def named_modes(self) -> str:
@@ -110,7 +111,7 @@ class SpillOver(Value):
     @property
     def summary(self) -> str:
         """The finding in one line."""
-        found = f"{self._measure} {self.stability:.6f}"
+        found = in_words({self._measure: self.stability})
         if not self.is_stable:
             return f"unstable ({self.states} states), {found}: {self.named_modes}"
         there = f"stable ({self.states} states), {found}, |S| at u up to {_db(self.modulus_margin)}"

@@ -7,10 +7,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..errors import ModelError, ShapeError, unknown_label
+from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import (
     ComplexArray,
     FloatArray,
@@ -21,7 +20,11 @@ from ..values import (
     rebuild,
     signal_names,
 )
+from .channels import chosen_pair
+from .frf_arithmetic import Arithmetic
+from .grid import checked_freq as checked_freq
 from .grid import default_freq as default_freq
+from .grid import sampled_freq as sampled_freq
 from .joining import short_list
 from .line_correlation import checked_correlation, checked_overlap, checked_window, line_correlation
 from .responses import responses
@@ -32,7 +35,7 @@ _PER_TIME = ("", "/s", "/s^2")
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
+class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
     """Frequency response functions between named channels, computed or measured.
 
     Parameters
@@ -153,7 +156,7 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         return f"<Frf: {sides}, {self.freq.size} frequencies {span}>"
 
     def __getitem__(self, key: tuple[str, str]) -> ComplexArray:
-        """Return the response (n_freq,) of `frf["output", "input"]`."""
+        """Return the response (n_freq,) of `frf["output", "input"]` or `frf[0, 1]`."""
         row, column = self._place(key)
         return np.asarray(self.data[row, column])
 
@@ -312,9 +315,13 @@ class Frf(Value, Mapping[tuple[str, str], ComplexArray]):
         )
 
     def _place(self, key: tuple[str, str]) -> tuple[int, int]:
-        if not isinstance(key, tuple) or len(key) != 2:
-            raise unknown_label("channel", key, [f"{a}, {b}" for a, b in self])
-        return _index(self.outputs, key[0], "output"), _index(self.inputs, key[1], "input")
+        rows, columns = chosen_pair(self.outputs, self.inputs, key)
+        if len(rows) != 1 or len(columns) != 1:
+            raise LabelError(
+                f"frf[output, input] is one response, got {len(rows)} outputs and {len(columns)} "
+                "inputs. Use frf.select(outputs, inputs) for several."
+            )
+        return _index(self.outputs, rows[0], "output"), _index(self.inputs, columns[0], "input")
 
 
 def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
@@ -364,34 +371,6 @@ def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
     frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0, "units": g.units})
     assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
     return frf
-
-
-def checked_freq(freq: npt.ArrayLike) -> FloatArray:
-    """Return frequencies as a finite array (n,) that is not negative."""
-    freq = real_array(freq, "freq", (None,))
-    if freq.size and freq.min() < 0:
-        raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
-    return freq
-
-
-def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
-    """Return frequencies [Hz] at which a system of sampling time dt has a response.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When they are no array, a frequency is negative or above half the rate, or they do not
-        increase.
-    """
-    grid = checked_freq(freq)
-    if dt and grid.size and grid.max() > 0.5 / dt * (1 + 1e-12):
-        raise ModelError(
-            f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / dt:g} Hz), "
-            "where a sampled system has no response of its own. Stay below."
-        )
-    if np.any(np.diff(grid) <= 0):
-        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
-    return grid
 
 
 def _index(known: Sequence[str], name: str, side: str) -> int:

@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
+import numpy.typing as npt
 
 from ..errors import ModelError
-from ..values import ComplexArray, FloatArray, IntArray, positive
+from ..values import ComplexArray, FloatArray, IntArray, positive, real_array
 from .responses import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
@@ -201,3 +202,31 @@ def climbed(
         order = np.argsort(both)
         grid, values = both[order], np.concatenate([values, find(fresh)])[order]
     return grid, values
+
+
+def checked_freq(freq: npt.ArrayLike) -> FloatArray:
+    """Return frequencies as a finite array (n,) that is not negative."""
+    freq = real_array(freq, "freq", (None,))
+    if freq.size and freq.min() < 0:
+        raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
+    return freq
+
+
+def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
+    """Return frequencies [Hz] at which a system of sampling time dt has a response.
+
+    Raises
+    ------
+    ModelError, ShapeError
+        When they are no array, a frequency is negative or above half the rate, or they do not
+        increase.
+    """
+    grid = checked_freq(freq)
+    if dt and grid.size and grid.max() > 0.5 / dt * (1 + 1e-12):
+        raise ModelError(
+            f"frequency {grid.max():g} Hz lies above half the sampling rate ({0.5 / dt:g} Hz), "
+            "where a sampled system has no response of its own. Stay below."
+        )
+    if np.any(np.diff(grid) <= 0):
+        raise ModelError("freq must increase strictly: sort the frequencies and merge doubles.")
+    return grid

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError
+from ..errors import ModelError
 from ..values import (
     ComplexArray,
     FloatArray,
@@ -20,10 +20,10 @@ from ..values import (
     known_units,
     positive,
     real_array,
-    short,
     signal_names,
 )
-from .channels import Channels, chosen_names, rows_of
+from .channels import Channels, chosen_pair, rows_of
+from .direct import direct_gain
 from .foreign import foreign_fields
 from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series, short_list
 from .scaling import state_scale
@@ -47,7 +47,7 @@ class StateSpace(Value):
     Parameters
     ----------
     A, B, C, D : (n, n), (n, m), (p, n), (p, m) arrays
-        Real and finite. n = 0 is a static gain.
+        Real and finite; D may be the number 0. n = 0 is a static gain.
     dt : float [s]
         Sampling time; 0 for continuous time.
     inputs, outputs, states : sequences of str, optional
@@ -105,7 +105,7 @@ class StateSpace(Value):
         ) -> None: ...
 
     def __post_init__(self) -> None:
-        D = real_array(self.D, "D", (None, None))
+        D = direct_gain(self.D, self.B, self.C)
         p, m = D.shape
         A = real_array(self.A, "A", (None, None)) if np.size(self.A) else np.zeros((0, 0))
         n = A.shape[0]
@@ -207,13 +207,7 @@ class StateSpace(Value):
         LabelError
             When a name or number is unknown, or the key is not a pair.
         """
-        if not isinstance(key, tuple) or len(key) != 2:
-            raise LabelError(
-                f"a channel is a pair, sys[output, input], by name or number, got {short(key)}."
-            )
-        return self.select(
-            chosen_names(self.outputs, key[0], "output"), chosen_names(self.inputs, key[1], "input")
-        )
+        return self.select(*chosen_pair(self.outputs, self.inputs, key))
 
     #: arrays leave `2.0 * g` with a numpy number to this class
     __array_ufunc__ = None
@@ -224,17 +218,21 @@ class StateSpace(Value):
 
     def __add__(self, other: System) -> StateSpace:
         """Return `parallel(self, other)`: same channels, outputs added."""
+        if isinstance(other, Mapping):  # an Frf, which is computed line by line
+            return NotImplemented
         return StateSpace(**in_parallel(self, as_statespace(other)))
 
     def __sub__(self, other: System) -> StateSpace:
         """Return self + (-other): same channels, outputs subtracted."""
-        return self + -as_statespace(other)
+        return NotImplemented if isinstance(other, Mapping) else self + -as_statespace(other)
 
     def __mul__(self, other: System | float) -> StateSpace:
         """Return `series(other, self)`, as transfer functions multiply; a number scales outputs."""
         if isinstance(other, int | float | np.number):
             factor = float(real_array(other, "the factor", ()))
             return self.replace(C=factor * self.C, D=factor * self.D)
+        if isinstance(other, Mapping):
+            return NotImplemented
         return StateSpace(**in_series(as_statespace(other), self))
 
     def __rmul__(self, other: float) -> StateSpace:

@@ -15,6 +15,8 @@ from ..values import Matrix, real_array
 _SYMMETRY_TOLERANCE = 1e-9
 #: relative to the diagonal: K and D may have eigenvalues this far below zero
 SEMIDEFINITE = 1e-9
+#: a structure whose every DOF is slower than this [rad/s] is no machine
+_SLOW = 1e-2
 
 
 def check_semidefinite(matrix: Matrix, name: str) -> None:
@@ -79,6 +81,30 @@ def _is_semidefinite(matrix: Matrix) -> bool:
         # the factorisation in solve_modes finds the rest; here it would double the cost
         return not np.any(diagonal(matrix) < 0)
     return is_positive_definite(matrix, SEMIDEFINITE)
+
+
+def without_inertia(M: Matrix, K: Matrix) -> str:
+    """Return in words why M is not positive definite, and what to do."""
+    if not np.any(diagonal(M) <= 0) and is_positive_definite(K) and _is_semidefinite(M):
+        return (
+            f"{lowest(M)}, as a stiffness has that moves freely, and K is positive definite, as a "
+            "mass is: they are swapped. The order is FEModel(M, K, D)."
+        )
+    return (
+        f"{lowest(M)}. Some motion would have no inertia, or a negative one. Condense massless "
+        "DOFs out, or look for a sign."
+    )
+
+
+def slow(M: Matrix, K: Matrix) -> str:
+    """Return in words that no motion of a structure is as fast as one has; empty when one is."""
+    fastest = float(np.sqrt(np.max(diagonal(K) / diagonal(M), initial=0.0)))
+    if not 0.0 < fastest < _SLOW:
+        return ""
+    return (
+        f"no sqrt(K_ii / M_ii) is above {fastest:.3g} rad/s, slower than any machine: are K and M "
+        "swapped (the order is FEModel(M, K, D)), or in different units?"
+    )
 
 
 def lowest(matrix: Matrix) -> str:

@@ -18,7 +18,7 @@ from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, sum_of
 from .damping import Damping, Rayleigh
 from .damping_matrix import damping_matrix
-from .definite import check_semidefinite, lowest, symmetric
+from .definite import check_semidefinite, slow, symmetric, without_inertia
 from .eigen import elastic_modes
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
@@ -62,7 +62,7 @@ class FEModel(Placed, Value):
     -----
     FlexplantWarning
         When K comes in single precision and its rounding holds rigid-body motions, or endangers
-        the first elastic eigenvalue.
+        the first elastic eigenvalue; or no DOF is as fast as a machine's: swapped K and M?
 
     Examples
     --------
@@ -86,10 +86,7 @@ class FEModel(Placed, Value):
         M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
         D = None if self.D is None else symmetric(self.D, "D", n)
         if not is_positive_definite(M):
-            raise ModelError(
-                f"M is not positive definite: {lowest(M)}. Some motion would have no inertia, or "
-                "a negative one. Condense massless DOFs out, or look for a sign."
-            )
+            raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)
         try:
             check_semidefinite(K, "K")
@@ -103,13 +100,12 @@ class FEModel(Placed, Value):
             check_semidefinite(D, "D")
         if self.held_inertia is not None:
             self._set(held_inertia=real_array(self.held_inertia, "held_inertia", (n, 6)))
+        remarks: list[str | None] = [slow(M, K)]
         if digits is not None:
-            for said in (
-                endangered(K, M, digits),
-                held_by_rounding(K, M, self.dofs, digits, self.rigid_body),
-            ):
-                if said:
-                    warnings.warn(f"{self.name or 'K'}: {said}", FlexplantWarning, 3)
+            remarks.append(endangered(K, M, digits))
+            remarks.append(held_by_rounding(K, M, self.dofs, digits, self.rigid_body))
+        for said in filter(None, remarks):
+            warnings.warn(f"{self.name or 'K'}: {said}", FlexplantWarning, 3)
 
     def __repr__(self) -> str:
         named = f" {self.name!r}" if self.name else ""

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ..certificates import stability_name
 from ..errors import CertificateError
 from ..lti.norms import peak_gain
 from ..lti.responses import Responder, responder
@@ -35,7 +36,7 @@ def certified_norm(
     -------
     dict
         `norm` by level sets on a Hamiltonian, `swept norm` by a sweep refined at the resonances,
-        `stability` (spectral radius when sampled, else the largest real part) and `claim`.
+        `spectral radius` when sampled, else `largest real part` [rad/s], and `claim`.
 
     Raises
     ------
@@ -48,9 +49,9 @@ def certified_norm(
     else:
         stability = float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real))
     if not stability < (1.0 if loop.dt else 0.0):
-        kind = "spectral radius" if loop.dt else "largest real part"
         raise CertificateError(
-            f"the closed loop is not stable ({kind} {stability:.6g}): the controller is refused. "
+            f"the closed loop is not stable ({stability_name(loop.dt)} {stability:.6g}): the "
+            "controller is refused. "
             "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
         )
     norm, _ = peak_gain(loop)
@@ -65,7 +66,7 @@ def certified_norm(
             f"the closed loop has the norm {norm:.6g}, but {claim:.6g} was claimed: "
             "the controller is refused."
         )
-    return {"norm": norm, "swept norm": swept, "stability": stability, "claim": claim}
+    return {"norm": norm, "swept norm": swept, stability_name(loop.dt): stability, "claim": claim}
 
 
 def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:

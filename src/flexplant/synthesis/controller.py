@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from ..certificates import in_words
 from ..loop import SpillOver
 from ..lti.statespace import StateSpace
 from ..values import Value
@@ -61,14 +62,15 @@ class Controller(Value):
 
     def __repr__(self) -> str:
         gamma = "" if self.gamma is None else f", gamma {self.gamma:.4g}"
+        if self.gamma is not None and self.lower is not None:
+            gamma += f" (lower bound {self.lower:.4g})"
         lines = [f"<Controller {self.method}: {self.system.n_states} states{gamma}>"]
         if self.reached:
             shown = ", ".join(f"{key} {value:.3g}" for key, value in self.reached.items())
             lines.append(f"  reached, of 1 that the weights require: {shown}")
         if self.certificate:
-            own = self.certificate.items()
-            shown = ", ".join(f"{k} {v:.4g}" for k, v in own if "left out" not in k)
-            lines.append(f"  verified: {shown}")
+            own = {k: v for k, v in self.certificate.items() if "left out" not in k}
+            lines.append(f"  verified: {in_words(own)}")
         if self.left_out is not None:
             lines.append(f"  with the modes left out: {self.left_out.summary}")
         lines += [f"  {note}" for note in self.notes]

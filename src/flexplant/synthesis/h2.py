@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..certificates import stability_name
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.interconnection import lft
 from ..lti.norms import h2_norm
@@ -198,11 +199,10 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
     stability = float(np.max(growth, initial=0.0 if loop.dt else -np.inf))
     norm = h2_norm(loop)
     if not (stability < (1.0 if loop.dt else 0.0) and np.isfinite(norm)):
-        kind = "spectral radius" if loop.dt else "largest real part"
         raise CertificateError(
-            f"the closed loop is not stable ({kind} {stability:.6g}) or its H2 norm is infinite: "
-            "the controller is refused. The plant is too badly conditioned, or a mode that "
-            "neither z nor w contains stays undamped: weight its motion and disturb it."
+            f"the closed loop is not stable ({stability_name(loop.dt)} {stability:.6g}) or its H2 "
+            "norm is infinite: the controller is refused. The plant is too badly conditioned, or a "
+            "mode that neither z nor w contains stays undamped: weight its motion and disturb it."
         )
     if not abs(norm - claim) <= AGREEMENT * norm:
         raise CertificateError(
@@ -210,4 +210,4 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
             "synthesis: the problem is too badly conditioned to trust. Bring the "
             "sizes of the weights closer together."
         )
-    return {"H2 norm": norm, "stability": stability, "claim": claim}
+    return {"H2 norm": norm, stability_name(loop.dt): stability, "claim": claim}

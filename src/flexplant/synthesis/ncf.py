@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..certificates import stability_name
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..loop import modulus_margin
 from ..lti.discretisation import bilinear, tustin
@@ -231,7 +232,7 @@ def verified_controller(
     found = {
         "margin": margin,
         "smallest gamma by the Hankel norm": other,
-        "stability": stability,
+        stability_name(shaped.dt): stability,
     }
     return K, least, found
 

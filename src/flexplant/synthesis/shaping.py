@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..certificates import stability_name
 from ..errors import CertificateError, ModelError, SolverError
 from ..loop import LoopReport, report_loops
 from ..lti.discretisation import tustin
@@ -213,7 +214,8 @@ def _designed(
             "and y to size 1."
         )
     error = _following_error(shaped, model, K)
-    found = certificate | {"margin": margin, "stability": stability, "error of following": error}
+    found = certificate | {"margin": margin, stability_name(shaped.dt): stability}
+    found["error of following"] = error
     return _Designed(K, gamma, least, found)
 
 

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...certificates import stability_name
 from ...errors import CertificateError, FlexplantWarning
 from ...loop import close_loop
 from ...lti.interconnection import lft
@@ -18,6 +19,7 @@ from ...plant import StandardPlant
 class LoopFacts(NamedTuple):
     """Stability, modulus margin at u, and gamma of a weighted plant (NaN of another)."""
 
+    sampled: bool
     stability: float
     is_stable: bool
     margin: float
@@ -26,7 +28,7 @@ class LoopFacts(NamedTuple):
     @property
     def certificate(self) -> dict[str, float]:
         """The numbers, named."""
-        found = {"stability": self.stability, "modulus margin": self.margin}
+        found = {stability_name(self.sampled): self.stability, "modulus margin": self.margin}
         return found if np.isnan(self.gamma) else found | {"gamma": self.gamma}
 
 
@@ -42,7 +44,9 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
         gamma = peak_gain(lft(plant.system, controller))[0]
     stable = loop.obstacle is None
     margin = loop.modulus_margin if stable else 0.0
-    return LoopFacts(float(np.max(size, initial=-np.inf)), stable, margin, gamma)
+    return LoopFacts(
+        bool(loop.plant.dt), float(np.max(size, initial=-np.inf)), stable, margin, gamma
+    )
 
 
 def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:

@@ -1,0 +1,49 @@
+"""Mistakes of a first hour: the message says which one it was."""
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
+
+
+def test_records_with_time_as_first_axis():
+    rng = np.random.default_rng(0)
+    u, y = rng.normal(size=(800, 2)), rng.normal(size=(800, 3))
+    with pytest.raises(ShapeError, match=r"800 channels of 2 samples each: .* Pass inputs\.T"):
+        fx.estimate_frf(u, y, 1e3)
+    with pytest.raises(ShapeError, match=r"800 channels of 3 .* Pass np\.swapaxes\(outputs, 1, 2"):
+        fx.estimate_frf(u.T[None], y[None], 1e3)
+    assert fx.estimate_frf(u.T, y.T, 1e3).data.shape[:2] == (3, 2)
+
+
+def test_mass_and_stiffness_swapped():
+    """Of a free structure, and of one that is held, where both are definite."""
+    free = fx.beam(length=1, elements=3, density=1, youngs_modulus=1e9, area=1, inertia=1)
+    with pytest.raises(ModelError, match=r"swapped\. The order is FEModel\(M, K, D\)"):
+        fx.FEModel(free.K, free.M, dofs=free.dofs)
+    held = fx.chain(masses=[1.0, 2.0], stiffnesses=[1e6], ground=1e6)
+    with pytest.warns(FlexplantWarning, match=r"swapped \(the order is FEModel\(M, K, D\)\)"):
+        fx.FEModel(held.K, held.M, dofs=held.dofs)
+    with pytest.raises(ModelError, match="no inertia, or a negative one"):  # not that mistake
+        fx.FEModel(np.diag([1.0, -1.0]), np.eye(2), dofs=held.dofs)
+
+
+def test_a_gain_of_zero_written_as_a_number():
+    g = fx.StateSpace([[-1.0]], [[1.0, 2.0]], [[1.0], [3.0], [4.0]], 0)
+    assert g.D.tolist() == [[0.0, 0.0]] * 3
+    with pytest.raises(ShapeError, match=r"from 2 inputs to 3 outputs, .* \(3, 2\); got"):
+        g.replace(D=1.0)
+    with pytest.raises(ShapeError, match="B must have shape"):
+        fx.StateSpace([[-1.0]], [1.0], [[1.0]], 0)
+
+
+def test_channels_by_number():
+    g = fx.StateSpace([[-1.0]], [[1.0, 2.0]], [[1.0], [3.0]], 0)
+    assert g[0, 1].inputs == ("u2",) and g[0, 1].outputs == ("y1",)
+    with pytest.raises(LabelError, match=r"no input number 2: the system has 2 \(u1, u2\)"):
+        g[0, 2]
+    with pytest.raises(LabelError, match=r"by name, number or slice, got 0\.0"):
+        g[0.0, 1]
+    with pytest.raises(LabelError, match="a channel is a pair"):
+        g[0]
