@@ -20,7 +20,17 @@ from difflib import get_close_matches
 
 
 class FlexplantError(Exception):
-    """Base of all errors of this package."""
+    """Base of all errors of this package.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> try:
+    ...     fx.testbeds.three_masses().system["y3", "u1"]
+    ... except fx.FlexplantError as error:
+    ...     print(type(error).__name__)
+    LabelError
+    """
 
 
 class LabelError(FlexplantError, ValueError):

@@ -152,6 +152,16 @@ def load(path: str | Path) -> Any:
     ------
     FlexplantError
         When the file was not written by flexplant.
+
+    Examples
+    --------
+    >>> import os, tempfile
+    >>> import flexplant as fx
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "chain.npz")
+    ...     fx.chain(masses=[1.0, 2.0], stiffnesses=[100.0]).save(path)
+    ...     fx.load(path)
+    <FEModel 'chain': 2 DOFs, sparse, 1 rigid-body motion, D not given>
     """
     foreign = FlexplantError(
         f"{str(path)!r} was not written by flexplant. Use flexplant.io for foreign formats."

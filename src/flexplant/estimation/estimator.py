@@ -58,6 +58,14 @@ class KalmanEstimator(Value):
         known.
     left_out : LeftOut, optional
         The modes left out, as noise and static compliance.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> observer.sensors, observer.system.outputs
+    (('y1', 'y2'), ('die:hat',))
+    >>> hat, state = observer.step(np.zeros(2), np.zeros(1))
     """
 
     system: StateSpace

@@ -117,6 +117,12 @@ def design_static(
     References
     ----------
     The paper, section 5: "the static geometric relation".
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.design_static(fx.testbeds.three_masses()).gain.round(6)  # the mean of both ends
+    array([[0.5, 0.5]])
     """
     plant = checked_plant(plant)
     if plant.is_weighted:

@@ -43,6 +43,16 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
         When they have different channels or frequencies.
     ModelError
         When there are fewer than two, they differ in quantity or do not differ at all.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> runs = [fx.Frf([10.0, 20.0], [[[1.0 - e, 2.0 + e]]]) for e in (-0.1, 0.1)]
+    >>> mean = fx.average_frfs(runs)
+    >>> mean.data.real
+    array([[[1., 2.]]])
+    >>> mean.variance.round(4)
+    array([[[0.01, 0.01]]])
     """
     frfs = list(repeated)
     if len(frfs) < 2 or not all(isinstance(frf, Frf) for frf in frfs):

@@ -173,6 +173,18 @@ def identify_modes(
     Pintelon, Schoukens, "System Identification: A Frequency Domain Approach", 2012, ch. 9.
     Pintelon, Guillaume, Schoukens, "Uncertainty calculation in (operational) modal analysis",
     Mechanical Systems and Signal Processing 21 (2007) 2359-2373.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], ground=[1e5, 0.0])
+    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.01))
+    >>> sensors = [fx.Sensor(f"y{i}", at=f"{i}:x") for i in (1, 2)]
+    >>> plant = fx.assemble_plant(modes, fx.Ports(u=[fx.Actuator("u1", at="1:x")], y=sensors))
+    >>> found = fx.identify_modes(fx.frequency_response(plant.Gyu, np.linspace(10.0, 250.0, 400)))
+    >>> found.freq.round(2), modes.freq.round(2)
+    (array([ 34.46, 147.  ]), array([ 34.46, 147.  ]))
     """
     with one_thread(), Progress(STAGES, "modes", progress=progress) as bar:
         found = _identified(frf, band, orders, start, lower, upper, hold, dofs, max_iterations, bar)

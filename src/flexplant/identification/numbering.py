@@ -70,6 +70,16 @@ def numbered(
     ----------
     Allemang, "The Modal Assurance Criterion - twenty years of use and abuse", Sound and Vibration
     37 (2003) 14-21.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> model = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> shape = [[1.0], [0.02], [-1.0]]
+    >>> measured = fx.MeasuredModes(poles=[-6 + 630j], shapes=shape, dofs=["1:x", "2:x", "3:x"])
+    >>> fx.numbered(measured, model).modes
+    (2,)
     """
     import scipy.optimize as so
 

@@ -90,6 +90,16 @@ def read_matrices(
         When the reader of this format has no such option, and what it raises itself.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import scipy.io, scipy.sparse, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     scipy.io.mmwrite(f"{folder}/K.mtx", scipy.sparse.eye_array(2))
+    ...     found = fx.read_matrices(f"{folder}/K.mtx")
+    >>> found.n_dof, found.M is None
+    (2, True)
     """
     path = file_path(path)
     form = _format(path)
@@ -189,6 +199,21 @@ def read_model(
     -----
     FlexplantWarning
         When the digits of a text file endanger the soft modes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import scipy.io, scipy.sparse, tempfile
+    >>> K = scipy.sparse.csc_array([[2.0, -1.0], [-1.0, 1.0]])  # N/mm
+    >>> dofs = fx.DofSet([1, 2], ["x", "x"], [[0.0, 0, 0], [10.0, 0, 0]])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     k, m = f"{folder}/K.mtx", f"{folder}/M.mtx"
+    ...     scipy.io.mmwrite(k, K)
+    ...     scipy.io.mmwrite(m, scipy.sparse.eye_array(2) * 1e-3)  # t
+    ...     model = fx.read_model(k, mass=m, dofs=dofs, units=("mm", "t", "s"))
+    >>> model.K.toarray()
+    array([[ 2000., -1000.],
+           [-1000.,  1000.]])
     """
     sizes = tuple(units) if isinstance(units, Iterable) and not isinstance(units, str) else ()
     if len(sizes) != 3:

@@ -116,6 +116,17 @@ def compare_loops(
         When there is no mapping of closed loops, or some are sampled and some continuous.
     LabelError
         When a loop lacks the channels.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer, loops = fx.design_kalman(plant), {}
+    >>> for hz in (10.0, 20.0):
+    ...     servo = fx.design_servo(plant, bandwidth=hz, observer=observer)
+    ...     loops[f"{hz:g} Hz"] = fx.close_loop(plant, observer, servo)
+    >>> {name: row.stable for name, row in fx.compare_loops(loops).rows.items()}
+    {'10 Hz': True, '20 Hz': True}
     """
     if not isinstance(loops, Mapping) or not loops:
         raise ModelError(

@@ -28,6 +28,15 @@ def modulus_margin(loop: Loop) -> float:
     ------
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> round(fx.modulus_margin(fx.close_loop(plant, observer, servo)), 2)
+    0.57
     """
     return taken_apart(loop).modulus_margin
 

@@ -59,6 +59,12 @@ def discretized(
     -----
     FlexplantWarning
         When all modes lie above half the rate.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.discretized(fx.lti.tf([1.0], [1.0, 1.0]), rate=10.0).poles().real.round(6)  # exp(-0.1)
+    array([0.904837])
     """
     g = as_statespace(sys)
     if g.dt and g.n_states:

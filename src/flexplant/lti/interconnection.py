@@ -97,6 +97,15 @@ def lft(P: System, K: System) -> StateSpace:
         When a channel of K is not one of P.
     ModelError
         When the loop is ill-posed (I - D22 DK singular) or sampling times differ.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> A, B, C = [[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]]
+    >>> plant = fx.StateSpace(A, B, C, [[0, 0], [0, 0]], inputs=["w", "u"], outputs=["z", "y"])
+    >>> gain = fx.StateSpace([], [], [], [[-9.0]], inputs=["y"], outputs=["u"])
+    >>> fx.lft(plant, gain).poles().real
+    array([-10.])
     """
     plant, controller = as_statespace(P), as_statespace(K)
     y, u = plant.output_index(controller.inputs), plant.input_index(controller.outputs)

@@ -52,6 +52,12 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     ----------
     Tombs, Postlethwaite, Truncated balanced realization of a stable non-minimal state-space
     system, Int. J. Control 46, 1987.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.minimal(fx.lti.tf([1.0, 2.0], [1.0, 3.0, 2.0])).poles().real.round(9)
+    array([-1.])
     """
     g = as_statespace(sys)
     if not positive(tol, "tol") < 1.0:

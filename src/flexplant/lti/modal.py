@@ -72,6 +72,13 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
     ------
     ModelError
         When `sys` is no system or largest_condition not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.modal_form(fx.lti.tf([1.0], [1.0, 2.0, 101.0])).system.A.round(9)
+    array([[ -1.,  10.],
+           [-10.,  -1.]])
     """
     g = as_statespace(sys)
     positive(largest_condition, "largest_condition")

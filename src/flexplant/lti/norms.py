@@ -158,6 +158,13 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
     quadratically convergent algorithm for computing its L-infinity norm, Syst. Control Lett. 15,
     1990. Bruinsma, Steinbuch, A fast algorithm to compute the H-infinity norm of a transfer
     function matrix, Syst. Control Lett. 14, 1990.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> gain, freq = fx.peak_gain(fx.lti.tf([1.0], [1.0, 0.02, 1.0]))
+    >>> round(gain, 3), round(freq, 4)  # 1 / (2 zeta sqrt(1 - zeta^2)), near 1 / (2 pi) Hz
+    (50.003, 0.1591)
     """
     g = as_statespace(sys)
     with Progress(LEVELS, "levels of the norm", progress=progress) as bar:

@@ -56,6 +56,12 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     ------
     ModelError
         When freq is not positive, gain not a number, or the order neither 1 nor 2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> round(abs(fx.lowpass(100.0)(2j * 3.141592653589793 * 100.0)), 4)
+    0.7071
     """
     omega, gain = 2.0 * np.pi * positive(freq, "freq"), _number(gain)
     if order == 1:

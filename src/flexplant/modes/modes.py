@@ -76,6 +76,15 @@ class Modes(Placed, Value):
     ------
     ShapeError, ModelError
         When sizes do not match or the rigid-body modes are not at 0.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0]), count=2)
+    >>> modes
+    <Modes: 2 of 2 DOFs (1 rigid-body, 1 elastic at 2.251 Hz)>
+    >>> modes.at("2:x").round(4)
+    array([ 0.7071, -0.7071])
     """
 
     omega: FloatArray

@@ -42,6 +42,15 @@ class Placement(Value):
         Why the search ended before it had proven what it should; empty when it did not.
     unit : str
         Of the square root of the value, where it is a mean square of a motion.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> best = fx.place_sensors(plant, candidates, 2)
+    >>> best.on(plant).y
+    ('s1', 's3', 'die:ref')
     """
 
     chosen: tuple[str, ...]

@@ -147,6 +147,15 @@ def score_sensors(
         When the criterion has no meaning on this plant, whatever the sensors.
     CertificateError
         When the best layout's score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> scores = fx.score_sensors(plant, [["s1"], ["s2"], ["s3"]], candidates=candidates)
+    >>> scores.best
+    ('s2',)
     """
     return _scored(plant, "y", layouts, criterion, candidates, executor, progress)
 
@@ -193,6 +202,15 @@ def score_actuators(
         When the criterion has no meaning on this plant, whatever the actuators.
     CertificateError
         When the best layout's score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
+    >>> scores = fx.score_actuators(plant, [["a1"], ["a2"]], candidates=candidates)
+    >>> scores.best
+    ('a2',)
     """
     return _scored(plant, "u", layouts, criterion, candidates, executor, progress)
 

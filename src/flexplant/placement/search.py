@@ -93,6 +93,15 @@ def place_sensors(
         When no choice of this size has a finite score.
     CertificateError
         When the score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> best = fx.place_sensors(plant, candidates, 1)
+    >>> best.chosen, best.proven
+    (('s1',), True)
     """
     options = (constraints, method, executor, checkpoint, progress, rng)
     return _placed(plant, {"y": (candidates, count)}, criterion, required, *options)
@@ -161,6 +170,14 @@ def place_actuators(
         When no choice of this size has a finite score.
     CertificateError
         When the score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
+    >>> fx.place_actuators(plant, candidates, 1).proven
+    True
     """
     options = (constraints, method, executor, checkpoint, progress, rng)
     return _placed(plant, {"u": (candidates, count)}, criterion, required, *options)
@@ -229,6 +246,16 @@ def place_both(
         When no choice of these sizes has a finite score.
     CertificateError
         When the score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> sensors = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> actuators = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2)]
+    >>> found = fx.place_both(plant, sensors, actuators, (1, 1))
+    >>> len(found.sensors), len(found.actuators)
+    (1, 1)
     """
     if isinstance(counts, str) or not isinstance(counts, Sequence) or len(counts) != 2:
         raise ModelError(

@@ -129,6 +129,14 @@ def sensor_map(
         When even a sensor at every point misses a rigid-body mode, which is named.
     CertificateError
         When the best score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> found = fx.sensor_map(plant, [(0, 0, 0), (1, 0, 0)], asd=1e-10, direction="x")
+    >>> found.best
+    array([0., 0., 0.])
     """
     plant = checked_plant(plant)
     places = real_array(points, "points", (None, 3))

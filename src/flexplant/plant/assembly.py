@@ -54,5 +54,21 @@ def assemble_plant(
     References
     ----------
     The paper, equations (1)-(8) and Fig. 2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0]), count=2)
+    >>> ports = fx.Ports(
+    ...     u=[fx.Actuator("u1", at="1:x")],
+    ...     z=[fx.Poi("die", at="2:x", axes=("x",))],
+    ...     y=[fx.Sensor("y1", at="1:x", asd=1e-10)],
+    ... )
+    >>> fx.assemble_plant(modes, ports)
+    <StandardPlant: 4 states, continuous>
+      w (1) y1:noise
+      u (1) u1
+      z (2) die:x  u1:effort
+      y (1) y1
     """
     return continuous_plant(StandardPlant, modes_of(model, residual), ports)

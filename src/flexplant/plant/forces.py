@@ -42,6 +42,12 @@ class Disturbance(ForcePort):
     ------
     LabelError, ModelError
         For a bad name, place, direction, shape or a negative asd.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Disturbance("amp", at="41:z", asd=1e-3)  # white, 1e-3 N/sqrt(Hz) one-sided
+    Disturbance(name='amp', at='41:z', direction='z', asd=0.001, shape=None, held=False)
     """
 
     name: str
@@ -95,6 +101,13 @@ class BaseAcceleration(ForcePort):
     Modes and reduced models have an inertia against motions that their shapes can make: free
     or suspended structures. For a held one pass the FEModel; one that was held by `fixed` has the
     mass that couples it to its held DOFs, matrices made elsewhere have lost it.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> floor = fx.BaseAcceleration("floor", "z", asd=2e-5, shape=fx.lowpass(60.0))
+    >>> floor.unit
+    'm/s^2'
     """
 
     name: str
@@ -146,6 +159,12 @@ class OutputDisturbance(ForcePort):
     ------
     LabelError, ModelError
         For a bad name, shape or a negative asd.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.OutputDisturbance("cable", sensor="y1", asd=1e-12)
+    OutputDisturbance(name='cable', sensor='y1', asd=1e-12, shape=None)
     """
 
     name: str
@@ -191,6 +210,13 @@ class Actuator(ForcePort):
     LabelError, ModelError
         For a bad name, place, direction, dynamics, a negative asd, or a latency that is
         negative or a second or more.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> motor = fx.Actuator("u1", at=(0.1, 0.2, 0.0), dynamics=fx.lowpass(4e3), asd=1e-4)
+    >>> motor.unit, motor.direction
+    ('N', 'z')
     """
 
     home: ClassVar = "u"

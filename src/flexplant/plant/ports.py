@@ -33,6 +33,12 @@ class Reference(Value):
     ----------
     poi : str
         The POI's name.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Reference("die")  # adds die:ref to w and y, and die:error to z
+    Reference(poi='die')
     """
 
     home: ClassVar = "references"
@@ -66,6 +72,18 @@ class Ports(Value):
         When a name is used twice, a Reference names no POI, or an OutputDisturbance no sensor.
     ModelError
         When an entry has the wrong type.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> ports = fx.Ports(
+    ...     w=[fx.Disturbance("amp", at="1:x", asd=1e-3)],
+    ...     u=[fx.Actuator("u1", at="1:x")],
+    ...     z=[fx.Poi("die", at="2:x", axes=("x",))],
+    ...     y=[fx.Sensor("y1", at="1:x", asd=1e-10)],
+    ... )
+    >>> ports
+    <Ports w: amp, u: u1, z: die, y: y1>
     """
 
     w: Sequence[ForcePort] = ()

@@ -52,6 +52,14 @@ class Sensor(SensorPort):
     LabelError, ModelError
         For a bad name, place, direction, quantity, dynamics, a negative asd or latency, or
         a latency of a second or more.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Sensor("y1", at="41:z", asd=1e-12).unit
+    'm'
+    >>> fx.Sensor("acc", at="41:z", quantity="acceleration").unit
+    'm/s^2'
     """
 
     name: str
@@ -96,6 +104,13 @@ class Poi(Value):
     ------
     LabelError, ModelError
         For a bad name, place or axis.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> die = fx.Poi("die", at=(0.3, 0.3, 0.0), axes=("z", "rx", "ry"))
+    >>> [die.channel(axis) for axis in die.axes]
+    ['die:z', 'die:rx', 'die:ry']
     """
 
     home: ClassVar = "z"

@@ -53,6 +53,19 @@ class StandardPlant(Partition):
         When the names are not those of the system's channels, in this order.
     ModelError
         When a density is negative or not finite.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> plant
+    <StandardPlant: 7 states, dt 0.0005 s, delay 1>
+      w (4) amp  y1:noise  y2:noise  die:ref
+      u (1) u1
+      z (3) die:x  die:error  u1:effort
+      y (3) y1  y2  die:ref
+    >>> plant.Gyu.outputs
+    ('y1', 'y2', 'die:ref')
     """
 
     def discretized(self, rate: float, *, delay: float = 0.0) -> StandardPlant:

@@ -57,6 +57,13 @@ class CraigBampton(ReductionMethod):
     -----
     R. R. Craig, M. C. C. Bampton, Coupling of substructures for dynamic analyses, AIAA Journal
     6(7), 1968.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.reduce(model, fx.CraigBampton(["1:x", "3:x"], modes=1)).modes().freq.round(2)
+    array([  0.  , 100.66, 174.35])
     """
 
     boundary: Iterable[str]
@@ -227,6 +234,13 @@ class Rubin(_FreeInterface):
     -----
     S. Rubin, Improved component-mode representation for structural dynamic analysis, AIAA Journal
     13(8), 1975.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
+    >>> fx.reduce(model, fx.Rubin(["1:x"], modes=2)).modes().freq[:2].round(2)
+    array([ 0.  , 77.04])
     """
 
     boundary: Iterable[str]
@@ -278,6 +292,13 @@ class MacNeal(_FreeInterface):
     Notes
     -----
     R. H. MacNeal, A hybrid method of component mode synthesis, Computers & Structures 1(4), 1971.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5, 4e5])
+    >>> fx.reduce(model, fx.MacNeal(["1:x"], modes=2)).modes().freq[:2].round(2)
+    array([ 0.  , 77.04])
     """
 
     boundary: Iterable[str]

@@ -111,6 +111,14 @@ class Guyan(ReductionMethod):
     Notes
     -----
     R. J. Guyan, Reduction of stiffness and mass matrices, AIAA Journal 3(2), 1965.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1e-3, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.reduce(model, fx.Guyan(["1:x", "3:x"])).K.round(3)
+    array([[ 200000., -200000.],
+           [-200000.,  200000.]])
     """
 
     dofs: Iterable[str]
@@ -167,6 +175,16 @@ class Irs(ReductionMethod):
     techniques, J. Sound and Vibration 186(2), 1995, and The convergence of the iterated IRS
     method, 211(1), 1998. Each mode converges like the ratio of its omega^2 to the lowest one of
     the structure with the kept DOFs held.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5], ground=1e5)
+    >>> exact = fx.solve_modes(model, count=1).freq
+    >>> for method in (fx.Guyan(["1:x", "3:x"]), fx.Irs(["1:x", "3:x"])):
+    ...     print((fx.reduce(model, method).modes().freq[:1] / exact - 1).round(6))
+    [0.017545]
+    [0.000105]
     """
 
     dofs: Iterable[str]
@@ -261,6 +279,13 @@ class Serep(ReductionMethod):
     -----
     J. C. O'Callahan, P. Avitabile, R. Riemer, System equivalent reduction expansion process, IMAC
     7, 1989. With fewer modes than DOFs its M* is singular, which no plant can take: refused.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.reduce(model, fx.Serep(["1:x", "3:x"])).modes().freq.round(2)
+    array([  0.  , 100.66])
     """
 
     dofs: Iterable[str]

@@ -62,6 +62,13 @@ class Krylov(ReductionMethod):
     second-order Arnoldi method, SIAM J. Scientific Computing 26(5), 2005; B. Salimbahrami, B.
     Lohmann, Order reduction of large scale second-order systems using Krylov subspace methods,
     Linear Algebra and its Applications 415, 2006.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.reduce(model, fx.Krylov(["1:x"], freq=[50.0, 150.0])).n_dof
+    3
     """
 
     inputs: Place | Iterable[Place]

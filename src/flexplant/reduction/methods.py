@@ -47,6 +47,13 @@ class DesiredDofs(ReductionMethod):
     ------
     LabelError
         When a label appears twice, or none is given.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.reduce(modes, fx.DesiredDofs(["1:x", "3:x"])).dofs.labels
+    ('1:x', '3:x')
     """
 
     dofs: Iterable[str]

@@ -141,6 +141,14 @@ def rank_modes(
     C. Z. Gregory, Reduction of large flexible spacecraft models using internal balancing theory,
     J. Guidance 7(6), 1984; W. Gawronski, Advanced Structural Dynamics and Active Control of
     Structures, Springer, 2004, chapter 4.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
+    >>> fx.rank_modes(modes, inputs=["1:x"], outputs=["3:x"]).order
+    array([2, 3])
     """
     refuse_unstable(modes, "a ranking of modes")
     into, out, B, C = channels(modes, inputs, outputs)

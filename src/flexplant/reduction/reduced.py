@@ -68,6 +68,14 @@ class ReducedModel(Value):
     ------
     ShapeError, ModelError
         When sizes do not match or entries are not finite.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> small = fx.reduce(modes, fx.DesiredDofs(["1:x", "3:x"]))
+    >>> small.expand([1.0, -1.0]).round(6) + 0.0
+    array([ 1.,  0., -1.])
     """
 
     M: FloatArray

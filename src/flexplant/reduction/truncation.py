@@ -61,6 +61,13 @@ class ModalTruncation(ReductionMethod):
     sqrt(1 - zeta^2))``, G the residual flexibility of one static solution. With `static_at`, the
     peaks of the vectors are added. Over a band, modes above it are far from their peaks:
     `ErrorBound.below(freq)` is tighter by orders.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.reduce(model, fx.ModalTruncation(2)).modes().freq.round(2)
+    array([  0.  , 100.66])
     """
 
     count: int | None = None
@@ -198,6 +205,14 @@ class ModalBalanced(ReductionMethod):
     sum of neglected Hankel values (K. Glover, 1984) bounds the truncation of the exactly balanced
     model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
     W. Gawronski, Advanced Structural Dynamics and Active Control of Structures, 2004, chapter 6.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> method = fx.ModalBalanced(2, inputs=["1:x"], damping=fx.ModalDamping(0.01))
+    >>> fx.reduce(model, method).modes().freq.round(2)
+    array([  0.  , 100.66])
     """
 
     count: int

@@ -79,6 +79,14 @@ def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
     ------
     ModelError
         When there is no mapping of estimators.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> designs = {"static": fx.design_static(plant), "filter": fx.design_kalman(plant)}
+    >>> [output for block in fx.reading_along(designs) for output in block.outputs]
+    ['static|die:hat', 'filter|die:hat']
     """
     _check(designs)
     return tuple(
@@ -120,6 +128,18 @@ def compare_estimators(
         When there is no mapping of estimators, or there is only one run.
     LabelError
         When the run lacks the motion or an estimate of it.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> designs = {"static": fx.design_static(plant), "filter": fx.design_kalman(plant)}
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=designs["filter"])
+    >>> loop = fx.close_loop(plant, designs["filter"], servo, *fx.reading_along(designs))
+    >>> run = fx.simulate(loop, duration=0.5, rng=1, runs=5)
+    >>> found = fx.compare_estimators(designs, run, "die:x", start=0.2)
+    >>> bool(found["filter"][1] < found["static"][1])  # measured
+    True
     """
     _check(designs)
     instance(run, Response, "run", "Pass what simulate returned.")

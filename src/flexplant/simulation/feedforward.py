@@ -186,6 +186,16 @@ def design_feedforward(
     ----------
     Boerlage, Tousain, Steinbuch, Jerk derivative feedforward control for motion systems, American
     Control Conference, 2004.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> forward = fx.design_feedforward(fx.testbeds.three_masses())
+    >>> forward.gains.shape
+    (1, 1, 5)
+    >>> forward
+    <Feedforward die:ref to 1 actuators>
+      x: acceleration 3  jerk 0.00225  snap 3.313e-06
     """
     loop = given if isinstance(given, ClosedLoop) else None
     plant, poi, name = tracked(given if loop is None else loop.plant, reference)

@@ -125,6 +125,16 @@ class Specification(Value):
     ------
     ModelError
         When a limit is not positive, none is given, or `settling` comes without `ma`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> fx.Specification(modulus_margin=0.4, bandwidth=5.0).check(loop).passed
+    True
     """
 
     ma: float | None = None

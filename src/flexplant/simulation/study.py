@@ -64,6 +64,14 @@ def study(
     ModelError
         When there are no machines, the pipeline cannot be called or returns something else than a
         mapping of numbers, truths and texts, or the checkpoint is of another study.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> def pipeline(machine):
+    ...     return {"root": machine**0.5}
+    >>> fx.study([4.0, 9.0], pipeline)["root"]
+    array([2., 3.])
     """
     items = list(machines)
     if not items:

@@ -33,6 +33,14 @@ class PointMass(Value):
     ------
     ModelError
         When mass or inertia is negative.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0])
+    >>> model.with_parts(fx.PointMass("2:x", 3.0)).M.toarray()
+    array([[1., 0.],
+           [0., 4.]])
     """
 
     at: Place
@@ -94,6 +102,14 @@ class Spring(Value):
     ------
     ShapeError, ModelError
         When the stiffness is no finite number.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0])
+    >>> model.with_parts(fx.Spring("1:x", 50.0)).K.toarray()
+    array([[ 150., -100.],
+           [-100.,  100.]])
     """
 
     at: Place
@@ -134,6 +150,14 @@ class Damper(Value):
     ------
     ModelError
         When the rate is negative.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[100.0])
+    >>> model.with_parts(fx.Damper("1:x", 2.0, to="2:x")).D.toarray()
+    array([[ 2., -2.],
+           [-2.,  2.]])
     """
 
     at: Place

@@ -58,6 +58,15 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     the curl of the displacements, or the one slope that is known: rx = dz/dy, ry = -dz/dx on a
     plate. Up to 600 nodes the field is smooth; on larger models it is that of the 80 nearest
     nodes, and may step by the error of interpolation where these change.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> size, mesh = {"size": (1.0, 1.0, 1.0)}, {"elements": (2, 2, 2)}
+    >>> block = fx.solid_block(**size, **mesh, density=1.0, youngs_modulus=1.0, poisson_ratio=0.3)
+    >>> row = fx.interpolated(block).dofs.row((0.4, 0.5, 0.5), "x")
+    >>> round(row.sum(), 9)  # the weights of the nodes around add up to one
+    np.float64(1.0)
     """
     dofs = item.dofs if isinstance(item, FEModel) else item
     instance(dofs, DofSet, "dofs", "Pass an FEModel or its dofs.")

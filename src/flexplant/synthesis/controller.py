@@ -37,6 +37,13 @@ class Controller(Value):
         What the certificate does not cover, and what else is worth knowing.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
         Of `design_structured`: what it was given, with the numbers that it found.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> controller = fx.design_h2(fx.testbeds.three_masses())
+    >>> controller.system.inputs, controller.system.outputs
+    (('y1', 'y2', 'die:ref'), ('u1',))
     """
 
     system: StateSpace

@@ -21,6 +21,12 @@ class Pid(SingleElement):
         Gains [command per error, per s, times s].
     pole : float [Hz], optional
         Corner w above which the derivative no longer grows; needed with d.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Pid(2.0, i=1.0, d=0.1, pole=100.0)
+    Pid p 2 i 1 d 0.1 pole 100 Hz
     """
 
     p: float
@@ -102,6 +108,12 @@ class Lead(SingleElement):
         Where the phase is largest, ``asin((r - 1) / (r + 1))``; the zero lies at freq / sqrt(r).
     ratio : float
         Pole over zero; below 1 it is a lag.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Lead(50.0)  # most phase at 50 Hz
+    Lead 50 Hz ratio 9
     """
 
     freq: float
@@ -132,6 +144,12 @@ class Notch(SingleElement):
         Gain at the centre, below 1; above 1 it is a resonance.
     width : float
         Damping ratio of the poles: half the relative width.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Notch(130.0, depth=0.1, width=0.2)
+    Notch 130 Hz depth 0.1 width 0.2
     """
 
     freq: float
@@ -167,6 +185,12 @@ class LowPass(SingleElement):
         Slope above it.
     damping : float
         Of order 2; Butterworth unless given.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.LowPass(400.0)
+    LowPass 400 Hz order 2
     """
 
     freq: float

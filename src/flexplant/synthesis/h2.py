@@ -97,6 +97,13 @@ def design_h2(
     References
     ----------
     Zhou, Doyle, Glover, Robust and Optimal Control, 1996, theorems 14.7 and 21.14.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> controller = fx.design_h2(fx.testbeds.three_masses())
+    >>> controller.certificate["H2 norm"] == controller.gamma
+    True
     """
     if u is None and y is None:
         plant = standard_plant(plant)

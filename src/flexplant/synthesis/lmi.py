@@ -59,6 +59,13 @@ class Lmi(Value):
     Nonlinear Control 4, 1994 (the smallest gamma). Scherer, Gahinet, Chilali, Multiobjective
     output-feedback control via LMI optimization, IEEE Trans. Autom. Control 42, 1997 (the
     controller, section IV; its Â is eliminated here).
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> fx.design_hinf(sys, fx.Lmi()).gamma < 1
+    True
     """
 
     back_off: float = 0.05

@@ -209,6 +209,15 @@ def design_loops(
     -----
     FlexplantWarning
         When the loop is unstable, or is with the modes left out.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.lti.tf([1.0], [1.0, 0.0, 0.0])  # a free mass
+    >>> law = fx.Pid(9e4) * fx.Lead(50.0) * fx.LowPass(500.0)
+    >>> design = fx.design_loops(plant, law)
+    >>> design.report.is_stable
+    True
     """
     axes = axes_of(plant, before, after, rate, delay, hold)
     found = made(axes, checked_laws(axes, laws), rigid, unstable, references, larger)

@@ -88,6 +88,14 @@ def design_ncf(
     ----------
     McFarlane, Glover, A loop-shaping design procedure using H-infinity synthesis, IEEE Trans.
     Automatic Control 37, 1992.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.lti.tf([1.0], [1.0, 0.0, 0.0])  # a free mass
+    >>> controller = fx.design_ncf(plant)
+    >>> round(fx.ncf_margin(plant, controller), 2)
+    0.35
     """
     G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
     back_off = positive(back_off, "back_off")
@@ -147,6 +155,13 @@ def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -
     ------
     ModelError, ShapeError
         When the two do not go together.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant, controller = fx.lti.tf([1.0], [1.0, 0.0]), fx.lti.tf([-1.0], [1.0])
+    >>> round(fx.ncf_margin(plant, controller), 4)  # 1 / sqrt(2)
+    0.7071
     """
     G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
     return loop_margin(G, as_statespace(controller))[0]

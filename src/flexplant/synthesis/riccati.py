@@ -63,6 +63,13 @@ class Riccati(Value):
     ------
     ModelError
         When a value is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> fx.design_hinf(sys, fx.Riccati(tolerance=1e-2)).gamma < 1
+    True
     """
 
     back_off: float = 0.05

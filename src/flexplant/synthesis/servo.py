@@ -98,6 +98,15 @@ def design_servo(
     FlexplantWarning
         When the loop on the POI itself is unstable, or the modes left out make the loop unstable or
         bring |S| at u above 8 dB.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> fx.close_loop(plant, observer, servo).is_stable
+    True
     """
     task = servo_task(
         plant,
@@ -191,6 +200,13 @@ def servo_bandwidth(
         As `design_servo`; ModelError when peak is not above 1.
     SolverError
         When no bandwidth holds it.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> fx.servo_bandwidth(plant, observer=fx.design_kalman(plant)) > 20.0
+    True
     """
     if positive(peak, "peak") <= 1.0:
         raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")

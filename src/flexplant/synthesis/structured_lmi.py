@@ -81,6 +81,13 @@ class StructuredLmi(Value):
     Nonlinear Control 4, 1994. Helmberg, Rendl, Vanderbei, Wolkowicz, An interior-point method for
     semidefinite programming, SIAM J. Optim. 6, 1996. Iwasaki, Skelton, All controllers for the
     general H-infinity control problem, Automatica 30, 1994 (the eliminated variables).
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> fx.design_hinf(sys, fx.StructuredLmi()).gamma < 1
+    True
     """
 
     back_off: float = 0.05

@@ -79,6 +79,14 @@ def tune_loops(
         each other too much.
     ModelError, ShapeError, LabelError, AssumptionError
         As for `design_loops`; ModelError when peak is not above 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.discretized(fx.lti.tf([1.0], [1.0, 0.0, 0.0]), 2e3, delay=2)
+    >>> design = fx.tune_loops(plant)
+    >>> design.report.is_stable
+    True
     """
     if positive(peak, "peak") <= 1.0:
         raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")

@@ -131,6 +131,18 @@ class UpdateResult(Value):
         end at a bound.
     rounds : (r, q) array or None
         The estimate of the reduced model alone and after each round of defect correction.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> fit.parameters, fit.units, fit.values.round(4)
+    (('mass at 3:x',), ('kg',), array([0.1186]))
+    >>> fit.model.M.round(4)[2, 2]
+    np.float64(1.1186)
     """
 
     parameters: tuple[str, ...]

@@ -102,6 +102,12 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
         When an axis is not one of the structure's.
     ModelError
         When the plant was not assembled from a structure, or it is held.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.decouple(fx.testbeds.three_masses()).mass.round(6)  # all three masses
+    array([[3.]])
     """
     plant = standard_plant(plant)
     realisation, ports = plant.assembled.realisation, plant.assembled.ports

@@ -52,6 +52,13 @@ def reference_errors(plant: StandardPlant, *, poi: str | None = None) -> StateSp
         When several POIs have a reference and none is named, or the named one has none.
     ModelError
         When the plant was not assembled from a structure.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> plant.through(fx.reference_errors(plant)).y
+    ('y1:error', 'y2:error')
     """
     plant, motions = _stage(plant)
     ports = plant.assembled.ports
@@ -205,6 +212,14 @@ def stage_weights(
         When there are several POIs and none is named, or the name is unknown.
     ModelError
         When the plant was not assembled from a structure, or a number is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> weights = fx.stage_weights(plant, 20.0)
+    >>> sorted(weights.z), sorted(weights.w)
+    (['die:error', 'die:x', 'u1:effort'], ['amp', 'y1:noise', 'y2:noise'])
     """
     plant, motions = _stage(plant)
     ports = plant.assembled.ports

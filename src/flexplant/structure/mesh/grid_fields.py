@@ -32,6 +32,12 @@ class Rectangle(Value):
     ------
     ModelError
         When upper is not above lower.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Rectangle((0.1, 0.1), (0.2, 0.3)).holds(np.array([[0.15, 0.2], [0.5, 0.5]]))
+    array([ True, False])
     """
 
     lower: Sequence[float]
@@ -69,6 +75,12 @@ class Disc(Value):
     ------
     ModelError
         When the radius is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.Disc((0.3, 0.3), radius=0.1).holds(np.array([[0.3, 0.35], [0.5, 0.5]]))
+    array([ True, False])
     """
 
     centre: Sequence[float]

@@ -65,6 +65,11 @@ class Rib(Value):
     ----------
     Torsion of a rectangle: Timoshenko and Goodier, Theory of Elasticity, sec. 109 (a fit within
     0.5 %): ``J = w^3 h (1/3 - 0.21 w/h (1 - (w/h)^4 / 12))`` for w <= h.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> rib = fx.Rib((0.0, 0.3), (0.6, 0.3), width=0.01, height=0.03)
     """
 
     start: Sequence[float]

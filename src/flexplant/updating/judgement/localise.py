@@ -93,6 +93,17 @@ def localise(
     ----------
     Chen, Chen: Extended Bayesian information criteria for model selection with large model spaces,
     Biometrika 95, 2008.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 2.0, 1.5], stiffnesses=[4e5, 3e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> heavier = fx.chain(masses=[1.0, 2.0, 1.8], stiffnesses=[4e5, 3e5])
+    >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
+    >>> masses = [fx.AddedMass(place, name=place) for place in drawing.dofs.labels]
+    >>> fx.localise(drawing, [fx.Eigenvalues(measured)], masses).ranking[0]
+    '3:x'
     """
     listed = checked_parameters(candidates)
     none = isinstance(nuisance, list | tuple) and not nuisance

@@ -116,6 +116,18 @@ def validate(
         As `update`.
     ModelError
         When unused data were fitted.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> heavier = fx.chain(masses=[1.0, 1.0, 1.2], stiffnesses=[4e5, 4e5])
+    >>> poles = fx.solve_modes(heavier, count=3).poles
+    >>> known = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[1]], modes=[2]))
+    >>> unused = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[2]], modes=[3]))
+    >>> fx.validate(drawing, [fx.AddedMass("3:x")], [known], [unused]).helped
+    True
     """
     listed = checked_parameters(parameters)
     given, kept = checked_residuals(residuals), checked_residuals(unused)
