@@ -23,6 +23,7 @@ ROOMS = (
     "structure",
     "modes",
     "reduction",
+    "joining",
     "identification",
     "updating",
     "plant",

@@ -23,6 +23,7 @@ read_model read_matrices check DofSet FEModel FEMatrices kirchhoff_plate beam ch
 Rib Disc Rectangle interpolated PointMass Spring Damper ModalDamping Rayleigh Hysteretic
 solve_modes Modes reduce ReducedModel DesiredDofs ModalTruncation ModalBalanced Guyan Irs Serep
 CraigBampton Rubin MacNeal Krylov select_dofs rank_modes
+joined Joint Patch Pose
 estimate_frf average_frfs identify_modes numbered MeasuredModes
 update UpdateResult AddedMass AddedDamping AddedStiffness MatrixParameter Eigenvalues ModeShapes
 FrfResidual localise identifiability validate sample_posterior
@@ -40,7 +41,17 @@ setpoint scan simulate Response Specification study design_feedforward compare_e
 show_versions
 """
 ROOMS = {
-    *("lti", "sparse", "structure", "modes", "reduction", "identification", "updating", "plant"),
+    *(
+        "lti",
+        "sparse",
+        "structure",
+        "modes",
+        "reduction",
+        "joining",
+        "identification",
+        "updating",
+        "plant",
+    ),
     *("loop", "estimation", "synthesis", "placement", "simulation", "testbeds", "io", "errors"),
     "plot",
 }

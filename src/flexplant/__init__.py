@@ -26,6 +26,10 @@ from .identification import identify_modes as identify_modes
 from .identification import numbered as numbered
 from .io import read_matrices as read_matrices
 from .io import read_model as read_model
+from .joining import Joint as Joint
+from .joining import Patch as Patch
+from .joining import Pose as Pose
+from .joining import joined as joined
 from .labels import DofSet as DofSet
 from .loop import ClosedLoop as ClosedLoop
 from .loop import close_loop as close_loop

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .errors import LabelError
-from .values import FloatArray, IntArray
+from .values import FloatArray, IntArray, check_names, name_list, short
 
 _COLUMNS = ("node", "direction", "x", "y", "z")
 #: node numbers stay exact as floats, and their keys in 64 bits
@@ -99,6 +99,35 @@ def direction_names(directions: Any) -> tuple[str, ...]:
     except TypeError:
         pass
     return tuple(str(direction) for direction in given)
+
+
+def component_columns(
+    names: Any, owners: Any, count: int
+) -> tuple[tuple[str, ...], IntArray | None]:
+    """Return the names of components and which of them (count,) each DOF belongs to.
+
+    Raises
+    ------
+    LabelError
+        When a name cannot begin a label, or the DOFs and the names do not fit.
+    """
+    listed_names = name_list(names, "components")
+    if owners is None and not listed_names:
+        return (), None
+    check_names(listed_names, "components")
+    wrong = [name for name in listed_names if ":" in name or name != name.strip(" /")]
+    if wrong:
+        raise LabelError(
+            f"{wrong[0]!r} cannot name a component: labels are 'stage/41:z', so that names hold no "
+            "':' and neither begin nor end with '/' or a blank. Rename it."
+        )
+    numbers = np.zeros(0, dtype=np.int64) if owners is None else node_numbers(owners)
+    if numbers.shape != (count,) or not np.all((numbers >= 0) & (numbers < len(listed_names))):
+        raise LabelError(
+            f"component_of must hold the number (from 0) of one of the {len(listed_names)} "
+            f"components for each of the {count} DOFs, got {short(owners)}."
+        )
+    return listed_names, numbers
 
 
 def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:

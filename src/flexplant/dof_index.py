@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,27 +19,52 @@ _COMPARABLE = 2000
 class DofIndex:
     """The rows of DOFs, given their node numbers (n,) and kinds (n,), 0 to 5 for x to rz.
 
-    Attributes
+    Parameters
     ----------
-    keys : (n,) array of int
-        One whole number for each DOF, ascending.
-    order : (n,) array of int
-        The rows in this order.
+    nodes, kinds : (n,) arrays of int
+        Node and direction of each DOF.
+    components : sequence of str
+        Names of components, which come before the node in a label.
+    component_of : (n,) array of int, optional
+        Which of them each DOF belongs to.
     """
 
-    def __init__(self, nodes: IntArray, kinds: IntArray) -> None:
+    def __init__(
+        self,
+        nodes: IntArray,
+        kinds: IntArray,
+        components: tuple[str, ...] = (),
+        component_of: IntArray | None = None,
+    ) -> None:
         keys = nodes * len(DIRECTIONS) + kinds
-        order = np.arange(keys.size)
-        if np.any(keys[1:] < keys[:-1]):
-            order = np.argsort(keys, kind="stable")
-        self.keys, self.order = keys[order], order
+        self._order = np.arange(keys.size)
+        self._ends = {"": (0, keys.size)}
+        if component_of is not None:
+            self._order = np.lexsort((keys, component_of))
+            ends = np.searchsorted(component_of[self._order], np.arange(len(components) + 1))
+            pairs = zip(ends[:-1].tolist(), ends[1:].tolist(), strict=True)
+            self._ends = dict(zip(components, pairs, strict=True))
+        elif np.any(keys[1:] < keys[:-1]):
+            self._order = np.argsort(keys, kind="stable")
+        self._keys = keys[self._order]
+
+    @property
+    def doubled(self) -> tuple[int, int] | None:
+        """Two rows with the same DOF, or None."""
+        for start, end in self._ends.values():
+            same = np.flatnonzero(np.diff(self._keys[start:end]) == 0)
+            if same.size:
+                first = start + int(same[0])  # the stable sort keeps equal keys in their order
+                return int(self._order[first]), int(self._order[first + 1])
+        return None
 
     def found(self, label: object) -> int:
         """Return the row of a label, or -1: by its number, so that a million need no dictionary."""
         if not isinstance(label, str):
             return -1
-        node, _, direction = label.partition(":")
-        if direction not in DIRECTIONS:
+        component, _, rest = label.rpartition("/")
+        node, _, direction = rest.partition(":")
+        if direction not in DIRECTIONS or component not in self._ends:
             return -1
         try:
             number = int(node)
@@ -47,21 +72,20 @@ class DofIndex:
             return -1
         if str(number) != node or abs(number) > LARGEST_NODE:  # "07:z" and "1_0:z" are no labels
             return -1
-        keys, order = self.keys, self.order
+        start, end = self._ends[component]
         key = number * len(DIRECTIONS) + DIRECTIONS.index(direction)
-        place = int(np.searchsorted(keys, key))
-        return int(order[place]) if place < keys.size and keys[place] == key else -1
+        place = start + int(np.searchsorted(self._keys[start:end], key))
+        return int(self._order[place]) if place < end and self._keys[place] == key else -1
 
 
-def unknown_dof(label: object, nodes: IntArray, directions: Sequence[str]) -> LabelError:
+def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) -> LabelError:
     """Return the error for a label that is not there, without comparing it with a million."""
     if nodes.size <= _COMPARABLE:
-        known = [f"{n}:{d}" for n, d in zip(nodes.tolist(), directions, strict=True)]
-        return unknown_label("DOF", label, known)
-    number = re.match(r"-?\d{1,15}", str(label))
+        return unknown_label("DOF", label, [label_of(row) for row in range(nodes.size)])
+    number = re.match(r"-?\d{1,15}", str(label).rpartition("/")[2])
     near = int(number.group()) if number else int(nodes[0])
-    rows = np.argsort(np.abs(nodes - near), kind="stable")[:6]
-    listed = ", ".join(f"'{nodes[i]}:{directions[i]}'" for i in rows)
+    rows = np.argsort(np.abs(nodes - near), kind="stable")[:6].tolist()
+    listed = ", ".join(repr(label_of(row)) for row in rows)
     return LabelError(
         f"no DOF {label!r} ({nodes.size} known). At the nodes next to it there are: {listed}."
     )

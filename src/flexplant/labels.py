@@ -1,4 +1,4 @@
-"""Degrees of freedom (DOFs) and signals by name: `"41:z"` is the z-displacement of node 41."""
+"""Degrees of freedom (DOFs) by name: `"41:z"` is the z-displacement of node 41."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from typing import Any
 
 import numpy as np
 
-from .dof_columns import columns_of, direction_names, listed, node_numbers
+from .dof_columns import (
+    columns_of,
+    component_columns,
+    direction_names,
+    listed,
+    node_numbers,
+)
 from .dof_index import DofIndex, unknown_dof
 from .errors import LabelError, ShapeError, unknown_label
 from .places import DIRECTIONS as DIRECTIONS
@@ -34,13 +40,17 @@ class DofSet(Value):
     interpolation : Interpolation, optional
         Element shape functions, or those of `interpolated`; without them only points at nodes are
         known.
+    components : sequence of str
+        The components of a joined machine: labels are `"stage/41:z"` then.
+    component_of : (n,) array of int, optional
+        Which of them (from 0) each DOF belongs to.
 
     Raises
     ------
     ShapeError
         When the lengths differ.
     LabelError
-        When a direction is unknown or a DOF appears twice.
+        When a direction is unknown, a DOF appears twice, or names of components do not fit.
 
     Examples
     --------
@@ -53,6 +63,8 @@ class DofSet(Value):
     directions: tuple[str, ...]
     xyz: FloatArray
     interpolation: Interpolation | None = None
+    components: tuple[str, ...] = ()
+    component_of: IntArray | None = None
 
     def __post_init__(self) -> None:
         nodes = node_numbers(self.nodes)
@@ -79,13 +91,13 @@ class DofSet(Value):
             "Leave it out, or use flexplant.interpolated.",
             LabelError,
         )
-        index = self._index
-        doubled = np.flatnonzero(np.diff(index.keys) == 0)
-        if doubled.size:
-            # the stable sort keeps equal keys in the order of the rows
-            first, second = index.order[doubled[0]], index.order[doubled[0] + 1]
+        names, owners = component_columns(self.components, self.component_of, nodes.size)
+        self._set(components=names, component_of=owners)
+        doubled = self._index.doubled
+        if doubled:
+            first, second = doubled
             raise LabelError(
-                f"DOF '{nodes[first]}:{directions[first]}' appears twice, in rows {first} and "
+                f"DOF '{self._label(first)}' appears twice, in rows {first} and "
                 f"{second} (from 0): rows of the matrices would be ambiguous. Drop one of them, or "
                 "renumber the node."
             )
@@ -102,12 +114,28 @@ class DofSet(Value):
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
-        """The labels `"node:direction"`, in order."""
-        return tuple(f"{n}:{d}" for n, d in zip(self.nodes.tolist(), self.directions, strict=True))
+        """The labels `"node:direction"`, of a joined machine with its components, in order."""
+        return tuple(self._label(row) for row in range(len(self)))
+
+    def _label(self, row: int) -> str:
+        label = f"{self.nodes[row]}:{self.directions[row]}"
+        if self.component_of is None:
+            return label
+        return f"{self.components[self.component_of[row]]}/{label}"
+
+    @cached_property
+    def node_index(self) -> IntArray:
+        """The number (n,) of each DOF's node, from 0; equal numbers in two components differ."""
+        index: Any = np.unique(self.nodes, return_inverse=True)[1]
+        if self.component_of is not None:
+            pairs = index * len(self.components) + self.component_of
+            index = np.unique(pairs, return_inverse=True)[1]
+        index.flags.writeable = False
+        return np.asarray(index)
 
     @cached_property
     def _index(self) -> DofIndex:
-        return DofIndex(self.nodes, self.kinds)
+        return DofIndex(self.nodes, self.kinds, self.components, self.component_of)
 
     def __len__(self) -> int:
         return int(self.nodes.size)
@@ -121,7 +149,9 @@ class DofSet(Value):
     def __repr__(self) -> str:
         counts = np.bincount(self.kinds, minlength=len(DIRECTIONS)).tolist()
         kinds = ", ".join(f"{n} {d}" for n, d in zip(counts, DIRECTIONS, strict=True) if n)
-        return f"<DofSet {len(self)} DOFs at {np.unique(self.nodes).size} nodes: {kinds}>"
+        nodes = int(self.node_index.max(initial=-1)) + 1
+        of = f" of {', '.join(self.components)}" if self.components else ""
+        return f"<DofSet {len(self)} DOFs at {nodes} nodes{of}: {kinds}>"
 
     def index(self, label: str) -> int:
         """Return the row of a DOF in the matrices (from 0).
@@ -138,8 +168,28 @@ class DofSet(Value):
         """
         row = self._index.found(label)
         if row < 0:
-            raise unknown_dof(label, self.nodes, self.directions)
+            if self._dependent(label) is not None:
+                raise LabelError(
+                    f"DOF {label!r} is no row of the matrices: it follows others, by a joint. Its "
+                    "motion is row(label); name a DOF that is there, such as "
+                    f"{self._label(0)!r}."
+                )
+            raise unknown_dof(label, self.nodes, self._label)
         return row
+
+    def _dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        return None if self.interpolation is None else self.interpolation.dependent(label)
+
+    def location(self, label: str) -> FloatArray:
+        """Return the coordinates (3,) [m] of a DOF's node, of one that follows others too.
+
+        Raises
+        ------
+        LabelError
+            When there is no such DOF, with close matches.
+        """
+        found = None if label in self else self._dependent(label)
+        return self.xyz[self.index(label)] if found is None else found[1]
 
     def indices(self, labels: Iterable[str]) -> IntArray:
         """Return the rows of several DOFs, in the order given."""
@@ -155,7 +205,21 @@ class DofSet(Value):
     def _taken(self, rows: IntArray) -> DofSet:
         """Return the DofSet of some rows (n,), in the order given (no interpolation)."""
         names = np.array(DIRECTIONS, dtype=object)
-        return DofSet(self.nodes[rows], tuple(names[self.kinds[rows]]), self.xyz[rows])
+        return DofSet(
+            self.nodes[rows],
+            tuple(names[self.kinds[rows]]),
+            self.xyz[rows],
+            components=self.components,
+            component_of=None if self.component_of is None else self.component_of[rows],
+        )
+
+    def _owned(self, component: str | None) -> Any:
+        """Return which DOFs (n,) belong to a component; None: all."""
+        if component is None:
+            return np.ones(len(self), dtype=bool)
+        if self.component_of is None or component not in self.components:
+            raise unknown_label("component", component, self.components)
+        return self.component_of == self.components.index(component)
 
     def where(
         self,
@@ -163,6 +227,7 @@ class DofSet(Value):
         directions: Iterable[str] | str | None = None,
         *,
         box: Sequence[Sequence[float]] | FloatArray | None = None,
+        component: str | None = None,
     ) -> DofSet:
         """Return the DOFs at the given nodes, in the given directions, in a box (None: all).
 
@@ -175,13 +240,15 @@ class DofSet(Value):
         box : (2, 3) array [m], optional
             Its lowest and highest corner, both belonging to it: ``[(0, 0, 0), (0, 0.6, 0)]`` is an
             edge. Infinite entries are allowed.
+        component : str, optional
+            Of a joined machine.
 
         Raises
         ------
         LabelError
-            When a node or direction is not there, or no DOF is in the box.
+            When a node, direction or component is not there, or no DOF is in the box.
         """
-        keep = np.ones(len(self), dtype=bool)
+        keep = self._owned(component)
         if nodes is not None:
             wanted = node_numbers(nodes if isinstance(nodes, Iterable) else [nodes])
             missing = np.setdiff1d(wanted, self.nodes)
@@ -223,7 +290,13 @@ class DofSet(Value):
         slack = 1e-9 * float(np.ptp(self.xyz, axis=0).max(initial=0.0))
         return np.all((self.xyz >= corners[0] - slack) & (self.xyz <= corners[1] + slack), axis=1)
 
-    def nearest(self, xyz: Sequence[float] | FloatArray, direction: str = "z") -> str:
+    def nearest(
+        self,
+        xyz: Sequence[float] | FloatArray,
+        direction: str = "z",
+        *,
+        component: str | None = None,
+    ) -> str:
         """Return the label of the DOF in `direction` whose node is nearest to a point.
 
         Parameters
@@ -232,6 +305,8 @@ class DofSet(Value):
             The point.
         direction : str
             One of the directions present.
+        component : str, optional
+            Of a joined machine; None: of all.
 
         Raises
         ------
@@ -239,15 +314,14 @@ class DofSet(Value):
             When no DOF has this direction.
         """
         kind = DIRECTIONS.index(direction) if direction in DIRECTIONS else -1
-        rows = np.flatnonzero(self.kinds == kind)
+        rows = np.flatnonzero((self.kinds == kind) & self._owned(component))
         if not rows.size:
             raise LabelError(
                 f"no DOF in direction {direction!r}: {self!r}. Choose one that is there."
             )
         point = real_array(xyz, "xyz", (3,))
         distance = np.linalg.norm(self.xyz[rows] - point, axis=1)
-        row = int(rows[np.argmin(distance)])
-        return f"{self.nodes[row]}:{direction}"
+        return self._label(int(rows[np.argmin(distance)]))
 
     def row(self, at: Place, direction: str = "z") -> FloatArray:
         """Return the row (n,) that picks the motion at a place from the vector of all DOFs.
@@ -269,6 +343,9 @@ class DofSet(Value):
         """
         row = np.zeros(len(self))
         if isinstance(at, str):
+            dependent = None if at in self else self._dependent(at)
+            if dependent is not None:
+                return dependent[0]
             row[self.index(at)] = 1.0
             return row
         if isinstance(at, Mapping):

@@ -36,3 +36,10 @@ class Interpolation(Value):
             When one of them is off the structure.
         """
         return np.array([self.row(point, direction) for point in points])
+
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
+
+        A joint makes DOFs follow: they are no rows of the matrices, but their labels stay known.
+        """
+        return None

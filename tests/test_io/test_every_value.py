@@ -213,6 +213,9 @@ def of_structures():
     block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}
     corner = fx.solid_block(**block, **steel, holes=np.array([[[True]], [[False]]]))
     yield corner.dofs.interpolation
+    ends = fx.Patch("up", [1, 2]), fx.Joint("up/1:z", "bar/1:z")
+    machine = fx.joined({"up": bar, "bar": bar}, ends[1], placed={"up": fx.Pose((0, 0, 1))})
+    yield from (*ends, machine, fx.Pose((0, 0, 1)))
     foreign = fx.FEMatrices(np.eye(2), np.diag([1.0, 0.0]), digits=9, constrained=["3:x"])
     yield from (foreign, fx.check(foreign))
 

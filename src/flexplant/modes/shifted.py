@@ -151,7 +151,7 @@ def dissection_of(model: FEModel) -> Dissection:
         # of both matrices: entries that cancel in one stay in the other
         same = np.array_equal(M.indptr, K.indptr) and np.array_equal(M.indices, K.indices)
         pattern = K if same else sp.csc_array(abs(K) + abs(M))
-        found = dissect(pattern, model.dofs.nodes, model.dofs.xyz)
+        found = dissect(pattern, model.dofs.node_index, model.dofs.xyz)
         _dissected[model] = found
     return found
 

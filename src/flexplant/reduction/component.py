@@ -104,6 +104,7 @@ class CraigBampton(ReductionMethod):
             coordinates=names,
             method=f"{count} fixed-interface modes (Craig-Bampton)",
             damping=self.damping,
+            static_at=labels,
         )
 
     def _fixed(self, model: FEModel, part: DofPartition) -> FloatArray:
@@ -204,6 +205,7 @@ def _built(
         condition=float(values[-1] / values[0]),
         condition_of="M*",
         coordinates=_free_names(labels, k),
+        static_at=labels,
     )
 
 

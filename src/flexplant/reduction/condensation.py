@@ -141,6 +141,7 @@ class Guyan(ReductionMethod):
             dofs=model.dofs.select(labels),
             method="static condensation (Guyan)",
             damping=self.damping,
+            static_at=labels,
         )
 
 
@@ -229,6 +230,7 @@ class Irs(ReductionMethod):
             method=f"improved condensation (IRS, {done} iteration{'s' * (done != 1)})",
             damping=self.damping,
             singular="The iteration lost modes: take fewer iterations, or other DOFs.",
+            static_at=labels,
         )
 
 

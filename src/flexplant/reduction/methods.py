@@ -115,6 +115,7 @@ class DesiredDofs(ReductionMethod):
             condition=condition,
             truncated=truncated,
             n_vectors=modes.n_vectors,
+            static_at=modes.vector_dofs,
         )
 
 

@@ -158,6 +158,7 @@ def projected(
     condition_of: str = "M*",
     bound: ErrorBound | None = None,
     singular: str = "",
+    static_at: Sequence[str] = (),
 ) -> ReducedModel:
     """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``.
 
@@ -204,4 +205,5 @@ def projected(
         condition_of=condition_of,
         coordinates=coordinates,
         bound=bound,
+        static_at=static_at,
     )

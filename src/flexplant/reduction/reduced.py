@@ -17,7 +17,15 @@ from ..structure import FEModel
 from ..structure.negative_stiffness import refuse_unstable, unstable_stiffness
 from ..structure.placed import SPANNED, missed
 from ..structure.rigid import orthonormalised, rigid_motions
-from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
+from ..values import (
+    ComplexArray,
+    FloatArray,
+    IntArray,
+    Value,
+    name_list,
+    positive,
+    real_array,
+)
 from .bounds import ErrorBound
 from .quality import ReductionQuality, quality_of
 
@@ -63,6 +71,12 @@ class ReducedModel(Value):
     n_vectors : int
         How many shapes are attachment vectors: as many of the model's modes are none of the
         structure's, but hold the compliance of those left out.
+    static_at : sequence of str
+        Places whose static compliance it holds in full.
+    joint_motions : (k, m) array, optional
+        Of a joined machine: motions of its components as rigid bodies that its rigid joints allow.
+    joining : Value, optional
+        Of a joined machine: how it was joined, with the checks that were made.
 
     Raises
     ------
@@ -92,6 +106,9 @@ class ReducedModel(Value):
     bound: ErrorBound | None = None
     truncated: Modes | None = None
     n_vectors: int = 0
+    static_at: Iterable[str] = ()
+    joint_motions: FloatArray | None = None
+    joining: Value | None = None
 
     def __post_init__(self) -> None:
         names = tuple(str(name) for name in self.coordinates) or self.dofs.labels
@@ -109,7 +126,10 @@ class ReducedModel(Value):
             rigid_body=real_array(self.rigid_body, "rigid_body", (k, None)),
             condition=positive(self.condition, "condition"),
             coordinates=names,
+            static_at=name_list(self.static_at, "static_at"),
         )
+        if self.joint_motions is not None:
+            self._set(joint_motions=real_array(self.joint_motions, "joint_motions", (k, None)))
         if self.truncated is not None and self.truncated.dofs.labels != self.full_dofs.labels:
             raise ModelError(
                 f"the truncated modes are over {len(self.truncated.dofs)} DOFs that are not the "
@@ -202,6 +222,7 @@ class ReducedModel(Value):
             T=self.T @ follow,
             dofs=self.dofs.select(kept),
             rigid_body=self.rigid_body[heavy],
+            joint_motions=None if self.joint_motions is None else self.joint_motions[heavy],
             coordinates=names,
         )
         return model, follow, flexibility
@@ -322,6 +343,8 @@ class ReducedModel(Value):
     @property
     def body_motions(self) -> FloatArray:
         """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
+        if self.joint_motions is not None:
+            return orthonormalised(self.M, self.joint_motions, dependent="drop")
         made = self.missed_motions() < SPANNED
         return orthonormalised(self.M, self.rigid_motions()[:, made], dependent="drop")
 

@@ -386,4 +386,5 @@ def _diagonal(
         condition_of="M*",
         bound=bound if bound is None or np.isfinite(bound.value) else None,
         n_vectors=modes.n_vectors,
+        static_at=modes.vector_dofs,
     )

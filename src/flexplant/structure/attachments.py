@@ -213,6 +213,11 @@ class HeldShape(Interpolation):
         """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
         return np.asarray(self.free.rows(points, direction)[:, self.rows_left])
 
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        found = self.free.dependent(label)
+        return None if found is None else (found[0][self.rows_left], found[1])
+
 
 def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.csc_array]:
     """Return what parts add to M, K and D, those that are touched only.

@@ -27,7 +27,8 @@ def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
         entries = sp.coo_array(M)
         label = _joined(label, *entries.coords)
     if dofs is not None and label.max(initial=0) > 0:
-        first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)[1:]
+        node = dofs.node_index
+        first = np.unique(node, return_index=True)[1]
         label = _joined(label, np.arange(label.size), first[node])
     sizes = np.bincount(label)
     place = np.empty(sizes.size, dtype=np.int64)

@@ -23,7 +23,7 @@ from .eigen import elastic_modes
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
-from .rigid import body_motions, force_parts, rigid_body_basis
+from .rigid import body_motions, force_parts, orthonormalised, rigid_body_basis
 from .units import units
 
 
@@ -49,6 +49,11 @@ class FEModel(Placed, Value):
     held_inertia : (n, 6) array, optional
         Loads ``M_fs r_s`` that the acceleration of held DOFs s makes by their mass coupling, for
         the six rigid-body motions of the ground about the origin; kept by `fixed`.
+    joint_motions : (n, m) array, optional
+        Of a joined machine: M-orthonormal motions of its components as rigid bodies that its rigid
+        joints allow (a slide, a hinge), in place of those that follow from the coordinates.
+    joining : Value, optional
+        Of a joined machine: how it was joined, with the checks that were made.
 
     Raises
     ------
@@ -77,6 +82,8 @@ class FEModel(Placed, Value):
     dofs: DofSet = field(kw_only=True)
     name: str | None = field(default=None, kw_only=True)
     held_inertia: FloatArray | None = field(default=None, kw_only=True)
+    joint_motions: FloatArray | None = field(default=None, kw_only=True)
+    joining: Value | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         n = len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
@@ -100,6 +107,8 @@ class FEModel(Placed, Value):
             check_semidefinite(D, "D")
         if self.held_inertia is not None:
             self._set(held_inertia=real_array(self.held_inertia, "held_inertia", (n, 6)))
+        if self.joint_motions is not None:
+            self._set(joint_motions=real_array(self.joint_motions, "joint_motions", (n, None)))
         remarks: list[str | None] = [slow(M, K)]
         if digits is not None:
             remarks.append(endangered(K, M, digits))
@@ -140,7 +149,11 @@ class FEModel(Placed, Value):
     @cached_property
     def body_motions(self) -> FloatArray:
         """The M-orthonormal rigid-body motions (n, r) of every piece, whether held or not."""
-        motions = body_motions(self.M, self.K, self.dofs)
+        if self.joint_motions is not None:
+            # a mass or held DOFs may have been added since the machine was joined
+            motions = orthonormalised(self.M, self.joint_motions, dependent="drop")
+        else:
+            motions = body_motions(self.M, self.K, self.dofs)
         motions.flags.writeable = False
         return motions
 
@@ -327,6 +340,7 @@ class FEModel(Placed, Value):
                 for name, matrix in (("M", self.M), ("K", self.K), ("D", self.D))
             },
             held_inertia=frozen(load),
+            joint_motions=None if self.joint_motions is None else frozen(self.joint_motions[rows]),
             dofs=self.dofs._taken(rows).replace(interpolation=shape),
         )
 

@@ -70,7 +70,7 @@ def place_motion(dofs: DofSet, at: Place, direction: str) -> FloatArray:
         parts = [weight * place_motion(dofs, place, direction) for place, weight in at.items()]
         return np.asarray(np.sum(parts, axis=0))
     if isinstance(at, str):
-        direction, at = at.rpartition(":")[2], dofs.xyz[dofs.index(at)]
+        direction, at = at.rpartition(":")[2], dofs.location(at)
     axis, own = DIRECTIONS.index(direction), np.zeros(6)
     own[axis] = 1.0
     if axis < 3:  # (e_r x p) . e = (p x e) . e_r

@@ -79,13 +79,14 @@ def zero_energy(
     located: bool,
     rounding: float,
     M: Any = None,
+    joint_motions: FloatArray | None = None,
 ) -> ZeroEnergy:
     """Return the rigid-body motions of the geometry and the mechanisms among `zero_modes` (n, q).
 
     Free are those whose energy is below three times the relative `rounding` of the entries of K,
     unless soft springs hold them: judged by `unheld`, as the rigid-body motions of a model are.
     Rotations are left out where coordinates are not known. Pieces that neither K nor M joins have
-    their own motions each.
+    their own motions each, and a joined machine those that its joints allow.
     """
     center = dofs.xyz.mean(axis=0) if len(dofs) else np.zeros(3)
     motions = rigid_motions(dofs.replace(xyz=dofs.xyz - center, interpolation=None))
@@ -94,7 +95,8 @@ def zero_energy(
     names = DIRECTIONS[: motions.shape[1]]
     present = np.any(motions != 0, axis=0)
     several = bodies(K, M, dofs)
-    almost, basis = _of_bodies(K, M, motions, several, rounding)
+    every = motions if joint_motions is None else np.hstack([motions, joint_motions])
+    almost, basis = _of_bodies(K, M, every, several, rounding)
     left = motions - basis @ (basis.T @ motions)
     free = present & (np.linalg.norm(left, axis=0) < _RANK * np.linalg.norm(motions, axis=0))
     suspended = _shared(zero_modes, almost) - _shared(zero_modes, basis)

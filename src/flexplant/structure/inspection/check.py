@@ -137,7 +137,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
             f"check needs an FEModel or FEMatrices, got {type(model).__name__}. "
             "Pass FEMatrices(K, M, dofs=...), which takes matrices of any quality."
         )
-    found = facts(matrices_)
+    found = facts(matrices_, given.joint_motions if isinstance(model, FEModel) else None)
     lines: list[Line] = [
         *matrices(found),
         *zero_rows(found),

@@ -78,8 +78,16 @@ class Facts:
         return float(np.sqrt(elastic[0]) / (2 * np.pi)) if elastic.size else float("nan")
 
 
-def facts(given: FEMatrices) -> Facts:
-    """Return the facts on some matrices, all that can be known of them."""
+def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
+    """Return the facts on some matrices, all that can be known of them.
+
+    Parameters
+    ----------
+    given : FEMatrices
+        The matrices.
+    joint_motions : (n, m) array, optional
+        Of a joined machine: what its joints allow.
+    """
     skew = {
         name: _skew(matrix)
         for name, matrix in (("K", given.K), ("M", given.M), ("D", given.D))
@@ -105,6 +113,7 @@ def facts(given: FEMatrices) -> Facts:
                 located=given.located,
                 rounding=max(ROUNDING, rounding),
                 M=M,
+                joint_motions=joint_motions,
             )
             mechanisms = motions.mechanisms
             lowest = _held(lowest, motions.n_suspended)

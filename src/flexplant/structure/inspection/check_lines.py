@@ -234,6 +234,9 @@ def _freedom(motions: ZeroEnergy) -> str:
     if motions.n_bodies > 1:
         together = f"free in {free}" if free else "held"
         return f"{motions.n_bodies} bodies, each with its own motions; together {together}{absent}"
+    if combined > 0 and not held:
+        one = "motion" if combined == 1 else "motions"
+        return f"free in {free}, and {combined} {one} of components in their joints{absent}"
     if combined > 0:
         alone = f"free in {free}, and " if free else ""
         among = f"{combined} combination{'s' * (combined != 1)} of {held}"

@@ -1,0 +1,160 @@
+"""How a machine was joined, and the checks of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import CertificateError
+from ..values import FloatArray, IntArray, Value
+from .component import Component
+from .elimination import Elimination
+from .links import Link, machine_size, rows_of
+
+#: largest gap, imbalance and error of the inertia, relative
+_LIMIT = 1e-7
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JoiningCertificate(Value):
+    """What `joined` checked.
+
+    Parameters
+    ----------
+    gap : float
+        Largest opening of a rigid joint over all motions of what is left, relative to what cancels
+        there.
+    balance : float
+        Largest resultant of the forces of a joint between two components, relative: what a motion
+        of the whole machine stretches it.
+    mass : float [kg]
+        Of the machine; NaN without displacements.
+    inertia_error : float
+        Largest difference between the machine's inertia against the six rigid-body motions and the
+        sum of its components', relative.
+    constraints, rank : int
+        Axes of rigid joints, and how many of them are independent.
+    rigid : mapping {str: int}
+        Rigid-body motions of each component before it was joined.
+    pieces : tuple of tuple of str
+        The components of each part of the machine that joints hold together.
+    n_rigid : int
+        Rigid-body motions of the machine.
+    rigid_force : float
+        Largest elastic force of these motions, relative to what cancels.
+    patches : mapping {str: float}
+        For each joint of a patch, by how much of the compliance of its mean motion a patch that
+        stays rigid would be stiffer, at most over its axes: the error of either is below.
+    """
+
+    gap: float
+    balance: float
+    mass: float
+    inertia_error: float
+    constraints: int
+    rank: int
+    rigid: Mapping[str, int]
+    pieces: tuple[tuple[str, ...], ...]
+    n_rigid: int
+    rigid_force: float
+    patches: Mapping[str, float]
+
+    def __post_init__(self) -> None:
+        self._set(rigid=self.rigid, patches=self.patches)
+
+    def __repr__(self) -> str:
+        before = ", ".join(f"{name} {count}" for name, count in self.rigid.items())
+        pieces = f"{len(self.pieces)} piece{'s' * (len(self.pieces) != 1)}"
+        independent = f"{self.rank} of {self.constraints} rigid constraints independent"
+        errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
+        head = f"{self.n_rigid} rigid-body motions (alone: {before}), {pieces}"
+        text = [f"<JoiningCertificate: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
+        text += [f" {name}: compliance to {error:.2g}" for name, error in self.patches.items()]
+        return "\n".join(text) + ">"
+
+
+def certified(
+    parts: Sequence[Component],
+    links: Sequence[Link],
+    done: Elimination,
+    matrices: Mapping[str, Any],
+    groups: Sequence[IntArray],
+    rigid: FloatArray,
+    expected: int,
+    patches: Mapping[str, float],
+) -> JoiningCertificate:
+    """Return the checks of a joined machine.
+
+    Parameters
+    ----------
+    parts, links, groups
+        Components, joints, and what these hold together.
+    done : Elimination
+        What was eliminated.
+    matrices : mapping {str: (k, k) matrix}
+        "M" and "K" of what is left.
+    rigid : (k, r) array
+        The machine's rigid-body motions.
+    expected : int
+        How many of its components' motions stretch no joint.
+    patches : mapping
+        Errors of patches.
+
+    Raises
+    ------
+    CertificateError
+        When a joint opens, forces do not balance, inertia is lost, or the counts differ.
+    """
+    B = rows_of([link for link in links if link.joint.is_rigid], parts)
+    opening: Any = abs(B @ done.T).max(axis=1)
+    most: Any = (abs(B) @ abs(done.T)).max(axis=1)
+    opening, most = (np.asarray(part.todense()).ravel() for part in (opening, most))
+    gap = float(np.max(opening / np.where(most > 0, most, 1.0), initial=0.0))
+    size = np.array([1.0] * 3 + [machine_size(parts)] * 3)
+    stretched = [np.abs(link.carried / size).max() for link in links if link.joint.is_rigid]
+    motions = np.vstack([part.model.rigid_motions() for part in parts])
+    apart = sum(
+        part.model.rigid_motions().T @ part.model.inertia(part.model.rigid_motions())
+        for part in parts
+    )
+    error = _inertia_error(np.asarray(apart), motions[done.kept], matrices["M"])
+    found = JoiningCertificate(
+        gap=gap,
+        balance=float(max(stretched, default=0.0)),
+        mass=float(max(np.diag(np.asarray(apart))[:3])) or float("nan"),
+        inertia_error=error,
+        constraints=B.shape[0],
+        rank=done.rank,
+        rigid={part.name: int(part.model.rigid_body.shape[1]) for part in parts},
+        pieces=tuple(tuple(parts[i].name for i in group) for group in groups),
+        n_rigid=rigid.shape[1],
+        rigid_force=_force(matrices["K"], rigid),
+        patches=patches,
+    )
+    if not max(gap, found.balance, error, found.rigid_force) < _LIMIT:
+        raise CertificateError(
+            f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer axes, "
+            "or look for joints that nearly repeat each other."
+        )
+    if found.n_rigid != expected:
+        raise CertificateError(
+            f"the machine has {found.n_rigid} rigid-body motions, but {expected} of its "
+            "components' stretch no joint: a joint is too soft or too stiff for the digits of the "
+            "matrices. Look for a wrong unit of a stiffness, or leave the joint out."
+        )
+    return found
+
+
+def _force(K: Any, motions: FloatArray) -> float:
+    force = np.linalg.norm(np.asarray(K @ motions), axis=0)
+    most = np.linalg.norm(np.asarray(abs(K) @ np.abs(motions)), axis=0)
+    return float(np.max(force / np.where(most > 0, most, 1.0), initial=0.0))
+
+
+def _inertia_error(apart: FloatArray, motions: FloatArray, M: Any) -> float:
+    whole = motions.T @ np.asarray(M @ motions)
+    size = np.sqrt(np.maximum(np.diag(apart), 1e-300))
+    return float(np.abs((whole - apart) / np.outer(size, size)).max())

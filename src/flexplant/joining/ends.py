@@ -1,0 +1,162 @@
+"""The ends of joints: motions of places of components, with lever arms."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..errors import LabelError, unknown_label
+from ..labels import DIRECTIONS
+from ..structure.rigid import rigid_motions
+from ..values import FloatArray
+from .component import Component
+from .patch import Patch
+
+#: lever arms below this part of the machine's size are none
+_NO_ARM = 1e-9
+
+
+class JointEnd:
+    """One end of a joint.
+
+    Parameters
+    ----------
+    parts : sequence of Component
+        All components.
+    end : str, (str, (3,) array) or Patch
+        As in `Joint`.
+    size : float [m]
+        Of the machine: lever arms below 1e-9 of it are none.
+
+    Attributes
+    ----------
+    index : int
+        Which component it is of.
+    point : (3,) array [m]
+        Where it is.
+    axes : tuple of str
+        The directions it moves in.
+    label : bool
+        Whether it is one DOF: without lever arm.
+
+    Raises
+    ------
+    LabelError
+        When there is no such place.
+    """
+
+    def __init__(self, parts: Sequence[Component], end: Any, size: float) -> None:
+        self.text = repr(end) if isinstance(end, Patch) else str(end)
+        name = end.component if isinstance(end, Patch) else end[0]
+        rest = ""
+        if isinstance(end, str):
+            name, rest = _split(end, [part.name for part in parts])
+        names = [part.name for part in parts]
+        if name not in names:
+            raise unknown_label("component", name, names)
+        self.index, self._size = names.index(name), size
+        self._dofs = parts[self.index].dofs
+        self.label = ":" in rest
+        self.axes: tuple[str, ...]
+        if self.label:
+            try:
+                self._rows = {rest.rpartition(":")[2]: self._dofs.row(rest)}
+            except LabelError as error:
+                raise LabelError(f"component {name!r}: {error}") from None
+            self.point = np.asarray(self._dofs.location(rest))
+        elif rest:
+            self._at_node(rest)
+        elif isinstance(end, Patch):
+            self._at_patch(end)
+        else:
+            self._at_point(end[1])
+        self.axes = tuple(axis for axis in DIRECTIONS if axis in self._rows)
+
+    def _at_node(self, node: str) -> None:
+        rows = np.zeros(0, dtype=np.int64)
+        if node.lstrip("-").isdigit():
+            rows = np.flatnonzero(self._dofs.nodes == int(node))
+        if not rows.size:
+            raise LabelError(
+                f"no node {node!r} for the joint at {self.text!r}: {self._dofs!r}. "
+                "dofs.nearest((x, y, z)) finds one by its place."
+            )
+        self.point = np.asarray(self._dofs.xyz[rows[0]])
+        self._rows = {}
+        for row in rows:
+            self._rows[self._dofs.directions[row]] = _unit(len(self._dofs), row)
+
+    def _at_patch(self, patch: Patch) -> None:
+        self.point = patch.point(self._dofs)
+        mean, _, made = patch.mean(self._dofs, self.point)
+        rows, self._rows = patch.rows(self._dofs), {}
+        for axis in made:
+            self._rows[axis] = np.zeros(len(self._dofs))
+            self._rows[axis][rows] = mean[DIRECTIONS.index(axis)]
+
+    def _at_point(self, point: Any) -> None:
+        self.point, self._rows = np.asarray(point, dtype=np.float64), {}
+        failed = ""
+        for axis in DIRECTIONS:
+            try:
+                self._rows[axis] = self._dofs.row(self.point, axis)
+            except LabelError as error:
+                failed = str(error)
+        if not self._rows:
+            raise LabelError(f"the joint at {self.text} is nowhere: {failed}")
+
+    def row(self, axis: str, point: FloatArray) -> FloatArray:
+        """Return the motion (n,) along an axis at a point that moves with this end.
+
+        A displacement there is ``u + theta x (point - own point)``.
+
+        Raises
+        ------
+        LabelError
+            When the end does not move along the axis, or a rotation that the lever arm needs is
+            not there.
+        """
+        if axis not in self._rows:
+            raise LabelError(
+                f"the joint at {self.text} has no axis {axis!r}: it moves along "
+                f"{', '.join(self.axes)}. Join along these, or join a Patch of nodes, which has "
+                "mean rotations."
+            )
+        found = self._rows[axis]
+        arm = point - self.point
+        if DIRECTIONS.index(axis) >= 3 or self.label or np.abs(arm).max() <= _NO_ARM * self._size:
+            return found
+        along = np.eye(3)[DIRECTIONS.index(axis)]
+        for k, turn in enumerate(("rx", "ry", "rz")):
+            share = float(np.cross(np.eye(3)[k], arm) @ along)
+            if abs(share) <= _NO_ARM * self._size:
+                continue
+            if turn not in self._rows:
+                raise LabelError(
+                    f"the lever arm ({', '.join(f'{x:g}' for x in arm)}) m of the joint at "
+                    f"{self.text} needs its rotation {turn}, which it has not. Give point=, where "
+                    "the joint acts, on its side, or join a Patch of nodes, which has mean "
+                    "rotations."
+                )
+            found = found + share * self._rows[turn]
+        return found
+
+    def carried(self, row: FloatArray) -> FloatArray:
+        """Return what a row (n,) gives for the six rigid-body motions of the machine (6,)."""
+        some = np.flatnonzero(row)
+        return np.asarray(row[some] @ rigid_motions(self._dofs._taken(some)))
+
+
+def _split(text: str, names: Sequence[str]) -> tuple[str, str]:
+    for name in sorted(names, key=len, reverse=True):
+        if text.startswith(f"{name}/"):
+            return name, text[len(name) + 1 :]
+    return text.partition("/")[0], text.partition("/")[2]
+
+
+def _unit(n: int, row: Any) -> FloatArray:
+    found = np.zeros(n)
+    found[row] = 1.0
+    return found

@@ -1,0 +1,151 @@
+"""What holds two components together: rigid, or a spring and a damper."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from ..errors import LabelError, ModelError, unknown_label
+from ..labels import DIRECTIONS
+from ..values import FloatArray, Value, name_list, real_array
+from .patch import Patch
+
+#: an end: "stage/41:z", "stage/41" (a node), ("stage", (x, y, z)) or a Patch
+End: TypeAlias = "str | tuple[str, Sequence[float]] | Patch"
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Joint(Value):
+    """A joint between two places of components, or between one and the ground.
+
+    Rigid unless it has a stiffness or a rate: along each of its axes both sides move alike at the
+    point of the joint, or are held together by a spring and a damper there.
+
+    Parameters
+    ----------
+    first, second : str, (str, (3,) array [m]) or Patch
+        A DOF ``"stage/41:z"``, a node ``"stage/41"`` with the directions it has, a point
+        ``("stage", (x, y, z))`` of its shapes in the coordinates of the machine, or a patch of
+        nodes. No second: the ground, for a spring or a damper.
+    axes : sequence of str, optional
+        Which of x, y, z, rx, ry, rz are joined, in the directions of the machine. None: that of a
+        DOF, or those that both ends have where these are the same.
+    stiffness : float or one for each axis [N/m, N m/rad], optional
+        Of springs; negative ones attract, as magnets do.
+    rate : float or one for each axis [N s/m, N m s/rad], optional
+        Of dampers.
+    point : (3,) array [m], optional
+        Where the joint acts: both ends reach there with lever arms, by their rotations. None: at
+        the first end. DOFs have no lever arm.
+
+    Raises
+    ------
+    LabelError, ModelError
+        When an end, an axis or a number is none; when a rigid joint has no second end.
+
+    Examples
+    --------
+    >>> Joint("stage/41:z", "frame/7:z")
+    <Joint stage/41:z - frame/7:z, rigid>
+    >>> Joint("stage/41:z", stiffness=1e5, rate=20.0)
+    <Joint stage/41:z - ground, 1e+05 N/m, 20 N s/m>
+    """
+
+    first: End
+    second: End | None = None
+    axes: Iterable[str] | None = field(default=None, kw_only=True)
+    stiffness: float | Sequence[float] | FloatArray | None = field(default=None, kw_only=True)
+    rate: float | Sequence[float] | FloatArray | None = field(default=None, kw_only=True)
+    point: Sequence[float] | FloatArray | None = field(default=None, kw_only=True)
+
+    def __post_init__(self) -> None:
+        axes = None if self.axes is None else name_list(self.axes, "axes of a joint")
+        unknown = [axis for axis in axes or () if axis not in DIRECTIONS]
+        if unknown:
+            raise unknown_label("axis", unknown[0], DIRECTIONS)
+        if axes is not None and (not axes or len(set(axes)) < len(axes)):
+            raise LabelError(f"axes of a joint must be different ones, got {axes!r}: name each.")
+        self._set(
+            first=_checked(self.first),
+            second=None if self.second is None else _checked(self.second),
+            axes=axes,
+            stiffness=_numbers(self.stiffness, "stiffness of a joint"),
+            rate=_numbers(self.rate, "rate of a joint"),
+            point=None if self.point is None else real_array(self.point, "point", (3,)),
+        )
+        if self.is_rigid and self.second is None:
+            raise ModelError(
+                f"a rigid joint of {_shown(self.first)} needs a second end. Hold DOFs to the "
+                "ground by model.fixed([...]) before they are joined, or give stiffness=."
+            )
+        if self.rate is not None and np.any(np.asarray(self.rate) < 0):
+            raise ModelError(f"the rate of a damper must not be negative, got {self.rate}.")
+
+    def __repr__(self) -> str:
+        ends = f"{_shown(self.first)} - {'ground' if self.second is None else _shown(self.second)}"
+        along = "" if self.axes is None else f" along {', '.join(self.axes)}"
+        if self.is_rigid:
+            return f"<Joint {ends}{along}, rigid>"
+        kinds = ((self.stiffness, "N/m"), (self.rate, "N s/m"))
+        listed = [
+            f"{' '.join(f'{float(x):g}' for x in np.atleast_1d(np.asarray(value)))} {unit}"
+            for value, unit in kinds
+            if value is not None
+        ]
+        return f"<Joint {ends}{along}, {', '.join(listed)}>"
+
+    @property
+    def is_rigid(self) -> bool:
+        """Whether both sides move alike along its axes."""
+        return self.stiffness is None and self.rate is None
+
+    def values(self, axes: Sequence[str]) -> tuple[FloatArray, FloatArray]:
+        """Return the stiffness and the rate along each of some axes (k,).
+
+        Raises
+        ------
+        ModelError
+            When one number is to stand for displacements and rotations, or their number differs.
+        """
+        found = []
+        for value, name in ((self.stiffness, "stiffness"), (self.rate, "rate")):
+            array = np.zeros(len(axes)) if value is None else np.asarray(value, dtype=np.float64)
+            if array.ndim == 0 and len({axis[0] == "r" for axis in axes}) > 1 and array:
+                raise ModelError(
+                    f"one {name} of {self!r} cannot serve displacements and rotations "
+                    f"({', '.join(axes)}): their units differ. Give one number for each axis."
+                )
+            if array.ndim and array.size != len(axes):
+                raise ModelError(
+                    f"{array.size} numbers as {name} of {self!r}, which joins "
+                    f"{', '.join(axes)}. Give one for each axis."
+                )
+            found.append(np.broadcast_to(array, (len(axes),)).copy())
+        return found[0], found[1]
+
+
+def _checked(end: Any) -> Any:
+    if isinstance(end, Patch) or (isinstance(end, str) and "/" in end):
+        return end
+    if isinstance(end, tuple | list) and len(end) == 2 and isinstance(end[0], str):
+        return end[0], tuple(real_array(end[1], "the point of a joint", (3,)).tolist())
+    raise LabelError(
+        f"the end of a joint must be a DOF 'stage/41:z', a node 'stage/41', a point "
+        f"('stage', (x, y, z)) or a Patch, got {end!r:.80}. Begin with the component's name."
+    )
+
+
+def _numbers(value: Any, name: str) -> Any:
+    if value is None:
+        return None
+    array = real_array(value, name)
+    return float(array) if array.ndim == 0 else real_array(array, name, (None,))
+
+
+def _shown(end: Any) -> str:
+    if isinstance(end, tuple):
+        return f"{end[0]}/({', '.join(f'{x:g}' for x in end[1])})"
+    return repr(end) if isinstance(end, Patch) else str(end)

@@ -1,0 +1,175 @@
+"""Joints as rows: one for each axis, over the coordinates of all components."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantWarning, LabelError, ModelError
+from ..labels import DIRECTIONS
+from ..values import FloatArray, instance
+from .component import Component
+from .ends import JointEnd
+from .joint import Joint
+
+#: relative: what a joint feels of a motion of the whole machine below this is rounding
+BALANCED = 1e-9
+#: part of a joint's row that static shapes of a reduced component may miss
+_STATIC = 1e-3
+
+
+class Link(NamedTuple):
+    """One axis of one joint.
+
+    Attributes
+    ----------
+    joint : Joint
+        Which.
+    axis : str
+        Of x, y, z, rx, ry, rz.
+    ends : tuple of (int, (n_full,) array)
+        Components and what is felt of all their DOFs: the stretch is the sum.
+    stiffness, rate : float
+        Zero of a rigid one.
+    carried : (6,) array
+        The stretch by the six rigid-body motions of the machine; of a grounded one, zero.
+    """
+
+    joint: Joint
+    axis: str
+    ends: tuple[tuple[int, FloatArray], ...]
+    stiffness: float
+    rate: float
+    carried: FloatArray
+
+    @property
+    def owners(self) -> tuple[int, ...]:
+        """The components it joins."""
+        return tuple(index for index, _ in self.ends)
+
+
+def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
+    """Return all axes of all joints.
+
+    Raises
+    ------
+    LabelError
+        When a place or an axis is not there.
+    ModelError
+        When a rigid joint would hold the machine against the ground.
+    """
+    listed = [joints] if isinstance(joints, Joint) else list(_iterated(joints))
+    size = machine_size(parts)
+    return [link for joint in listed for link in _links(joint, parts, size)]
+
+
+def machine_size(parts: Sequence[Component]) -> float:
+    """Return the largest extent of a machine [m], 1 when it has none."""
+    xyz = np.vstack([part.dofs.xyz for part in parts])
+    return float(np.ptp(xyz, axis=0).max()) or 1.0
+
+
+def _iterated(joints: Any) -> Iterable[Any]:
+    found: Iterable[Any] = instance(joints, Iterable, "joints", "Pass Joint(...) in [...].")
+    return found
+
+
+def _links(joint: Any, parts: Sequence[Component], size: float) -> list[Link]:
+    instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
+    first = JointEnd(parts, joint.first, size)
+    second = None if joint.second is None else JointEnd(parts, joint.second, size)
+    axes = _axes(joint, first, second)
+    point = first.point if joint.point is None else np.asarray(joint.point, dtype=np.float64)
+    found = []
+    for axis, stiffness, rate in zip(axes, *joint.values(axes), strict=True):
+        row = first.row(axis, point)
+        ends, carried = [(first.index, row)], np.zeros(6)
+        if second is not None:
+            other = -second.row(axis, point)
+            ends.append((second.index, other))
+            carried = first.carried(row) + second.carried(other)
+            if first.index == second.index:
+                ends = [(first.index, row + other)]
+            _check_balance(joint, axis, carried, size)
+        if not any(part.any() for _, part in ends):
+            raise ModelError(f"both ends of {joint!r} are one place: it would do nothing.")
+        found.append(Link(joint, axis, tuple(ends), float(stiffness), float(rate), carried))
+    return found
+
+
+def _axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
+    if joint.axes is not None:
+        return tuple(joint.axes)
+    for place in (first, second):
+        if place is not None and place.label:
+            return place.axes
+    if second is not None and first.axes != second.axes:
+        raise LabelError(
+            f"the ends of {joint!r} move along {', '.join(first.axes)} and along "
+            f"{', '.join(second.axes)}: it is not clear what is joined. Name axes=[...]."
+        )
+    return first.axes
+
+
+def _check_balance(joint: Joint, axis: str, carried: FloatArray, size: float) -> None:
+    """Refuse or warn of a joint that a motion of the whole machine stretches."""
+    felt = np.abs(carried) / np.array([1.0] * 3 + [size] * 3)
+    if felt.max() <= BALANCED:
+        return
+    axes = ", ".join(DIRECTIONS[k] for k in np.flatnonzero(felt > BALANCED))
+    arm = f"{np.abs(carried[3:]).max():.3g} m apart" if felt[:3].max() <= BALANCED else "oblique"
+    said = (
+        f"{joint!r} would hold the machine's motion {axes} against the ground: along {axis}, its "
+        f"ends are {arm}, and its forces do not balance. Join nodes or points with axes=[...], "
+        "which have lever arms, shift a component by its Pose, or join a Patch."
+    )
+    if joint.is_rigid:
+        raise ModelError(said)
+    warnings.warn(said, FlexplantWarning, 5)
+
+
+def rows_of(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
+    """Return the stretches of links (m, n) by the coordinates of all components."""
+    starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
+    data, rows, columns = [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
+    for i, link in enumerate(links):
+        for index, full in link.ends:
+            row = parts[index].coordinate_row(full)
+            some = np.flatnonzero(row)
+            data.append(row[some])
+            rows.append(np.full(some.size, i))
+            columns.append(starts[index] + some)
+    entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
+    return sp.csr_array(entries, shape=(len(links), int(starts[-1])))
+
+
+def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -> None:
+    """Warn of reduced components without static shapes for the loads of their joints."""
+    for index, part in enumerate(parts):
+        if not part.is_reduced or part.n == len(part.dofs):
+            continue
+        loads = [row for link in links for owner, row in link.ends if owner == index]
+        names = [f"{link.joint!r} ({link.axis})" for link in links if index in link.owners]
+        if not loads:
+            continue
+        known = part.static_rows
+        wanted = np.array(loads)
+        left = wanted
+        if known.size:
+            left = wanted - (wanted @ np.linalg.pinv(known)) @ known
+        part_left = np.linalg.norm(left, axis=1) / np.linalg.norm(wanted, axis=1)
+        lost = [name for name, share in zip(names, part_left, strict=True) if share > _STATIC]
+        if lost:
+            more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
+            warnings.warn(
+                f"component {part.name!r} ({part.model!r}) holds no static shape for the load of "
+                f"{lost[0]}{more}: without the compliance of the modes left out, the joint is too "
+                "stiff. Solve with compliance_at=[...] there, or reduce by "
+                "CraigBampton(boundary=[...]) or Rubin.",
+                FlexplantWarning,
+                4,
+            )

@@ -1,0 +1,154 @@
+"""Motions at places of components that are placed and joined."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import LabelError
+from ..labels import DIRECTIONS, DofSet, Interpolation
+from ..values import FloatArray
+from .pose import Pose
+
+#: rows of one place on two components that differ by less are one motion
+_SAME = 1e-9
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PlacedShape(Interpolation):
+    """The shapes of a component that was turned and shifted.
+
+    Parameters
+    ----------
+    own : Interpolation
+        Of the component where it was made.
+    pose : Pose
+        Where it stands.
+    C : (n, n) sparse array
+        Its DOFs in the directions of the machine by those of its own, ``q = C q_own``.
+    """
+
+    own: Interpolation
+    pose: Pose
+    C: sp.csc_array
+
+    def __post_init__(self) -> None:
+        self._set(C=self.C)
+
+    def __repr__(self) -> str:
+        return f"<PlacedShape of {self.own!r}>"
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of all DOFs in the motion `direction` at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is off the component, or its shapes do not give the motion.
+        """
+        return np.asarray(self.rows(np.asarray(xyz, dtype=np.float64)[None], direction)[0])
+
+    def rows(self, points: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
+        axis, places = DIRECTIONS.index(direction), self.pose.own_points(points)
+        first = 3 * (axis // 3)
+        share = np.asarray(self.pose.rotation)[axis - first]
+        C: Any = self.C
+        found = sum(
+            share[k] * self.own.rows(places, DIRECTIONS[first + k])
+            for k in range(3)
+            if share[k] != 0
+        )
+        return np.asarray((C @ np.asarray(found).T).T)
+
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
+
+        Only where the component is not turned: labels keep their directions then.
+        """
+        found = self.own.dependent(label)
+        if found is None or not np.array_equal(self.pose.rotation, np.eye(3)):
+            return None
+        return found[0], self.pose.points(found[1][None])[0]
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class JoinedShape(Interpolation):
+    """The shapes of all components of a joined machine.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the components.
+    parts : sequence of DofSet
+        Their DOFs with their shapes, where they are placed.
+    expansion : (n_all, n) sparse array, optional
+        All DOFs of all components, one after the other, by those that are left. None: all are.
+    """
+
+    names: tuple[str, ...]
+    parts: tuple[DofSet, ...]
+    expansion: sp.csc_array | None = None
+
+    def __post_init__(self) -> None:
+        self._set(names=tuple(self.names), parts=tuple(self.parts), expansion=self.expansion)
+
+    def __repr__(self) -> str:
+        return f"<JoinedShape of {', '.join(self.names)}>"
+
+    def row(self, xyz: FloatArray, direction: str) -> FloatArray:
+        """Return the weights (n,) of the DOFs in the motion `direction` at a point.
+
+        Raises
+        ------
+        LabelError
+            When the point is on no component that has this motion, or on several that move
+            independently.
+        """
+        found: dict[str, FloatArray] = {}
+        failed: list[str] = []
+        for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
+            try:
+                found[name] = self._expanded(index, part.row(xyz, direction))
+            except LabelError as error:
+                failed.append(f"{name}: {error}")
+        if not found:
+            raise LabelError(
+                f"the point {tuple(np.asarray(xyz).tolist())} is on no component with the motion "
+                f"{direction!r}. {' '.join(failed)}"
+            )
+        rows = list(found.values())
+        if any(np.abs(row - rows[0]).max() > _SAME * np.abs(rows[0]).max() for row in rows[1:]):
+            one, other = list(found)[:2]
+            raise LabelError(
+                f"the point {tuple(np.asarray(xyz).tolist())} is on {one!r} and on {other!r}, "
+                "which have a motion of their own there. Name a DOF: "
+                f"dofs.nearest(point, {direction!r}, component={one!r})."
+            )
+        return rows[0]
+
+    def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
+        """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None."""
+        for index, (name, part) in enumerate(zip(self.names, self.parts, strict=True)):
+            rest = label.removeprefix(f"{name}/")
+            if rest != label and rest in part:
+                return self._expanded(index, part.row(rest)), part.xyz[part.index(rest)]
+            if rest != label and part.interpolation is not None:
+                inner = part.interpolation.dependent(rest)
+                if inner is not None:
+                    return self._expanded(index, inner[0]), inner[1]
+        return None
+
+    def _expanded(self, index: int, row: FloatArray) -> FloatArray:
+        sizes = [len(part) for part in self.parts]
+        start = sum(sizes[:index])
+        if self.expansion is None:
+            found = np.zeros(sum(sizes))
+            found[start : start + sizes[index]] = row
+            return found
+        rows = np.flatnonzero(row)
+        taken: Any = sp.csr_array(self.expansion[start + rows])
+        return np.asarray(row[rows] @ taken)

@@ -1,0 +1,374 @@
+"""Components joined: the machine in one piece, dense algebra and physics are the references."""
+
+import re
+import warnings
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+import scipy.sparse as sp
+
+import flexplant as fx
+import oracles_joining as oracles
+from flexplant.errors import CertificateError, FlexplantWarning, LabelError, ModelError
+from flexplant.joining import certificate, join
+from flexplant.joining.component import components_of
+
+PLATE = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
+SOLID = {"density": 2700, "youngs_modulus": 70e9, "poisson_ratio": 0.3}
+RIGHT = {"right": fx.Pose(shift=(0.3, 0, 0))}
+
+
+def plate(nx, lx=0.6, ny=4):
+    return fx.kirchhoff_plate(size=(lx, 0.6), thickness=0.0272, elements=(nx, ny), **PLATE)
+
+
+def edge(model, x):
+    found = model.dofs.where(box=[(x, -9, -9), (x, 9, 9)]).nodes
+    return list(dict.fromkeys(found.tolist()))
+
+
+def seam(half, names=("left", "right")):
+    pairs = zip(edge(half, 0.3), edge(half, 0.0), strict=True)
+    return [fx.Joint(f"{names[0]}/{i}", f"{names[1]}/{j}") for i, j in pairs]
+
+
+def halves():
+    half = plate(2, 0.3)
+    return fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
+
+
+def elastic(model, count):
+    modes = fx.solve_modes(model, count=count)
+    return modes.freq[modes.n_rigid :]
+
+
+def stage_on_frame():
+    stage = fx.solid_block(size=(0.3, 0.2, 0.05), elements=(3, 2, 1), **SOLID)
+    frame = fx.solid_block(size=(0.6, 0.4, 0.1), elements=(4, 2, 1), **SOLID)
+    models = {"stage": stage, "frame": frame}
+    return models, {"stage": fx.Pose(shift=(0.1, 0.1, 0.1))}
+
+
+#: three feet below the stage
+FEET = [(0.2, 0.2, 0.1), (0.4, 0.2, 0.1), (0.3, 0.3, 0.1)]
+
+
+def at_feet(axes, **kind):
+    return [fx.Joint(("stage", p), ("frame", p), axes=axes, **kind) for p in FEET]
+
+
+def test_two_halves_are_one_plate():
+    """To 1e-10, with places, labels of what was eliminated, plants and files as one model has."""
+    whole, machine = plate(4), halves()
+    assert machine.n_dof == whole.n_dof
+    assert sp.issparse(machine.K)
+    np.testing.assert_allclose(elastic(machine, 15), elastic(whole, 15), rtol=1e-10)
+    assert machine.mass == pytest.approx(whole.mass, rel=1e-12)
+    found = machine.joining
+    assert (found.n_rigid, found.rank, found.constraints) == (3, 15, 15)
+    assert dict(found.rigid) == {"left": 3, "right": 3}
+    assert found.pieces == (("left", "right"),)
+    assert max(found.gap, found.balance, found.inertia_error, found.rigid_force) < 1e-13
+    # the second end follows the first, and stays known as a place
+    assert "left/3:z" in machine.dofs
+    assert "right/1:z" not in machine.dofs
+    np.testing.assert_array_equal(machine.row("right/1:z"), machine.row("left/3:z"))
+    np.testing.assert_array_equal(machine.dofs.location("right/1:z"), [0.3, 0, 0])
+    with pytest.raises(LabelError, match="follows others"):
+        machine.dofs.index("right/1:z")
+    assert machine.dofs.nearest((0.6, 0.6, 0), "z") == "right/15:z"
+    assert machine.dofs.nearest((0.6, 0.6, 0), "z", component="left") == "left/15:z"
+    assert set(machine.dofs.where(component="right").components) == {"left", "right"}
+    assert fx.check(machine).ok
+    ports = fx.Ports(
+        u=[fx.Actuator("u", at=(0.3, 0.25, 0.0))],
+        y=[fx.Sensor("a", at=(0.45, 0.2, 0.0)), fx.Sensor("b", at=(0.1, 0.6, 0.0))],
+    )
+    freq = np.array([120.0, 245.0, 600.0])
+    both = [
+        fx.frequency_response(fx.assemble_plant(fx.solve_modes(m, count=20), ports).Gyu, freq).data
+        for m in (machine, whole)
+    ]
+    np.testing.assert_allclose(both[0], both[1], rtol=1e-8)
+
+
+def test_a_machine_goes_through_a_file_and_is_held(tmp_path):
+    machine, whole = halves(), plate(4)
+    machine.save(tmp_path / "machine.npz")
+    loaded = fx.load(tmp_path / "machine.npz")
+    assert loaded.dofs.labels == machine.dofs.labels
+    assert repr(loaded.joining) == repr(machine.joining)
+    np.testing.assert_array_equal(loaded.row((0.5, 0.1, 0.0)), machine.row((0.5, 0.1, 0.0)))
+    held = loaded.fixed(loaded.dofs.where(box=[(0, -1, -1), (0, 1, 1)]).labels)
+    same = whole.fixed(whole.dofs.where(box=[(0, -1, -1), (0, 1, 1)]).labels)
+    np.testing.assert_allclose(elastic(held, 8), elastic(same, 8), rtol=1e-10)
+    np.testing.assert_array_equal(held.row("right/1:z"), held.row("left/3:z"))
+    with pytest.raises(LabelError, match=r"no DOF 'frame/1:z'.*Close matches"):
+        machine.row("frame/1:z")
+
+
+def test_a_turned_component():
+    """A quarter turn about z exchanges rx and ry, about y it makes a plate stand upright."""
+    whole, half = plate(4), plate(2, 0.3)
+    lying = fx.kirchhoff_plate(size=(0.6, 0.3), thickness=0.0272, elements=(4, 2), **PLATE)
+    pose = fx.Pose(shift=(0.6, 0.0, 0.0), rotation=(0, 0, np.pi / 2))
+    other = components_of({"b": lying}, {"b": pose})[0].dofs
+    joints = []
+    for node in edge(half, 0.3):
+        place = half.dofs.xyz[half.dofs.index(f"{node}:z")]
+        joints.append(fx.Joint(f"a/{node}", "b/" + other.nearest(place).partition(":")[0]))
+    machine = fx.joined({"a": half, "b": lying}, joints, placed={"b": pose})
+    np.testing.assert_allclose(elastic(machine, 15), elastic(whole, 15), rtol=1e-10)
+    turn = machine.row((0.5, 0.2, 0.0), "rx") @ machine.rigid_motions()
+    np.testing.assert_allclose(turn, np.eye(6)[3], atol=1e-14)
+    upright = fx.joined({"wall": half}, placed={"wall": fx.Pose(rotation=(0, np.pi / 2, 0))})
+    assert set(upright.dofs.directions) == {"x", "ry", "rz"}
+    assert upright.rigid_body.shape[1] == 3
+    with pytest.raises(ModelError, match="oblique"):
+        fx.joined({"wall": half}, placed={"wall": fx.Pose(rotation=(0.5, 0, 0))})
+    with pytest.raises(ModelError, match="mirror"):
+        fx.Pose(rotation=np.diag([1.0, 1.0, -1.0]))
+
+
+def test_solids_at_any_angle():
+    """A block cut in two and the machine turned by odd angles: the block's frequencies."""
+    turn = (0.4, -0.7, 1.1)
+    R = fx.Pose(rotation=turn).rotation
+    whole = fx.solid_block(size=(0.4, 0.2, 0.1), elements=(4, 2, 1), **SOLID)
+    half = fx.solid_block(size=(0.2, 0.2, 0.1), elements=(2, 2, 1), **SOLID)
+    placed = {"left": fx.Pose((0.1, 0, 0), turn), "right": fx.Pose([0.1, 0, 0] + 0.2 * R[:, 0], R)}
+    pairs = zip(edge(half, 0.2), edge(half, 0.0), strict=True)
+    joints = [fx.Joint(f"left/{i}", f"right/{j}") for i, j in pairs]
+    machine = fx.joined({"left": half, "right": half}, joints, placed=placed)
+    assert machine.n_dof == whole.n_dof
+    assert machine.rigid_body.shape[1] == 6
+    np.testing.assert_allclose(elastic(machine, 16), elastic(whole, 16), rtol=1e-10)
+    point = np.array([0.1, 0, 0]) + R @ [0.3, 0.1, 0.05]
+    turned_row = machine.row(point, "x") @ machine.rigid_motions()
+    np.testing.assert_allclose(turned_row[:3], [1, 0, 0], atol=1e-12)
+
+
+def test_joints_with_lever_arms_and_springs_are_those_of_dense_algebra():
+    """A stage on three ball joints above the frame, springs beside: B and k written out by hand."""
+    upper, lower = plate(3, 0.6, 3), plate(4)
+    placed = {"upper": fx.Pose(shift=(0.0, 0.0, 0.2))}
+    # at (0.2, 0.2) of the frame, 0.05 m beside its node 13 at (0.15, 0.15), by lever arms
+    joints = [
+        fx.Joint("upper/6", "lower/7", axes=("z", "rx", "ry")),
+        fx.Joint("upper/1:z", "lower/1:z", stiffness=2e5, rate=30.0),
+        fx.Joint("upper/16:z", stiffness=1e5),
+    ]
+    machine = fx.joined({"upper": upper, "lower": lower}, joints, placed=placed)
+    names = [*(f"upper/{n}" for n in upper.dofs.labels), *(f"lower/{n}" for n in lower.dofs.labels)]
+    n = len(names)
+    arm = upper.dofs.xyz[upper.dofs.index("6:z")] - lower.dofs.xyz[lower.dofs.index("7:z")]
+    assert np.linalg.norm(arm) > 0.05
+    B = np.zeros((3, n))
+    for i, axis in enumerate(("z", "rx", "ry")):
+        B[i, names.index(f"upper/6:{axis}")], B[i, names.index(f"lower/7:{axis}")] = 1.0, -1.0
+    B[0, names.index("lower/7:rx")], B[0, names.index("lower/7:ry")] = -arm[1], arm[0]
+    M, K = (
+        la.block_diag(a.toarray(), b.toarray()) for a, b in ((upper.M, lower.M), (upper.K, lower.K))
+    )
+    D = np.zeros_like(M)
+    between, ground = np.zeros(n), np.zeros(n)
+    between[[names.index("upper/1:z"), names.index("lower/1:z")]] = 1.0, -1.0
+    ground[names.index("upper/16:z")] = 1.0
+    K += 2e5 * np.outer(between, between) + 1e5 * np.outer(ground, ground)
+    D += 30.0 * np.outer(between, between)
+    reference = oracles.frequencies(M, K, B)
+    found = fx.solve_modes(machine, damping=fx.ModalDamping(0.0))
+    r = machine.rigid_body.shape[1]
+    assert r == 2  # one spring to ground leaves two rotations of the whole
+    np.testing.assert_allclose(found.freq[r:], reference[r:], rtol=1e-7)
+    Z = la.null_space(B, rcond=1e-10)
+    stretch = machine.row("upper/1:z") - machine.row("lower/1:z")
+    np.testing.assert_allclose(machine.D.toarray(), 30 * np.outer(stretch, stretch), rtol=1e-14)
+    poles = oracles.poles(*(Z.T @ A @ Z for A in (M, D, K)))
+    poles = poles[np.abs(poles) > 1.0]
+    complex_modes = fx.solve_modes(machine)
+    assert np.iscomplexobj(complex_modes.phi)
+    np.testing.assert_allclose(complex_modes.poles[r : r + 12], poles[:12], rtol=1e-6)
+
+
+def test_reduced_components_to_their_truncation():
+    """Craig-Bampton on one side: errors fall with the modes; without vectors, a warning."""
+    whole, half = elastic(plate(4), 9), plate(2, 0.3)
+    boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in ("z", "rx", "ry")]
+    errors = []
+    for method in (fx.CraigBampton(boundary, 2), fx.CraigBampton(boundary, 30)):
+        rom = fx.reduce(half, method)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            machine = fx.joined({"left": half, "right": rom}, seam(half), placed=RIGHT)
+        assert isinstance(machine, fx.ReducedModel)
+        found = machine.modes()
+        assert found.n_rigid == machine.joining.n_rigid == 3
+        assert np.all(found.freq[:3] == 0)
+        errors.append(found.freq[3:9] / whole - 1)
+        assert np.all(errors[-1] > -1e-10)  # Rayleigh-Ritz
+    assert errors[0].max() > 1e-4
+    assert errors[1].max() < 1e-9  # all modes of the interior
+    truncated = fx.reduce(fx.solve_modes(half, count=20), fx.ModalTruncation(count=20))
+    with pytest.warns(FlexplantWarning, match="no static shape for the load"):
+        fx.joined({"left": half, "right": truncated}, seam(half), placed=RIGHT)
+    label = half.dofs.nearest((0, 0.3, 0))
+    vectors = fx.solve_modes(half, count=20, compliance_at=[label])
+    rom = fx.reduce(vectors, fx.ModalTruncation(count=20, static_at=[label]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        node = half.dofs.nearest((0.3, 0.3, 0))
+        machine = fx.joined(
+            {"left": half, "right": rom}, fx.Joint(f"left/{node}", f"right/{label}"), placed=RIGHT
+        )
+    assert machine.row(f"right/{label}") == pytest.approx(machine.row(f"left/{node}"))
+
+
+def test_a_reduced_machine_is_a_model_like_any():
+    """Labels, plants, an update of a joint's stiffness, a machine in a machine."""
+    half = plate(2, 0.3)
+    boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in ("z", "rx", "ry")]
+    rom = fx.reduce(half, fx.CraigBampton(boundary, 6, damping=fx.ModalDamping(0.01)))
+    corner = half.dofs.nearest((0, 0, 0))
+    springs = [
+        fx.Joint(f"left/{half.dofs.nearest((0, y, 0))}", f"right/{half.dofs.nearest((0, y, 0))}",
+                 stiffness=1e6)
+        for y in (0.0, 0.3, 0.6)
+    ]  # fmt: skip
+    machine = fx.joined({"left": rom, "right": rom}, springs)
+    assert machine.rigid_body.shape[1] == 4  # the halves turn about the line of the springs
+    assert machine.row(f"right/{corner}").any()
+    truth = machine.replace(
+        K=machine.K + 4e5 * np.outer(*[machine.row("left/1:z") - machine.row("right/1:z")] * 2)
+    )
+    numbers = [5, 6, 7]
+    measured = fx.MeasuredModes(poles=truth.modes().poles[4:7], modes=numbers)
+    unknown = fx.AddedStiffness("left/1:z", to="right/1:z")
+    fit = fx.update(machine, [unknown], [fx.Eigenvalues(measured)])
+    assert fit.values[0] == pytest.approx(4e5, rel=1e-6)
+    assert fit.model.joining.pieces == (("left", "right"),)
+    wafer = fx.chain(masses=[1.0, 0.5], stiffnesses=[1e7]).with_damping(fx.Rayleigh(0.0, 1e-6))
+    outer = fx.joined(
+        {"machine": machine, "wafer": wafer},
+        placed={"wafer": fx.Pose(rotation=(0, np.pi / 2, 0))},
+    )
+    assert outer.joining.n_rigid == 5
+    assert "machine/left/1:z" in outer.full_dofs
+    assert outer.full_dofs.components == ("machine/left", "machine/right", "wafer")
+    assert outer.modes().n_rigid == 5
+
+
+def test_slides_and_hinges_are_rigid_body_motions_at_zero():
+    models, placed = stage_on_frame()
+    machine = fx.joined(models, at_feet(("y", "z")), placed=placed)
+    assert machine.rigid_body.shape[1] == machine.joining.n_rigid == 7
+    modes = fx.solve_modes(machine, count=12)
+    assert np.all(modes.freq[:7] == 0)
+    report = fx.check(machine)
+    assert report.ok
+    assert report.n_rigid == 7
+    # springs along the slide, of the weakest kind that counts, give one soft mode and no more
+    joints = [*at_feet(("y", "z")), *at_feet(("x",), stiffness=100.0)]
+    soft = fx.solve_modes(fx.joined(models, joints, placed=placed), count=8)
+    assert soft.n_rigid == 6
+    m, frame = models["stage"].mass, models["frame"].mass
+    pure = np.sqrt(300.0 * (1 / m + 1 / frame)) / (2 * np.pi)
+    assert pure < soft.freq[6] < 1.5 * pure
+    # magnets along it: unstable, as a rigid body
+    joints = [*at_feet(("y", "z")), *at_feet(("x",), stiffness=-100.0)]
+    magnets = fx.joined(models, joints, placed=placed)
+    assert magnets.n_unstable == 1
+    assert fx.solve_modes(magnets, count=8).freq[6] == pytest.approx(-soft.freq[6], rel=1e-6)
+
+
+def test_joints_that_repeat_others_do_no_harm():
+    models, placed = stage_on_frame()
+    once = fx.joined(models, at_feet(("x", "y", "z")), placed=placed)
+    twice = fx.joined(models, [*at_feet(("x", "y", "z"))] * 2, placed=placed)
+    assert (twice.joining.constraints, twice.joining.rank) == (18, 9)
+    assert twice.n_dof == once.n_dof
+    np.testing.assert_allclose(elastic(twice, 12), elastic(once, 12), rtol=1e-9)
+
+
+def test_very_unlike_components():
+    """A rubber pad below steel: 1e6 between their stiffnesses, exact zeros and inertia kept."""
+    steel = fx.solid_block(size=(0.3, 0.2, 0.1), elements=(3, 2, 1), density=7850,
+                           youngs_modulus=210e9, poisson_ratio=0.3)  # fmt: skip
+    rubber = fx.solid_block(size=(0.3, 0.2, 0.02), elements=(3, 2, 1), density=1100,
+                            youngs_modulus=2e5, poisson_ratio=0.45)  # fmt: skip
+    pairs = zip(edge_z(rubber, 0.02), edge_z(steel, 0.0), strict=True)
+    joints = [fx.Joint(f"pad/{i}", f"steel/{j}") for i, j in pairs]
+    machine = fx.joined(
+        {"pad": rubber, "steel": steel}, joints, placed={"steel": fx.Pose(shift=(0, 0, 0.02))}
+    )
+    modes = fx.solve_modes(machine, count=10)
+    assert modes.n_rigid == 6
+    n = rubber.n_dof + steel.n_dof
+    B = np.zeros((3 * len(joints), n))
+    names = [*(f"pad/{x}" for x in rubber.dofs.labels), *(f"steel/{x}" for x in steel.dofs.labels)]
+    for i, (joint, axis) in enumerate((j, a) for j in joints for a in "xyz"):
+        B[i, names.index(f"{joint.first}:{axis}")] = 1.0
+        B[i, names.index(f"{joint.second}:{axis}")] = -1.0
+    M = la.block_diag(rubber.M.toarray(), steel.M.toarray())
+    K = la.block_diag(rubber.K.toarray(), steel.K.toarray())
+    np.testing.assert_allclose(modes.freq[6:], oracles.frequencies(M, K, B)[6:10], rtol=1e-6)
+
+
+def edge_z(model, z):
+    found = model.dofs.where(box=[(-9, -9, z), (9, 9, z)]).nodes
+    return list(dict.fromkeys(found.tolist()))
+
+
+def test_what_is_refused():
+    models, placed = stage_on_frame()
+
+    def join(*joints, **more):
+        return fx.joined(more.pop("models", models), joints, placed=placed, **more)
+
+    with pytest.raises(ModelError, match="would hold the machine's motion rx, ry against"):
+        join(fx.Joint("stage/1:z", "frame/1:z"))
+    with pytest.warns(FlexplantWarning, match="would hold the machine's motion"):
+        join(fx.Joint("stage/1:z", "frame/1:z", stiffness=1e4))
+    with pytest.raises(LabelError, match=r"component 'frame': no DOF '1:rz'"):
+        join(fx.Joint("stage/1:z", "frame/1:rz"))
+    with pytest.raises(LabelError, match="needs its rotation r"):
+        join(fx.Joint("stage/1", "frame/1"))
+    with pytest.raises(LabelError, match="has no axis 'rx'"):
+        join(fx.Joint("stage/1", "frame/1", axes=["rx"]))
+    with pytest.raises(LabelError, match=r"no component 'stag'.*Close matches: 'stage'"):
+        join(fx.Joint("stag/1:z", "frame/1:z"))
+    with pytest.raises(LabelError, match="nowhere"):
+        join(fx.Joint(("stage", (5.0, 5.0, 5.0)), "frame/1"))
+    with pytest.raises(LabelError, match="not clear what is joined"):
+        fx.joined({"a": plate(2), "b": models["frame"]}, fx.Joint("a/1", "b/1"))
+    with pytest.raises(ModelError, match="needs a second end"):
+        fx.Joint("stage/1:z")
+    with pytest.raises(ModelError, match="units differ"):
+        fx.joined({"a": plate(2)}, fx.Joint("a/1", stiffness=1e3))
+    with pytest.raises(ModelError, match="of type FEModel or ReducedModel, got Modes"):
+        join(models={"stage": fx.solve_modes(models["stage"], count=8)})
+    with pytest.raises(LabelError, match="cannot name a component"):
+        join(models={"st:age": models["stage"]})
+    damped = {"stage": models["stage"].with_damping(fx.Rayleigh(0.0, 1e-6))}
+    with pytest.warns(FlexplantWarning, match=re.escape("components ['frame'] have no D")):
+        join(models=models | damped)
+
+
+def test_the_certificate_can_fail(monkeypatch):
+    """A gap, and a count that is wrong, are found."""
+    half = plate(2, 0.3)
+    good = join.rows_of
+
+    def wrong(some, parts):
+        found = good(some, parts)
+        found.data[:1] *= 1.001
+        return found
+
+    monkeypatch.setattr(join, "rows_of", wrong)
+    with pytest.raises(CertificateError, match="fails its check"):
+        fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
+    monkeypatch.undo()
+    monkeypatch.setattr(certificate, "_force", lambda K, motions: 1.0)
+    with pytest.raises(CertificateError, match="fails its check"):
+        fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
