@@ -51,7 +51,7 @@ class Joint(Value):
     >>> Joint("stage/41:z", "frame/7:z")
     <Joint stage/41:z - frame/7:z, rigid>
     >>> Joint("stage/41:z", stiffness=1e5, rate=20.0)
-    <Joint stage/41:z - ground, 1e+05 N/m, 20 N s/m>
+    <Joint stage/41:z - ground, 100000 N/m, 20 N s/m>
     """
 
     first: End
