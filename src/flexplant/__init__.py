@@ -39,7 +39,6 @@ from .lti import Frf as Frf
 from .lti import StateSpace as StateSpace
 from .lti import balanced as balanced
 from .lti import discretized as discretized
-from .lti import frequency_response as frequency_response
 from .lti import h2_norm as h2_norm
 from .lti import hinf_norm as hinf_norm
 from .lti import lft as lft
@@ -68,6 +67,7 @@ from .plant import Sensor as Sensor
 from .plant import StandardPlant as StandardPlant
 from .plant import assemble_plant as assemble_plant
 from .plant import decouple as decouple
+from .plant import frequency_response as frequency_response
 from .plant import reference_errors as reference_errors
 from .plant import stage_weights as stage_weights
 from .reduction import CraigBampton as CraigBampton

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 import meshes
 from flexplant.errors import SolverError
+from flexplant.sparse.complex_symmetric import ComplexSymmetricFactor
 from flexplant.sparse.factor import is_positive_definite, lowest_eigenvalue_bound
 from flexplant.sparse.multifrontal import MultifrontalCholesky, multifrontal_inertia
 from flexplant.sparse.ordering import dissect
@@ -147,3 +148,19 @@ def test_the_bound_is_below_the_lowest_eigenvalue():
         bound = lowest_eigenvalue_bound(A)
         assert bound < lowest
         assert (bound > 0) == (lowest > 0)
+
+
+def test_a_complex_symmetric_factor_between_resonances():
+    """A damped dynamic stiffness among its eigenvalues, whose real part is indefinite."""
+    for seed, links in ((1, 0), (2, 150), (3, 700)):
+        A = random_sparse(seed, 300, links)
+        values = la.eigvalsh(A.toarray())
+        shift = 0.5 * (values[140] + values[141])
+        B = sp.csc_array(A * (1 + 1e-3j) - shift * sp.eye_array(300))
+        b = np.random.default_rng(seed).standard_normal((300, 2))
+        factor = ComplexSymmetricFactor(B, dissect(B, leaf=20))
+        wanted = la.solve(B.toarray(), b)
+        np.testing.assert_allclose(factor.solve(b), wanted, rtol=0, atol=1e-10 * abs(wanted).max())
+        np.testing.assert_allclose(factor.solve(b[:, 0]), factor.solve(b)[:, 0], rtol=1e-12)
+    with pytest.raises(SolverError, match="singular"):
+        ComplexSymmetricFactor(sp.csc_array((3, 3), dtype=complex))

@@ -153,7 +153,7 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         units = {self.unit(*channel) for channel in self}
         unit = units.pop() if len(units) == 1 else None
         sides += f" [{unit}]" if unit is not None else ""
-        return f"<Frf: {sides}, {self.freq.size} frequencies {span}>"
+        return f"<{type(self).__name__}: {sides}, {self.freq.size} frequencies {span}>"
 
     def __getitem__(self, key: tuple[str, str]) -> ComplexArray:
         """Return the response (n_freq,) of `frf["output", "input"]` or `frf[0, 1]`."""

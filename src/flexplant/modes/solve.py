@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from collections.abc import Iterable
 from typing import Any
 
@@ -29,6 +30,10 @@ _ORTHONORMAL = 1e-12
 _RESIDUAL = (1e-8, 1e-12)
 #: the part of the largest entry of a shape that counts for the rounding of each
 _ENTRY = 1e-3
+#: elastic modes that responses are made of at least
+_FEW = 6
+#: modes of models that are in use
+_solved: weakref.WeakKeyDictionary[FEModel, weakref.ref[Modes]] = weakref.WeakKeyDictionary()
 #: with a larger part of all modes wanted, a dense solution of a model of this size is faster
 _MANY, _DENSE_MANY = 10, 6000
 
@@ -132,7 +137,7 @@ def solve_modes(
         zeta = np.concatenate([np.zeros(r), projected_zeta(model.D, phi[:, r:], omega[r:])])
     else:
         zeta = damping.zeta(omega)
-    return Modes(
+    found = Modes(
         omega,
         zeta,
         phi,
@@ -146,6 +151,37 @@ def solve_modes(
         rounding=_rounding(model, omega, phi),
         certificate=certificate,
     )
+    _solved[model] = weakref.ref(found)
+    return found
+
+
+def modes_reaching(model: FEModel, freq: float, *, least: int = 0) -> Modes:
+    """Return the undamped modes of a structure up to a frequency, and perhaps further.
+
+    Those that `solve_modes` found for this model are taken while they are in use and reach so far.
+
+    Parameters
+    ----------
+    model : FEModel
+        The structure.
+    freq : float [Hz]
+        Up to where; those just solved for reach half as far again.
+    least : int
+        How many modes at least.
+    """
+    known = _solved.get(model)
+    modes = known() if known is not None else None
+    least = min(least, model.n_dof)
+    if modes is not None and modes.n_modes >= least and (
+        modes.n_modes == model.n_dof or modes.freq[-1] > freq
+    ):  # fmt: skip
+        return modes
+    modes = solve_modes(model, below=1.5 * freq, damping=ModalDamping(0.0))
+    few = modes.n_rigid + _FEW
+    if modes.n_modes < max(least, few):
+        count = min(max(least, few), model.n_dof)
+        modes = solve_modes(model, count=count, damping=ModalDamping(0.0))
+    return modes
 
 
 def _asked(model: FEModel, count: int | None, below: float | None) -> tuple[int, float]:

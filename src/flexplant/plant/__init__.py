@@ -34,6 +34,8 @@ from .sensors import Poi as Poi
 from .sensors import Sensor as Sensor
 from .standard import StandardPlant as StandardPlant
 from .standard import standard_plant as standard_plant
+from .structure_frf import StructureFrf as StructureFrf
+from .structure_frf import frequency_response as frequency_response
 from .truncation import larger_plant as larger_plant
 from .uncertainty.neglected import NeglectedModes as NeglectedModes
 from .uncertainty.neglected import neglected_modes as neglected_modes

@@ -48,7 +48,7 @@ class MultifrontalCholesky:
         self.dissection = dissect(lower) if dissection is None else dissection
         self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
         with one_thread():
-            for front, pivots, below, rest in _assembled(lower, self.dissection):
+            for front, pivots, below, rest in assembled(lower, self.dissection):
                 _, info = lapack.dpotrf(pivots, lower=1, overwrite_a=1, clean=0)
                 if info:
                     raise SolverError(
@@ -138,7 +138,7 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
     energy = np.zeros(3)
     negative = 0
     with one_thread():
-        for front, pivots, below, rest in _assembled(lower, chosen):
+        for front, pivots, below, rest in assembled(lower, chosen):
             kept = pivots.copy(order="F")
             _, info = lapack.dpotrf(pivots, lower=1, overwrite_a=1, clean=0)
             y = b[front.first : front.last]
@@ -201,10 +201,12 @@ def _signed(
     return turned[:, :width], turned[:, width:], np.sign(main)
 
 
-def _assembled(
+def assembled(
     lower: Any, dissection: Dissection
 ) -> Iterator[tuple[Front, FloatArray, FloatArray, FloatArray]]:
     """Yield each front with its assembled blocks: pivots, below, rest; its caller eliminates it.
+
+    The blocks are real or complex, as the matrix is, their lower triangles.
 
     `rest` must hold what remains for the parent when the next front is allocated.
     """
@@ -217,8 +219,9 @@ def _assembled(
         p, q = last - first, rows.size
         place[first:last] = np.arange(p)
         place[rows] = np.arange(p, p + q)
-        pivots, below = np.zeros((p, p), order="F"), np.zeros((q, p), order="F")
-        rest = np.zeros((q, q), order="F")
+        pivots = np.zeros((p, p), value.dtype, order="F")
+        below = np.zeros((q, p), value.dtype, order="F")
+        rest = np.zeros((q, q), value.dtype, order="F")
         begin, end = int(pointer[first]), int(pointer[last])
         at = place[index[begin:end]]
         column = np.repeat(np.arange(p), np.diff(pointer[first : last + 1]))

@@ -11,11 +11,9 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..modes import solve_modes
-from ..modes.attachment_vectors import static_response
-from ..modes.shifted import stiffness_factor
+from ..modes.dynamic_basis import beyond, static_shapes
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
-from ..sparse.factor import DENSE_LIMIT
 from ..structure.model import FEModel
 from ..values import FloatArray
 from .pairing import pair
@@ -28,14 +26,10 @@ from .updated_model import summed
 
 #: modes of the basis for each coordinate of the reduced model
 WIDER = 4
-#: of the diagonal of a scaled Gram matrix: vectors below it depend on the others
-DEPENDENT = 1e-10
 #: DOFs from which an FEModel is updated in such a basis, and from which it is too large for that
 LARGE, TOO_LARGE = 300, 20_000
 #: DOFs from which few modes (one of so many) are found faster by Lanczos than densely
 SPARSE, FEW = 600, 10
-#: loads above which the second static response of each is left out
-MANY = 30
 #: bases of a large FEModel until its estimate moves no more
 MOST_ROUNDS = 10
 
@@ -166,15 +160,11 @@ class FullBasis:
     def _basis(self, p: FloatArray) -> FloatArray:
         """Return the M-orthonormal basis (n, k) at `p`, rigid-body motions of the model first."""
         changed = self._changed(p)
-        phi = self._modes(changed)
-        static = self._static(changed, self.loads)
-        # many candidates: their static responses alone fill the basis
-        few = static.shape[1] <= MANY
-        further = self._static(changed, np.asarray(changed.M @ static)) if few else static[:, :0]
+        phi, static = self._modes(changed), static_shapes(changed, self.loads)
         M: Any = self.full.M
         V = np.array(self.full.rigid_body)
-        for part in (phi, static, further):
-            V = np.hstack([V, _beyond(M, V, part)])
+        for part in (phi, static):
+            V = np.hstack([V, beyond(M, V, part)])
         return V
 
     def _modes(self, model: FEModel) -> FloatArray:
@@ -188,13 +178,6 @@ class FullBasis:
         if omega.size < n and omega[-1] < top:
             _, phi = _lowest(model, n, top)
         return phi
-
-    def _static(self, model: FEModel, loads: FloatArray) -> FloatArray:
-        if not loads.shape[1]:
-            return loads
-        if sp.issparse(model.K) and sp.issparse(model.M) and model.n_dof > DENSE_LIMIT:
-            return stiffness_factor(model).static(loads)
-        return static_response(model.M, model.K, model.rigid_body, loads)
 
     def _changed(self, p: FloatArray) -> FEModel:
         changes: dict[str, Any] = {"M": self.full.M, "K": self.full.K}
@@ -216,19 +199,3 @@ def _lowest(model: FEModel, count: int, top: float = np.inf) -> tuple[FloatArray
     below = None if np.isinf(top) else top / (2 * np.pi)
     modes = solve_modes(model, count=None if below else count, below=below)
     return modes.omega, np.real(modes.phi)
-
-
-def _beyond(M: Any, V: FloatArray, part: FloatArray) -> FloatArray:
-    """Return M-orthonormal vectors that span, with V, what V and `part` span."""
-    length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))
-    part = part / np.where(length > 0, length, 1.0)
-    for _ in range(2):
-        part = part - V @ (V.T @ np.asarray(M @ part))
-    gram = part.T @ np.asarray(M @ part)
-    size, mix = la.eigh((gram + gram.T) / 2)
-    keep = size > DEPENDENT
-    new = part @ (mix[:, keep] / np.sqrt(size[keep]))
-    # once more: what was nearly dependent has lost digits
-    new = new - V @ (V.T @ np.asarray(M @ new))
-    factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
-    return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)

@@ -1,0 +1,161 @@
+"""Responses in a basis, checked by direct solutions with all of the matrices at a few points."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..lti.dips import dips
+from ..values import ComplexArray, FloatArray
+from .dynamic_basis import DynamicBasis
+
+#: channels this far below the others of their row and column are zero by symmetry
+_FLOOR = 1e-6
+#: relative: next to a resonance, still within its peak
+_BESIDE = 1e-6
+#: error let pass relative to the response at a frequency, at antiresonances too
+_THERE = 1e-2
+#: of the peak: what an antiresonance has at least, undamped ones too
+_DEEPEST = 1e-7
+#: how often direct solutions join the basis, where it is not good enough
+_ROUNDS = 3
+#: frequencies on which antiresonances are bracketed, over the band and between two resonances
+_GRID, _BETWEEN = 300, 5
+
+
+@dataclass(frozen=True)
+class DirectCheck:
+    """What direct solutions said of responses.
+
+    Parameters
+    ----------
+    freq : (c,) array [Hz]
+        Where.
+    of_peak : (c,) array
+        Error of the worst channel, relative to the largest size that this channel has at all.
+    there : (c,) array
+        Error of the worst channel, relative to its own size at this frequency.
+    """
+
+    freq: FloatArray
+    of_peak: FloatArray
+    there: FloatArray
+
+    @property
+    def worst(self) -> float:
+        """The largest error, of the peaks."""
+        return float(self.of_peak.max(initial=0.0))
+
+    def holds(self, tolerance: float) -> bool:
+        """Return whether errors are within `tolerance` of the peak, and 1 % of the response."""
+        return self.worst <= tolerance and bool(np.all(self.there <= _THERE))
+
+    def __str__(self) -> str:
+        if not self.freq.size:
+            return "not checked"
+        points = "frequencies" if self.freq.size > 1 else "frequency"
+        return (
+            f"direct solutions at {self.freq.size} {points} differ by {self.worst:.1g} of the "
+            f"peak, {self.there.max():.1g} of the response there"
+        )
+
+
+def checked_response(
+    basis: DynamicBasis,
+    freq: FloatArray,
+    rows: FloatArray,
+    loads: FloatArray,
+    *,
+    checks: int,
+    tolerance: float,
+    seen: Callable[[FloatArray, ComplexArray], ComplexArray] | None = None,
+) -> tuple[DynamicBasis, ComplexArray, DirectCheck]:
+    """Return a basis that is good to a tolerance, its responses, and the check of them.
+
+    Where the error is larger, the direct solutions join the basis, which is checked again at other
+    frequencies.
+
+    Parameters
+    ----------
+    basis : DynamicBasis
+        What is tried first.
+    freq : (n_freq,) array [Hz]
+        Where responses are wanted.
+    rows, loads : (p, n), (n, q) arrays
+        Of motions and of loads.
+    checks : int
+        How many direct solutions; 0 for none.
+    tolerance : float
+        Error relative to the peak; relative to the response at each point it is 1 %.
+    seen : function, optional
+        Of frequencies and the responses there: what is wanted of them, through filters say.
+    """
+    view = seen or (lambda _, response: response)
+
+    def find(at: FloatArray) -> ComplexArray:
+        return view(at, basis.response(at, rows, loads))
+
+    found = find(freq)
+    none = np.zeros(0)
+    if not checks or not found.size:
+        return basis, found, DirectCheck(none, none, none)
+    points = _points(basis, find, float(freq[0]), float(freq[-1]))
+    for last in range(_ROUNDS - 1, -1, -1):
+        at = np.array(sorted({next(points) for _ in range(checks)}))
+        motions = [basis.solved(f, loads) for f in at.tolist()]
+        wanted = view(at, np.array([rows @ motion for motion in motions]))
+        check = _compared(at, find(at), wanted, found)
+        if check.holds(tolerance) or not last:
+            return basis, found, check
+        fresh = np.hstack([part for motion in motions for part in (motion.real, motion.imag)])
+        basis = basis.enriched(fresh)
+        found = find(freq)
+    raise AssertionError
+
+
+def _compared(
+    at: FloatArray, found: ComplexArray, wanted: ComplexArray, whole: ComplexArray
+) -> DirectCheck:
+    peak = np.maximum(np.abs(whole).max(axis=0), np.abs(wanted).max(axis=0))
+    floor = _FLOOR * np.sqrt(np.outer(peak.max(axis=1), peak.max(axis=0)))
+    absent, peak = peak <= floor, np.maximum(peak, floor)
+    peak[peak == 0] = 1.0
+    gap = np.abs(found - wanted)
+    own = np.where(absent, peak, np.maximum(np.abs(wanted), _DEEPEST * peak))
+    return DirectCheck(at, (gap / peak).max(axis=(1, 2)), (gap / own).max(axis=(1, 2)))
+
+
+def _points(
+    basis: DynamicBasis, find: Callable[[FloatArray], ComplexArray], low: float, high: float
+) -> Iterator[float]:
+    """Yield frequencies: highest resonances, deepest antiresonances, edges of the band, random."""
+    chance = np.random.default_rng(0)
+    inside = basis.damped_freq[(basis.damped_freq > low) & (basis.damped_freq < high)]
+    peaks = []
+    if inside.size:
+        size = np.abs(find(inside))
+        share = (size / np.maximum(size.max(axis=0), 1e-300)).max(axis=(1, 2))
+        # beside them: repeated modes may hold one that is not damped
+        peaks = (inside * (1 + _BESIDE))[np.argsort(-share, kind="stable")].tolist()
+    deep = antiresonances(find, basis.freq, low, high).tolist() if high > low else []
+    edges = [high, low] if high > low else [high]
+    while True:
+        for few in (peaks, deep, edges):
+            if few:
+                yield few.pop(0)
+        # of three in a row one: they are independent of what the basis was made of
+        yield low * (high / low) ** chance.random() if low > 0 else high * chance.random()
+
+
+def antiresonances(
+    find: Callable[[FloatArray], ComplexArray], resonances: FloatArray, low: float, high: float
+) -> FloatArray:
+    """Return the antiresonances [Hz] of responses in a band, the deepest first."""
+    start = low if low > 0 else high / 1000
+    inside = resonances[(resonances > start) & (resonances < high)] * (1 + _BESIDE)
+    ends = np.concatenate([[start], inside, [high]])
+    share = np.linspace(0.0, 1.0, _BETWEEN + 2)
+    between = (ends[:-1, None] + np.diff(ends)[:, None] * share).ravel()
+    return dips(find, np.unique(np.concatenate([np.geomspace(start, high, _GRID), between])))

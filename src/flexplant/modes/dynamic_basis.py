@@ -1,0 +1,316 @@
+"""A structure in its modes and the static shapes of some loads: responses at any frequency."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+import scipy.sparse as sp
+
+from ..errors import ModelError, SolverError
+from ..sparse.complex_symmetric import ComplexSymmetricFactor
+from ..sparse.factor import DENSE_LIMIT, dense
+from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
+from ..structure.negative_stiffness import signed_root, unstable_stiffness
+from ..values import ComplexArray, FloatArray
+from .attachment_vectors import static_response
+from .modes import Modes
+from .shifted import dissection_of, stiffness_factor
+
+#: of the diagonal of a scaled Gram matrix: vectors below it depend on the others
+_DEPENDENT = 1e-10
+#: loads above which the second static response of each is left out
+_MANY = 30
+#: relative: damping between coordinates below this is rounding
+_COUPLED = 1e-11
+#: relative: a rate of decay below this leaves a resonance without a finite response
+_UNDAMPED = 1e-9
+#: frequencies that are solved at once
+_CHUNK = 256
+#: relative change of a direct solution by its last refinement, wanted and at most
+_SETTLED, _UNSETTLED = 1e-9, 1e-6
+
+
+@dataclass(frozen=True)
+class Losses:
+    """How a structure dissipates: ``K (1 + i eta) + i omega (a M + b K + D + M V R V^T M)``.
+
+    R (diagonal, `own`) belongs to shapes V: those of the modes and vectors of a `DynamicBasis`.
+    """
+
+    own: FloatArray
+    eta: float = 0.0
+    a: float = 0.0
+    b: float = 0.0
+    D: Any = None
+
+
+class DynamicBasis:
+    """``M q'' + D q' + K q = B f`` in q = V p: modes, and static responses to the loads.
+
+    V holds the modes, the static responses ``u = G f`` to the loads (inertia relief), and
+    ``G M u``, M-orthonormal and diagonal in K. Responses between loads then have an error of order
+    ``(f / f_cut)^8`` of what the modes left out give, f_cut being the last frequency of the modes.
+
+    Parameters
+    ----------
+    model : FEModel
+        The structure.
+    modes : Modes
+        Its lowest ones, real.
+    loads : (n, m) array
+        Where it is pushed and watched.
+    damping : Damping, optional
+        In place of the model's D. A `Hysteretic` is the complex stiffness itself, a `Rayleigh` its
+        matrix; other laws hold for the modes and shapes of the basis, and what is beyond them
+        decays at the rate of the last mode. None: the model's D.
+    """
+
+    def __init__(
+        self, model: FEModel, modes: Modes, loads: FloatArray, damping: Damping | None = None
+    ) -> None:
+        self.model = model
+        self.n_modes, self.n_rigid = modes.n_modes, modes.n_rigid
+        phi = np.real(modes.phi)
+        shapes, squares = _diagonal(model, beyond(model.M, phi, static_shapes(model, loads)))
+        self.V = np.hstack([phi, shapes])
+        self.squares = np.concatenate([modes.basis_squares[: modes.n_modes], squares])
+        #: shapes that a damping law by modes is of
+        self._inertia = np.asarray(model.M @ self.V)
+        self.losses = self._losses(damping)
+        self._damped()
+
+    def __repr__(self) -> str:
+        return f"<DynamicBasis: {self.n_modes} modes and {self.n_shapes} shapes>"
+
+    @property
+    def n_shapes(self) -> int:
+        """Number of shapes beside the modes."""
+        return int(self.V.shape[1]) - self.n_modes
+
+    @property
+    def freq(self) -> FloatArray:
+        """Frequencies [Hz] of the elastic modes."""
+        return np.asarray(np.sqrt(np.abs(self.squares[self.n_rigid : self.n_modes])) / (2 * np.pi))
+
+    @property
+    def damped_freq(self) -> FloatArray:
+        """Frequencies [Hz] of the elastic modes whose response at resonance is finite."""
+        rates = self._rates + self.losses.eta * np.sqrt(np.abs(self.squares))
+        own = rates[self.n_rigid : self.n_modes]
+        return np.asarray(self.freq[own > _UNDAMPED * 2 * np.pi * self.freq])
+
+    def enriched(self, shapes: FloatArray) -> DynamicBasis:
+        """Return the basis with more shapes (n, m), damped as it is."""
+        found = object.__new__(DynamicBasis)
+        found.__dict__.update(self.__dict__)
+        model, phi = self.model, self.V[:, : self.n_modes]
+        more = np.hstack([self.V[:, self.n_modes :], beyond(model.M, self.V, shapes)])
+        more, squares = _diagonal(model, more)
+        found.V = np.hstack([phi, more])
+        found.squares = np.concatenate([self.squares[: self.n_modes], squares])
+        found._damped()
+        return found
+
+    def response(self, freq: FloatArray, rows: FloatArray, loads: FloatArray) -> ComplexArray:
+        """Return the responses (n_freq, p, q) of motions (p, n) to loads (n, q).
+
+        Raises
+        ------
+        ModelError
+            When a frequency is one of an undamped motion.
+        """
+        left, right = rows @ self.V, self.V.T @ loads
+        found = np.zeros((freq.size, left.shape[0], right.shape[1]), dtype=np.complex128)
+        for begin in range(0, freq.size, _CHUNK):
+            part = slice(begin, begin + _CHUNK)
+            omega = 2 * np.pi * freq[part, None]
+            main = self.squares * (1 + 1j * self.losses.eta) - omega**2 + 1j * omega * self._rates
+            if np.any(main == 0):
+                i = int(np.flatnonzero(np.any(main == 0, axis=1))[0])
+                raise ModelError(
+                    f"the response at {omega[i, 0] / (2 * np.pi):.6g} Hz is infinite: an undamped "
+                    "(or rigid-body) motion is there. Leave that frequency out, or pass "
+                    "damping=ModalDamping(0.01)."
+                )
+            if self._coupling is None:
+                found[part] = (left * (1 / main)[:, None]) @ right
+                continue
+            whole = 1j * omega[:, :, None] * self._coupling
+            at = np.arange(self.squares.size)
+            whole[:, at, at] = main
+            found[part] = left @ np.linalg.solve(whole, right[None].astype(np.complex128))
+        return found
+
+    def compliance(self, rows: FloatArray, loads: FloatArray) -> FloatArray:
+        """Return the static response (p, q), that of elastic motions; exact for the own loads."""
+        elastic = self.V[:, self.n_rigid :]
+        return np.asarray(((rows @ elastic) / self.squares[self.n_rigid :]) @ (elastic.T @ loads))
+
+    def solved(self, freq: float, loads: FloatArray) -> ComplexArray:
+        """Return the motion (n, q) of all DOFs under loads, from the matrices alone.
+
+        Raises
+        ------
+        SolverError
+            When the dynamic stiffness is singular, or rounding spoils the solution.
+        """
+        model, law, omega = self.model, self.losses, 2 * np.pi * freq
+        M, K = model.M, model.K
+        stiff = 1 + 1j * (law.eta + omega * law.b)
+        matrix: Any = K * stiff - (omega**2 - 1j * omega * law.a) * M
+        if law.D is not None:
+            matrix = matrix + 1j * omega * _as_like(law.D, matrix)
+        chosen = np.flatnonzero(law.own)
+        U = self._inertia[:, chosen]
+        size: ComplexArray = np.asarray(1j * omega * law.own[chosen], dtype=np.complex128)
+        if sp.issparse(matrix) and model.n_dof > DENSE_LIMIT:
+            # a D may join DOFs that K and M do not
+            order = dissection_of(model) if law.D is None else None
+            solve = _with_rank(ComplexSymmetricFactor(matrix, order).solve, U, size)
+        else:
+            full = _dense(matrix) + (U * size) @ U.T
+            scale = 1.0 / np.sqrt(np.abs(np.diag(full)))[:, None]
+            lu = la.lu_factor(full * scale * scale.T)
+            matrix, U, size = full, U[:, :0], size[:0]
+
+            def solve(right: Any) -> Any:
+                return la.lu_solve(lu, right * scale) * scale
+
+        found = solve(loads.astype(np.complex128))
+        for _ in range(4):
+            left = loads - matrix @ found - (U * size) @ (U.T @ found)
+            step = solve(left)
+            found = found + step
+            size_of = np.linalg.norm(found, axis=0)
+            change = np.linalg.norm(step, axis=0) / np.where(size_of > 0, size_of, 1.0)
+            if np.all(change <= _SETTLED):
+                break
+        if not np.all(change <= _UNSETTLED):
+            raise SolverError(
+                f"a direct solution at {freq:.6g} Hz changes by {change.max():.2g} when refined: "
+                "the frequency is at a resonance of an undamped motion. Move it a little, or give "
+                "the structure damping."
+            )
+        return np.asarray(found, dtype=np.complex128)
+
+    def _losses(self, damping: Damping | None) -> Losses:
+        r, none = self.n_rigid, np.zeros(self.squares.size)
+        if damping is None:
+            return Losses(none, D=self.model.D)
+        if isinstance(damping, Hysteretic):
+            return Losses(none, eta=damping.loss_factor)
+        if isinstance(damping, Rayleigh):
+            own = none.copy()
+            own[:r] = 0.0 if damping.rigid else -damping.alpha
+            return Losses(own, a=damping.alpha, b=damping.beta)
+        omega = signed_root(self.squares)
+        rates = 2 * damping.zeta(omega) * np.abs(omega)
+        if isinstance(damping, ModalDamping):
+            rates[:r] = damping.rigid
+        a = float(rates[: self.n_modes].max(initial=0.0))
+        return Losses(rates - a, a=a)
+
+    def _damped(self) -> None:
+        """Set what the losses are in the coordinates: rates, and what couples them."""
+        law, k = self.losses, self.squares.size
+        C = np.diag(law.a + law.b * self.squares)
+        if law.D is not None:
+            C = C + self.V.T @ np.asarray(law.D @ self.V)
+        if np.any(law.own):
+            turned = self.V.T @ self._inertia
+            C = C + (turned * law.own) @ turned.T
+        self._rates = np.diag(C).copy()
+        off = np.abs(C - np.diag(self._rates))
+        size = np.sqrt(np.abs(np.outer(self._rates, self._rates))) + 1e-3 * np.abs(C).max(initial=0)
+        coupled = k > 0 and bool(np.any(off > _COUPLED * size))
+        self._coupling = C if coupled else None
+
+
+def beyond(M: Any, V: FloatArray, part: FloatArray) -> FloatArray:
+    """Return M-orthonormal vectors that span, with V, what V and `part` span.
+
+    Parameters
+    ----------
+    M : (n, n) matrix
+        The mass.
+    V : (n, k) array
+        M-orthonormal.
+    part : (n, m) array
+        Any vectors; those that depend on the others add none.
+    """
+    if not part.shape[1]:
+        return part
+    length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))
+    part = part / np.where(length > 0, length, 1.0)
+    for _ in range(2):
+        part = part - V @ (V.T @ np.asarray(M @ part))
+    gram = part.T @ np.asarray(M @ part)
+    size, mix = la.eigh((gram + gram.T) / 2)
+    keep = size > _DEPENDENT
+    new = part @ (mix[:, keep] / np.sqrt(size[keep]))
+    # once more: what was nearly dependent has lost digits
+    new = new - V @ (V.T @ np.asarray(M @ new))
+    factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
+    return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)
+
+
+def static_shapes(model: FEModel, loads: FloatArray) -> FloatArray:
+    """Return static responses ``u = G f`` to loads (n, m) and, of few loads, ``G M u``."""
+    if not loads.shape[1]:
+        return loads
+    sparse = sp.issparse(model.K) and sp.issparse(model.M) and model.n_dof > DENSE_LIMIT
+    factor = stiffness_factor(model) if sparse else None
+
+    def static(forces: FloatArray) -> FloatArray:
+        if model.n_unstable:
+            # there is no static response: that to forces that grow faster than the motion
+            balanced = forces - np.asarray(
+                model.M @ (model.rigid_body @ (model.rigid_body.T @ forces))
+            )
+            if factor is not None:
+                return factor.solve(balanced)
+            square = 2 * float(unstable_stiffness(model.K, model.body_motions)[0])
+            return np.asarray(la.solve(dense(model.K) - square * dense(model.M), balanced))
+        if factor is None:
+            return static_response(model.M, model.K, model.rigid_body, forces)
+        return factor.static(forces)
+
+    found = static(loads)
+    if loads.shape[1] > _MANY:
+        return found
+    return np.hstack([found, static(np.asarray(model.M @ found))])
+
+
+def _diagonal(model: FEModel, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return M-orthonormal shapes that are orthogonal in K too, and their omega^2."""
+    if not shapes.shape[1]:
+        return shapes, np.zeros(0)
+    inner = shapes.T @ np.asarray(model.K @ shapes)
+    squares, mix = la.eigh((inner + inner.T) / 2)
+    return shapes @ mix, squares
+
+
+def _with_rank(solve: Any, U: FloatArray, size: ComplexArray) -> Any:
+    """Return how ``(A + U diag(size) U^T) x = b`` is solved by solutions with A (Woodbury)."""
+    if not size.size:
+        return solve
+    moved = solve(U.astype(np.complex128))
+    small = la.lu_factor(np.diag(1 / size) + U.T @ moved)
+
+    def both(right: Any) -> Any:
+        found = solve(right)
+        return found - moved @ la.lu_solve(small, U.T @ found)
+
+    return both
+
+
+def _as_like(D: Any, matrix: Any) -> Any:
+    return D if sp.issparse(matrix) == sp.issparse(D) else dense(D)
+
+
+def _dense(matrix: Any) -> ComplexArray:
+    full: Any = matrix.toarray() if hasattr(matrix, "toarray") else matrix
+    return np.asarray(full, dtype=np.complex128)

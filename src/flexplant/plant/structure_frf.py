@@ -1,0 +1,351 @@
+"""frequency_response: of a system, and of a structure between its ports without a plant."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, field
+from types import SimpleNamespace
+from typing import Any, NamedTuple, overload
+
+import numpy as np
+import scipy.sparse as sp
+
+from ..errors import FlexplantWarning, ModelError
+from ..lti.frequency import Frf
+from ..lti.frequency import frequency_response as system_response
+from ..lti.grid import sampled_freq
+from ..lti.responses import responses
+from ..lti.statespace import StateSpace, System
+from ..modes import Modes
+from ..modes.direct_check import checked_response
+from ..modes.dynamic_basis import DynamicBasis
+from ..modes.solve import modes_reaching
+from ..reduction import ReducedModel
+from ..structure import Damping, FEModel
+from ..values import ComplexArray, FloatArray, instance, positive, real_array, whole
+from .ports import Ports
+from .realisation import Structure
+from .residual import modes_of
+
+
+def _none() -> FloatArray:
+    return np.zeros(0)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class StructureFrf(Frf):
+    """Responses of a structure between its ports, with the error that direct solutions found.
+
+    Parameters
+    ----------
+    route : str
+        How the responses were found.
+    check_freq : (c,) array [Hz]
+        Where ``(K - omega^2 M + i omega D) q = f`` was solved with all of the matrices.
+    error : (c,) array
+        Of the worst channel there, relative to the largest size that this channel has at all.
+    error_there : (c,) array
+        Of the worst channel, relative to its own size at this frequency.
+
+    See Also
+    --------
+    flexplant.Frf : for all other fields.
+    """
+
+    route: str = ""
+    check_freq: FloatArray = field(default_factory=_none)
+    error: FloatArray = field(default_factory=_none)
+    error_there: FloatArray = field(default_factory=_none)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        checks = real_array(self.check_freq, "check_freq", (None,))
+        self._set(
+            route=str(self.route),
+            check_freq=checks,
+            error=real_array(self.error, "error", checks.shape),
+            error_there=real_array(self.error_there, "error_there", checks.shape),
+        )
+
+    def __repr__(self) -> str:
+        lines = [super().__repr__()[:-1], f"by {self.route}"]
+        if self.check_freq.size:
+            lines.append(
+                f"direct solutions at {self.check_freq.size} frequencies differ by "
+                f"{self.error.max():.1g} of the peak, {self.error_there.max():.1g} of the "
+                "response there"
+            )
+        return "\n  ".join(lines) + ">"
+
+
+@overload
+def frequency_response(model: System, ports: FloatArray | None = None) -> Frf: ...
+
+
+@overload
+def frequency_response(model: System, *, freq: FloatArray | None = None) -> Frf: ...
+
+
+@overload
+def frequency_response(
+    model: Structure,
+    ports: Ports,
+    freq: FloatArray,
+    *,
+    damping: Damping | None = None,
+    checks: int = 4,
+    tolerance: float = 1e-4,
+) -> StructureFrf: ...
+
+
+def frequency_response(
+    model: Any,
+    ports: Any = None,
+    freq: Any = None,
+    *,
+    damping: Damping | None = None,
+    checks: int = 4,
+    tolerance: float = 1e-4,
+) -> Frf:
+    """Return the responses of a structure between its ports, or of a system.
+
+    ``frequency_response(model, ports, freq)``: from all disturbances and actuators to all POIs and
+    sensors, through their filters and latencies. A large FEModel is not solved frequency by
+    frequency: its modes up to 1.5 times the last one, and the static responses to all loads and at
+    all outputs, answer at any number of frequencies. They are checked by solutions with
+    ``K + i omega D - omega^2 M`` at a few: at resonances, antiresonances, the ends of the band, and
+    at random. Where these differ by more than `tolerance` they join the basis.
+
+    ``frequency_response(system, freq)``: ``C (s I - A)^-1 B + D``; see
+    `flexplant.lti.frequency_response`.
+
+    Parameters
+    ----------
+    model : FEModel, Modes or ReducedModel; or StateSpace
+        Modes that `solve_modes` found for an FEModel are used again while they are in use.
+    ports : Ports
+        The channels of a structure. Of a system: freq.
+    freq : (n_freq,) array [Hz]
+        Increasing. Of a system None gives `default_freq`.
+    damping : Damping, optional
+        Of an FEModel, in place of its D: a `Hysteretic` is the complex stiffness ``K (1 + i eta)``
+        itself, a Rayleigh its matrix; modal damping is that of the modes and static shapes used,
+        beyond them motions decay at the rate of the last mode.
+    checks : int
+        How many direct solutions of an FEModel; 0 for none.
+    tolerance : float
+        Of their difference, relative to the largest response of a channel.
+
+    Returns
+    -------
+    Frf
+        Of a structure a `StructureFrf`, with the error that was found.
+
+    Raises
+    ------
+    ModelError
+        When a response is infinite at one of the frequencies, a side of the ports is empty, or
+        arguments do not go together.
+    LabelError
+        When a place is not on the structure.
+    SolverError
+        When a direct solution is spoilt by rounding.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the error found stays above the tolerance.
+
+    Examples
+    --------
+    >>> from flexplant.structure import ModalDamping, chain
+    >>> from flexplant.plant import Actuator, Sensor
+    >>> two = chain(masses=[1, 2], stiffnesses=[5e4])
+    >>> ports = Ports(u=[Actuator("u1", "1:x", "x")], y=[Sensor("y1", "2:x", "x")])
+    >>> frequency_response(two, ports, [10.0, 20.0, 40.0], damping=ModalDamping(0.01))
+    <StructureFrf: u1 -> y1 [m/N], 3 frequencies 10 .. 40 Hz
+      by 2 modes and 0 static shapes
+      direct solutions at 4 frequencies differ by 2e-16 of the peak, 2e-16 of the response there>
+    """
+    if not isinstance(model, FEModel | Modes | ReducedModel):
+        if ports is not None and freq is not None:
+            raise ModelError(
+                f"ports go with a structure, got {type(model).__name__}: a system has channels of "
+                "its own. Call frequency_response(system, freq)."
+            )
+        return system_response(model, ports if freq is None else freq)
+    instance(ports, Ports, "ports", "Call frequency_response(model, ports, freq).")
+    if freq is None:
+        raise ModelError("freq is missing: call frequency_response(model, ports, freq), in Hz.")
+    if damping is not None:
+        instance(damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
+        if not isinstance(model, FEModel):
+            raise ModelError(
+                f"{type(model).__name__} are damped already: damping= is for an FEModel. Leave it "
+                "out."
+            )
+    grid = sampled_freq(freq, 0.0)
+    through = _Channels(model, ports)
+    through.check_start(grid)
+    if not isinstance(model, FEModel):
+        data = through.seen(grid, _realised(model, grid, through.rows, through.loads))
+        route = f"all modes of the {type(model).__name__}"
+        return through.frf(grid, data, route=route)
+    basis = DynamicBasis(
+        model,
+        modes_reaching(model, float(grid.max(initial=0.0))),
+        np.hstack([through.loads, through.rows.T]),
+        damping,
+    )
+    limit = positive(tolerance, "tolerance")
+    basis, data, check = checked_response(
+        basis,
+        grid,
+        through.rows,
+        through.loads,
+        checks=whole(checks, "checks", minimum=0),
+        tolerance=limit,
+        seen=through.seen,
+    )
+    if check.freq.size and not check.holds(limit):
+        warnings.warn(
+            f"the responses of {model!r:.60} are not good to {limit:g}: {check}. Give more modes, "
+            "solve_modes(model, below=...), which are used while you hold them.",
+            FlexplantWarning,
+            stacklevel=2,
+        )
+    return through.frf(
+        grid,
+        data,
+        route=f"{basis.n_modes} modes and {basis.n_shapes} static shapes",
+        check_freq=check.freq,
+        error=check.of_peak,
+        error_there=check.there,
+    )
+
+
+class _Term(NamedTuple):
+    """A displacement row, its time derivative, and the channel that it is part of."""
+
+    row: FloatArray
+    order: int
+    channel: int
+
+
+class _Channels:
+    """The channels of ports over the coordinates of a model: loads, rows, filters, latencies."""
+
+    def __init__(self, model: Structure, ports: Ports) -> None:
+        if not ports.forces or not (ports.z or ports.y):
+            raise ModelError(
+                f"a response needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
+            )
+        motions = _motions(model)
+        forces = ports.forces
+        self.inputs = [port.name for port in forces]
+        self.outputs = [
+            *(poi.channel(axis) for poi in ports.z for axis in poi.axes),
+            *(sensor.name for sensor in ports.y),
+        ]
+        self.units = ports.units
+        seen = [poi.see(motions, axis) for poi in ports.z for axis in poi.axes]
+        orders = [0] * len(seen) + [sensor.order for sensor in ports.y]
+        seen += [sensor.see(motions) for sensor in ports.y]
+        self.loads = np.array([port.push(motions) for port in forces]).T
+        n = self.loads.shape[0]
+        self._terms = [
+            _Term(row, order, i)
+            for i, one in enumerate(seen)
+            for order, row in enumerate(one.row.reshape(3, n))
+            if np.any(row)
+        ]
+        self.rows = np.array([term.row for term in self._terms]).reshape(-1, n)
+        ground = np.array([port.ground for port in forces])
+        self._carried = np.array([one.carried for one in seen]) @ ground.T
+        self._orders = np.array(orders)
+        self._added = np.zeros(self._carried.shape)
+        for j, port in enumerate(forces):
+            if port.added_to is not None:
+                self._added[self.outputs.index(port.added_to), j] = 1.0
+        late = ports.latencies
+        pois = len(seen) - len(ports.y)
+        self._before = [(port.filter, late.get(port.name, 0.0)) for port in forces]
+        self._after: list[tuple[StateSpace | None, float]] = [(None, 0.0)] * pois
+        self._after += [(s.filter, late.get(s.name, 0.0)) for s in ports.y]
+        self._free = bool(getattr(model, "n_rigid", 0))
+        if isinstance(model, FEModel | ReducedModel):
+            self._free = model.rigid_body.shape[1] > 0
+
+    def frf(self, freq: FloatArray, data: ComplexArray, **found: Any) -> StructureFrf:
+        """Return responses (f, p, q) of the channels as an Frf."""
+        return StructureFrf(
+            freq,
+            np.moveaxis(data, 0, 2),
+            inputs=self.inputs,
+            outputs=self.outputs,
+            units=self.units,
+            **found,
+        )
+
+    def check_start(self, freq: FloatArray) -> None:
+        """Refuse 0 Hz where a response is infinite there."""
+        moving = np.any(self._carried[self._orders < 2])
+        if freq.size and freq[0] == 0 and (self._free or moving):
+            raise ModelError(
+                "a structure that is free, or moves with the ground, has no response at 0 Hz. "
+                "Begin above it."
+            )
+
+    def seen(self, freq: FloatArray, response: ComplexArray) -> ComplexArray:
+        """Return the responses (f, p, q) of the channels, of those of the displacement rows."""
+        s = 2j * np.pi * freq
+        found = np.zeros((freq.size, *self._carried.shape), dtype=np.complex128)
+        for i, term in enumerate(self._terms):
+            found[:, term.channel] += s[:, None] ** term.order * response[:, i]
+        for i in np.flatnonzero(np.any(self._carried, axis=1)).tolist():
+            found[:, i] += s[:, None] ** (self._orders[i] - 2) * self._carried[i]
+        found += self._added
+        after = np.array([_passed(*part, freq) for part in self._after])
+        before = np.array([_passed(*part, freq) for part in self._before])
+        return np.asarray(found * after.T[:, :, None] * before.T[:, None])
+
+
+def _motions(model: Structure) -> Any:
+    """Return what ports read of a realisation, with the states (q, dq/dt, d2q/dt2) of all DOFs."""
+    n = model.row(model.full_dofs.labels[0]).size
+    nothing: Any = sp.csr_array((n, 3 * n))
+
+    def motion(row: FloatArray, derivative: int) -> FloatArray:
+        whole_row = np.zeros((3, n))
+        whole_row[derivative] = row
+        return whole_row.ravel()
+
+    return SimpleNamespace(
+        model=model,
+        row=model.row,
+        inputs=nothing,
+        outputs=nothing,
+        motion=motion,
+        at_once=lambda row: np.zeros(n),
+    )
+
+
+def _passed(part: StateSpace | None, latency: float, freq: FloatArray) -> ComplexArray:
+    """Return the response (f,) of a filter and a delay."""
+    late = np.exp(-2j * np.pi * freq * latency)
+    return np.asarray(late if part is None else late * responses(part, freq)[0, 0])
+
+
+def _realised(
+    model: Modes | ReducedModel, freq: FloatArray, rows: FloatArray, loads: FloatArray
+) -> ComplexArray:
+    """Return the responses (f, p, q) of a model by its modes."""
+    own = modes_of(model)
+    system = StateSpace(
+        own.A,
+        np.array([own.force(load) for load in loads.T]).T,
+        own.motion(rows, 0),
+        (rows @ own.static_outputs) @ (own.static_inputs.T @ loads),
+        blocks=own.blocks,
+    )
+    return np.moveaxis(responses(system, freq), 2, 0)
