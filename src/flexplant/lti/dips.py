@@ -53,7 +53,7 @@ def dips(
 
 
 def _lower_side(size: FloatArray, at: int, low: float) -> float:
-    """Return the lower one of the maxima left and right of a minimum, up to where it is undercut."""
+    """Return the lower one of the maxima left and right of a minimum, up to where it is as low."""
     sides = (size[:at][::-1], size[at + 1 :])
     ends = [np.flatnonzero(side < low) for side in sides]
     return min(

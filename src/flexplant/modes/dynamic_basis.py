@@ -34,7 +34,7 @@ _SETTLED, _UNSETTLED = 1e-9, 1e-6
 
 
 @dataclass(frozen=True)
-class Losses:
+class DampingTerms:
     """How a structure dissipates: ``K (1 + i eta) + i omega (a M + b K + D + M V R V^T M)``.
 
     R (diagonal, `own`) belongs to shapes V: those of the modes and vectors of a `DynamicBasis`.
@@ -196,22 +196,22 @@ class DynamicBasis:
             )
         return np.asarray(found, dtype=np.complex128)
 
-    def _losses(self, damping: Damping | None) -> Losses:
+    def _losses(self, damping: Damping | None) -> DampingTerms:
         r, none = self.n_rigid, np.zeros(self.squares.size)
         if damping is None:
-            return Losses(none, D=self.model.D)
+            return DampingTerms(none, D=self.model.D)
         if isinstance(damping, Hysteretic):
-            return Losses(none, eta=damping.loss_factor)
+            return DampingTerms(none, eta=damping.loss_factor)
         if isinstance(damping, Rayleigh):
             own = none.copy()
             own[:r] = 0.0 if damping.rigid else -damping.alpha
-            return Losses(own, a=damping.alpha, b=damping.beta)
+            return DampingTerms(own, a=damping.alpha, b=damping.beta)
         omega = signed_root(self.squares)
         rates = 2 * damping.zeta(omega) * np.abs(omega)
         if isinstance(damping, ModalDamping):
             rates[:r] = damping.rigid
         a = float(rates[: self.n_modes].max(initial=0.0))
-        return Losses(rates - a, a=a)
+        return DampingTerms(rates - a, a=a)
 
     def _damped(self) -> None:
         """Set what the losses are in the coordinates: rates, and what couples them."""

@@ -185,7 +185,7 @@ def frequency_response(
                 "out."
             )
     grid = sampled_freq(freq, 0.0)
-    through = _Channels(model, ports)
+    through = _PortChannels(model, ports)
     through.check_start(grid)
     if not isinstance(model, FEModel):
         data = through.seen(grid, _realised(model, grid, through.rows, through.loads))
@@ -224,7 +224,7 @@ def frequency_response(
     )
 
 
-class _Term(NamedTuple):
+class _PortTerm(NamedTuple):
     """A displacement row, its time derivative, and the channel that it is part of."""
 
     row: FloatArray
@@ -232,7 +232,7 @@ class _Term(NamedTuple):
     channel: int
 
 
-class _Channels:
+class _PortChannels:
     """The channels of ports over the coordinates of a model: loads, rows, filters, latencies."""
 
     def __init__(self, model: Structure, ports: Ports) -> None:
@@ -254,7 +254,7 @@ class _Channels:
         self.loads = np.array([port.push(motions) for port in forces]).T
         n = self.loads.shape[0]
         self._terms = [
-            _Term(row, order, i)
+            _PortTerm(row, order, i)
             for i, one in enumerate(seen)
             for order, row in enumerate(one.row.reshape(3, n))
             if np.any(row)
