@@ -44,7 +44,7 @@ def dips(
         left, right = edges[rows, best], edges[rows, best + 2]
     share = np.array(
         [
-            low / max(_lower_side(size[:, own], at + 1, low), 1e-300)
+            low / max(_lower_side(size[:, own], int(at) + 1, low), 1e-300)
             for at, own, low in zip(place, channel, lowest, strict=True)
         ]
     )
