@@ -38,6 +38,10 @@ class StructureFrf(Frf):
 
     Parameters
     ----------
+    freq, data, inputs, outputs, quantity, coherence, variance, correlation, resolution
+        As of `Frf`.
+    window, overlap, freedom, units
+        As of `Frf`.
     route : str
         How the responses were found.
     check_freq : (c,) array [Hz]
@@ -46,10 +50,6 @@ class StructureFrf(Frf):
         Of the worst channel there, relative to the largest size that this channel has at all.
     error_there : (c,) array
         Of the worst channel, relative to its own size at this frequency.
-
-    See Also
-    --------
-    flexplant.Frf : for all other fields.
     """
 
     route: str = ""
