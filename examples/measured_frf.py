@@ -231,7 +231,7 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
     keep("identified")
     before, after = (predicted(model, frf.freq) for model in (drawing, fit.model))
     shown = {"measured": frf, "drawing": before, "updated": after}
-    fx.plot.frf(shown, UNUSED, "u1").set(xlim=(100.0, ABOVE[1]))
+    fx.plot.frf(shown, UNUSED, "u1", band=(100.0, ABOVE[1]))
     keep("unused_sensor")
     at = {name: SENSORS[name] for name in FITTED}
     data = [fx.Eigenvalues(result["numbered"]), fx.ModeShapes(result["numbered"], at=at)]

@@ -108,12 +108,11 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
         for name, model in (("full model", full), ("drawing", nominal), ("updated", fit.model))
     }
     frfs["measured"] = result["frf"]
-    colors = {"full model": "tab:green", "drawing": "0.45", "updated": "tab:blue", "measured": "k"}
     drawn = []
 
     def frf(*names: str, **options: Any) -> Any:
         shown = {name: frfs[name] for name in names}
-        return fx.plot.frf(shown, "y1", "u1", colors=colors, **options)
+        return fx.plot.frf(shown, "y1", "u1", **options)
 
     def keep(name: str) -> None:
         drawn.append(folder / f"{name}.png")
@@ -122,9 +121,10 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
 
     fx.plot.layout(plate.dofs, ports=ports(), desired=grid, marked={"z8": z8})
     keep("figure_03_plate")
-    frf("full model", "drawing", reference="full model")
+    frfs["reduced"] = frfs["drawing"]
+    frf("full model", "reduced", reference="full model")
     keep("figure_04_reduction")
-    fx.plot.mode_shape(full, 4, color="tab:green")
+    fx.plot.mode_shape(full, 4)
     keep("figure_05_torsion_full")
     fx.plot.mode_shape(nominal.modes(), 4)
     keep("figure_06_torsion_reduced")
@@ -135,10 +135,9 @@ def pictures(result: dict[str, Any], folder: Path = OUT) -> list[Path]:
     _, axs = plt.subplots(2, 1, figsize=(6.0, 6.0), layout="constrained")
     fx.plot.parameters(fit, truth=dict(zip(fit.parameters, (0.5, 0.0), strict=True)), axs=list(axs))
     keep("figure_09_parameters")
-    frf("measured", "drawing", "updated").set(xlim=(100.0, 2900.0), ylim=(-190.0, -105.0))
+    frf("measured", "drawing", "updated", band=(100.0, 2900.0))
     keep("figure_10_updated")
-    zoom = {"xlim": (430.0, 680.0), "ylim": (-165.0, -130.0), "xscale": "linear"}
-    frf("measured", "drawing", "updated").set(**zoom)
+    frf("measured", "drawing", "updated", band=(430.0, 680.0)).set(xscale="linear")
     keep("figure_11_zoom")
     return drawn
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from math import isfinite
@@ -35,6 +36,8 @@ _PREFIXES = (
     (1e3, "k"),
     (1e6, "M"),
 )
+#: units that take a prefix, alone or before others: m^2, N m, rad/s
+_PREFIXED = re.compile(r"(m|g|s|N|rad|Hz|V|A|W|J|Pa|T)(?:\^(\d))?(?![A-Za-z])")
 
 
 def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
@@ -133,17 +136,29 @@ def short(value: Any) -> str:
     return text if len(text) <= 80 else text[:77] + "..."
 
 
-def scale(size: float) -> tuple[float, str]:
-    """Return the factor and the letters of the SI prefix that bring a size to 1 .. 1000."""
-    return next((s for s in _PREFIXES if size < 1e3 * s[0]), _PREFIXES[-1]) if size else (1.0, "")
+def in_unit(size: float, unit: str | None) -> tuple[float, str]:
+    """Return the factor and the unit with its SI prefix that bring a size to 1 .. 1000.
+
+    Examples
+    --------
+    >>> in_unit(2e-9, "m"), in_unit(0.02, "kg"), in_unit(3e-18, "m^2"), in_unit(5.0, "%")
+    ((1e-09, 'nm'), (0.001, 'g'), (1e-18, 'nm^2'), (1.0, '%'))
+    """
+    base, per = (unit[1:], 1e-3) if unit and unit.startswith("kg") else (unit or "", 1.0)
+    head = _PREFIXED.match(base)
+    if head is None or not size:
+        return 1.0, unit or ""
+    power = int(head[2] or 1)
+    known = ((factor**power, prefix) for factor, prefix in _PREFIXES)
+    most = size / (per * 1e3**power) * (1.0 + 1e-9)  # 1e-6 m is 1 um, whatever rounding says
+    factor, prefix = next((s for s in known if most < s[0]), (1e6**power, "M"))
+    return per * factor, prefix + base
 
 
 def with_unit(value: float, unit: str | None) -> str:
     """Return a number in words: `0.527 nm`; without a unit as it is."""
-    if not unit:
-        return f"{value:.3g}"
-    factor, prefix = scale(abs(value))
-    return f"{value / factor:.3g} {prefix}{unit}"
+    factor, shown = in_unit(abs(value), unit)
+    return f"{value / factor:.3g} {shown}".rstrip()
 
 
 def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str]) -> str:

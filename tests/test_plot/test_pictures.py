@@ -151,7 +151,7 @@ def test_response_gives_each_unit_a_panel():
     assert [panel.get_ylabel() for panel in panels] == labels
     assert [len(panel.get_lines()) for panel in panels] == [2, 1, 1]
     np.testing.assert_allclose(panels[1].get_lines()[0].get_ydata(), 300 * wave)
-    assert [panel.get_xlabel() for panel in panels] == ["", "", "time [s]"]
+    assert [panel.get_xlabel() for panel in panels] == ["", "", "time [ms]"]
     colors = [line.get_color() for panel in panels for line in panel.get_lines()]
     assert len(set(colors)) == 4
     assert 0.005 < ink(first) < 0.6
@@ -184,10 +184,10 @@ def test_layout_shows_every_port_where_it_is():
     ax = fx.plot.layout(dofs, ports=ports(), desired=[z8], marked={"here": z8})
     lines = {line.get_label(): np.array(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["nodes"]) == 81
-    np.testing.assert_allclose(lines["actuators u"], [p[:2] for p in INSET])
-    np.testing.assert_allclose(lines["sensors y"], [p[:2] for p in CORNERS])
-    np.testing.assert_allclose(lines["points of interest"], [[L / 2, L / 2]])
-    np.testing.assert_allclose(lines["1 desired DOFs"], [Z8[:2]])
+    np.testing.assert_allclose(lines["actuators u"], [1e3 * np.array(p[:2]) for p in INSET])
+    np.testing.assert_allclose(lines["sensors y"], [1e3 * np.array(p[:2]) for p in CORNERS])
+    np.testing.assert_allclose(lines["points of interest"], [[500 * L, 500 * L]])
+    np.testing.assert_allclose(lines["1 desired DOFs"], [1e3 * np.array(Z8[:2])])
     assert {"u1", "y4", "die", "here"} <= texts(ax)
     assert 0.005 < ink(ax) < 0.5
     bare = fx.plot.layout(dofs)
@@ -235,21 +235,28 @@ def test_the_update():
     assert all(len(line.get_ydata()) == steps for line in lines)
     drawn = fx.plot.parameters(fit, truth=dict(zip(fit.parameters, (0.5, 0.0), strict=True)))
     assert len(drawn) == 2
-    np.testing.assert_allclose(drawn[0].get_lines()[0].get_ydata(), fit.history.parameters[:, 0])
-    assert drawn[0].get_lines()[1].get_ydata()[0] == 0.5
-    assert "[kg]" in drawn[0].get_ylabel()
+    true, found = drawn[0].get_lines()
+    np.testing.assert_allclose(found.get_ydata(), 1e3 * fit.history.parameters[:, 0])
+    assert true.get_ydata()[0] == pytest.approx(500.0)
+    assert drawn[0].get_ylabel().endswith("[g]")
     assert ink(drawn[1]) > 0.005
     axs = list(plt.subplots(2)[1])
     assert fx.plot.parameters(fit, axs=axs) == axs
 
 
-def test_they_draw_where_they_are_told():
+def test_what_is_drawn_later_has_the_unit_of_the_axes():
+    """A second run of another size lies where its values are; another quantity is refused."""
     ax = plt.subplots()[1]
-    assert fx.plot.frf({"one": some_frf()}, "y1", "u1", ax=ax) is ax
-    assert fx.plot.layout(some_modes().dofs, ax=ax) is ax
     wave = np.ones((2, 50))
-    assert fx.plot.response(run_of(wave), ax=ax) is ax
-    assert fx.plot.residual(fitted(reduced(), POLES), ax=ax) is ax
+    assert fx.plot.response(run_of(1e-6 * wave), ax=ax) is ax
+    fx.plot.response(run_of(2e-9 * wave), label="small", ax=ax)
+    np.testing.assert_allclose(ax.get_lines()[1].get_ydata(), 2e-3)
+    assert ax.get_ylabel() == "error [\N{MICRO SIGN}m]"
+    rotation = run_of(wave).replace(units={"die:error": "rad"})
+    with pytest.raises(ModelError, match="one axes holds one unit: it shows 'error"):
+        fx.plot.response(rotation, ax=ax)
+    with pytest.raises(ModelError, match=r"this is in m\. Draw it"):
+        fx.plot.layout(some_modes().dofs, ax=ax)
 
 
 def test_frf_shows_what_others_cover_and_differ_by():
@@ -270,7 +277,7 @@ def test_a_part_of_a_run_has_its_own_prefix():
     wave = np.where(np.arange(50) < 25, 1e-3, 1e-9) * np.ones(50)
     ax = fx.plot.response(run_of([wave, wave]), ["die:z"], span=(0.03, 0.045))
     (line,) = ax.get_lines()
-    np.testing.assert_allclose(line.get_xdata(), np.arange(30, 46) * 1e-3)
+    np.testing.assert_allclose(line.get_xdata(), np.arange(30, 46))
     np.testing.assert_allclose(line.get_ydata(), 1.0)
     assert ax.get_ylabel() == "displacement [nm]"
     with pytest.raises(ModelError, match="no sample between 1 and 2 s"):
@@ -330,7 +337,7 @@ def test_an_estimate_with_its_band_and_what_waiting_brings():
     names = (*observer.sensors, *observer.plant.u)
     result = observer.estimate({name: 1e-9 * rng.standard_normal(40) for name in names})
     ax = fx.plot.estimate(result)
-    np.testing.assert_allclose(ax.get_lines()[0].get_xdata(), result.time)
+    np.testing.assert_allclose(ax.get_lines()[0].get_xdata(), 1e3 * result.time)
     assert ax.get_ylabel().startswith("die:hat [")
     assert ink(ax) > 0.005
     ax = fx.plot.estimate(result, "y1:innovation", deviations=3.0)

@@ -31,8 +31,7 @@ def test_the_curve_is_in_nanometres_and_its_bound_below():
     curve = pareto_curve(plant, sensors, range(3, 6), method=Exchange(1), rng=0)
     ax = plot.pareto_curve(curve)
     found, bound = ax.get_lines()[:2]
-    assert ax.get_ylabel() in ("rms [nm]", "rms [pm]")
-    factor = {"rms [nm]": 1e9, "rms [pm]": 1e12}[ax.get_ylabel()]
+    factor = {"rms error [nm]": 1e9, "rms error [pm]": 1e12}[ax.get_ylabel()]
     np.testing.assert_allclose(found.get_ydata(), factor * np.sqrt(curve.values))
     assert np.all(bound.get_ydata() < found.get_ydata())
     with pytest.raises(ModelError, match="found must be"):
@@ -46,8 +45,9 @@ def test_devices_on_a_mode_shape():
     ax = plot.placed(best.on(plant), mode=4, zones=[die])
     marked = {line.get_label(): line.get_xydata() for line in ax.get_lines()}
     assert len(marked["sensors"]) == 4 and len(marked["actuators"]) == 4
-    np.testing.assert_allclose(marked["sensors"], [port.at[:2] for port in best.ports])
-    np.testing.assert_allclose(marked["POI"], [[0.22, 0.16]])
+    np.testing.assert_allclose(marked["sensors"], [1e3 * np.array(port.at[:2]) for port in best.ports])
+    np.testing.assert_allclose(marked["POI"], [[220.0, 160.0]])
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [mm]", "y [mm]")
     assert ax.get_title().startswith("mode 4, ")
     assert len(ax.patches) == 1
     with pytest.raises(ModelError, match="mode must be"):

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import AssumptionError, FlexplantWarning, ModelError, unknown_label
 from ..loop import close_loop
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, scale, short
+from ..values import FloatArray, Value, in_unit, short
 from .channels import poi_channels, row_of
 from .loop_error import loop_variances
 
@@ -56,10 +56,10 @@ class MachineTable(Value):
 
     def __repr__(self) -> str:
         finite = self.nominal[np.isfinite(self.nominal)]
-        factor, prefix = scale(float(np.max(finite, initial=0.0))) if self.unit else (1.0, "")
+        factor, unit = in_unit(float(np.max(finite, initial=0.0)), self.unit)
         width = max(10, *(len(name) for name in self.names)) + 2
         heads = ("own model", "median", "95 %", "worst", "worst / own")
-        title = f"rms error of {self.channel} [{prefix}{self.unit or '?'}]"
+        title = f"rms error of {self.channel} [{unit or '?'}]"
         lines = [
             f"{title} on {self.values.shape[1]} machines",
             " " * width + "".join(f"{head:>13s}" for head in heads),

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import CertificateError, ModelError, unknown_label
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.statespace import StateSpace
-from ..values import FloatArray, Value, real_array, scale, short
+from ..values import FloatArray, Value, in_unit, real_array, short
 from .noise import Source
 from .spectrum import densities, integrated, periodogram
 
@@ -96,8 +96,8 @@ class ErrorBudget(Value):
         return float(np.interp(half, row[known], self.freq[known]))
 
     def __repr__(self) -> str:
-        size, prefix = scale(self.rms) if self.unit else (1.0, "")
-        factor, unit = 1.0 / size, prefix + self.unit
+        size, unit = in_unit(self.rms, self.unit)
+        factor = 1.0 / size
         order = np.argsort(-self.variances, kind="stable")
         width = max(5, *map(len, self.names)) + 2 if self.names else 7
         head = f"rms of {self.channel}" + (f" [{unit}]" if unit else "")

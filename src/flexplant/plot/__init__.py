@@ -7,7 +7,6 @@ from .estimation import estimate as estimate
 from .estimation import lag_report as lag_report
 from .estimation import predictions as predictions
 from .frequency import frf as frf
-from .frequency import sensitivity as sensitivity
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
 from .localisation import localisation as localisation
@@ -17,6 +16,8 @@ from .placement import placed as placed
 from .placement import sensor_map as sensor_map
 from .pole_map import pole_map as pole_map
 from .response import response as response
+from .sensitivity import sensitivities as sensitivities
+from .sensitivity import sensitivity as sensitivity
 from .singular_values import singular_values as singular_values
 from .structure import layout as layout
 from .structure import mode_shape as mode_shape

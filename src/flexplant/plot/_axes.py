@@ -1,24 +1,36 @@
-"""What all pictures share: axes to draw on, and one colour for one thing."""
+"""What all pictures share: axes to draw on, their units, and legends that cover nothing."""
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.lines import Line2D
+from matplotlib.axis import Axis
+from matplotlib.collections import PolyCollection
 
-from ..values import FloatArray
+from ..errors import ModelError
+from ..values import FloatArray, in_unit
 
-#: one colour for one thing in every picture: the machine, the drawing, the updated model, and the
-#: full model that a reduction stands for
-MEASURED, NOMINAL, UPDATED, FULL = "black", "0.55", "tab:blue", "tab:green"
-#: what is marked, and small differences
-MARK, DIFFERENCE = "tab:red", "tab:orange"
 #: points along a line, of which none shall lie under a legend
 _DENSE = 500
-CYCLE = (UPDATED, "tab:orange", FULL, "tab:purple", "tab:brown", "tab:red")
+#: of ten, of the sizes that prefixes are for
+_POWERS = range(-36, 19)
+#: what a unit measures
+_QUANTITY = {
+    "m": "displacement",
+    "rad": "rotation",
+    "N": "force",
+    "N m": "moment",
+    "m/s": "velocity",
+    "rad/s": "angular velocity",
+    "m/s^2": "acceleration",
+    "rad/s^2": "angular acceleration",
+    "V": "voltage",
+    "A": "current",
+}
 
 
 def axes(ax: Axes | None, **figure: Any) -> Axes:
@@ -40,31 +52,100 @@ def panel_axes(ax: Axes | None, count: int) -> list[Axes]:
     return list(drawn[:, 0])
 
 
-def legend(ax: Axes, *, given: bool) -> None:
-    """Draw the legend where it covers no line: beside new axes, in a given one's emptiest corner.
+def quantity_of(unit: str | None) -> str:
+    """Return what a unit measures; "signal" where that is not known."""
+    return _QUANTITY.get(unit or "", "signal")
 
-    Beside is empty whatever part of the lines is shown later.
+
+def shown_in(axis: Axis, size: float, unit: str | None) -> tuple[float, str]:
+    """Return the factor and the unit in which an axis shows values up to a size.
+
+    An axis that has a label with a unit keeps it, so that what is drawn later lies right.
+
+    Raises
+    ------
+    ModelError
+        When it shows another quantity.
     """
+    label = re.search(r"\[(.+)\]$", axis.get_label_text())
+    if label is None:
+        return in_unit(size, unit)
+    for prefixed in (in_unit(10.0**k, unit) for k in _POWERS):
+        if prefixed[1] == label[1]:
+            return prefixed
+    raise ModelError(
+        f"one axes holds one unit: it shows {axis.get_label_text()!r}, and this is in "
+        f"{unit or 'no known unit'}. Draw it on axes of its own."
+    )
+
+
+def named(quantity: str, unit: str) -> str:
+    """Return the label of an axis: a quantity with its unit where there is one."""
+    return f"{quantity} [{unit}]" if unit else quantity
+
+
+def plan(ax: Axes, points: FloatArray) -> float:
+    """Make axes a view from above on points (n, 2 or 3) [m]; return the factor of places on it."""
+    factor, unit = shown_in(ax.xaxis, float(np.max(np.abs(points[:, :2]), initial=0.0)), "m")
+    ax.set_aspect("equal")
+    finish(ax, x=f"x [{unit}]", y=f"y [{unit}]")
+    return factor
+
+
+def legend_below(ax: Axes, columns: int = 3) -> None:
+    """Draw the legend under a view from above."""
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=columns, frameon=False)
+
+
+def legend(ax: Axes, *, given: bool) -> None:
+    """Draw the legend where it covers nothing: beside new axes, in a given one's emptiest corner.
+
+    Beside is empty whatever part of the lines is shown later. Where no corner is empty, the
+    ordinate of a given one reaches further up.
+    """
+    if not ax.get_legend_handles_labels()[0]:
+        return
     if not given:
         ax.legend(frameon=False, loc="center left", bbox_to_anchor=(1.0, 0.5))
         return
     shown = ax.legend(frameon=False)
     box = shown.get_window_extent().transformed(ax.transAxes.inverted())
-    width, height = box.width + 0.02, box.height + 0.02
-    to_axes = ax.transData + ax.transAxes.inverted()
-    points = np.vstack([to_axes.transform(_polyline(line)) for line in ax.get_lines()])
+    width, height = box.width + 0.02, box.height + 0.03
+    points = _drawn(ax)
     across = {"right": points[:, 0] > 1 - width, "left": points[:, 0] < width}
     along = {"upper": points[:, 1] > 1 - height, "lower": points[:, 1] < height}
     corners = {
         f"{v} {h}": int((up & at).sum()) for h, at in across.items() for v, up in along.items()
     }
     emptiest: Any = min(corners, key=lambda corner: corners[corner])
+    if corners[emptiest]:
+        emptiest = min(("upper right", "upper left"), key=lambda corner: corners[corner])
+        side = points[across[emptiest.split()[1]], 1]
+        _raise_top(ax, float(side[side <= 1.0].max(initial=0.0)) + height)
     ax.legend(frameon=False, loc=emptiest)
 
 
-def _polyline(line: Line2D) -> FloatArray:
-    """Return points (k, 2) along a line, also between those far apart, in data coordinates."""
-    points = np.asarray(line.get_xydata(), dtype=np.float64)
+def _raise_top(ax: Axes, top: float) -> None:
+    """Show more above: what is now at `top`, in units of the axes, is then its upper end."""
+    scale = ax.yaxis.get_transform()
+    low, high = scale.transform(np.array(ax.get_ylim()))
+    further = scale.inverted().transform(np.array([low + max(top, 1.0) * (high - low)]))
+    ax.set_ylim(top=float(further[0]))
+
+
+def _drawn(ax: Axes) -> FloatArray:
+    """Return points (k, 2) along all lines and at the edges of areas, in units of the axes."""
+    to_axes = ax.transData + ax.transAxes.inverted()
+    parts = [_between(np.asarray(line.get_xydata(), dtype=float)) for line in ax.get_lines()]
+    for area in ax.collections:
+        if isinstance(area, PolyCollection):
+            parts += [_between(np.asarray(path.vertices)) for path in area.get_paths()]
+    return np.vstack([np.zeros((0, 2)), *(to_axes.transform(part) for part in parts)])
+
+
+def _between(points: FloatArray) -> FloatArray:
+    """Return points (k, 2) along a line, also between those far apart."""
     if len(points) > _DENSE or len(points) < 2:
         return points
     at = np.linspace(0, len(points) - 1, _DENSE)

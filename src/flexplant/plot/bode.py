@@ -74,7 +74,7 @@ def bode(
                 continuous = _draw(pair, curve, output, name, continuous)
             readable(pair[0])
             _whole_turns(pair[1])
-            finish(pair[0], x="", y=gain_label(output, name, drawn[0]))
+            finish(pair[0], x="", y=gain_label(output, name, first.unit(output, name)))
             last = i == len(rows) - 1
             finish(pair[1], x="frequency [Hz]" if last else "", y="phase [deg]")
     if any(curve.label for curve in drawn):

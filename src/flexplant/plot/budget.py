@@ -2,12 +2,19 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 
 from ..loop import ErrorBudget
-from ..values import instance, scale
-from ._axes import CYCLE, axes, finish
+from ..values import in_unit, instance, with_unit
+from ._axes import axes, finish, named
+from ._style import CYCLE
+
+#: of the areas, which differ without colour too
+_HATCHES = ("", "//", "", "\\\\", "", "..")
+_BESIDE: dict[str, Any] = {"loc": "center left", "bbox_to_anchor": (1.0, 0.5)}
 
 
 def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes:
@@ -35,10 +42,10 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
         When it is no ErrorBudget.
     """
     instance(found, ErrorBudget, "found", "Pass loop.budget(channel).")
-    ax = axes(ax, figsize=(7.0, 4.0))
+    given, ax = ax is not None, axes(ax, figsize=(9.0, 4.0))
     order = [int(i) for i in np.argsort(-found.variances, kind="stable")]
     shown, rest = order[: max(most, 1)], order[max(most, 1) :]
-    factor, prefix = scale(found.rms) if found.unit else (1.0, "")
+    factor, unit = in_unit(found.rms, found.unit)
     # from where a thousandth of the variance has come
     low = found.cumulative.sum(axis=0) < 1e-3 * found.variances.sum()
     inside = np.isfinite(found.freq) & (found.freq > 0) & ~low
@@ -53,14 +60,23 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
             freq,
             base,
             base + rows,
-            color=CYCLE[i % len(CYCLE)],
+            facecolor=CYCLE[i % len(CYCLE)]["color"],
+            hatch=_HATCHES[i % len(_HATCHES)],
             alpha=0.75,
-            linewidth=0.0,
-            label=f"{name}: {rms / factor:.3g} {prefix}{found.unit}",
+            edgecolor="white",
+            linewidth=0.8,
+            label=f"{name}: {with_unit(rms, found.unit)} rms",
         )
         base = base + rows
     ax.set(xscale="log", ylim=(0.0, None))
-    ax.legend(frameon=False, loc="upper left")
-    unit = f"[({prefix}{found.unit})$^2$]" if found.unit else ""
-    total = f"{found.channel}: {found.rms / factor:.4g} {prefix}{found.unit} rms"
-    return finish(ax, x="frequency [Hz]", y=f"variance below the frequency {unit}", title=total)
+    ax.legend(*_reversed(ax), frameon=False, **({"loc": "upper left"} if given else _BESIDE))
+    total = f"{found.channel}: {with_unit(found.rms, found.unit)} rms"
+    squared = f"({unit})^2" if set(unit) & set(" /") else f"{unit}^2" if unit else ""
+    label = named("variance below the frequency", squared)
+    return finish(ax, x="frequency [Hz]", y=label, title=total)
+
+
+def _reversed(ax: Axes) -> tuple[list[Any], list[str]]:
+    """Return handles and labels of the legend from the uppermost area down."""
+    handles, labels = ax.get_legend_handles_labels()
+    return handles[::-1], labels[::-1]

@@ -6,8 +6,9 @@ from matplotlib.axes import Axes
 
 from ..errors import ModelError
 from ..simulation import ErrorMap
-from ..values import instance, scale, short
-from ._axes import MARK, axes, finish
+from ..values import in_unit, instance, short
+from ._axes import axes, legend_below, named, plan
+from ._style import RED
 
 
 def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> Axes:
@@ -39,14 +40,13 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
         raise ModelError("a picture needs at least three points that span an area: add some.")
     ax = axes(ax, figsize=(6.0, 5.0))
     values = found.ma if what == "ma" else found.msd
-    factor, prefix = scale(float(values.max())) if found.unit else (1.0, "")
-    x, y = found.points[:, 0], found.points[:, 1]
+    factor, unit = in_unit(float(values.max()), found.unit)
+    x, y = found.points[:, :2].T / plan(ax, found.points)
     contours = ax.tricontourf(x, y, values / factor, levels=20, cmap="viridis")
-    label = f"{what.upper()} along {found.axis} [{prefix}{found.unit}]"
-    ax.figure.colorbar(contours, ax=ax, label=label)
+    label = f"{what.upper()} of the error along {found.axis}"
+    ax.figure.colorbar(contours, ax=ax, label=named(label, unit))
     ax.plot(x, y, ".", color="white", markersize=2.0)
     worst = int(values.argmax())
-    ax.plot(x[worst], y[worst], "x", color=MARK, markersize=10, label="worst point")
-    ax.set_aspect("equal")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), frameon=False)
-    return finish(ax, x="x [m]", y="y [m]")
+    ax.plot(x[worst], y[worst], "x", color=RED, markersize=10, label="worst point")
+    legend_below(ax)
+    return ax

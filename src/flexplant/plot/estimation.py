@@ -14,8 +14,9 @@ from ..estimation import Estimate, LagReport
 from ..estimation.channels import row_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
-from ..values import FloatArray, instance, name_list, positive, real_array, scale, short
-from ._axes import CYCLE, MEASURED, NOMINAL, UPDATED, axes, finish
+from ..values import FloatArray, instance, name_list, positive, real_array, short
+from ._axes import axes, finish, legend, named, shown_in
+from ._style import BLACK, BLUE, CYCLE, GREY, ORANGE, RED
 
 
 def predictions(
@@ -67,19 +68,20 @@ def predictions(
     if any(np.any(table[:, :2] <= 0) for table in tables.values()):
         raise ModelError("errors must be positive: they are drawn on a logarithmic axis.")
     ax = axes(ax, figsize=(7.0, 3.6))
-    factor, prefix = scale(float(np.median([np.median(t[:, 1]) for t in tables.values()])))
+    typical = float(np.median([np.median(t[:, 1]) for t in tables.values()]))
+    factor, shown = shown_in(ax.xaxis, typical, unit)
     names = list(tables)
     for i, (name, table) in enumerate(tables.items()):
-        color = (colors or {}).get(name, CYCLE[i % len(CYCLE)])
+        color = (colors or {}).get(name, str(CYCLE[i % len(CYCLE)]["color"]))
         _row(ax, len(names) - 1 - i, table / factor, color)
-    _name_cases(ax, cases, next(iter(tables.values()))[:, 1] / factor, len(names) - 1)
     ax.set_xscale("log")
+    _name_cases(ax, cases, next(iter(tables.values()))[:, 1] / factor, len(names) - 1)
     ax.set_yticks(range(len(names)), names[::-1])
     ax.set_ylim(-0.6, len(names) - 0.4)
     ax.legend(
         handles=_legend(), frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=2
     )
-    return finish(ax, x=f"rms error{title} [{prefix}{unit}]", y="")
+    return finish(ax, x=named(f"rms error{title}", shown), y="")
 
 
 def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None = None) -> Axes:
@@ -109,14 +111,15 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
     instance(report, LagReport, "report", "Pass observer.report().")
     row = row_of(report.channels, report.channels[0] if channel is None else channel)
     name = report.channels[row]
-    unit = report.units.get(name, "")
-    factor, prefix = scale(float(report.curve[0, row])) if unit else (1.0, "")
-    ax = axes(ax, figsize=(7.0, 4.0))
+    given, ax = ax is not None, axes(ax, figsize=(9.0, 4.0))
+    size = float(report.curve[0, row])
+    factor, unit = shown_in(ax.yaxis, size, report.units.get(name))
+    lag, second = shown_in(ax.xaxis, float(np.median(report.lag)), "s")
     later = report.lag > 0
-    ax.semilogx(1e3 * report.lag[later], report.curve[later, row] / factor, color=UPDATED,
+    ax.semilogx(report.lag[later] / lag, report.curve[later, row] / factor, color=BLUE,
                 label="estimate with this lag")  # fmt: skip
-    levels = (("filter", "tab:orange", "--"), (PREDICTOR, "tab:red", ":"),
-              (SMOOTHER, MEASURED, "--"), (STATIC, NOMINAL, "-."))  # fmt: skip
+    levels = (("filter", ORANGE, "--"), (PREDICTOR, RED, ":"),
+              (SMOOTHER, BLACK, (0, (5, 1, 1, 1))), (STATIC, GREY, "-."))  # fmt: skip
     for level, color, style in levels:
         value = float(report[level][row])
         if np.isfinite(value):
@@ -126,8 +129,8 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
         ax.set_yscale("log")
     else:
         ax.set_ylim(bottom=0.0)
-    ax.legend(frameon=False, fontsize="small", loc="center right")
-    return finish(ax, x="lag [ms]", y=f"rms error of {name} [{prefix}{unit or '?'}]")
+    legend(ax, given=given)
+    return finish(ax, x=named("lag", second), y=named(f"rms error of {name}", unit))
 
 
 def estimate(
@@ -174,26 +177,29 @@ def estimate(
     if truth is not None:
         signal = signal - real_array(truth, "truth", signal.shape)
         middle, label = np.zeros_like(signal), f"error of {name}"
-    unit = result.units.get(name, "")
     known = np.isfinite(signal) & np.isfinite(spread)
     size = float(np.max(np.abs(signal[known]), initial=0.0))
-    factor, prefix = scale(size) if unit else (1.0, "")
-    ax = axes(ax, figsize=(8.0, 3.6))
+    given, ax = ax is not None, axes(ax, figsize=(9.0, 3.6))
+    factor, unit = shown_in(ax.yaxis, size, result.units.get(name))
+    second, time = shown_in(ax.xaxis, float(np.max(np.abs(result.time), initial=0.0)), "s")
     low, high = (np.where(known, middle + s * spread, np.nan) / factor for s in (-1.0, 1.0))
-    ax.fill_between(result.time, low, high, color=UPDATED, alpha=0.25, linewidth=0.0,
+    ax.fill_between(result.time / second, low, high, color=BLUE, alpha=0.25, linewidth=0.0,
                     label=f"\N{PLUS-MINUS SIGN} {deviations:g} deviations")  # fmt: skip
-    ax.plot(result.time, signal / factor, color=UPDATED, linewidth=0.8, label=label)
-    ax.legend(frameon=False, loc="upper right")
-    return finish(ax, x="time [s]", y=f"{label} [{prefix}{unit or '?'}]")
+    ax.plot(result.time / second, signal / factor, color=BLUE, linewidth=0.8, label=label)
+    legend(ax, given=given)
+    return finish(ax, x=named("time", time), y=named(label, unit))
 
 
 def _name_cases(ax: Axes, cases: Sequence[str], found: FloatArray, place: float) -> None:
-    """Write the names of cases above the row of the first design."""
-    named = name_list(cases, "cases")
-    if named and len(named) != found.size:
-        raise ShapeError(f"{len(named)} names of cases are given for {found.size}. Name each.")
-    for name, size in zip(named, found, strict=False):
+    """Write the names of cases above the row of the first design, within the axes."""
+    texts = name_list(cases, "cases")
+    if texts and len(texts) != found.size:
+        raise ShapeError(f"{len(texts)} names of cases are given for {found.size}. Name each.")
+    for name, size in zip(texts, found, strict=False):
         ax.annotate(name, (size, place), (0, 11), textcoords="offset points", ha="center")
+    ends = [text.get_window_extent().transformed(ax.transAxes.inverted()) for text in ax.texts]
+    beyond = max((max(-box.x0, box.x1 - 1.0) for box in ends), default=0.0)
+    ax.margins(x=0.05 + 1.5 * max(beyond, 0.0))
 
 
 def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
@@ -202,7 +208,7 @@ def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
     ax.hlines(np.full(found.size, place), np.minimum(predicted, found),
               np.maximum(predicted, found), color=color, linewidth=1.0)  # fmt: skip
     bars = np.maximum(np.array([found - low, high - found]), 0.0)
-    ax.errorbar(found, np.full(found.size, place), xerr=bars, fmt="|", color=MEASURED, capsize=4,
+    ax.errorbar(found, np.full(found.size, place), xerr=bars, fmt="|", color=BLACK, capsize=4,
                 markersize=14, markeredgewidth=2.0)  # fmt: skip
     ax.plot(predicted, np.full(found.size, place), "D", color=color, fillstyle="none",
             markersize=9, markeredgewidth=2.0)  # fmt: skip
@@ -210,7 +216,7 @@ def _row(ax: Axes, place: float, table: FloatArray, color: str) -> None:
 
 def _legend() -> Sequence[Line2D]:
     diamond = {"marker": "D", "fillstyle": "none", "linestyle": "", "color": "0.4"}
-    bar = {"marker": "|", "linestyle": "", "color": MEASURED, "markersize": 12}
+    bar = {"marker": "|", "linestyle": "", "color": BLACK, "markersize": 12}
     return (
         Line2D([], [], label="predicted by the design", **diamond),  # type: ignore[arg-type]
         Line2D([], [], label="on the machine, 95 %", markeredgewidth=2.0, **bar),  # type: ignore[arg-type]

@@ -1,37 +1,41 @@
-"""Pictures over frequency."""
+"""Frequency responses of one channel side by side."""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
-from ..loop import ClosedLoop
-from ..loop.comparison import error_sensitivity
 from ..lti.frequency import Frf
-from ..values import ComplexArray, FloatArray, instance, short
-from ._axes import CYCLE, axes, finish, legend
+from ..values import FloatArray, real_array, short
+from ._axes import axes, finish, legend
+from ._style import STYLES, role_of
+from .gains import Curve, curves, decibel, gain_label, readable
 
 
 def frf(
-    responses: Mapping[str, Frf],
+    responses: Mapping[str, Any],
     output: str,
     input: str,
     *,
     colors: Mapping[str, str] | None = None,
     unit: str | None = None,
     reference: str | None = None,
+    band: tuple[float, float] | None = None,
+    freq: FloatArray | None = None,
     ax: Axes | None = None,
 ) -> Axes:
-    """Draw the magnitude of one channel of several FRFs (paper, Figs. 4, 10 and 11).
+    """Draw the magnitude of one channel of several responses (paper, Figs. 4, 10 and 11).
 
-    The first one is drawn as a thick line, so that those that cover it do not hide it.
+    Measurements are black points under the lines. The first of lines whose labels name nothing is
+    thick, so that those that cover it do not hide it.
 
     Parameters
     ----------
-    responses : mapping {label: Frf}
+    responses : mapping {label: Frf or system}
         What to compare.
     output, input : str
         The channel.
@@ -40,8 +44,12 @@ def frf(
     unit : str, optional
         Of the gain, where the responses have none; 0 dB is one of it.
     reference : str, optional
-        A label: the differences of the other responses from this one are drawn as dotted lines,
-        where they share its frequencies.
+        A label: the differences of the other responses from this one are drawn as well, where
+        they share its frequencies.
+    band : (low, high) [Hz], optional
+        The frequencies to draw; all when not given.
+    freq : (n_freq,) array [Hz], optional
+        Where systems are evaluated; a grid of each, refined at resonances, when not given.
     ax : Axes, optional
         Where to draw.
 
@@ -52,84 +60,61 @@ def frf(
     Raises
     ------
     LabelError
-        When there is no such reference.
+        When there is no such reference or channel.
     ModelError
-        When there is no such mapping, or the responses are of different units.
+        When there is no such mapping, the responses are of different units, or nothing of one is
+        in the band.
     """
     if not isinstance(responses, Mapping) or isinstance(responses, Frf):
         raise ModelError(
             f"need a mapping of labels to Frfs, got {short(responses)}. Type {{'model': frf}}."
         )
-    wrong = [found for found in responses.values() if not isinstance(found, Frf)]
-    if wrong:
-        raise ModelError(f"need Frfs to draw, got {short(wrong[0])}. Use frequency_response(sys).")
-    units = {label: found.unit(output, input) or unit for label, found in responses.items()}
-    known = {own for own in units.values() if own is not None}
+    drawn = [_part(curve, band) for curve in curves(responses, freq, colors)]
+    found = {curve.label: curve.response.unit(output, input) or unit for curve in drawn}
+    known = {own for own in found.values() if own is not None}
     if len(known) > 1:
         raise ModelError(
-            f"{output} / {input} is in different units, which share no axis: {units}. Convert one "
+            f"{output} / {input} is in different units, which share no axis: {found}. Convert one "
             "(frf.converted), or draw them apart."
         )
-    if reference is not None and reference not in responses:
-        raise unknown_label("response", reference, responses)
-    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
-    for i, (label, response) in enumerate(responses.items()):
-        color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
-        thick = i == 0 and len(responses) > 1
-        line = {"color": color, "linewidth": 2.6 if thick else 1.1, "alpha": 0.6 if thick else 1.0}
-        ax.semilogx(response.freq, _decibel(response[output, input]), label=label, **line)
-        base = None if reference in (None, label) else responses[str(reference)]
-        if base is not None and np.array_equal(base.freq, response.freq):
-            error = _decibel(response[output, input] - base[output, input])
-            text = f"{label} less {reference}"
-            ax.semilogx(response.freq, error, ":", color=color, label=text, linewidth=1.1)
+    if reference is not None and reference not in found:
+        raise unknown_label("response", reference, found)
+    given, ax = ax is not None, axes(ax, figsize=(9.0, 4.5))
+    wide = {"linewidth": 3.2, "alpha": 0.5} if len(drawn) > 1 and _names_nothing(drawn[0]) else {}
+    for i, (label, response, line) in enumerate(drawn):
+        look = line | wide if i == 0 else line
+        ax.semilogx(response.freq, decibel(response[output, input]), label=label, **look)
+    for curve, base in ((c, b) for b in drawn if b.label == reference for c in drawn if c is not b):
+        if np.array_equal(base.response.freq, curve.response.freq):
+            error = curve.response[output, input] - base.response[output, input]
+            look = dict(STYLES["difference"])
+            if len(drawn) > 2:
+                look["color"] = curve.line["color"]
+            text = f"{curve.label} less {reference}"
+            ax.semilogx(curve.response.freq, decibel(error), label=text, **look)
+    readable(ax)
     legend(ax, given=given)
-    one = f"1 {known.pop()}".removesuffix(" 1") if known else "1"
-    return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [dB, 0 dB = {one}]")
+    gain = known.pop() if known else None
+    return finish(ax, x="frequency [Hz]", y=gain_label(output, input, gain))
 
 
-def _decibel(values: ComplexArray) -> FloatArray:
-    return np.asarray(20.0 * np.log10(np.maximum(np.abs(values), 1e-300)))
+def _names_nothing(curve: Curve) -> bool:
+    return role_of(curve.label) is None and "marker" not in curve.line
 
 
-def sensitivity(
-    curves: Mapping[str, ClosedLoop | tuple[FloatArray, FloatArray]],
-    *,
-    colors: Mapping[str, str] | None = None,
-    dashed: Collection[str] = (),
-    ax: Axes | None = None,
-) -> Axes:
-    """Draw the size of sensitivities over frequency, with lines at 0 and 6 dB.
-
-    Parameters
-    ----------
-    curves : mapping {label: ClosedLoop, or (freq [Hz], size)}
-        What to compare; of a loop |S| from its reference to the error at the POI.
-    colors : mapping {label: color}, optional
-        Of some lines.
-    dashed : collection of str
-        Labels of lines to draw thin and dashed, so that they show on equal ones.
-    ax : Axes, optional
-        Where to draw.
-
-    Returns
-    -------
-    Axes
-
-    Raises
-    ------
-    ModelError
-        When there is no such mapping.
-    """
-    instance(curves, Mapping, "curves", "Type {'model': (freq, size)}.")
-    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
-    for i, (label, curve) in enumerate(curves.items()):
-        freq, size = error_sensitivity(curve) if isinstance(curve, ClosedLoop) else curve
-        color = (colors or {}).get(label, CYCLE[i % len(CYCLE)])
-        thin = label in dashed
-        line = {"linestyle": "--", "linewidth": 1.0} if thin else {"linewidth": 2.2, "alpha": 0.8}
-        ax.semilogx(freq, 20.0 * np.log10(size), color=color, label=label, **line)
-    for level, style in ((0.0, "-"), (6.0, ":")):
-        ax.axhline(level, color="0.4", linestyle=style, linewidth=0.8)
-    legend(ax, given=given)
-    return finish(ax, x="frequency [Hz]", y="|S| [dB]")
+def _part(curve: Curve, band: tuple[float, float] | None) -> Curve:
+    """Return the part of a curve within a band of frequencies."""
+    if band is None:
+        return curve
+    low, high = real_array(band, "band", (2,)).tolist()
+    freq = curve.response.freq
+    inside = (freq >= low) & (freq <= high)
+    if not inside.any():
+        raise ModelError(
+            f"{curve.label!r} has no frequency from {low:g} to {high:g} Hz: it reaches from "
+            f"{freq[0]:g} to {freq[-1]:g} Hz. Choose another band."
+        )
+    whole = curve.response
+    data, units = whole.data[:, :, inside], whole.channel_units
+    shown = Frf(freq[inside], data, whole.inputs, whole.outputs, units=units)
+    return curve._replace(response=shown)

@@ -12,10 +12,12 @@ from ..errors import FlexplantError, ModelError
 from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
 from ..values import ComplexArray, FloatArray, short
-from ._axes import CYCLE, MEASURED
+from ._style import POINTS, Style, role_of, styles
 
 #: of a magnitude below the largest one that is drawn, nothing can be read: zeros at half the rate
 _DEPTH = 160.0
+#: share of the decades that may lie below the axis, and by how much it reaches below the others
+_SHARE, _MORE = 0.03, 15.0
 
 
 class Curve(NamedTuple):
@@ -23,10 +25,12 @@ class Curve(NamedTuple):
 
     label: str
     response: Frf
-    line: dict[str, Any]
+    line: Style
 
 
-def curves(found: Any, freq: FloatArray | None = None) -> list[Curve]:
+def curves(
+    found: Any, freq: FloatArray | None = None, colors: Mapping[str, str] | None = None
+) -> list[Curve]:
     """Return what to draw of a system, an Frf, or a mapping {label: one of these}.
 
     Systems are evaluated at `freq`; when it is not given, on their own grids.
@@ -37,17 +41,24 @@ def curves(found: Any, freq: FloatArray | None = None) -> list[Curve]:
         When it is none of these, or a mapping without entries.
     """
     several = isinstance(found, Mapping) and not isinstance(found, Frf)
-    named = dict(found) if several else {"": found}
+    named = {str(label): one for label, one in found.items()} if several else {"": found}
     if not named:
         raise ModelError("there is nothing to draw: the mapping is empty.")
+    measured = [label for label, one in named.items() if _is_measured(label, one)]
+    modelled = iter(styles([label for label in named if label not in measured], colors))
     drawn = []
-    for i, (label, one) in enumerate(named.items()):
-        measured = isinstance(one, Frf) and (one.variance is not None or one.coherence is not None)
-        line: dict[str, Any] = {"color": CYCLE[i % len(CYCLE)], "linewidth": 1.3}
-        if measured:
-            line = {"color": MEASURED, "linestyle": "none", "marker": ".", "markersize": 3.0}
-        drawn.append(Curve(str(label), _response(one, freq), line))
+    for label, one in named.items():
+        line = dict(POINTS) if label in measured else next(modelled)
+        if colors and label in colors:
+            line["color"] = colors[label]
+        drawn.append(Curve(label, _response(one, freq), line))
     return drawn
+
+
+def _is_measured(label: str, one: Any) -> bool:
+    if role_of(label) == "measured":
+        return True
+    return isinstance(one, Frf) and (one.variance is not None or one.coherence is not None)
 
 
 def _response(one: Any, freq: FloatArray | None) -> Frf:
@@ -69,14 +80,34 @@ def decibel(values: ComplexArray | FloatArray) -> FloatArray:
 
 
 def readable(ax: Axes) -> None:
-    """Limit a decibel axis below where magnitudes can be read: zeros would draw it down."""
-    sizes = np.concatenate([np.ravel(np.asarray(line.get_ydata())) for line in ax.get_lines()])
-    top = float(np.max(sizes))
-    if float(np.min(sizes)) < top - _DEPTH:
-        ax.set_ylim(top - _DEPTH, top + 0.05 * _DEPTH)
+    """End a decibel axis where magnitudes can be read: zeros at half the rate would draw it down.
+
+    Over a small share of the decades, lines may lie below the axis.
+    """
+    lines = [np.asarray(line.get_xydata(), dtype=float) for line in ax.get_lines()]
+    over = [line[line[:, 0] > 0] for line in lines if len(line) > 2]
+    if not over:
+        return
+    top = max(float(line[:, 1].max()) for line in over)
+    deep = min(_depth(line) for line in over)
+    lowest = min(float(line[:, 1].min()) for line in over)
+    bottom = max(deep - _MORE, top - _DEPTH)
+    if lowest < bottom:
+        ax.set_ylim(bottom, top + 0.05 * (top - bottom))
 
 
-def gain_label(output: str, input: str, curve: Curve) -> str:
+def _depth(line: FloatArray) -> float:
+    """Return the level below which a line is over `_SHARE` of its decades."""
+    decades = np.log10(line[:, 0])
+    levels = np.interp(np.linspace(decades[0], decades[-1], 400), decades, line[:, 1])
+    return float(np.quantile(levels, _SHARE))
+
+
+def gain_label(output: str, input: str, unit: str | None) -> str:
     """Return the label of a decibel axis, with what 0 dB is."""
-    unit = curve.response.unit(output, input)
-    return f"|{output} / {input}| [dB, 0 dB = {'1' if unit in (None, '1') else f'1 {unit}'}]"
+    return f"|{output} / {input}| [dB, 0 dB = {reference_of(unit)}]"
+
+
+def reference_of(unit: str | None) -> str:
+    """Return what 0 dB is: one of the unit of a gain."""
+    return "1" if unit in (None, "1") else f"1 {unit}"

@@ -7,15 +7,16 @@ from matplotlib.axes import Axes
 
 from ..identification import IdentifiedModes, StabilisationDiagram
 from ..lti.frequency import Frf
-from ..values import instance
-from ._axes import DIFFERENCE, MARK, MEASURED, UPDATED, axes, finish
+from ..values import ComplexArray, FloatArray, instance
+from ._axes import axes, finish, legend, named, shown_in
+from ._style import BLUE, GREY, LIGHT, ORANGE, RED, STYLES, Style
 
 #: marker, colour and legend of the flags 0 to 3
 _MARKS = (
-    (".", "0.7", "new"),
-    ("o", DIFFERENCE, "frequency"),
-    ("d", UPDATED, "and damping"),
-    ("+", MARK, "and shape: stable"),
+    (".", GREY, "new"),
+    ("o", ORANGE, "steady frequency"),
+    ("d", BLUE, "and damping"),
+    ("+", RED, "and shape: stable"),
 )
 
 
@@ -38,7 +39,7 @@ def stabilisation(
     Axes
     """
     instance(diagram, StabilisationDiagram, "diagram", "Pass what stabilisation_diagram returned.")
-    ax = axes(ax, figsize=(9.0, 5.0))
+    given, ax = ax is not None, axes(ax, figsize=(10.0, 5.0))
     for flag, (marker, color, label) in enumerate(_MARKS):
         mine = diagram.flags == flag
         ax.plot(
@@ -49,10 +50,22 @@ def stabilisation(
         behind = ax.twinx()
         assert isinstance(behind, Axes)  # noqa: S101 - of the same class as ax
         size = np.sum(np.abs(frf.data), axis=(0, 1))
-        behind.semilogy(frf.freq, size, color="0.5", linewidth=0.8)
-        behind.set_ylabel("sum of |FRF|")
-    ax.legend(frameon=False, loc="upper right")
-    return finish(ax, x="frequency [Hz]", y="model order")
+        inside = (frf.freq >= diagram.band[0]) & (frf.freq <= diagram.band[1])
+        factor, unit = shown_in(behind.yaxis, float(np.max(size[inside], initial=0.0)), _unit(frf))
+        behind.semilogy(frf.freq[inside], size[inside] / factor, color=GREY, linewidth=0.8)
+        behind.set_ylabel(named("sum of all |FRF|", unit))
+    finish(ax, x="frequency [Hz]", y="model order")
+    if given or frf is None:
+        legend(ax, given=given)
+    else:  # beside is the ordinate of the responses
+        ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
+    return ax
+
+
+def _unit(frf: Frf) -> str | None:
+    """Return the unit that all responses share; None when there is none."""
+    units = {frf.unit(*channel) for channel in frf}
+    return units.pop() if len(units) == 1 else None
 
 
 def identified(
@@ -83,22 +96,27 @@ def identified(
         measurement in grey where known.
     """
     instance(modes, IdentifiedModes, "modes", "Pass what identify_modes returned.")
-    ax = axes(ax, figsize=(9.0, 5.0))
+    given, ax = ax is not None, axes(ax, figsize=(10.0, 5.0))
     if frf.quantity is not None:
         frf = frf.converted("displacement")
     band = modes.freq.min() * 0.8, max(modes.top, float(modes.freq.max()))
     inside = (frf.freq >= band[0]) & (frf.freq <= band[1])
     freq = frf.freq[inside]
     known, fit = frf[output, input][inside], modes.frf(freq)[output, input]
-    ax.semilogy(freq, np.abs(known), color=MEASURED, label="measured", linewidth=1.4)
-    ax.semilogy(freq, np.abs(fit), "--", color=UPDATED, label="identified", linewidth=1.1)
-    ax.semilogy(freq, np.abs(known - fit), color=DIFFERENCE, label="difference", linewidth=0.7)
+    factor, unit = shown_in(ax.yaxis, float(np.max(np.abs(known))), frf.unit(output, input))
+
+    def draw(values: FloatArray | ComplexArray, label: str, style: Style) -> None:
+        ax.semilogy(freq, np.abs(values) / factor, label=label, **style)
+
+    draw(known, "measured", STYLES["measured"])
+    draw(fit, "identified", STYLES["model"] | {"linestyle": "--"})
+    draw(known - fit, "difference", STYLES["difference"] | {"linestyle": "-", "linewidth": 0.7})
     if frf.variance is not None:
         place = list(frf.outputs).index(output), list(frf.inputs).index(input)
         deviation = np.sqrt(frf.variance[place][inside])
-        ax.semilogy(freq, deviation, color="0.6", label="standard deviation", linewidth=0.7)
+        draw(deviation, "standard deviation", {"color": GREY, "linewidth": 1.2, "linestyle": "--"})
     for pole in modes.freq.tolist():
-        ax.axvline(pole, color="0.8", linestyle=":", linewidth=0.8)
-    ax.legend(frameon=False)
+        ax.axvline(pole, color=LIGHT, linestyle=":", linewidth=0.8, zorder=1.0)
+    legend(ax, given=given)
     ax.set_xlim(float(freq[0]), float(freq[-1]))
-    return finish(ax, x="frequency [Hz]", y=f"|{output} / {input}| [m per unit]")
+    return finish(ax, x="frequency [Hz]", y=named(f"|{output} / {input}|", unit))

@@ -12,12 +12,13 @@ from ..labels import DofSet
 from ..updating import Localisation
 from ..updating.parameters.added import Parameter, PointParameter
 from ..values import FloatArray, instance
-from ._axes import MARK, NOMINAL, UPDATED, axes, finish
+from ._axes import axes, finish, legend_below, plan
+from ._style import BLUE, GREY, LIGHT, RED
 
 #: candidates in the bars
 SHOWN = 12
 #: colours of what was chosen, cannot be distinguished from it, hardly can, and of all others
-COLOURS = {"chosen": MARK, "alike": UPDATED, "rival": NOMINAL, "other": "0.8"}
+COLOURS = {"chosen": RED, "alike": BLUE, "rival": GREY, "other": LIGHT}
 
 
 def localisation(
@@ -93,12 +94,13 @@ def _plan(
     found: Localisation, candidates: Sequence[Parameter], dofs: DofSet, ax: Axes | None
 ) -> Axes:
     ax = axes(ax, figsize=(6.4, 5.4))
-    nodes = np.unique(dofs.xyz[:, :2], axis=0)
-    ax.plot(*nodes.T, ".", color="0.85", markersize=3, zorder=1)
+    factor = plan(ax, dofs.xyz)
+    nodes = np.unique(dofs.xyz[:, :2], axis=0) / factor
+    ax.plot(*nodes.T, ".", color=LIGHT, markersize=3, zorder=1)
     placed = [(q, _xy(q, dofs)) for q in candidates if isinstance(q, PointParameter)]
     if not placed:
         raise ModelError("no candidate acts at a place: leave dofs= out for bars.")
-    xy = np.array([where for _, where in placed])
+    xy = np.array([where for _, where in placed]) / factor
     share = np.array([100 * found[q.name] for q, _ in placed])
     order = np.argsort(share)
     dots = ax.scatter(
@@ -119,10 +121,8 @@ def _plan(
                 edgecolors=COLOURS[kind],
                 linewidths=1.8,
             )
-    ax.set_aspect("equal")
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
-    return finish(ax, x="x [m]", y="y [m]")
+    legend_below(ax)
+    return ax
 
 
 def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:

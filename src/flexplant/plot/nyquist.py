@@ -10,7 +10,8 @@ from matplotlib.patches import Circle
 
 from ..errors import ModelError, unknown_label
 from ..values import FloatArray, positive
-from ._axes import MARK, axes, finish, legend
+from ._axes import axes, finish, legend
+from ._style import GREY, RED
 from .gains import curves
 
 
@@ -73,9 +74,25 @@ def nyquist(
         ax.plot(values.real, values.imag, label=label, **curve.line)
         ax.plot(*_point(values[nearest]), "o", color=curve.line["color"], markersize=5)
     level = 20.0 * np.log10(positive(modulus, "modulus"))
-    ax.add_patch(Circle((-1, 0), 1.0 / modulus, fill=True, alpha=0.15, color=MARK, linewidth=0))
-    ax.add_patch(Circle((0, 0), 1.0, fill=False, color="0.6", linestyle=":", linewidth=0.9))
-    ax.plot(-1, 0, "+", color=MARK, markersize=10, label=f"-1, with |S| = {level:.1f} dB about it")
+    ax.add_patch(
+        Circle(
+            (-1, 0),
+            1.0 / modulus,
+            fill=True,
+            alpha=0.15,
+            color=RED,
+            linewidth=0,
+        )
+    )
+    ax.add_patch(Circle((0, 0), 1.0, fill=False, color=GREY, linestyle=":", linewidth=0.9))
+    ax.plot(
+        -1,
+        0,
+        "+",
+        color=RED,
+        markersize=10,
+        label=f"-1, with |S| = {level:.1f} dB about it",
+    )
     limit = positive(reach, "reach")
     ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
     legend(ax, given=given)

@@ -16,8 +16,9 @@ from ..placement.places import Zone, places_of
 from ..placement.shapes import shapes_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
-from ..values import FloatArray, instance, scale, whole
-from ._axes import MARK, MEASURED, NOMINAL, UPDATED, axes, finish
+from ..values import FloatArray, in_unit, instance, whole
+from ._axes import axes, finish, legend, legend_below, named, plan
+from ._style import BLACK, BLUE, LIGHT, RED, STYLES
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
@@ -46,21 +47,23 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     instance(found, SensorMap, "found", "Pass what sensor_map returned.")
     ax = axes(ax, figsize=(6.4, 5.4))
     ratio = np.sqrt(found.ratio)
-    x, y = found.points[:, 0], found.points[:, 1]
+    factor = plan(ax, found.points)
+    x, y = found.points[:, :2].T / factor
     contours = ax.tricontourf(x, y, ratio, levels=20, cmap="viridis_r")
-    ax.figure.colorbar(contours, ax=ax, label="POI error with / without a further sensor [1]")
+    ax.figure.colorbar(contours, ax=ax, label="POI error with / without a further sensor [-]")
     ax.plot(x, y, ".", color="white", markersize=1.5)
     for i, zone in enumerate(found.excluded):
         style = {"facecolor": "white", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
         label = "no sensor possible" if i == 0 else None
-        ax.add_patch(_patch(zone, label=label, **style))
+        ax.add_patch(_patch(zone, factor, label=label, **style))
     if ports is not None:
-        _devices(ax, ports.y, ports.u)
-        _pois(ax, [np.asarray(poi.at) for poi in ports.z if isinstance(poi.at, tuple)])
-    ax.plot(*found.best[:2], "*", color=MARK, markersize=14, label="best place", clip_on=False)
-    ax.set_aspect("equal")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
-    return finish(ax, x="x [m]", y="y [m]")
+        _devices(ax, factor, ports.y, ports.u)
+        _pois(ax, factor, [np.asarray(poi.at) for poi in ports.z if isinstance(poi.at, tuple)])
+    ax.plot(
+        *(found.best[:2] / factor), "*", color=RED, markersize=14, label="best place", clip_on=False
+    )
+    legend_below(ax)
+    return ax
 
 
 def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
@@ -84,25 +87,23 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
         When `found` is no ParetoCurve.
     """
     instance(found, ParetoCurve, "found", "Pass what pareto_curve returned.")
-    ax = axes(ax, figsize=(7.0, 4.2))
+    given, ax = ax is not None, axes(ax, figsize=(8.0, 4.2))
     values, bounds, label = found.values, found.bounds, found.placements[0].criterion
     if found.unit:
         values, bounds = np.sqrt(values), np.sqrt(np.maximum(bounds, 0.0))
-        size, prefix = scale(float(np.max(values)))
-        values, bounds, label = values / size, bounds / size, f"rms [{prefix}{found.unit}]"
+        size, unit = in_unit(float(np.max(values)), found.unit)
+        values, bounds, label = values / size, bounds / size, named("rms error", unit)
     low = np.isfinite(bounds)
-    ax.plot(found.amounts, values, "o-", color=UPDATED, label="best found")
+    ax.plot(found.amounts, values, "o-", color=BLUE, label="best found")
     if np.any(low):
-        ax.plot(
-            found.amounts[low], bounds[low], "--", color=NOMINAL, label="no choice is below this"
-        )
-        ax.fill_between(found.amounts[low], bounds[low], values[low], color=UPDATED, alpha=0.15)
+        bound = STYLES["bound"]
+        ax.plot(found.amounts[low], bounds[low], label="no choice is below this", **bound)
+        ax.fill_between(found.amounts[low], bounds[low], values[low], color=BLUE, alpha=0.15)
     if not found.by_cost:
         ax.set_xticks(found.amounts)
     ax.set_ylim(bottom=0.0 if found.unit else None)
-    finish(ax, x="cost" if found.by_cost else "number of devices", y=label)
-    ax.legend(frameon=False)
-    return ax
+    legend(ax, given=given)
+    return finish(ax, x="cost" if found.by_cost else "number of devices", y=label)
 
 
 def placed(
@@ -142,8 +143,9 @@ def placed(
     rows = np.flatnonzero(np.array(dofs.directions) == "z")
     if rows.size < 3:
         raise ModelError("a picture from above needs at least three DOFs in z: the model has less.")
-    x, y = dofs.xyz[rows, 0], dofs.xyz[rows, 1]
-    ax.plot(x, y, ".", color="0.8", markersize=2)
+    factor = plan(ax, dofs.xyz[rows])
+    x, y = dofs.xyz[rows, :2].T / factor
+    ax.plot(x, y, ".", color=LIGHT, markersize=2)
     title = ""
     if mode is not None:
         shapes = shapes_of(plant, ())
@@ -152,22 +154,27 @@ def placed(
         size = float(np.max(np.abs(shape)))
         levels = np.linspace(-1.0, 1.0, 21)
         filled = ax.tricontourf(x, y, shape / size, levels=levels, cmap="RdBu_r", alpha=0.8)
-        ax.figure.colorbar(filled, ax=ax, label="z, scaled to 1")
+        ax.figure.colorbar(filled, ax=ax, label="motion in z, largest 1 [-]")
         if shape.min() < 0.0 < shape.max():
             ax.tricontour(x, y, shape / size, levels=[0.0], colors="black", linewidths=0.8)
         title = f"mode {mode}, {shapes.omega[mode - 1] / 2 / np.pi:.4g} Hz"
     for zone in zones:
-        ax.add_patch(_patch(zone, facecolor="none", edgecolor="0.3", hatch="///", zorder=2.5))
+        hatched = {"facecolor": "none", "edgecolor": "0.3", "hatch": "///", "zorder": 2.5}
+        ax.add_patch(_patch(zone, factor, **hatched))
     where = places_of(plant, (*own.ports.y, *own.ports.u))
-    _devices(ax, own.ports.y, own.ports.u, where.points)
-    _pois(ax, [points.mean(axis=0) for points in where.pois])
-    ax.set_aspect("equal")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
-    return finish(ax, x="x [m]", y="y [m]", title=title)
+    _devices(ax, factor, own.ports.y, own.ports.u, where.points)
+    _pois(ax, factor, [points.mean(axis=0) for points in where.pois])
+    legend_below(ax)
+    ax.set_title(title)
+    return ax
 
 
 def _devices(
-    ax: Axes, sensors: Sequence[Any], actuators: Sequence[Any], points: Sequence[FloatArray] = ()
+    ax: Axes,
+    factor: float,
+    sensors: Sequence[Any],
+    actuators: Sequence[Any],
+    points: Sequence[FloatArray] = (),
 ) -> None:
     """Mark sensors and actuators; those whose place is no point only where points are given."""
     listed = points or [
@@ -175,28 +182,29 @@ def _devices(
         for port in (*sensors, *actuators)
     ]
     kinds = (
-        ("sensors", listed[: len(sensors)], "P", MEASURED),
-        ("actuators", listed[len(sensors) :], "^", MARK),
+        ("sensors", listed[: len(sensors)], "P", BLACK),
+        ("actuators", listed[len(sensors) :], "^", RED),
     )
     for label, parts, marker, color in kinds:
-        if parts and len(found := np.vstack(parts)):
+        if parts and len(found := np.vstack(parts) / factor):
             style: dict[str, Any] = {"color": color, "markeredgecolor": "white", "zorder": 4}
             ax.plot(
                 found[:, 0], found[:, 1], marker, label=label, markersize=11, clip_on=False, **style
             )
 
 
-def _pois(ax: Axes, points: Sequence[FloatArray]) -> None:
+def _pois(ax: Axes, factor: float, points: Sequence[FloatArray]) -> None:
     """Mark POIs."""
     if points:
-        at = np.array(points)
+        at = np.array(points) / factor
         style: dict[str, Any] = {"fillstyle": "none", "markersize": 12, "zorder": 4}
-        ax.plot(at[:, 0], at[:, 1], "o", color=MARK, label="POI", **style)
+        ax.plot(at[:, 0], at[:, 1], "o", color=RED, label="POI", **style)
 
 
-def _patch(zone: Zone, **style: Any) -> Patch:
+def _patch(zone: Zone, factor: float, **style: Any) -> Patch:
     """Return the outline of a zone."""
     if isinstance(zone, Disc):
-        return Circle((zone.centre[0], zone.centre[1]), zone.radius, **style)
-    (x, y), (right, top) = zone.lower, zone.upper
+        x, y = zone.centre[0] / factor, zone.centre[1] / factor
+        return Circle((x, y), zone.radius / factor, **style)
+    x, y, right, top = (side / factor for side in (*zone.lower, *zone.upper))
     return Box((x, y), right - x, top - y, **style)

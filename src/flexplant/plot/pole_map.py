@@ -11,8 +11,11 @@ from matplotlib.axes import Axes
 from ..lti.responses import continuous_poles
 from ..lti.statespace import StateSpace, as_statespace
 from ..values import ComplexArray, FloatArray
-from ._axes import CYCLE, MARK, axes, finish, legend
+from ._axes import axes, finish, legend
+from ._style import GREY, RED, styles
 
+#: markers of poles and zeros, one of each for a system
+_MARKERS = (("x", "o"), ("+", "s"), ("1", "D"), ("2", "^"))
 #: damping ratios of the lines
 _RATIOS = (1e-3, 1e-2, 0.1, 0.3, 0.7)
 
@@ -45,19 +48,20 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     """
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     named = dict(systems) if isinstance(systems, Mapping) else {"": systems}
+    looks = styles(str(label) for label in named)
     for i, (label, one) in enumerate(named.items()):
-        g = as_statespace(one)
-        color = CYCLE[i % len(CYCLE)]
-        _draw(ax, continuous_poles(g), "x", color, f"{label} poles".strip())
+        g, color = as_statespace(one), str(looks[i]["color"])
+        pole, zero = _MARKERS[i % len(_MARKERS)]
+        _draw(ax, continuous_poles(g), pole, color, f"{label} poles".strip())
         if zeros:
-            _draw(ax, _continuous(g.zeros(), g), "o", color, f"{label} zeros".strip())
+            _draw(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
     ax.set_xscale("log")
     ax.set_yscale("symlog", linthresh=1e-4)
     ax.axhline(0.0, color="0.3", linewidth=0.9)
     for ratio in _RATIOS:
-        ax.axhline(ratio, color="0.7", linewidth=0.6, linestyle=":")
+        ax.axhline(ratio, color=GREY, linewidth=0.6, linestyle=":")
     legend(ax, given=given)
-    return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio")
+    return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio [-]")
 
 
 def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:
@@ -75,5 +79,6 @@ def _draw(ax: Axes, roots: ComplexArray, marker: str, color: str, label: str) ->
         label = f"{label}, {int(still.sum())} more at 0 Hz"
     freq: FloatArray = size[~still] / (2 * np.pi)
     ratio = -upper[~still].real / size[~still]
-    ax.plot(freq, ratio, marker, color=color, label=label, markersize=6, fillstyle="none")
-    ax.plot(freq[ratio < 0], ratio[ratio < 0], marker, color=MARK, markersize=7, fillstyle="none")
+    ax.plot(freq, ratio, marker, color=color, label=label, markersize=7, fillstyle="none")
+    unstable: dict[str, Any] = {"color": RED, "markersize": 11, "fillstyle": "none"}
+    ax.plot(freq[ratio < 0], ratio[ratio < 0], marker, **unstable)

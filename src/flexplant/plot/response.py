@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
 from ..simulation import Response
-from ..values import instance, name_list, real_array, scale
-from ._axes import CYCLE, finish, legend, panel_axes
-
-#: what a unit measures
-_QUANTITY = {
-    "m": "displacement",
-    "rad": "rotation",
-    "N": "force",
-    "N m": "moment",
-    "m/s": "velocity",
-    "rad/s": "angular velocity",
-    "m/s^2": "acceleration",
-    "rad/s^2": "angular acceleration",
-}
+from ..values import instance, name_list, real_array
+from ._axes import finish, legend, named, panel_axes, quantity_of, shown_in
+from ._style import GREY, styles
 
 
 def response(
@@ -33,6 +24,7 @@ def response(
     label: str | None = None,
     color: str | None = None,
     span: tuple[float, float] | None = None,
+    exposures: npt.ArrayLike | None = None,
     ax: Axes | None = None,
 ) -> Axes:
     """Draw channels of a run over time, one panel for each unit; of several runs the first.
@@ -51,6 +43,8 @@ def response(
         Of the lines; a cycle when not given.
     span : (start, end) [s], optional
         The part of the run to draw; all of it when not given. The prefix is chosen for this part.
+    exposures : (k, 2) array [s], optional
+        Beginning and end of each, such as `SetPoint.exposures`: they are shaded.
     ax : Axes, optional
         Where to draw channels of one unit.
 
@@ -84,11 +78,26 @@ def response(
         )
     drawn = panel_axes(ax, len(panels))
     for (own, group), panel in zip(panels.items(), drawn, strict=True):
+        if exposures is not None:
+            shade(panel, exposures, run)
         _panel(panel, run, group, own, names, label=label, color=color, given=ax is not None)
     if len(drawn) > 1:
         for panel in drawn[:-1]:
             panel.set_xlabel("")
     return drawn[0]
+
+
+def shade(ax: Axes, exposures: npt.ArrayLike, run: Response) -> None:
+    """Shade exposures (k, 2) [s] of a run."""
+    second, _ = time_axis(ax, run)
+    for i, (start, end) in enumerate(real_array(exposures, "exposures", (None, 2)).tolist()):
+        look: dict[str, Any] = {"color": GREY, "alpha": 0.2, "linewidth": 0.0, "zorder": 0.5}
+        ax.axvspan(start / second, end / second, label=None if i else "exposure", **look)
+
+
+def time_axis(ax: Axes, run: Response) -> tuple[float, str]:
+    """Return the factor and the unit of the time axis of a run."""
+    return shown_in(ax.xaxis, float(np.max(np.abs(run.time), initial=0.0)), "s")
 
 
 def _label(label: str | None, name: str, names: Sequence[str]) -> str:
@@ -123,16 +132,14 @@ def _panel(
     """Draw channels of one unit; colours follow the place among all channels."""
     signals = [np.atleast_2d(run[name])[0] for name in group]
     size = max(float(np.max(np.abs(signal), initial=0.0)) for signal in signals)
-    factor, prefix = scale(size) if unit else (1.0, "")
+    factor, shown = shown_in(ax.yaxis, size, unit)
+    second, time = time_axis(ax, run)
+    labels = [_label(label, name, names) for name in names]
+    looks = dict(zip(names, styles(labels, taken=len(ax.get_lines())), strict=True))
     for name, signal in zip(group, signals, strict=True):
-        ax.plot(
-            run.time,
-            signal / factor,
-            color=color or CYCLE[names.index(name) % len(CYCLE)],
-            label=_label(label, name, names),
-            linewidth=0.8,
-        )
+        look = looks[name] | {"linewidth": 0.8} | ({"color": color} if color else {})
+        ax.plot(run.time / second, signal / factor, label=_label(label, name, names), **look)
     legend(ax, given=given)
     errors = all(name.endswith(":error") for name in group)
-    quantity = "error" if errors else _QUANTITY.get(unit or "", "signal")
-    finish(ax, x="time [s]", y=f"{quantity} [{prefix}{unit}]" if unit else quantity)
+    quantity = "error" if errors else quantity_of(unit)
+    finish(ax, x=named("time", time), y=named(quantity, shown))

@@ -13,7 +13,8 @@ from ..errors import ModelError
 from ..labels import DofSet
 from ..modes import Modes
 from ..plant import Ports
-from ._axes import FULL, MARK, NOMINAL, UPDATED, axes, finish
+from ._axes import axes, legend_below, plan
+from ._style import BLACK, BLUE, GREEN, GREY, PURPLE, RED
 
 
 def layout(
@@ -44,31 +45,33 @@ def layout(
     Axes
     """
     ax = axes(ax, figsize=(6.0, 6.0))
-    nodes = np.unique(dofs.xyz, axis=0)
+    factor = plan(ax, dofs.xyz)
+    nodes = np.unique(dofs.xyz, axis=0) / factor
     ax.plot(nodes[:, 0], nodes[:, 1], ".", color="0.5", label="nodes")
     wanted = list(desired)
     if wanted:
-        xyz = dofs.xyz[dofs.indices(wanted)]
-        ax.plot(xyz[:, 0], xyz[:, 1], "x", color="tab:purple", label=f"{len(wanted)} desired DOFs")
+        xyz = dofs.xyz[dofs.indices(wanted)] / factor
+        ax.plot(xyz[:, 0], xyz[:, 1], "x", color=PURPLE, label=f"{len(wanted)} desired DOFs")
     if ports is not None:
         for kind, listed, marker, color, size in (
-            ("actuators u", ports.u, "o", FULL, 12),
-            ("sensors y", ports.y, "P", UPDATED, 9),
-            ("points of interest", ports.z, "*", MARK, 15),
+            ("actuators u", ports.u, "o", GREEN, 12),
+            ("sensors y", ports.y, "P", BLUE, 9),
+            ("points of interest", ports.z, "*", RED, 15),
         ):
-            _mark(ax, dofs, kind, listed, marker=marker, color=color, markersize=size)
+            _mark(ax, dofs, factor, kind, listed, marker=marker, color=color, markersize=size)
     for text, place in (marked or {}).items():
-        point = _point(dofs, place)
-        ax.plot(point[0], point[1], "s", color="black", fillstyle="none", markersize=11)
+        point = _point(dofs, place) / factor
+        ax.plot(point[0], point[1], "s", color=BLACK, fillstyle="none", markersize=11)
         ax.annotate(text, (point[0], point[1]), (8, -14), textcoords="offset points")
-    ax.set_aspect("equal")
-    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, frameon=False)
-    return finish(ax, x="x [m]", y="y [m]")
+    legend_below(ax)
+    return ax
 
 
-def _mark(ax: Axes, dofs: DofSet, kind: str, listed: Sequence[Any], **style: Any) -> None:
+def _mark(
+    ax: Axes, dofs: DofSet, factor: float, kind: str, listed: Sequence[Any], **style: Any
+) -> None:
     """Draw and name the ports of one kind."""
-    points = [_point(dofs, port.at) for port in listed]
+    points = [_point(dofs, port.at) / factor for port in listed]
     if not points:
         return
     ax.plot(*np.array(points).T[:2], linestyle="", fillstyle="none", label=kind, **style)
@@ -84,7 +87,7 @@ def _point(dofs: DofSet, at: Any) -> Any:
     return np.asarray(at)
 
 
-def mode_shape(modes: Modes, number: int, *, ax: Any = None, color: str = NOMINAL) -> Any:
+def mode_shape(modes: Modes, number: int, *, ax: Any = None, color: str = GREY) -> Any:
     """Draw the z-displacements of one mode as a surface (paper, Figs. 5 and 6).
 
     Parameters

@@ -13,8 +13,9 @@ from matplotlib.ticker import MaxNLocator
 from ..lti.frequency import Frf
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
 from ..updating.search import Objective
-from ..values import FloatArray, instance
-from ._axes import MEASURED, NOMINAL, UPDATED, finish
+from ..values import FloatArray, in_unit, instance
+from ._axes import finish, legend, named, shown_in
+from ._style import BLUE, GREY, LIGHT, POINTS, STYLES
 
 #: parameters that are drawn by themselves; the rest are left to the repr
 SHOWN = 12
@@ -48,9 +49,9 @@ def update(
     -------
     dict of Axes
         `frequencies` and `damping` (errors before and after, with poles), `mac before` and
-        `mac after` (with shapes), `parameters` (estimates with intervals, priors in grey, each
-        parameter scaled by the far end of its interval), `convergence`,
-        `response` (measured, before and after, with responses).
+        `mac after` (with shapes), `parameters` (estimates with intervals and priors in grey, each
+        parameter in a row with an axis of its own), `convergence`, `response` (measured, before and
+        after, with responses).
 
     Raises
     ------
@@ -70,7 +71,11 @@ def update(
     rows: Any = [names[i : i + 2] for i in range(0, len(names), 2)]
     if shown:
         rows.append(["response", "response"])
-    figure, drawn = plt.subplot_mosaic(rows, figsize=(10.5, 3.2 * len(rows)), layout="constrained")
+    heights = [3.2] * len(rows)
+    heights[names.index("parameters") // 2] += 0.45 * max(min(len(fit.parameters), SHOWN) - 4, 0)
+    figure, drawn = plt.subplot_mosaic(
+        rows, figsize=(11.5, sum(heights)), height_ratios=heights, layout="constrained"
+    )
     axs: dict[str, Axes] = dict(drawn)
     if old.modes:
         _errors(axs["frequencies"], old, old.freq_error, new.freq_error, "frequency")
@@ -90,8 +95,8 @@ def update(
 def _errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what: str) -> None:
     place = np.arange(len(seen.modes))
     unit = 100.0
-    ax.bar(place - 0.2, unit * old, 0.38, color=NOMINAL, label="before")
-    ax.bar(place + 0.2, unit * new, 0.38, color=UPDATED, label="after")
+    ax.bar(place - 0.2, unit * old, 0.38, color=GREY, label="before")
+    ax.bar(place + 0.2, unit * new, 0.38, color=BLUE, label="after")
     for x, value in zip(place + 0.2, unit * new, strict=True):
         above = value >= 0
         ax.annotate(
@@ -102,20 +107,22 @@ def _errors(ax: Axes, seen: Correlation, old: FloatArray, new: FloatArray, what:
             ha="center",
             va="bottom" if above else "top",
             fontsize=7,
-            color=UPDATED,
+            color=BLUE,
             bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.5},
         )
     ax.axhline(0.0, color="0.3", linewidth=0.8)
     ax.margins(y=0.2)
     ax.set_xticks(place, [str(number) for number in seen.modes])
-    ax.legend(frameon=False, fontsize=8)
+    if what != "frequency":  # one legend serves both
+        legend(ax, given=False)
     kind = "%" if what == "frequency" else "percentage points"
     finish(ax, x="mode", y=f"error [{kind}]", title=f"{what}, model less measured")
 
 
 def _mac(ax: Axes, seen: Correlation, name: str) -> None:
     image = ax.imshow(seen.mac, vmin=0.0, vmax=1.0, cmap="Blues", aspect="auto")
-    ax.figure.colorbar(image, ax=ax, label="MAC [-]")
+    if name == "mac after":  # one colour bar serves both
+        ax.figure.colorbar(image, ax=ax, label="MAC [-]")
     place = np.arange(len(seen.modes))
     if len(seen.modes) <= 12:
         for i, row in enumerate(seen.mac):
@@ -134,72 +141,66 @@ def _mac(ax: Axes, seen: Correlation, name: str) -> None:
 
 
 def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
-    """Each parameter on its own scale: 0 is no change, 1 the end of its interval."""
+    """Draw each parameter in a row with an axis of its own: estimate, interval, prior, start."""
     count = min(len(fit.parameters), SHOWN)
-    place = np.arange(count)[::-1]
-    values = fit.values[:count]
-    half = np.zeros(count)
+    half = np.zeros(len(fit.values))
     if fit.std is not None:
-        half = fit.interval(level)[:count, 1] - values
-    size = np.abs(values) + half
-    size = np.where(size > 0, size, 1.0)
-    labels = []
+        half = fit.interval(level)[:, 1] - fit.values
+    ax.set_axis_off()
     for i in range(count):
-        error = "" if fit.std is None else f" ± {fit.std[i]:.1g}"
-        edge = ", AT ITS BOUND" if fit.parameters[i] in fit.at_bound else ""
-        labels.append(f"{fit.parameters[i]}\n{values[i]:.4g}{error} {fit.units[i]}{edge}")
+        row = ax.inset_axes((0.0, 1.0 - (i + 0.62) / count, 1.0, 0.4 / count))
         prior = getattr(fit.unknowns[i], "prior", None) if fit.unknowns else None
+        factor, unit = in_unit(abs(float(fit.values[i])) + half[i], fit.units[i])
         if prior is not None:
-            mean, width = prior[0] / size[i], 1.96 * prior[1] / size[i]
-            ax.barh(place[i], 2 * width, 0.5, left=mean - width, color="0.88", label="prior, 95 %")
-    ax.errorbar(
-        values / size,
-        place,
-        xerr=None if fit.std is None else half / size,
-        fmt="o",
-        color=UPDATED,
-        capsize=4,
-        label=f"estimate, {100 * level:g} %",
-    )
-    ax.axvline(0.0, color=NOMINAL, linewidth=1.0, label="before")
-    ax.set_xlim(-1.4, 1.4)
-    ax.set_yticks(place, labels, fontsize=8)
-    handles, texts = ax.get_legend_handles_labels()
-    unique = dict(zip(texts, handles, strict=True))
-    ax.legend(
-        unique.values(),
-        unique.keys(),
-        frameon=False,
-        fontsize=8,
-        ncols=3,
-        loc="upper center",
-    )
-    ax.set_ylim(-0.7, count + 0.1)
+            ends = (prior[0] - 1.96 * prior[1]) / factor, 3.92 * prior[1] / factor
+            row.barh(0.0, ends[1], 1.2, left=ends[0], color=LIGHT, label="prior, 95 %")
+        row.axvline(0.0, color=GREY, linewidth=1.6, label="before")
+        row.errorbar(
+            [fit.values[i] / factor],
+            [0.0],
+            xerr=None if fit.std is None else [half[i] / factor],
+            fmt="o",
+            color=BLUE,
+            capsize=4,
+            label=f"after, {100 * level:g} %",
+        )
+        row.set(ylim=(-1.0, 1.0), yticks=[])
+        row.margins(x=0.08)
+        row.tick_params(labelsize=7)
+        spread = "" if fit.std is None else f" \N{PLUS-MINUS SIGN} {fit.std[i] / factor:.1g}"
+        edge = ", AT ITS BOUND" if fit.parameters[i] in fit.at_bound else ""
+        text = f"{fit.parameters[i]}: {fit.values[i] / factor:.4g}{spread} {unit}{edge}"
+        row.set_title(text, fontsize=8, loc="left", pad=2.0)
+    handles, texts = row.get_legend_handles_labels()
+    place: Any = {"loc": "upper center", "bbox_to_anchor": (0.5, 0.0), "ncols": 3}
+    ax.legend(handles, texts, frameon=False, **place)
     more = len(fit.parameters) - count
-    title = "parameters" + (f" ({more} more not drawn)" if more else "")
-    finish(ax, x="value / (|estimate| + half interval) [-]", y="", title=title)
+    title = "parameters, \N{PLUS-MINUS SIGN} one standard deviation"
+    ax.set_title(title + (f" ({more} more not drawn)" if more else ""), pad=16)
 
 
 def _convergence(ax: Axes, fit: UpdateResult) -> None:
     steps = np.arange(len(fit.history) + 1)
-    ax.semilogy(steps, np.maximum(fit.history.error, 1e-300), "o-", color=NOMINAL, markersize=4)
+    ax.semilogy(steps, np.maximum(fit.history.error, 1e-300), "o-", color=BLUE, markersize=4)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    finish(ax, x="iteration", y="sum of squares of residuals", title="convergence")
+    finish(ax, x="iteration", y="sum of squares of model less measured", title="convergence")
 
 
 def _response(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:
     frf, lines = residual.measured, residual.lines
     freq = frf.freq[lines]
     # the pair of channels that was measured strongest
-    o, i = np.unravel_index(np.argmax(np.sum(np.abs(frf.data) ** 2, axis=2)), frf.data.shape[:2])
-    style = "-" if lines.size > 100 else ".-"
-    ax.semilogy(freq, np.abs(frf.data[o, i, lines]), style, color=MEASURED, label="measured", lw=2)
-    for label, model, color in (("before", before, NOMINAL), ("after", after, UPDATED)):
+    strength = np.sum(np.abs(frf.data) ** 2, axis=2)
+    o, i = (int(k) for k in np.unravel_index(np.argmax(strength), strength.shape))
+    size = np.abs(frf.data[o, i, lines])
+    factor, shown = shown_in(ax.yaxis, float(size.max()), frf.unit(frf.outputs[o], frf.inputs[i]))
+    ax.semilogy(freq, size / factor, label="measured", **POINTS)
+    for label, model in (("before", before), ("after", after)):
         objective = Objective(model, [], [residual])
         tied: Any = objective.bounds[0]
         H = tied.responses(objective.begin(np.zeros(0)))[:, o, i]
-        ax.semilogy(freq, np.abs(H), color=color, label=label, linewidth=1.1)
-    ax.legend(frameon=False, fontsize=8)
-    name = f"|{frf.outputs[int(o)]} / {frf.inputs[int(i)]}|"
-    unit = {"velocity": "m/s", "acceleration": "m/s^2"}.get(frf.quantity or "", "m")
-    finish(ax, x="frequency [Hz]", y=f"{name} [{unit} per unit]", title="response")
+        look = STYLES["nominal" if label == "before" else "model"]
+        ax.semilogy(freq, np.abs(H) / factor, label=label, **look)
+    legend(ax, given=False)
+    name = f"|{frf.outputs[o]} / {frf.inputs[i]}|"
+    finish(ax, x="frequency [Hz]", y=named(name, shown), title="response")

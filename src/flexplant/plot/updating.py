@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 
 from ..updating import UpdateResult
 from ..values import ComplexArray
-from ._axes import CYCLE, MEASURED, UPDATED, axes, finish
+from ._axes import axes, finish, legend, named, shown_in
+from ._style import BLUE, CYCLE, STYLES
 
 
 def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = None) -> Axes:
@@ -25,9 +26,10 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     Returns
     -------
     Axes
-        Distance to the measured eigenvalue [rad/s] over iterations, on a log scale.
+        Distance of the real and the imaginary part to the measured one [rad/s] over iterations, on
+        a log scale.
     """
-    ax = axes(ax, figsize=(7.0, 4.0))
+    given, ax = ax is not None, axes(ax, figsize=(9.0, 4.0))
     steps = np.arange(len(fit.history) + 1)
     goal = np.asarray(measured)
     for i in range(goal.size):
@@ -37,17 +39,17 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
                 steps,
                 np.maximum(np.abs(values), 1e-13 * abs(goal[i])),
                 style,
-                marker="o",
-                color=CYCLE[i % len(CYCLE)],
-                label=f"{part}, measured {goal[i]:.1f} rad/s",
+                marker="os^D"[i % 4],
+                color=CYCLE[i % len(CYCLE)]["color"],
+                label=f"{part} of {goal[i]:.1f} rad/s",
             )
-    ax.legend(frameon=False)
+    legend(ax, given=given)
     ax.set_xticks(steps)
-    return finish(ax, x="iteration", y="distance to measured [rad/s]")
+    return finish(ax, x="iteration", y="distance to the measured eigenvalue [rad/s]")
 
 
 def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
-    """Draw the sum of squared residuals over iterations, e_i of equation (12) (paper, Fig. 8).
+    """Draw how far the model is from the measurement over iterations (paper, eq. (12), Fig. 8).
 
     Parameters
     ----------
@@ -59,13 +61,15 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     Returns
     -------
     Axes
+        The sum of squares of all differences between model and measurement, each divided by its
+        standard deviation where that is known.
     """
     ax = axes(ax, figsize=(7.0, 4.0))
     steps = np.arange(len(fit.history) + 1)
     error = np.maximum(fit.history.error, 1e-300)
-    ax.semilogy(steps, error, "o-", color=UPDATED)
+    ax.semilogy(steps, error, "o-", color=BLUE)
     ax.set_xticks(steps)
-    return finish(ax, x="iteration", y="sum of squared residuals")
+    return finish(ax, x="iteration", y="sum of squares of model less measured")
 
 
 def parameters(
@@ -78,7 +82,7 @@ def parameters(
     fit : UpdateResult
         The update.
     truth : dict, optional
-        True values to draw as black lines.
+        True values, drawn as wide lines.
     axs : list of Axes, optional
         Where to draw, one for each parameter.
 
@@ -90,9 +94,13 @@ def parameters(
     steps = np.arange(len(fit.history) + 1)
     for i, name in enumerate(fit.parameters):
         ax = axes(None if axs is None else axs[i], figsize=(6.0, 3.5))
-        ax.plot(steps, fit.history.parameters[:, i], "o-", color=CYCLE[i])
+        values, given = fit.history.parameters[:, i], axs is not None
+        factor, unit = shown_in(ax.yaxis, float(np.max(np.abs(values))), fit.units[i])
         if truth is not None and name in truth:
-            ax.axhline(truth[name], color=MEASURED, linewidth=0.9)
+            ax.axhline(truth[name] / factor, label="true value", **STYLES["truth"])
+        ax.plot(steps, values / factor, "o-", color=BLUE, label="estimate")
         ax.set_xticks(steps)
-        drawn.append(finish(ax, x="iteration", y=f"{name} [{fit.units[i]}]"))
+        if truth is not None:
+            legend(ax, given=given)
+        drawn.append(finish(ax, x="iteration", y=named(name, unit)))
     return drawn
