@@ -45,7 +45,9 @@ def test_devices_on_a_mode_shape():
     ax = plot.placed(best.on(plant), mode=4, zones=[die])
     marked = {line.get_label(): line.get_xydata() for line in ax.get_lines()}
     assert len(marked["sensors"]) == 4 and len(marked["actuators"]) == 4
-    np.testing.assert_allclose(marked["sensors"], [1e3 * np.array(port.at[:2]) for port in best.ports])
+    np.testing.assert_allclose(
+        marked["sensors"], [1e3 * np.array(port.at[:2]) for port in best.ports]
+    )
     np.testing.assert_allclose(marked["POI"], [[220.0, 160.0]])
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("x [mm]", "y [mm]")
     assert ax.get_title().startswith("mode 4, ")

@@ -22,7 +22,7 @@ STYLES: Mapping[str, Style] = {
     "truth": {"color": GREEN, "linestyle": "-", "linewidth": 3.5, "alpha": 0.5, "zorder": 1.5},
     "model": {"color": BLUE, "linestyle": "-", "linewidth": 1.4},
     "nominal": {"color": GREY, "linestyle": (0, (5, 1.5)), "linewidth": 1.4},
-    "reduced": {"color": ORANGE, "linestyle": (0, (5, 1.5)), "linewidth": 1.4},
+    "reduced": {"color": ORANGE, "linestyle": (0, (2.5, 1)), "linewidth": 1.4},
     "bound": {"color": RED, "linestyle": (0, (1, 1)), "linewidth": 1.6},
     "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": 1.3},
 }

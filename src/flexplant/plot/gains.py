@@ -84,8 +84,10 @@ def readable(ax: Axes) -> None:
 
     Over a small share of the decades, lines may lie below the axis.
     """
+    left, right = ax.get_xlim()
     lines = [np.asarray(line.get_xydata(), dtype=float) for line in ax.get_lines()]
-    over = [line[line[:, 0] > 0] for line in lines if len(line) > 2]
+    over = [line[(line[:, 0] >= left) & (line[:, 0] <= right)] for line in lines if len(line) > 2]
+    over = [line for line in over if len(line) > 1]
     if not over:
         return
     top = max(float(line[:, 1].max()) for line in over)
@@ -106,6 +108,12 @@ def _depth(line: FloatArray) -> float:
 def gain_label(output: str, input: str, unit: str | None) -> str:
     """Return the label of a decibel axis, with what 0 dB is."""
     return f"|{output} / {input}| [dB, 0 dB = {reference_of(unit)}]"
+
+
+def shared_unit(response: Frf) -> str | None:
+    """Return the unit of a gain that all channels share; None when they do not."""
+    units = {response.unit(*channel) for channel in response}
+    return units.pop() if len(units) == 1 else None
 
 
 def reference_of(unit: str | None) -> str:

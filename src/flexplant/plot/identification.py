@@ -10,6 +10,7 @@ from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray, instance
 from ._axes import axes, finish, legend, named, shown_in
 from ._style import BLUE, GREY, LIGHT, ORANGE, RED, STYLES, Style
+from .gains import shared_unit
 
 #: marker, colour and legend of the flags 0 to 3
 _MARKS = (
@@ -51,7 +52,9 @@ def stabilisation(
         assert isinstance(behind, Axes)  # noqa: S101 - of the same class as ax
         size = np.sum(np.abs(frf.data), axis=(0, 1))
         inside = (frf.freq >= diagram.band[0]) & (frf.freq <= diagram.band[1])
-        factor, unit = shown_in(behind.yaxis, float(np.max(size[inside], initial=0.0)), _unit(frf))
+        factor, unit = shown_in(
+            behind.yaxis, float(np.max(size[inside], initial=0.0)), shared_unit(frf)
+        )
         behind.semilogy(frf.freq[inside], size[inside] / factor, color=GREY, linewidth=0.8)
         behind.set_ylabel(named("sum of all |FRF|", unit))
     finish(ax, x="frequency [Hz]", y="model order")
@@ -60,12 +63,6 @@ def stabilisation(
     else:  # beside is the ordinate of the responses
         ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4)
     return ax
-
-
-def _unit(frf: Frf) -> str | None:
-    """Return the unit that all responses share; None when there is none."""
-    units = {frf.unit(*channel) for channel in frf}
-    return units.pop() if len(units) == 1 else None
 
 
 def identified(

@@ -56,12 +56,21 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
         if zeros:
             _draw(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
     ax.set_xscale("log")
-    ax.set_yscale("symlog", linthresh=1e-4)
-    ax.axhline(0.0, color="0.3", linewidth=0.9)
+    if _unstable(ax):
+        ax.set_yscale("symlog", linthresh=1e-4)
+        ax.axhline(0.0, color="0.3", linewidth=0.9)
+    else:
+        ax.set_yscale("log")
+    ax.set_ylim(top=2.0)
     for ratio in _RATIOS:
         ax.axhline(ratio, color=GREY, linewidth=0.6, linestyle=":")
     legend(ax, given=given)
     return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio [-]")
+
+
+def _unstable(ax: Axes) -> bool:
+    """Whether a drawn root is on the right of the imaginary axis, or on it."""
+    return any(np.any(np.asarray(line.get_ydata()) <= 0.0) for line in ax.get_lines())
 
 
 def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:

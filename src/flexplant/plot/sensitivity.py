@@ -17,8 +17,8 @@ from ..lti.frequency import Frf, frequency_response
 from ..lti.statespace import as_statespace
 from ..values import FloatArray, real_array, short
 from ._axes import axes, finish, legend
-from ._style import GREY, STYLES, styles
-from .gains import decibel, readable, reference_of
+from ._style import GREY, STYLES, Style, styles
+from .gains import decibel, readable, reference_of, shared_unit
 
 #: what weights limit
 _LIMITED = ("S", "T", "KS")
@@ -75,6 +75,8 @@ def sensitivity(
             style |= {"linewidth": 2.6, "alpha": 0.7}
         ax.semilogx(line[0], decibel(line[1]), label=label or None, **style)
     _limit(ax, weight, "S", list(lines.values()))
+    if not given:
+        _from_where_it_rises(ax, list(lines.values()))
     _levels(ax)
     legend(ax, given=given)
     return finish(ax, x="frequency [Hz]", y="|S| [dB]")
@@ -92,7 +94,8 @@ def sensitivities(
     """Draw S, T and KS of loops below each other, with the bounds that weights set.
 
     ``S = (I - L)^-1``, ``T = I - S``, ``K S`` from measurements y to commands u, broken where `at`
-    says. Of several channels the largest singular value, which is the gain of the worst direction.
+    says. Of several channels the largest singular value, which is the gain of the worst direction;
+    of S the smallest as well, as a thin line: more actuators than axes leave a direction free.
 
     Parameters
     ----------
@@ -134,25 +137,48 @@ def sensitivities(
         found = [_kind_of(what, one, at, freq) for one in named.values()]
         lines = [(response.freq, largest(response)) for response in found]
         for label, line, style in zip(named, lines, looks, strict=True):
-            panel.semilogx(line[0], decibel(line[1]), label=label or None, **style)
+            text = label if label and what == "S" else None
+            panel.semilogx(line[0], decibel(line[1]), label=text, **style)
         _limit(panel, limits.get(what), what, lines)
+        if what == "S":
+            _smallest(panel, found, looks)
         if what == "KS":
             readable(panel)
         else:
             _levels(panel)
-        several = max(response.data.shape[0] for response in found) > 1
-        size = "largest singular value" if several else "size"
-        unit = f", 0 dB = {reference_of(_unit(found[0]))}" if what == "KS" else ""
-        finish(panel, x="frequency [Hz]" if what == "KS" else "", y=f"{what}: {size} [dB{unit}]")
+        unit = f", 0 dB = {reference_of(shared_unit(found[0]))}" if what == "KS" else ""
+        finish(panel, x="frequency [Hz]" if what == "KS" else "", y=f"|{what}| [dB{unit}]")
         legend(panel, given=ax is not None)
     first: Axes = panels[0]
     return first
 
 
+def _smallest(ax: Axes, found: Sequence[Frf], looks: Sequence[Style]) -> None:
+    """Draw the smallest singular values of S, and all from a hundredth of where they rise on."""
+    lines = [(response.freq, singular(response)[:, -1]) for response in found]
+    for line, response, style in zip(lines, found, looks, strict=True):
+        if response.data.shape[0] > 1:
+            ax.semilogx(line[0], decibel(line[1]), **(style | {"linewidth": 0.6}))
+            ax.set_title("largest singular values; thin: the smallest of S", fontsize="medium")
+    _from_where_it_rises(ax, lines)
+
+
+def _from_where_it_rises(ax: Axes, lines: Sequence[_Line]) -> None:
+    """Begin two decades below the frequency where a sensitivity first reaches 1/2."""
+    rises = [freq[np.argmax(size > 0.5)] for freq, size in lines if np.any(size > 0.5)]
+    start = min(freq[0] for freq, _ in lines)
+    if rises and 0.01 * min(rises) > start:
+        ax.set_xlim(left=0.01 * min(rises))
+
+
+def singular(response: Frf) -> FloatArray:
+    """Return the singular values (n_freq, k) of a response, the largest first."""
+    return np.asarray(np.linalg.svd(np.moveaxis(response.data, 2, 0), compute_uv=False))
+
+
 def largest(response: Frf) -> FloatArray:
     """Return the largest singular value of a response at each frequency."""
-    values = np.linalg.svd(np.moveaxis(response.data, 2, 0), compute_uv=False)
-    return np.asarray(values[:, 0])
+    return singular(response)[:, 0]
 
 
 def _named(found: Any) -> dict[str, Any]:
@@ -197,12 +223,6 @@ def _is_line(one: Any) -> bool:
     return isinstance(one, tuple) and len(one) == 2 and all(
         isinstance(part, np.ndarray | list) for part in one
     )  # fmt: skip
-
-
-def _unit(response: Frf) -> str | None:
-    """Return the unit of a gain that all channels share; None when they do not."""
-    units = {response.unit(*channel) for channel in response}
-    return units.pop() if len(units) == 1 else None
 
 
 def _limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> None:
