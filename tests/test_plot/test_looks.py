@@ -132,7 +132,7 @@ def test_three_sensitivities_under_their_weights():
     assert bound.get_label() == "1 / |W| of KS"
     np.testing.assert_allclose(bound.get_ydata(), 20 * np.log10(20.0))
     assert len(T.get_lines()) == 3  # T and two levels: it has no weight
-    assert [panel.get_ylabel() for panel in (S, KS)] == ["S: size [dB]", "KS: size [dB, 0 dB = 1]"]
+    assert [panel.get_ylabel() for panel in (S, KS)] == ["|S| [dB]", "|KS| [dB, 0 dB = 1]"]
     with pytest.raises(ModelError, match="weights are of S, T, KS"):
         fx.plot.sensitivities((PLANT, CONTROLLER), weights={"W": 1.0})
     with pytest.raises(ModelError, match="three axes"):

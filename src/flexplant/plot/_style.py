@@ -1,7 +1,7 @@
 """One look for one thing: the palette, and how measurements, models, truths and bounds are drawn.
 
-The colours are those of Okabe and Ito (jfly.uni-koeln.de/color, 2008), which colour-blind people
-distinguish; dashes and widths distinguish the same lines where there is no colour at all.
+The colours are those of Okabe and Ito (jfly.uni-koeln.de/color, 2008), which remain different for
+every kind of colour vision; dashes and widths differ too, for print without colour.
 """
 
 from __future__ import annotations

@@ -86,16 +86,19 @@ def readable(ax: Axes) -> None:
     """
     left, right = ax.get_xlim()
     lines = [np.asarray(line.get_xydata(), dtype=float) for line in ax.get_lines()]
-    over = [line[(line[:, 0] >= left) & (line[:, 0] <= right)] for line in lines if len(line) > 2]
+    whole = [line[line[:, 0] > 0] for line in lines if len(line) > 2]
+    over = [line[(line[:, 0] >= left) & (line[:, 0] <= right)] for line in whole]
     over = [line for line in over if len(line) > 1]
     if not over:
         return
     top = max(float(line[:, 1].max()) for line in over)
     deep = min(_depth(line) for line in over)
     lowest = min(float(line[:, 1].min()) for line in over)
-    bottom = max(deep - _MORE, top - _DEPTH)
-    if lowest < bottom:
-        ax.set_ylim(bottom, top + 0.05 * (top - bottom))
+    floor = max(deep - _MORE, top - _DEPTH)
+    if lowest < floor or sum(map(len, over)) < sum(map(len, whole)):
+        bottom = max(lowest, floor)
+        room = 0.05 * (top - bottom)
+        ax.set_ylim(bottom - room, top + room)
 
 
 def _depth(line: FloatArray) -> float:

@@ -61,6 +61,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
         ax.axhline(0.0, color="0.3", linewidth=0.9)
     else:
         ax.set_yscale("log")
+        ax.set_ylim(bottom=0.5 * ax.dataLim.intervaly[0])
     ax.set_ylim(top=2.0)
     for ratio in _RATIOS:
         ax.axhline(ratio, color=GREY, linewidth=0.6, linestyle=":")
