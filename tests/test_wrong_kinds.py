@@ -327,6 +327,8 @@ CALLS = [
     ("plot.response channels", lambda x: fx.plot.response(run(), x), ("none",)),
     ("plot.frf", lambda x: fx.plot.frf(x, "y1", "u1"), ()),
     ("plot.sensitivity", lambda x: fx.plot.sensitivity(x), ("dict",)),
+    ("plot.sensitivities", lambda x: fx.plot.sensitivities(x), ()),
+    ("plot.bode", lambda x: fx.plot.bode(x), ()),
     ("plot.sensor_map", lambda x: fx.plot.sensor_map(x), ()),
 ]  # fmt: skip
 

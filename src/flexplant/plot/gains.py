@@ -64,6 +64,8 @@ def _is_measured(label: str, one: Any) -> bool:
 def _response(one: Any, freq: FloatArray | None) -> Frf:
     if isinstance(one, Frf):
         return one
+    if isinstance(one, int | float):
+        raise ModelError(f"need systems or Frfs to draw, got {short(one)}. Pass StateSpaces.")
     try:
         return frequency_response(as_statespace(one), freq)
     except FlexplantError as error:

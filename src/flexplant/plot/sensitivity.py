@@ -65,9 +65,8 @@ def sensitivity(
     ShapeError
         When frequencies and sizes are not of one length.
     """
-    named = _named(curves)
+    lines = {label: _size(one, freq) for label, one in _named(curves).items()}
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
-    lines = {label: _size(one, freq) for label, one in named.items()}
     for (label, line), style in zip(lines.items(), styles(lines, colors), strict=True):
         if label in dashed:
             style |= {"linestyle": "--", "linewidth": 1.2, "zorder": 2.5}
@@ -127,6 +126,9 @@ def sensitivities(
     named, limits = _named(loops), dict(weights or {})
     if unknown := set(limits) - set(_LIMITED):
         raise ModelError(f"weights are of {', '.join(_LIMITED)}, got {sorted(map(str, unknown))}.")
+    responses = {
+        what: [_kind_of(what, one, at, freq) for one in named.values()] for what in _LIMITED
+    }
     if ax is not None and np.size(np.asarray(ax, dtype=object)) != 3:
         raise ModelError("ax= takes three axes: for S, T and KS. Leave it out for a new figure.")
     panels = ax if ax is not None else plt.subplots(
@@ -134,7 +136,7 @@ def sensitivities(
     )[1]  # fmt: skip
     looks = styles(named, colors)
     for what, panel in zip(_LIMITED, panels, strict=True):
-        found = [_kind_of(what, one, at, freq) for one in named.values()]
+        found = responses[what]
         lines = [(response.freq, largest(response)) for response in found]
         for label, line, style in zip(named, lines, looks, strict=True):
             text = label if label and what == "S" else None
