@@ -13,7 +13,8 @@ from flexplant import h2_norm, solid_block
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
-BLOCKS = re.findall(r"^```python\n(.*?)^```", README, flags=re.MULTILINE | re.DOTALL)
+FLAGS = re.MULTILINE | re.DOTALL
+BLOCKS = re.findall(r"^```python\n(.*?)^```", README, FLAGS)
 COMMANDS = (
     "python -m pip install -e . && python examples/wafer_stage.py",
     "python -m pip install -e '.[test]' && python -m pytest",
@@ -67,15 +68,55 @@ def write_stage(folder):
     (folder / "stage_dofs.csv").write_text(table, encoding="utf-8")
 
 
+def alike(printed, said):
+    """Raise where two texts differ in more than the last digits of their numbers."""
+    number = r"-?\d+(?:\.\d+)?(?:e[+-]?\d+)?"
+    assert re.sub(number, "#", printed) == re.sub(number, "#", said)
+    pairs = zip(re.findall(number, printed), re.findall(number, said), strict=True)
+    for ours, theirs in pairs:
+        assert float(ours) == pytest.approx(float(theirs), rel=0.02, abs=0), (ours, theirs)
+
+
+def test_texts_are_compared_by_their_numbers():
+    alike("rms 527 pm, 1.2e-06", "rms 527.4 pm, 1.21e-06")
+    for other in ("rms 600 pm", "mean 527 pm"):
+        with pytest.raises(AssertionError):
+            alike("rms 527 pm", other)
+
+
+def test_the_table_of_peers_is_that_of_the_command():
+    """Its rows are those of the script, and neither is always ahead."""
+    folder = ROOT / "tests" / "benchmarks"
+    script = (folder / "readme_table.py").read_text(encoding="utf-8")
+    tasks = re.findall(r"^    (\w+),$", script.split("ROWS = (")[1].split(")")[0], re.MULTILINE)
+    lines = README.split("| ratio |\n|---|---|---|---|---|\n")[1].split("\n\n")[0].splitlines()
+    assert "OMP_NUM_THREADS=1 python tests/benchmarks/readme_table.py" in README
+    assert len(lines) == len(tasks) > 10
+    ratios = [line.split("|")[5].strip() for line in lines]
+    known = [float(ratio) for ratio in ratios if ratio != "-"]
+    assert min(known) < 1.0 < max(known)
+
+
+def test_every_example_has_its_task():
+    table = README.split("## Which example for which task")[1].split("\n## ")[0]
+    for path in (ROOT / "examples").glob("*.py"):
+        assert f"`examples/{path.name}`" in table, path.name
+
+
 @pytest.mark.slow
-def test_the_code_runs(tmp_path, monkeypatch):
-    """All python blocks, in order, in one namespace, as a reader would paste them."""
+def test_the_code_runs(tmp_path, monkeypatch, capsys):
+    """All python blocks, in order, in one namespace, as a reader would paste them.
+
+    What the first one prints is the text below it.
+    """
     assert BLOCKS
     monkeypatch.chdir(tmp_path)
     write_stage(tmp_path)
     names = {"__name__": "readme"}
     for i, code in enumerate(BLOCKS, 1):
         exec(compile(code, f"README block {i}", "exec"), names)
+        if i == 1:
+            alike(capsys.readouterr().out, re.findall(r"^```text\n(.*?)^```", README, FLAGS)[0])
     g = names["loop"].system
     P = scipy.linalg.solve_discrete_lyapunov(g.A, g.B @ g.B.T)
     by_scipy = np.sqrt(np.trace(g.C @ P @ g.C.T) + np.sum(g.D**2))

@@ -60,7 +60,12 @@ def near(found, wanted, relative):
 def modes_of_a_solid():
     ours, peer = (large.measured("solid", 20, method) for method in ("ours", "default"))
     near(ours["freq"][:10], peer["freq"][:10], 1e-6)
-    return f"24 modes of a solid, {ours['n']} DOFs", "scipy eigsh", ours["modes"], peer["modes"]
+    return (
+        f"24 modes of a solid, {ours['n']:_} DOFs".replace("_", " "),
+        "scipy eigsh",
+        ours["modes"],
+        peer["modes"],
+    )
 
 
 def modes_of_a_small_plate():
@@ -144,7 +149,12 @@ def filtered():
             twin.predict(row[ny:])
 
     _, _, ours, theirs = race(lambda: kalman.estimate(records, start=start), peer)
-    return "100 000 samples through a Kalman filter", "filterpy", ours, theirs * count / part
+    return (
+        "100 000 samples through a Kalman filter",
+        f"filterpy ({part} of them)",
+        ours,
+        theirs * count / part,
+    )
 
 
 def simulated():
@@ -263,7 +273,7 @@ def row(task):
     """Return one line of the table."""
     with warnings.catch_warnings(action="ignore"):
         what, peer, ours, theirs = task()
-    ratio = "-" if theirs is None else f"{theirs / ours:.2g}"
+    ratio = "-" if theirs is None else f"{float(f'{theirs / ours:.2g}'):g}"
     return f"| {what} | {shown(ours)} | {peer} | {shown(theirs)} | {ratio} |"
 
 
