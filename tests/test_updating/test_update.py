@@ -8,7 +8,14 @@ import oracles_updating as oracle
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError, SolverError
 from flexplant.identification import MeasuredModes
 from flexplant.store import load
-from flexplant.updating import AddedDamping, AddedMass, AddedStiffness, Eigenvalues, update
+from flexplant.updating import (
+    AddedDamping,
+    AddedMass,
+    AddedStiffness,
+    Eigenvalues,
+    TrustRegion,
+    update,
+)
 
 
 def fitted(plate, model, target, **options):
@@ -514,6 +521,20 @@ def test_a_full_model_refuses_an_answer_that_is_not_physical(make):
     measured = MeasuredModes(changed_poles(held, [(1, 1, -0.05)]), modes=[1, 2])
     with pytest.raises(ModelError, match=r"the update ended at damping at 2:z = -0.05 N s/m"):
         update(held, [AddedDamping("2:z")], [Eigenvalues(measured)])
+
+
+def test_a_search_ends_where_no_step_is_possible(make):
+    """A free machine takes no negative spring to ground: K would be indefinite at any step."""
+    free, part = make([1, 2, 1], [(0, 1, 90), (1, 2, 110)], beta=1e-3), AddedStiffness("2:z")
+    poles = changed_poles(free, [])
+    poles = 0.99 * poles[poles.imag > 1.0]
+    std = 1e-4 * np.abs(poles)
+    data = [Eigenvalues(MeasuredModes(poles, modes=[2, 3], covariance=std**2))]
+    with pytest.warns(FlexplantWarning) as seen:
+        fit = update(free, [part], data, method=TrustRegion())
+    assert any("no step in the direction of descent is possible" in str(w.message) for w in seen)
+    assert not fit.converged
+    assert fit.values == pytest.approx(0.0, abs=1e-9)
 
 
 def test_a_fit_that_does_not_converge_says_so(plate):

@@ -111,6 +111,8 @@ class Family:
         self.condensed = self.massive.size < k
         self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
+        #: the modes without any change, once for all families of some of the parameters
+        self._unchanged: list[Eigen] = []
 
     def of(self, parameters: Sequence[int]) -> Family:
         """Return the family of some of the parameters, by position; coordinates are shared."""
@@ -177,6 +179,13 @@ class Family:
         ModelError
             When M is not positive definite there, or K is indefinite.
         """
+        if np.any(self._curves(p)[0]):
+            return self._solved(p)
+        if not self._unchanged:
+            self._unchanged.append(self._solved(p))
+        return self._unchanged[0]
+
+    def _solved(self, p: FloatArray) -> Eigen:
         M, D, K = self.matrices(p)
         rigid = self.rigid @ self.rigid_left(p)
         try:

@@ -22,8 +22,10 @@ JOIN = 6
 ROUNDS = 4
 #: relative tolerance of the fits that are compared, and of the one that is chosen
 COMPARED, CHOSEN = 1e-4, 1e-9
-#: parts of the way to a guess at which modes are followed
+#: parts of the way to a guess at which modes are followed, where their shapes change much on it
 WAY = (0.0, 0.25, 0.5, 0.75)
+#: least MAC of every mode with itself at which it is the same mode without a step between
+SAME = 0.8
 
 Subset = tuple[int, ...]
 
@@ -229,7 +231,7 @@ class Subsets:
         method = TrustRegion()
         if guess is not None:
             # modes keep the numbers of the start, and are followed on the way
-            objective.path = [first + part * (guess - first) for part in WAY]
+            objective.path = self._way(objective, first, guess)
             try:
                 found = method.search(objective, guess, most=50, tolerance=COMPARED)
             except (ModelError, SolverError, np.linalg.LinAlgError):
@@ -241,6 +243,25 @@ class Subsets:
         found = method.search(objective, first, most=50, tolerance=COMPARED)
         self.ways[subset] = found.trail.p
         return _left(objective, found.p, found.p)
+
+    def _way(self, objective: Objective, first: FloatArray, guess: FloatArray) -> list[FloatArray]:
+        """Return the points through which modes are followed from the start to a guess."""
+        try:
+            begin = objective.begin(first)
+            end = objective.at(guess)
+        except ModelError:
+            return [first + part * (guess - first) for part in WAY]
+        columns = [point.columns(objective.numbers) for point in (begin, end)]
+        X, Y = (
+            objective.family.weighted(point.eigen.X)[:, own]
+            for point, own in zip((begin, end), columns, strict=True)
+        )
+        cosine = np.abs(np.sum(X.conj() * Y, axis=0))
+        if np.all(
+            cosine**2 >= SAME * np.sum(np.abs(X) ** 2, axis=0) * np.sum(np.abs(Y) ** 2, axis=0)
+        ):
+            return [first]
+        return [first + part * (guess - first) for part in WAY]
 
     def _guess(self, subset: Subset) -> FloatArray | None:
         """Return values near the fit of a subset: of the best part of it, or to first order.

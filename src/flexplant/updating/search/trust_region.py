@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
+import scipy.linalg as la
 
 from ...errors import ModelError
 from ...values import FloatArray, one_of, positive
@@ -16,8 +17,18 @@ from .update_method import SearchEnd, Trail, UpdateMethod, units
 Loss: TypeAlias = Literal["linear", "huber", "soft_l1", "cauchy"]
 LOSSES = ("linear", "huber", "soft_l1", "cauchy")
 
+#: why a search ends where the matrices become indefinite or a mode is lost, however short the step
+EDGE = (
+    "no step in the direction of descent is possible: with it the matrices are indefinite or a "
+    "mode is lost (bounds= keep a parameter to what is possible)"
+)
+
 #: rows (r, J) added to those of the objective
 Extra = Callable[[FloatArray], tuple[FloatArray, FloatArray]]
+
+
+class _ImpossibleError(Exception):
+    """No step from the last point is possible."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,12 +124,18 @@ def _within(
         try:
             r = objective.values(objective.at(p))
         except ModelError:
+            # least_squares would shorten the step to the last digit: the tolerance is enough
+            if trail.p and la.norm((p - trail.p[-1]) / unit) <= tolerance * max(
+                1.0, float(la.norm(trail.p[-1] / unit))
+            ):
+                raise _ImpossibleError from None
             r = np.full(count, np.inf)
         return r if extra is None else np.concatenate([r, extra(p)[0]])
 
     def slopes(p: FloatArray) -> FloatArray:
         point = objective.at(p, refer=True)
-        trail.add(objective, p, 1.0 if trail.p else 0.0)
+        if not trail.p or not np.array_equal(trail.p[-1], p):
+            trail.add(objective, p, 1.0 if trail.p else 0.0)
         J = objective.slopes(point)
         return J if extra is None else np.vstack([J, extra(p)[1]])
 
@@ -132,26 +149,35 @@ def _within(
     loss: Any = method.loss
     if method.loss != "linear":
         loss = _data_loss(method.loss, rows)
-    answer = least_squares(
-        values,
-        inside,
-        slopes,
-        bounds=(low, high),
-        method="trf",
-        x_scale=units(objective, objective.slopes(point, prior=False)),
-        # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
-        ftol=max(1e-2 * tolerance, 2.3e-16),
-        xtol=max(tolerance, 2.3e-16),
-        gtol=1e-15,
-        loss=loss,
-        f_scale=method.scale,
-        max_nfev=most,
-    )
+    unit = units(objective, objective.slopes(point, prior=False))
+
+    def searched(start: FloatArray, most: int) -> Any:
+        return least_squares(
+            values,
+            start,
+            slopes,
+            bounds=(low, high),
+            method="trf",
+            x_scale=unit,
+            # the cost is flat at its least: 1e-12 of it are 1e-6 standard deviations
+            ftol=max(1e-2 * tolerance, 2.3e-16),
+            xtol=max(tolerance, 2.3e-16),
+            gtol=1e-15,
+            loss=loss,
+            f_scale=method.scale,
+            max_nfev=most,
+        )
+
+    stopped = "max_iterations reached"
+    try:
+        answer = searched(inside, most)
+    except _ImpossibleError:
+        answer, stopped = searched(trail.p[-1], 1), EDGE
     p = np.asarray(answer.x, dtype=np.float64)
     objective.at(p, refer=True)
     if not np.array_equal(trail.p[-1], p):
         trail.add(objective, p, 1.0)
-    reason = {0: "max_iterations reached", 1: "gradient is zero", 2: "error no longer falls"}.get(
+    reason = {0: stopped, 1: "gradient is zero", 2: "error no longer falls"}.get(
         answer.status, "step below the tolerance"
     )
     return SearchEnd(p, float(answer.cost), trail, answer.status > 0, reason)
