@@ -15,6 +15,7 @@ from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
 from .placement import sensor_map as sensor_map
 from .pole_map import pole_map as pole_map
+from .report import report as report
 from .response import response as response
 from .sensitivity import sensitivities as sensitivities
 from .sensitivity import sensitivity as sensitivity

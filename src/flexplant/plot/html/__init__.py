@@ -1,0 +1,1 @@
+"""The parts of the HTML report: its page, its pictures, mode shapes that move."""

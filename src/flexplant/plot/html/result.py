@@ -1,0 +1,150 @@
+"""What a report begins with: the error at the POI, the margins, stability with modes left out."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from ...certificates import in_words, stability_name
+from ...errors import FlexplantError
+from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
+from ...simulation import ExposureErrors, Verdict
+from ...values import with_unit
+from ..budget import budget
+from ..sensitivity import sensitivity
+from .design import Design
+from .page import Chapter, note, table, tiles
+from .picture import Gallery
+
+Tile = tuple[str, str, str, str]
+
+
+def result(design: Design, gallery: Gallery, channel: str | None) -> Chapter | None:
+    """Return the section of what matters most, of the first loop; None without a loop."""
+    loops = design.of(ClosedLoop)
+    if not loops:
+        return None
+    name, loop = next(iter(loops.items()))
+    compared = compare_loops(loops)
+    main = channel or next((n for n in loop.plant.z if n.endswith(":error")), loop.plant.z[0])
+    found, why = _budget(loop, main)
+    parts = [tiles([_error(main, found), *_stability(loop), *_margins(compared.rows[name])])]
+    for verdict in design.of(Verdict).values():
+        said = "The specification is met."
+        if not verdict.passed:
+            said = f"The specification is not met: {', '.join(verdict.failed)}."
+        parts.append(note(said, "note" if verdict.passed else "bad"))
+    for kind in (Verdict, ExposureErrors):
+        parts += [one._repr_html_() for one in design.of(kind).values()]
+    if len(loops) > 1:
+        parts += [note(f"These figures are of {name}; all loops:"), compared._repr_html_()]
+    if found is None:
+        return Chapter("Result", "".join([*parts, note(why, "bad")]))
+    caption = f"Where the error of {main} comes from, by frequency and source"
+    picture = gallery.picture(lambda: budget(found), caption)
+    rows = [[n, with_unit(loop.rms(n), loop.units.get(n))] for n in loop.plant.z]
+    motions = table(["channel", "rms under all noises"], rows)
+    parts.append(
+        f"<h3>Error budget of {escape(main)}</h3>"
+        f'<div class="pictures">{picture}<div>{found._repr_html_()}{motions}</div></div>'
+    )
+    return Chapter("Result", "".join(parts))
+
+
+def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
+    """Return the section of margins, loop by loop, and of sensitivities; None without a loop."""
+    loops = design.of(ClosedLoop)
+    if not loops:
+        return None
+    parts = []
+    compared = compare_loops(loops)
+    stable = {name: loop for name, loop in loops.items() if compared.rows[name].stable}
+    if compared.channel and stable:
+        caption = f"Sensitivity |S|, {compared.channel}"
+        drawn = gallery.picture(lambda: sensitivity(stable), caption)
+        parts.append(f'<div class="pictures">{drawn}</div>')
+    for name, loop in loops.items():
+        parts += [f"<h3>{escape(name)}</h3>", loop._repr_html_()]
+        parts.append(attempted(lambda loop=loop: _margin_table(loop)))  # type: ignore[misc]
+    return Chapter("Loop", "".join(parts))
+
+
+def attempted(make: Callable[[], str]) -> str:
+    """Return HTML, or in its place why it cannot be computed."""
+    try:
+        return make()
+    except FlexplantError as error:
+        return note(f"Not shown: {error}")
+
+
+def _budget(loop: ClosedLoop, channel: str) -> tuple[ErrorBudget | None, str]:
+    """Return the error budget, or why there is none."""
+    try:
+        return loop.budget(channel), ""
+    except FlexplantError as error:
+        return None, f"No error budget: {error}"
+
+
+def _error(channel: str, found: ErrorBudget | None) -> Tile:
+    if found is None:
+        return (f"{channel}, rms", "none", "see below", "bad")
+    beside, kind = "modes left out: not known", ""
+    if np.isinf(found.left_out):
+        beside, kind = "unstable with the modes left out", "bad"
+    elif np.isfinite(found.left_out):
+        beside = f"with the modes left out {with_unit(found.left_out, found.unit)}"
+    return (f"{channel}, rms", with_unit(found.rms, found.unit), beside, kind)
+
+
+def _stability(loop: ClosedLoop) -> list[Tile]:
+    stable = loop.obstacle is None
+    sampled = bool(loop.plant.dt)
+    size = loop.spectral_radius if sampled else loop.spectral_abscissa
+    own = in_words({stability_name(sampled): size})
+    found = [("stability", "stable" if stable else "UNSTABLE", own, "good" if stable else "bad")]
+    left = loop.left_out
+    if left is None:
+        return [*found, ("with the modes left out", "not checked", "close_loop(larger=...)", "")]
+    figure = "stable" if left.is_stable else "UNSTABLE"
+    beside = in_words({stability_name(sampled): left.stability})
+    if left.modes:
+        beside = left.named_modes
+    kind = "good" if left.is_fine else "bad"
+    return [*found, (f"with the modes left out ({left.states} states)", figure, beside, kind)]
+
+
+def _margins(row: LoopFigures) -> list[Tile]:
+    if not row.stable:
+        return []
+    peak = 20.0 * np.log10(1.0 / row.margin)
+    tiles: list[Tile] = [
+        ("|S| at u, largest", f"{peak:.1f} dB", f"modulus margin {row.margin:.3g}", "")
+    ]
+    if np.isfinite(row.bandwidth):
+        most = f"|S| at most {20.0 * np.log10(row.peak):.1f} dB, at {row.peak_freq:.4g} Hz"
+        tiles.append(("|S| < 1 up to", f"{row.bandwidth:.4g} Hz", most, ""))
+    return tiles
+
+
+def _margin_table(loop: ClosedLoop) -> str:
+    if loop.obstacle is not None:
+        return note(f"No margins: {loop.obstacle.reason}.", "bad")
+    found: Any = report_loops(loop)
+    rows = []
+    for one in found.values():
+        gain = f"{20.0 * np.log10(one.gain_margin):.1f}" if np.isfinite(one.gain_margin) else "none"
+        if one.gain_reduction:
+            gain += f" and {20.0 * np.log10(one.gain_reduction):.1f}"
+        crosses = ", ".join(f"{f:.4g}" for f in one.crossovers[:3]) or "none"
+        rows.append([
+            one.name, crosses, gain, f"{one.phase_margin:.0f}",
+            f"{one.modulus_margin:.3f}", f"{one.freq:.4g}",
+        ])  # fmt: skip
+    head = [
+        *("loop broken at", "crosses 1 at [Hz]", "gain margin [dB]", "phase margin [deg]"),
+        *("modulus margin", "at [Hz]"),
+    ]
+    return table(head, rows, "Each loop broken at its actuator while the others stay closed")

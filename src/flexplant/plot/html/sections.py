@@ -1,0 +1,222 @@
+"""The parts of a design: each value as it shows itself, with its pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from ...certificates import Certificate, figure
+from ...estimation import LagReport
+from ...identification import StabilisationDiagram
+from ...loop import ClosedLoop, ErrorBudget
+from ...lti.frequency import Frf
+from ...lti.statespace import StateSpace
+from ...modes import Modes
+from ...placement import ParetoCurve, Placement, SensorMap
+from ...plant import StandardPlant
+from ...reduction import ReducedModel
+from ...simulation import ErrorMap, ExposureErrors, Response, Verdict
+from ...synthesis import Controller
+from ...updating import Localisation, UpdateResult
+from ...values import with_unit
+from ..bode import bode
+from ..budget import budget
+from ..error_map import error_map
+from ..estimation import lag_report
+from ..identification import stabilisation
+from ..localisation import localisation
+from ..placement import pareto_curve, placed, sensor_map
+from ..response import response
+from ..singular_values import singular_values
+from ..updating import parameters, residual
+from .design import Design
+from .page import Chapter, table
+from .picture import Gallery
+from .result import attempted
+from .shapes import moving_shapes
+
+#: headings in the order of the page, and the rooms whose values stand below them
+_HEADINGS = {
+    "Runs": ("simulation",),
+    "Controller": ("synthesis",),
+    "Observer": ("estimation",),
+    "Placement": ("placement",),
+    "Plant": ("plant",),
+    "Measurement and update": ("identification", "updating"),
+    "Machine": ("structure", "modes", "reduction", "labels"),
+}
+#: channels of a Bode diagram that can be read on a page
+_CHANNELS = 9
+#: parameters of an update that are drawn, each by itself
+_PARAMETERS = 6
+
+Picture = tuple[str, Callable[[], Any]]
+
+
+def sections(design: Design, gallery: Gallery) -> Iterator[Chapter]:
+    """Yield the sections of all values but loops and verdicts, each value under its room."""
+    shown = {
+        name: value
+        for name, value in design.named.items()
+        if not isinstance(value, ClosedLoop | Verdict | ExposureErrors)
+    }
+    plant = design.plant
+    if plant is not None and not any(isinstance(one, StandardPlant) for one in shown.values()):
+        shown["Plant of the loop"] = plant
+    headed = {room: heading for heading, rooms in _HEADINGS.items() for room in rooms}
+    for heading in (*_HEADINGS, "Other values"):
+        parts = [
+            _shown(name, value, design, gallery)
+            for name, value in shown.items()
+            if headed.get(type(value).__module__.split(".")[1], "Other values") == heading
+        ]
+        if parts:
+            yield Chapter(heading, "".join(parts))
+
+
+def _shown(name: str, value: Any, design: Design, gallery: Gallery) -> str:
+    """Return a value: its name, what it says of itself, tables and pictures."""
+    parts = [f"<h3>{escape(name)}</h3>", value._repr_html_()]
+    modes = _modes_of(value)
+    if modes is not None:
+        parts.append(
+            f'<div class="pictures">{moving_shapes(modes)}<div>{_modes_table(modes)}</div></div>'
+        )
+    drawn = [
+        attempted(lambda draw=draw, said=said: gallery.picture(draw, said))  # type: ignore[misc]
+        for said, draw in _pictures(name, value, design)
+    ]
+    if isinstance(value, StandardPlant):
+        drawn.append(f"<div>{attempted(lambda: _ports_table(value))}{_assumptions(value)}</div>")
+    if drawn:
+        parts.append(f'<div class="pictures">{"".join(drawn)}</div>')
+    return "".join(parts)
+
+
+def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
+    """Return captions and functions that draw a value."""
+    if isinstance(value, Response):
+        return _of_run(name, value)
+    if isinstance(value, StandardPlant) and value.is_assembled:
+        return [("Sensors, actuators and POIs from above", lambda: placed(value))]
+    if isinstance(value, Placement):
+        plant = design.plant
+        if plant is None or not plant.is_assembled:
+            return []
+        own = plant
+        return [("The places that were chosen", lambda: placed(value.on(own)))]
+    if isinstance(value, Controller | StateSpace | Frf):
+        system: Any = value.system if isinstance(value, Controller) else value
+        if len(system.inputs) * len(system.outputs) <= _CHANNELS:
+            return [(f"Bode diagram of {name}", lambda: bode(system))]
+        return [(f"Singular values of {name}", lambda: singular_values(system))]
+    if isinstance(value, UpdateResult):
+        few = len(value.parameters) <= _PARAMETERS
+        through: list[Picture] = [("Parameters through the update", lambda: parameters(value))]
+        return through * few + [("Residuals through the update", lambda: residual(value))]
+    simple: dict[type, tuple[str, Callable[[Any], Any]]] = {
+        ErrorBudget: ("Error budget", budget),
+        ErrorMap: ("Errors over the surface", error_map),
+        LagReport: ("Error of the estimate by lag", lag_report),
+        Localisation: ("Where the model differs", lambda one: localisation(one)),
+        ParetoCurve: ("What each further device buys", pareto_curve),
+        SensorMap: ("Where one more sensor helps", sensor_map),
+        StabilisationDiagram: ("Stabilisation diagram", stabilisation),
+    }
+    return [
+        (said, lambda draw=draw: draw(value))  # type: ignore[misc]
+        for kind, (said, draw) in simple.items()
+        if isinstance(value, kind)
+    ]
+
+
+def _of_run(name: str, run: Response) -> list[Picture]:
+    errors = [n for n in run if n.endswith(":error")]
+    efforts = [n for n in run if n.endswith(":effort")]
+    pictures: list[Picture] = [(f"{name}: errors over time", lambda: response(run))]
+    if errors and efforts:
+        pictures.append((f"{name}: forces over time", lambda: response(run, efforts)))
+    return pictures
+
+
+def _modes_of(value: Any) -> Modes | None:
+    if isinstance(value, Modes):
+        return value
+    return value.modes() if isinstance(value, ReducedModel) else None
+
+
+def _modes_table(modes: Modes) -> str:
+    rows = []
+    for k in range(min(modes.n_modes, 40)):
+        elastic = k >= modes.n_rigid
+        freq = f"{modes.freq[k]:.5g} Hz" if elastic else "rigid-body"
+        rows.append([str(k + 1), freq, f"{100 * modes.zeta[k]:.3g} %" if elastic else ""])
+    more = f"The first 40 of {modes.n_modes} modes" if modes.n_modes > 40 else ""
+    return table(["mode", "frequency", "damping"], rows, more)
+
+
+def _ports_table(plant: StandardPlant) -> str:
+    """Return the channels with their places and noise."""
+    ports = plant.assembled.ports
+    units = {"w": "N/√Hz", "u": "N", "y": "m/√Hz"}
+    kinds = {"w": "w disturbance", "u": "u actuator", "z": "z POI", "y": "y sensor"}
+    rows = []
+    for side, kind in kinds.items():
+        for port in getattr(ports, side):
+            at = getattr(port, "at", "")
+            where = ", ".join(f"{x:g}" for x in at) if _point(at) else str(at)
+            asd = getattr(port, "asd", 0.0)
+            density = with_unit(asd, _density(plant, port.name, units.get(side, ""))) if asd else ""
+            along = getattr(port, "direction", None) or " ".join(getattr(port, "axes", ()))
+            rows.append([port.name, kind, where, str(along), density])
+    return table(["channel", "kind", "place [m]", "along", "noise density"], rows)
+
+
+def _density(plant: StandardPlant, name: str, otherwise: str) -> str:
+    own = plant.units.get(name)
+    return f"{own}/√Hz" if own else otherwise
+
+
+def _point(at: Any) -> bool:
+    return isinstance(at, tuple | list | np.ndarray) and len(at) == 3 and not isinstance(at[0], str)
+
+
+def _assumptions(plant: StandardPlant) -> str:
+    shown = attempted(lambda: plant.check()._repr_html_())
+    return f"<details><summary>Standard assumptions</summary>{shown}</details>"
+
+
+def certificates(design: Design) -> Chapter | None:
+    """Return the section of all that was verified after it was computed."""
+    rows = []
+    for name, value in design.named.items():
+        for what, number in _verified(value):
+            rows.append([name, what.replace("_", " "), figure(what, number)])
+    if not rows:
+        return None
+    return Chapter("Certificates", table(["value", "verified by another computation", ""], rows))
+
+
+def _verified(value: Any) -> Iterator[tuple[str, Any]]:
+    own = getattr(value, "certificate", None)
+    if isinstance(own, Certificate):
+        own = {n: v for n, v in own._fields().items() if v is not None}
+    if isinstance(own, Mapping):
+        yield from own.items()
+    if isinstance(value, ClosedLoop):
+        if value.plant.dt:
+            yield "spectral radius", value.spectral_radius
+        else:
+            yield "largest real part", value.spectral_abscissa
+        yield "modulus margin", value.modulus_margin
+        if value.left_out is not None:
+            yield from value.left_out.certificate.items()
+    if isinstance(value, UpdateResult) and value.covariance is not None:
+        yield "chi-square of the fit", value.chi2
+        yield "its degrees of freedom", value.dof
+    if isinstance(value, Placement):
+        yield "value", value.value
+        yield "no choice is below", value.bound

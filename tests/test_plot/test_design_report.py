@@ -1,0 +1,208 @@
+"""The report of a design: complete, self-contained, well-formed, and alive in a browser."""
+
+import html
+import json
+import re
+import shutil
+import subprocess
+from collections import Counter
+from xml.etree import ElementTree as ET
+
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import FlexplantWarning, ModelError
+from flexplant.plot.html.shapes import neighbours
+from flexplant.values import with_unit
+from stages import RATE, full, ports, reduced, some_modes
+
+CHROMIUM = next(
+    filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None
+)
+HOSTILE = "a <b> & \"'</script>"
+
+
+def tree_of(text):
+    """The page as XML: scripts hold signs that HTML allows there."""
+    body = re.sub(r"(<script[^>]*>).*?(</script>)", r"\1\2", text, flags=re.DOTALL)
+    return ET.fromstring(body.removeprefix("<!DOCTYPE html>"))
+
+
+def words(tree):
+    return " ".join("".join(tree.itertext()).split())
+
+
+@pytest.fixture(scope="module")
+def design():
+    plant = fx.assemble_plant(reduced(), ports()).discretized(RATE, delay=1)
+    observer = fx.design_static(plant)
+    servo = fx.design_servo(plant, bandwidth=40.0, observer=observer, larger=full())
+    loop = fx.close_loop(plant, observer, servo, larger=full())
+    move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0)
+    run = fx.simulate(loop, reference=move, duration=0.1, rng=7)
+    sensors = tuple(ports().y)
+    placement = fx.Placement(("y1", "y2"), 2.0, 1.0, 3, ((2.0,),), "anything", sensors[:2], "y")
+    return [loop, plant, {HOSTILE: servo, "run": run}, placement, observer, some_modes()]
+
+
+@pytest.fixture(scope="module")
+def text(design, tmp_path_factory):
+    path = tmp_path_factory.mktemp("report") / "design.html"
+    fx.plot.report(path, *design, title=f"Stage {HOSTILE}", seeds={"run": 7})
+    return path.read_text(encoding="utf-8")
+
+
+@pytest.mark.slow
+def test_the_page_is_well_formed_and_loads_nothing(text):
+    tree = tree_of(text)
+    ids = Counter(one.get("id") for one in tree.iter() if one.get("id"))
+    assert max(ids.values()) == 1
+    links = [one.get("href") for one in tree.iter() if one.get("href")]
+    assert all(link[1:] in ids for link in links if link[0] == "#")
+    assert all(link[0] == "#" or link.startswith("data:image/png") for link in links)
+    assert not re.search(r"https?:|//\w|@import|url\((?!#)", re.sub(r"// .*", "", text))
+    assert not [one for one in tree.iter() if one.get("src")]
+    assert len(text) < 2e6
+    assert "<b>" not in text.replace("<b>ClosedLoop", "")[: text.index("</header>")]
+    assert HOSTILE in words(tree)
+
+
+@pytest.mark.slow
+def test_it_begins_with_the_result_and_ends_with_versions(text, design):
+    tree, loop = tree_of(text), design[0]
+    headings = [one.text for one in tree.iter("h2")]
+    assert headings[:2] == ["Result", "Loop"] and headings[-2:] == ["Certificates", "Versions"]
+    assert {"Runs", "Controller", "Observer", "Placement", "Plant", "Machine"} < set(headings)
+    tiles = [words(one) for one in tree.iter("div") if "tile " in one.get("class", "")]
+    error = with_unit(loop.rms("die:error"), "m")
+    beyond = with_unit(loop.completed.rms("die:error"), "m")
+    assert tiles[0] == f"die:error, rms{error}with the modes left out {beyond}"
+    assert tiles[1] == f"stabilitystablespectral radius {loop.spectral_radius:.4f}"
+    assert "stablespectral radius" in tiles[2] and "(490 states)" in tiles[2]
+    assert f"modulus margin {loop.modulus_margin:.3g}" in tiles[3]
+    said = words(tree)
+    for part in (fx.__version__, np.__version__, "seed of run7", "u4:effort", "no choice is below"):
+        assert part in said
+    drawn = [one for one in tree.iter("figure") if one.get("class") == "picture"]
+    assert len(drawn) >= 7 and all(one.find(".//path") is not None for one in drawn)
+
+
+@pytest.mark.slow
+def test_the_same_values_give_the_same_file(design, tmp_path):
+    """Names of elements and the order of all parts hang on nothing else."""
+    parts = [one for one in design if not isinstance(one, fx.ClosedLoop)]
+    first, second = (fx.plot.report(tmp_path / name, *parts).read_bytes() for name in "ab")
+    assert first == second
+
+
+def test_an_unstable_loop_is_reported_as_such(tmp_path):
+    """Of a plant made elsewhere, whose noise is not known: what cannot be shown says why."""
+    g = fx.StateSpace(
+        [[1.0]], [[1.0, 1.0]], [[1.0], [1.0]], 0, inputs=["w", "u"], outputs=["z", "y"]
+    )
+    plant = fx.StandardPlant.from_statespace(g, w=["w"], u=["u"], z=["z"], y=["y"])
+    K = fx.StateSpace(
+        np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), [[-0.5]], inputs=["y"], outputs=["u"]
+    )
+    good = fx.close_loop(plant, K.replace(D=[[-2.0]]))
+    with pytest.warns(FlexplantWarning, match="unstable"):
+        bad = fx.close_loop(plant, K)
+    said = words(tree_of(fx.plot.report(tmp_path / "bad", bad, {"good": good}).read_text()))
+    assert "stabilityUNSTABLElargest real part 0.5 rad/s" in said
+    assert "No error budget: " in said and "No margins: unstable" in said
+    assert "with the modes left outnot checked" in said and "modulus margin" in said
+
+
+def test_what_is_no_report(tmp_path):
+    with pytest.raises(ModelError, match="nothing to report"):
+        fx.plot.report(tmp_path / "x")
+    with pytest.raises(ModelError, match="holds values of flexplant, got 3"):
+        fx.plot.report(tmp_path / "x", 3)
+    with pytest.raises(ModelError, match="two parts of the report are named 'a'"):
+        fx.plot.report(tmp_path / "x", {"a": fx.lowpass(1.0)}, {"a": fx.lowpass(2.0)})
+    assert not list(tmp_path.iterdir())
+
+
+def test_neighbours_are_the_lines_of_a_mesh():
+    """Of a box of 3 x 2 x 2 cells with sides 1, 4 and 0.5: all edges, no diagonals."""
+    x, y, z = np.meshgrid(np.arange(4.0), 4.0 * np.arange(3), 0.5 * np.arange(3), indexing="ij")
+    xyz = np.column_stack([x.ravel(), y.ravel(), z.ravel()])
+    pairs = neighbours(xyz)
+    assert len(pairs) == 3 * 9 + 2 * 12 + 2 * 12
+    steps = np.abs(xyz[pairs[:, 0]] - xyz[pairs[:, 1]])
+    assert np.all(np.count_nonzero(steps, axis=1) == 1)
+
+
+PROBE = """
+<script>
+window.addEventListener("load", async () => {
+  const figure = document.querySelector("figure.picture"), svg = figure.querySelector("svg");
+  const press = (what) => figure.querySelector(`[data-do=${what}]`).click();
+  const box = () => svg.getAttribute("viewBox").split(" ").map(Number);
+  const found = { whole: box() };
+  const panel = JSON.parse(figure.dataset.panels)[0], rect = svg.getBoundingClientRect();
+  const scale = rect.width / found.whole[2];
+  const place = (x, y) => ({ clientX: rect.left + x * scale, clientY: rect.top + y * scale });
+  const middle = place((panel.box[0] + panel.box[2]) / 2, (panel.box[1] + panel.box[3]) / 2);
+  const canvas = figure.querySelector(".canvas"), send = (kind, at, more = {}) =>
+    canvas.dispatchEvent(new PointerEvent(kind, { bubbles: true, pointerId: 1, ...at, ...more }));
+  send("pointermove", middle);
+  found.panel = panel;
+  found.read = figure.querySelector("output").textContent;
+  press("in");
+  found.zoomed = box();
+  canvas.setPointerCapture = () => {};
+  send("pointerdown", middle);
+  send("pointermove", { clientX: middle.clientX + 20, clientY: middle.clientY });
+  send("pointerup", middle);
+  found.dragged = box();
+  press("reset");
+  found.reset = box();
+  press("large");
+  found.large = getComputedStyle(figure).position;
+  press("large");
+  const shape = document.querySelector("figure.shape canvas");
+  shape.scrollIntoView();
+  const picture = () => shape.toDataURL();
+  const pause = (ms) => new Promise((done) => setTimeout(done, ms));
+  const first = picture();
+  for (let i = 0; i < 20 && picture() === first; i++) await pause(200);
+  found.moves = picture() !== first;
+  document.querySelector("figure.shape button").click();
+  const still = picture();
+  await pause(300);
+  found.stops = picture() === still;
+  const select = document.querySelector("figure.shape select");
+  select.value = "5";
+  select.dispatchEvent(new Event("input"));
+  found.other = picture() !== still;
+  found.wide = document.documentElement.scrollWidth <= window.innerWidth;
+  document.title = JSON.stringify(found);
+});
+window.addEventListener("error", (event) => { document.title = event.message; });
+</script>
+</body>"""
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(CHROMIUM is None, reason="needs chromium")
+@pytest.mark.parametrize("width", [1280, 500])
+def test_the_page_lives_in_a_browser(text, tmp_path, width):
+    """Zoom, drag, cursor, large view; a mode moves, stops and changes; nothing is too wide."""
+    page = tmp_path / "probed.html"
+    page.write_text(text.replace("</body>", PROBE), encoding="utf-8")
+    command = [CHROMIUM, "--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage"]
+    command += ["--virtual-time-budget=9000", f"--window-size={width},900", "--dump-dom"]
+    command += [f"--user-data-dir={tmp_path / 'profile'}", page.as_uri()]
+    answer = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    found = json.loads(html.unescape(re.search(r"<title>(.*?)</title>", answer.stdout)[1]))
+    whole, zoomed, dragged = (np.array(found[k]) for k in ("whole", "zoomed", "dragged"))
+    np.testing.assert_allclose(zoomed[2:], whole[2:] / 1.6, rtol=1e-3)
+    assert dragged[0] < zoomed[0] and dragged[2] == zoomed[2]
+    assert found["reset"] == found["whole"] and found["large"] == "fixed"
+    assert found["moves"] and found["stops"] and found["other"] and found["wide"]
+    low, high, logarithmic, label = found["panel"]["x"]
+    assert logarithmic and "[Hz]" in label
+    read = re.match(rf"{re.escape(label)}: ([\d.e+-]+)", found["read"])
+    assert float(read[1]) == pytest.approx(np.sqrt(low * high), rel=0.03)
