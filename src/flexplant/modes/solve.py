@@ -19,6 +19,7 @@ from ..structure.eigen import elastic_modes, signed
 from ..structure.negative_stiffness import signed_root, signed_square
 from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
+from .damped_modes import damped_modes, is_rayleigh, wider
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
 from .shifted import modes_below, stiffness_factor
@@ -119,7 +120,10 @@ def solve_modes(
     names = labels_of(at, model.dofs)
     # one factor for the modes and for the attachment vectors, while it is held here
     factored = stiffness_factor(model, factor) if at and _is_large(model) else None
-    omega, phi, certificate = _undamped(model, kept, top, factor)
+    # complex modes of a large model are found in a basis of more undamped ones
+    perhaps = damping is None and model.D is not None and _is_large(model)
+    more = wider(kept, top, model.n_dof) if perhaps and not is_rayleigh(model) else (kept, top)
+    omega, phi, certificate = _undamped(model, *more, factor)
     orthonormality, residual = _check(model, omega, phi)
     certificate["orthonormality"] = orthonormality
     if model.rigid_body.shape[1]:
@@ -127,7 +131,9 @@ def solve_modes(
         held = float(rounding_of(model.K, model.rigid_body).max())
         certificate["rigid_rounding"] = float(np.sqrt(held) / (2 * np.pi))
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
-        return _complex_modes(model, kept, top, names)
+        return _complex_modes(model, phi, kept, top, names, factor)
+    inside = np.flatnonzero(signed_square(omega) <= top)[:kept]
+    omega, phi, residual = omega[inside], phi[:, inside], residual[inside]
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
     if at:
         vectors, vector_omega = attachment_vectors(model, phi, at)
@@ -317,18 +323,21 @@ def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool
     return bool(np.all(coupling <= PROPORTIONAL * largest))
 
 
-def _complex_modes(model: FEModel, count: int, top: float, names: tuple[str, ...]) -> Modes:
-    if model.n_dof > DENSE_LIMIT:
-        raise ModelError(
-            f"the damping D of this model of {model.n_dof} DOFs is not proportional: its complex "
-            "modes need a dense solution, too large here. Solve with damping=ModalDamping(...), "
-            "reduce, and add the dampers to the reduced model."
-        )
+def _complex_modes(
+    model: FEModel,
+    phi: FloatArray,
+    count: int,
+    top: float,
+    names: tuple[str, ...],
+    factor: Pardiso | None,
+) -> Modes:
     if names:
         raise ModelError(
             "the model's D is not proportional: its modes are complex and take no attachment "
             "vectors. Pass damping=ModalDamping(...) in place of D, or leave out compliance_at."
         )
+    if _is_large(model):
+        return damped_modes(model, phi, count, top, factor)
     form = normal_form(model.M, model.D, model.K, model.rigid_body, lambda: model.body_motions)
     omega = form.omega
     keep = np.flatnonzero(signed_square(omega) <= top)[:count]

@@ -1,0 +1,174 @@
+"""Complex modes of a large sparse model whose damping is not proportional."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import SolverError
+from ..sparse.factor import by_rows, diagonal
+from ..sparse.pardiso import Pardiso
+from ..sparse.rayleigh_ritz import absolute
+from ..structure import FEModel
+from ..structure.negative_stiffness import signed_square
+from ..values import ComplexArray, FloatArray
+from .modes import Modes
+from .normal_form import NormalForm, normal_form
+from .shifted import StiffnessFactor, stiffness_factor
+
+#: what a mode may leave: part of its inertia forces, and of its elastic ones in absolute size
+_RESIDUAL = (1e-8, 1e-12)
+#: the part of the largest entry of a shape that counts for the rounding of each
+_ENTRY = 1e-3
+#: steps after which no more is expected
+_STEPS = 30
+#: part of a correction, beyond the basis, below which it is rounding
+_NEW = 1e-5
+#: more undamped modes than wanted, as a part and at least; and how far beyond a band
+_MORE, _LEAST, _BEYOND = 4, 8, 1.3
+
+
+def wider(count: int, top: float, n: int) -> tuple[int, float]:
+    """Return how many undamped modes, and up to which omega^2, make a basis of complex ones."""
+    return min(n, count + max(count // _MORE, _LEAST)), top * _BEYOND**2
+
+
+def is_rayleigh(model: FEModel) -> bool:
+    """Return whether ``D = alpha M + beta K``, seen on one vector."""
+    x = np.random.default_rng(0).standard_normal(model.n_dof) / np.sqrt(diagonal(model.K) + 1e-300)
+    sides: Any = [np.asarray(part @ x) for part in (model.M, model.K)]
+    basis = np.column_stack([side / np.linalg.norm(side) for side in sides])
+    damped = np.asarray(model.D @ x)  # type: ignore[operator]
+    left = damped - basis @ np.linalg.lstsq(basis, damped)[0]
+    return bool(np.linalg.norm(left) <= 1e-12 * np.linalg.norm(damped))
+
+
+def damped_modes(
+    model: FEModel,
+    phi: FloatArray,
+    count: int,
+    top: float,
+    method: Pardiso | None,
+) -> Modes:
+    """Return the complex modes of a large model, by a basis that grows until they are right.
+
+    Rayleigh-Ritz in real vectors V: the undamped modes, and ``(K - sigma M)^-1`` times what the
+    complex modes leave in ``(lambda^2 M + lambda D + K) x = 0``, again and again (Davidson's
+    method for the quadratic problem), until they leave no more than undamped modes may.
+
+    Parameters
+    ----------
+    model : FEModel
+        With a D that is not proportional.
+    phi : (n, k) array
+        Its undamped modes, more than are wanted; see `wider`.
+    count : int
+        How many modes are wanted, by magnitude of their poles.
+    top : float [rad^2/s^2]
+        And up to which omega^2.
+    method : Pardiso, optional
+        How K is factorised.
+
+    Returns
+    -------
+    Modes
+        With `residual` of each, and in the certificate how many vectors the basis has. A count
+        that none is missing is known for undamped modes only.
+
+    Raises
+    ------
+    SolverError
+        When they are not found.
+    ModelError
+        As `normal_form`.
+
+    Notes
+    -----
+    G. L. G. Sleijpen, J. G. L. Booten, D. R. Fokkema, H. A. van der Vorst, Jacobi-Davidson type
+    methods for generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.
+    """
+    V, r = phi, model.rigid_body.shape[1]
+    factor: StiffnessFactor | None = None
+    for _ in range(_STEPS):
+        form, keep = _ritz(model, V, r, count, top)
+        shapes = np.asarray(V @ form.phi[:, keep])
+        rest, size, limit = _rest(model, form, shapes, keep)
+        wrong = np.flatnonzero(size > limit)
+        if not wrong.size:
+            part = np.where(limit > 0, size / np.where(limit > 0, limit, 1.0), 0.0)
+            return Modes(
+                form.omega[keep],
+                form.zeta[keep],
+                shapes,
+                model.dofs,
+                n_rigid=r,
+                residual=_RESIDUAL[0] * part,
+                certificate={"basis": V.shape[1]},
+            )
+        if factor is None:
+            factor = stiffness_factor(model, method)
+        step = factor.solve(np.hstack([rest[:, wrong].real, rest[:, wrong].imag]))
+        more = _beyond(model, V, step)
+        if not more.shape[1]:
+            break
+        V = np.hstack([V, more])
+    worst = float((size[wrong] / limit[wrong]).max()) * _RESIDUAL[0]
+    raise SolverError(
+        f"complex modes leave a relative residual of {worst:.2g} (limit {_RESIDUAL[0]:g}) after "
+        f"{V.shape[1]} vectors: the damping is strong. Want fewer modes, or reduce the model by "
+        "CraigBampton at the dampers, which keeps D, and take its modes()."
+    )
+
+
+def _ritz(
+    model: FEModel, V: FloatArray, r: int, count: int, top: float
+) -> tuple[NormalForm, np.ndarray]:
+    M, D, K = (_projected(part, V) for part in (model.M, model.D, model.K))
+    rigid = np.eye(V.shape[1], r)
+    body = V.T @ np.asarray(model.M @ model.body_motions) if model.n_unstable else rigid
+    form = normal_form(M, D, K, rigid, lambda: body)
+    return form, np.flatnonzero(signed_square(form.omega) <= top)[:count]
+
+
+def _projected(matrix: Any, V: FloatArray) -> FloatArray:
+    product = V.T @ np.asarray(matrix @ V)
+    return np.asarray(0.5 * (product + product.T))
+
+
+def _rest(
+    model: FEModel, form: NormalForm, shapes: FloatArray | ComplexArray, keep: np.ndarray
+) -> tuple[ComplexArray, FloatArray, FloatArray]:
+    """Return what modes leave in the eigenvalue problem (n, k), its size and its limit (k,)."""
+    poles = form.poles[keep]
+    x: Any = np.array(shapes)
+    unstable = form.omega[keep] < 0
+    x[:, unstable] = x[:, unstable].real + x[:, unstable].imag  # that of the growing pole
+    K, M, D = by_rows(model.K), by_rows(model.M), by_rows(model.D)  # type: ignore[arg-type]
+    inertia = (M @ x) * poles**2
+    rest = inertia + (D @ x) * poles + K @ x
+    stiff = diagonal(model.K)
+    weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
+    size = np.linalg.norm(weight * rest, axis=0)
+    # an entry of a shape is known to a rounding of its largest ones, as in undamped modes
+    moved = np.abs(x)
+    whole = absolute(K) @ (moved + _ENTRY * moved.max(axis=0))
+    limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
+    limit = limit + _RESIDUAL[1] * np.linalg.norm(weight * whole, axis=0)
+    size[: form.n_rigid] = 0.0  # at zero by convention: checked as undamped modes
+    return np.asarray(rest), np.asarray(size), np.asarray(limit)
+
+
+def _beyond(model: FEModel, V: FloatArray, step: FloatArray) -> FloatArray:
+    """Return an M-orthonormal basis of what corrections (n, m) have beyond V."""
+    M = by_rows(model.M)
+    length = np.sqrt(np.einsum("ij,ij->j", step, M @ step))
+    new = step[:, length > 0] / length[length > 0]
+    for _ in range(2):  # the second time takes out what rounding of the first leaves
+        for _ in range(2):
+            new = new - V @ (V.T @ (M @ new))
+        values, mix = la.eigh(new.T @ (M @ new))
+        kept = values > _NEW**2
+        new = new @ (mix[:, kept] / np.sqrt(values[kept]))
+    return np.asarray(new)
