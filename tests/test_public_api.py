@@ -23,7 +23,7 @@ read_model read_matrices check DofSet FEModel FEMatrices kirchhoff_plate beam ch
 Rib Disc Rectangle interpolated PointMass Spring Damper ModalDamping Rayleigh Hysteretic
 solve_modes Modes reduce ReducedModel DesiredDofs ModalTruncation ModalBalanced Guyan Irs Serep
 CraigBampton Rubin MacNeal Krylov select_dofs rank_modes
-joined Joint Patch Pose
+joined Joint Patch Pose uncoupled
 estimate_frf average_frfs identify_modes numbered MeasuredModes
 update UpdateResult AddedMass AddedDamping AddedStiffness MatrixParameter Eigenvalues ModeShapes
 FrfResidual localise identifiability validate sample_posterior

@@ -30,6 +30,7 @@ from .joining import Joint as Joint
 from .joining import Patch as Patch
 from .joining import Pose as Pose
 from .joining import joined as joined
+from .joining import uncoupled as uncoupled
 from .labels import DofSet as DofSet
 from .loop import ClosedLoop as ClosedLoop
 from .loop import close_loop as close_loop

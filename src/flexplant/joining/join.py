@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 import scipy.linalg as la
@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError
 from ..labels import DIRECTIONS, DofSet
+from ..lti import Frf
 from ..reduction import ReducedModel
 from ..sparse.factor import dense
 from ..structure import FEModel
@@ -20,9 +21,11 @@ from ..values import FloatArray, frozen
 from .certificate import certified
 from .component import Component, Model, components_of
 from .elimination import Elimination, eliminated
+from .frf_coupling import joined_frfs
 from .joint import Joint
 from .links import Link, links_of, machine_size, rows_of, warn_of_missing_statics
 from .motions import groups_of, left_motions
+from .patch_error import patch_errors
 from .pose import Pose
 from .shapes import JoinedShape
 
@@ -30,13 +33,29 @@ from .shapes import JoinedShape
 _LARGEST = 5000
 
 
+@overload
+def joined(
+    components: Mapping[str, Frf], joints: Iterable[Joint] | Joint = (), *, name: str | None = None
+) -> Frf: ...
+
+
+@overload
 def joined(
     components: Mapping[str, Model],
     joints: Iterable[Joint] | Joint = (),
     *,
     placed: Mapping[str, Pose] | None = None,
     name: str | None = None,
-) -> FEModel | ReducedModel:
+) -> FEModel | ReducedModel: ...
+
+
+def joined(
+    components: Mapping[str, Any],
+    joints: Iterable[Joint] | Joint = (),
+    *,
+    placed: Mapping[str, Pose] | None = None,
+    name: str | None = None,
+) -> FEModel | ReducedModel | Frf:
     """Return a machine of components, held together by joints.
 
     ``q = T q_k`` fulfils the rigid joints, ``B q = 0``; the machine has ``T^T M T``,
@@ -46,8 +65,9 @@ def joined(
 
     Parameters
     ----------
-    components : mapping {str: FEModel or ReducedModel}
-        Labels of the machine begin with their names: "stage/41:z".
+    components : mapping {str: FEModel or ReducedModel}, or {str: Frf}
+        Labels of the machine begin with their names: "stage/41:z". Of measured responses, all
+        must be; their joints are between channels that are both outputs and inputs.
     joints : Joint or sequence of Joint
         What holds them together. The second end of a rigid joint follows the first.
     placed : mapping {str: Pose}, optional
@@ -58,11 +78,12 @@ def joined(
 
     Returns
     -------
-    FEModel or ReducedModel
+    FEModel, ReducedModel or Frf
         An FEModel of FEModels, sparse; a ReducedModel when one of them is reduced. DOFs that
         follow others stay known by their labels, as places. `joining` holds the checks: gaps,
         balance of forces, inertia, rigid-body motions, errors of patches. The modes that a
-        reduction of a component left out are not kept.
+        reduction of a component left out are not kept. Of responses, ``Y - Y B^T (B Y B^T +
+        Z)^-1 B Y``, Z being what springs and dampers give way (LM-FBS).
 
     Raises
     ------
@@ -95,6 +116,10 @@ def joined(
     >>> machine.row("frame/1:x").tolist()
     [1.0, 0.0, 0.0]
     """
+    if isinstance(components, Mapping) and _measured(components):
+        if placed is not None:
+            raise ModelError("measured responses have no place: leave placed= out.")
+        return joined_frfs(components, joints)
     parts = components_of(components, placed)
     links = links_of(joints, parts)
     warn_of_missing_statics(links, parts)
@@ -111,11 +136,16 @@ def joined(
     expected = rigid_body.shape[1]
     if not any(part.is_reduced for part in parts):  # by energy, as the model finds them
         rigid_body = rigid_body_basis(matrices["M"], matrices["K"], motions)
-    certificate = certified(parts, links, done, matrices, groups, rigid_body, expected, {})
+    patches = patch_errors(links, parts)
+    certificate = certified(parts, links, done, matrices, groups, rigid_body, expected, patches)
     common = {"joint_motions": motions, "joining": certificate}
     if not any(part.is_reduced for part in parts):
         return _full(parts, done, matrices | common, name)
     return _reduced(parts, done, matrices | common, rigid_body)
+
+
+def _measured(components: Mapping[str, Any]) -> bool:
+    return any(isinstance(component, Frf) for component in components.values())
 
 
 def _sizes(parts: Sequence[Component]) -> FloatArray:

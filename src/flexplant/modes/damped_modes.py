@@ -93,7 +93,7 @@ def damped_modes(
     factor: StiffnessFactor | None = None
     for _ in range(_STEPS):
         form, keep = _ritz(model, V, r, count, top)
-        shapes = np.asarray(V @ form.phi[:, keep])
+        shapes: Any = V @ form.phi[:, keep]
         rest, size, limit = _rest(model, form, shapes, keep)
         wrong = np.flatnonzero(size > limit)
         if not wrong.size:
@@ -145,7 +145,7 @@ def _rest(
     x: Any = np.array(shapes)
     unstable = form.omega[keep] < 0
     x[:, unstable] = x[:, unstable].real + x[:, unstable].imag  # that of the growing pole
-    K, M, D = by_rows(model.K), by_rows(model.M), by_rows(model.D)  # type: ignore[arg-type]
+    K, M, D = by_rows(model.K), by_rows(model.M), by_rows(model.D)
     inertia = (M @ x) * poles**2
     rest = inertia + (D @ x) * poles + K @ x
     stiff = diagonal(model.K)

@@ -1,0 +1,112 @@
+"""Measured responses coupled and uncoupled: models joined, and dense algebra, say the same."""
+
+import numpy as np
+import pytest
+import scipy.linalg as la
+
+import flexplant as fx
+import oracles_joining as oracles
+from flexplant.errors import FlexplantWarning, LabelError, ModelError
+
+PLATE = {"thickness": 0.02, "density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
+FREQ = np.array([60.0, 133.0, 290.0, 500.0])
+SIZES = {"stage": ((0.4, 0.3), (3, 2)), "frame": ((0.6, 0.5), (4, 3))}
+JOINTS = (
+    fx.Joint("stage/1:z", "frame/1:z"),
+    fx.Joint("stage/4:z", "frame/7:z", stiffness=2e5, rate=40.0),
+    fx.Joint("frame/20:z", stiffness=1e5, rate=10.0),
+)
+#: measured on each: at its joints and at one more place
+CHANNELS = {"stage": ["1:z", "4:z", "9:z"], "frame": ["1:z", "7:z", "20:z", "12:z"]}
+
+
+def models():
+    law = fx.Rayleigh(0.0, 1e-6)
+    found = {}
+    for name, (size, elements) in SIZES.items():
+        found[name] = fx.kirchhoff_plate(size=size, elements=elements, **PLATE).with_damping(law)
+    return found
+
+
+def measured(name, quantity="displacement"):
+    """The responses of a component alone, by dense algebra."""
+    model, channels = models()[name], CHANNELS[name]
+    out = np.array([model.row(label) for label in channels])
+    none = np.zeros((0, model.n_dof))
+    parts = [A.toarray() for A in (model.M, model.D, model.K)]
+    data = [oracles.receptance(*parts, none, FREQ, out, load) for load in out]
+    frf = fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), channels, channels, "displacement")
+    return frf.converted(quantity)
+
+
+def machine():
+    """The responses of the joined machine in dense algebra, B and the springs by hand."""
+    names = [f"{name}/{label}" for name, model in models().items() for label in model.dofs.labels]
+    M, D, K = (
+        la.block_diag(*(getattr(model, name).toarray() for model in models().values()))
+        for name in "MDK"
+    )
+    rows = np.eye(len(names))
+    row = {name: rows[i] for i, name in enumerate(names)}
+    between, ground = row["stage/4:z"] - row["frame/7:z"], row["frame/20:z"]
+    K += 2e5 * np.outer(between, between) + 1e5 * np.outer(ground, ground)
+    D += 40.0 * np.outer(between, between) + 10.0 * np.outer(ground, ground)
+    B = (row["stage/1:z"] - row["frame/1:z"])[None]
+    channels = [f"{name}/{label}" for name, listed in CHANNELS.items() for label in listed]
+    out = np.array([row[name] for name in channels])
+    data = [oracles.receptance(M, D, K, B, FREQ, out, load) for load in out]
+    return fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), channels, channels, "displacement")
+
+
+@pytest.mark.parametrize("quantity", ["displacement", "velocity", "acceleration"])
+def test_coupled_responses_are_those_of_the_machine(quantity):
+    """With rigid joints, given twice too, springs and dampers between and to the ground."""
+    frfs = {name: measured(name, quantity) for name in CHANNELS}
+    found = fx.joined(frfs, [JOINTS[0], *JOINTS])
+    reference = machine().converted(quantity)
+    assert found.outputs == reference.outputs
+    assert found.inputs == reference.inputs
+    np.testing.assert_allclose(found.data, reference.data, rtol=1e-6)
+    assert found.quantity == quantity
+
+
+def test_a_component_is_taken_out_again():
+    whole, frame, stage = machine(), measured("frame"), measured("stage")
+    rest = fx.uncoupled(whole, {"frame": frame}, JOINTS[:2])
+    assert rest.outputs == tuple(f"stage/{label}" for label in CHANNELS["stage"])
+    # the frame's spring to the ground was not taken out with it
+    held = fx.joined({"frame": frame}, JOINTS[2])
+    held = held.replace(inputs=frame.inputs, outputs=frame.outputs)
+    rest = fx.uncoupled(whole, {"frame": held}, JOINTS[:2])
+    np.testing.assert_allclose(rest.data, stage.data, rtol=1e-5)
+    # a rigid joint may be measured on its other side
+    kept = [name for name in whole.outputs if name != "frame/1:z"]
+    rest = fx.uncoupled(whole.select(kept, kept), {"frame": held}, JOINTS[:2])
+    np.testing.assert_allclose(rest.data, stage.data, rtol=1e-5)
+
+
+def test_what_responses_cannot_say_is_refused():
+    frfs = {name: measured(name) for name in CHANNELS}
+    with pytest.raises(LabelError, match="named alike"):
+        fx.joined(frfs, fx.Joint("stage/2:z", "frame/1:z"))
+    with pytest.raises(LabelError, match="no component 'base'"):
+        fx.joined(frfs, fx.Joint("base/2:z", "frame/1:z"))
+    with pytest.raises(ModelError, match="needs places or lever arms"):
+        fx.joined(frfs, fx.Joint(("stage", (0, 0, 0)), "frame/1:z"))
+    with pytest.raises(ModelError, match="frequencies of 'frame' are not those"):
+        fx.joined(frfs | {"frame": frfs["frame"].replace(freq=FREQ + 1)}, JOINTS)
+    with pytest.raises(ModelError, match="Convert them"):
+        fx.joined(frfs | {"frame": frfs["frame"].converted("velocity")}, JOINTS)
+    with pytest.raises(ModelError, match="state it"):
+        fx.joined({name: frf.replace(quantity=None) for name, frf in frfs.items()}, JOINTS)
+    with pytest.raises(ModelError, match="an Frf each"):
+        fx.joined(frfs | {"frame": models()["frame"]}, JOINTS)
+    with pytest.raises(LabelError, match="no joint holds"):
+        fx.uncoupled(machine(), {"frame": frfs["frame"]}, ())
+    double = frfs["stage"].replace(data=np.ones_like(frfs["stage"].data))
+    both = [fx.Joint(f"stage/{n}:z", f"frame/{n}:z") for n in (1, 4)]
+    with pytest.raises(ModelError, match="the interface has the condition"):
+        fx.joined({"stage": double, "frame": double}, both)
+    nearly = double.replace(data=double.data + 1e-10 * np.eye(3)[:, :, None])
+    with pytest.warns(FlexplantWarning, match="the interface has the condition"):
+        fx.joined({"stage": nearly, "frame": double}, both)
