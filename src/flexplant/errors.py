@@ -62,7 +62,17 @@ class CertificateError(FlexplantError, RuntimeError):
 
 
 class FlexplantWarning(UserWarning):
-    """A result that the caller should use with care."""
+    """A result that the caller should use with care.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import warnings
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", fx.FlexplantWarning)  # of this library alone
+    >>> issubclass(fx.FlexplantWarning, UserWarning)
+    True
+    """
 
 
 def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = "") -> LabelError:

@@ -20,6 +20,8 @@ from flexplant.lti import (
 )
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.factors import controllability_factor, observability_factor
+from flexplant.lti.splitting import split_stable
+from flexplant.lti.transfer import tf
 from oracles_lti import hankel, largest_gain, lyapunov, stein, sweep
 from systems_lti import machine
 
@@ -236,6 +238,14 @@ def test_peak_on_the_axis_of_unstable_systems(seed, sampled):
         assert norm == hinf_norm(g)
     else:
         assert hinf_norm(g) == np.inf
+
+
+def test_a_block_with_poles_of_both_kinds_is_split():
+    """1 / (s^2 - 1) is one block of 2 states: -0.5 / (s + 1) and 0.5 / (s - 1)."""
+    parts = split_stable(tf([1.0], [1.0, 0.0, -1.0]))
+    for part, pole in ((parts.stable, -1.0), (parts.rest, 1.0)):
+        np.testing.assert_allclose(part.poles(), [pole], rtol=1e-12)
+        assert part(2j) == pytest.approx(0.5 * pole / (2j - pole), rel=1e-12, abs=0)
 
 
 def test_the_reason_of_an_infinite_norm():

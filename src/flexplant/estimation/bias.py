@@ -47,6 +47,15 @@ def check_bias(plant: StandardPlant | System, inputs: Sequence[str]) -> None:
         When a name is no disturbance of w.
     ModelError
         When the plant is weighted.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> try:
+    ...     fx.estimation.check_bias(fx.testbeds.three_masses(), ["amp", "amp"])
+    ... except fx.FlexplantError as error:
+    ...     print(type(error).__name__)
+    LabelError
     """
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)

@@ -38,6 +38,13 @@ class KalmanCertificate(Certificate):
     unresolved : float, optional
         Largest share of a predicted variance that is from modes left out with fewer than 4 nodes
         of the larger model's mesh per wavelength; None: its mesh is not known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.design_kalman(fx.testbeds.three_masses()).certificate
+    >>> round(found.spectral_radius, 4), found.difference < 1e-6
+    (0.9601, True)
     """
 
     spectral_radius: float
@@ -73,6 +80,14 @@ def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -
         When sizes do not match.
     CertificateError
         When the error is not stable or the difference exceeds 1e-6.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> fx.estimation.check_gain(plant, observer.gain, observer.covariance) < 1e-6
+    True
     """
     n, p = plant.system.n_states, len(sensors(plant))
     gain = real_array(gain, "gain", (n, p))

@@ -61,6 +61,16 @@ class Consistency(Value):
         The verdict in words.
     level : float
         Of all tests together.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=2.0, rng=1)
+    >>> fx.estimation.consistency(observer, observer.estimate(run)).text
+    'the innovations are white and of the predicted size.'
     """
 
     nis: float
@@ -140,6 +150,16 @@ def consistency(
     ----------
     Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, ch.
     5.4; Ljung, Box, Biometrika 65, 1978; Bartlett, Stochastic Processes, 1955.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=2.0, rng=1)
+    >>> fx.estimation.consistency(observer, observer.estimate(run)).holds
+    True
     """
     if not isinstance(observer, KalmanEstimator) or not isinstance(estimate, Estimate):
         wrong = estimate if isinstance(observer, KalmanEstimator) else observer

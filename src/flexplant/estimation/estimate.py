@@ -57,6 +57,15 @@ class Estimate(Value, Mapping[str, FloatArray]):
         x[N|N-1], from which `estimate(..., start=)` goes on with the next record.
     units : mapping {channel: unit}
         SI units.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> found = observer.estimate({name: np.zeros(20) for name in ("y1", "y2", "u1")})
+    >>> sorted(found)
+    ['die:hat', 'y1:innovation', 'y2:innovation']
     """
 
     time: FloatArray

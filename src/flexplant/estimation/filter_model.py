@@ -44,6 +44,13 @@ class FilterModel(Value):
         Sampling time.
     channels, sensors, commands : tuples of str
         Names of z, y and u.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.design_kalman(fx.testbeds.three_masses()).model
+    >>> model.sensors, model.commands, model.A.shape
+    (('y1', 'y2'), ('u1',), (7, 7))
     """
 
     A: FloatArray

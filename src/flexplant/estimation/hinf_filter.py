@@ -65,6 +65,13 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
     References
     ----------
     Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999, ch. 4.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.estimation.design_hinf_filter(fx.testbeds.three_masses())
+    >>> found.certificate.gamma >= found.certificate.lower
+    True
     """
     accuracy = positive(accuracy, "accuracy")
     if not 1e-6 <= accuracy <= 1:

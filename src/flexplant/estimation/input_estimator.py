@@ -28,6 +28,15 @@ class InputCertificate(Certificate):
     difference : float
         Largest relative difference between the variances with the P that the gains were computed
         from and those with the P of the gains' own Stein equation, at most 1e-6.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> method = fx.estimation.Augmented(drift=1.0)
+    >>> found = fx.estimation.design_input_estimator(plant, ["amp"], method)
+    >>> found.certificate.spectral_radius < 1
+    True
     """
 
     spectral_radius: float
@@ -57,6 +66,14 @@ class InputEstimator(Value):
         Whether the sensors determine the inputs without any assumption of them.
     certificate : InputCertificate
         What was checked.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> method = fx.estimation.Augmented(drift=1.0)
+    >>> fx.estimation.design_input_estimator(plant, ["amp"], method).system.outputs
+    ('die:hat', 'amp:hat')
     """
 
     system: StateSpace

@@ -53,6 +53,13 @@ class Invertibility(Value):
         and x together that leave y at rest and do not decay. Empty when delay is None.
     dt : float [s]
         Sampling time.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.estimation.invertibility(fx.testbeds.three_masses(), ["amp"])
+    >>> found.rank_direct, found.rank_delayed, found.delay
+    (0, 1, 1)
     """
 
     inputs: tuple[str, ...]
@@ -142,6 +149,12 @@ def invertibility(plant: StandardPlant | System, inputs: Sequence[str]) -> Inver
         When a name is no disturbance of w.
     ModelError
         When the plant is weighted.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.estimation.invertibility(fx.testbeds.three_masses(), ["amp"]).holds
+    True
     """
     plant = checked_plant(plant)
     names = unknown_names(plant, inputs)

@@ -51,6 +51,13 @@ class LagReport(Value):
         Why there is no static relation, or "".
     units : mapping {channel: unit}
         SI units.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> report = fx.design_kalman(fx.testbeds.three_masses()).report()
+    >>> report.channels
+    ('die:x',)
     """
 
     channels: Sequence[str]

@@ -44,6 +44,16 @@ class LeftOut(Value):
         Shapes that stood for them (attachment vectors) are excited by u only.
     larger : StandardPlant, optional
         The plant that has the modes: from it the same follows for a POI elsewhere.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
+    >>> modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> plant = fx.assemble_plant(modes.select([0, 1, 2]), ports).discretized(2e3, delay=1)
+    >>> fx.design_kalman(plant, larger=modes).left_out.modes
+    array([4])
     """
 
     modes: IntArray

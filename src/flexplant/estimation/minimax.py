@@ -82,6 +82,14 @@ def design_minimax_filter(
     Geromel, Optimal linear filtering under parameter uncertainty, IEEE Trans. Signal Processing
     47, 1999 (the finite set of machines); the dual Stein equation for the gradient: Levine, Athans,
     IEEE Trans. Automatic Control 15, 1970.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> found = fx.estimation.design_minimax_filter(plant, [plant], iterations=20)
+    >>> bool(abs(found.rms("die") / fx.design_kalman(plant).rms("die") - 1) < 1e-3)
+    True
     """
     steps = whole(iterations, "iterations")
     kalman = design_kalman(plant, larger=plant)  # type: ignore[arg-type]

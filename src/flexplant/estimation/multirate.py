@@ -38,6 +38,13 @@ class PeriodicCertificate(Certificate):
     difference : float
         Largest relative difference between the variances at the start of a period, from the
         lifted equation, and those after one period of the recursion that it does not contain.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.estimation.design_multirate(fx.testbeds.three_masses(), {"y2": 2})
+    >>> found.certificate.spectral_radius < 1
+    True
     """
 
     spectral_radius: float
@@ -65,6 +72,13 @@ class PeriodicEstimator(Value):
         Of the errors at the POIs in each sample of a period.
     certificate : PeriodicCertificate
         What was checked.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.estimation.design_multirate(fx.testbeds.three_masses(), {"y2": 2})
+    >>> found.period, found.sensors
+    (2, ('y1', 'y2'))
     """
 
     plant: StandardPlant
@@ -226,6 +240,14 @@ def design_multirate(
     References
     ----------
     Bittanti, Colaneri, Periodic Systems, Springer, 2009, ch. 6 and 9.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> slow = fx.estimation.design_multirate(plant, {"y2": 4})  # y2 is read every fourth sample
+    >>> slow.period, bool(np.max(slow.rms("die")) > fx.design_kalman(plant).rms("die"))
+    (4, True)
     """
     plant = checked_plant(plant)
     model = filter_model(plant)

@@ -79,6 +79,17 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
     ----------
     Whittle, Arkiv foer Matematik 2, 1953; Odelson, Rajamani, Rawlings, A new autocovariance
     least-squares method for estimating noise covariances, Automatica 42, 2006.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> run = fx.simulate(fx.close_loop(plant, observer, servo), duration=4.0, rng=1)
+    >>> found = fx.estimation.estimate_noise(plant, run)
+    >>> 0.8 < found.asd["amp"] / 1e-3 < 1.2
+    True
     """
     plant = checked_plant(plant)
     channels = _channels(plant)

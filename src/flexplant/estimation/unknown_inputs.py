@@ -30,7 +30,14 @@ _STEPS, _SETTLED = 30, 1e-12
 
 @dataclass(frozen=True)
 class Unbiased(Value):
-    """Nothing is assumed of the inputs: minimum-variance unbiased filters of Gillijns, De Moor."""
+    """Nothing is assumed of the inputs: minimum-variance unbiased filters of Gillijns, De Moor.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.estimation.Unbiased()
+    Unbiased()
+    """
 
 
 @dataclass(frozen=True)
@@ -51,6 +58,12 @@ class Augmented(Value):
     ------
     ModelError
         When drift is not positive or corner is negative.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.estimation.Augmented(drift=1.0).step(1e3)
+    (1.0, 1000.0)
     """
 
     drift: float
@@ -126,6 +139,15 @@ def design_input_estimator(
     Gillijns, De Moor, Unbiased minimum-variance input and state estimation for linear discrete-time
     systems, Automatica 43, 2007, 111-116; ... with direct feedthrough, 934-937. Kitanidis, Unbiased
     minimum-variance linear state estimation, Automatica 23, 1987.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> method = fx.estimation.Augmented(drift=1.0)
+    >>> found = fx.estimation.design_input_estimator(plant, ["amp"], method)
+    >>> found.inputs
+    ('amp',)
     """
     instance(method, Unbiased | Augmented, "method", "Pass Unbiased() or Augmented(drift).")
     plant = checked_plant(plant)

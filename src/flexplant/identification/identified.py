@@ -53,6 +53,16 @@ class IdentifiedModes(MeasuredModes):
         E[n n^H] of the error n of each shape at its scale, from the FRF's variance and the
         correlation of its outputs' errors (where not known, they are taken for independent); not
         known where there are fewer outputs than inputs.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> freq = np.arange(10.0, 40.0, 0.1)
+    >>> H = 1 / (20.0**2 - freq**2 + 0.4j * freq)
+    >>> found = fx.identify_modes(fx.Frf(freq, H[None, None]))
+    >>> found.freq.round(3), found.zeta.round(4)
+    (array([20.]), array([0.01]))
     """
 
     participation: ComplexArray = field(kw_only=True)

@@ -71,6 +71,16 @@ def stabilisation_diagram(
     ----------
     Peeters, Van der Auweraer, Guillaume, Leuridan, "The PolyMAX frequency-domain method: a new
     standard for modal parameter estimation?", Shock and Vibration 11 (2004) 395-409.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> freq = np.arange(10.0, 40.0, 0.1)
+    >>> H = 1 / (20.0**2 - freq**2 + 0.4j * freq)
+    >>> diagram = fx.identification.stabilisation_diagram(fx.Frf(freq, H[None, None]))
+    >>> (abs(diagram.automatic().poles.imag) / (2 * np.pi)).round(2)
+    array([20.])
     """
     first, second, third = real_array(tolerances, "tolerances", (3,)).tolist()
     limits = (first, second, third)

@@ -94,6 +94,18 @@ def identify_output_only(
     Peeters, De Roeck: Reference-based stochastic subspace identification for output-only modal
     analysis, Mech. Syst. Signal Process. 13, 1999. Reynders, Pintelon, De Roeck: Uncertainty
     bounds on modal parameters obtained from stochastic subspace identification, ibid. 22, 2008.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> from scipy.signal import lfilter
+    >>> noise = np.random.default_rng(0).normal(size=5000)
+    >>> r, w = 0.99, 2 * np.pi * 10.0 / 100.0  # a resonance at 10 Hz, sampled at 100 Hz
+    >>> y = lfilter([1.0], [1.0, -2 * r * np.cos(w), r**2], noise)[None]
+    >>> found = fx.identification.identify_output_only(y, rate=100.0, band=(5.0, 20.0))
+    >>> found.freq.round(1)
+    array([10.])
     """
     y, names = signals(outputs, "outputs", "y")
     step = 1.0 / positive(rate, "rate")

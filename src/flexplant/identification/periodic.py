@@ -32,6 +32,14 @@ class Periodic(Value):
         Periods at the start that are dropped, for transients to die out.
     band : (low, high) [Hz], optional
         Lines to use; by default all lines that are excited.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> u = fx.identification.multisine(1, rate=1e3, period=0.1, periods=4, rng=1)[0]
+    >>> frf = fx.estimate_frf(u, 2 * u, rate=1e3, method=fx.identification.Periodic(period=0.1))
+    >>> abs(frf.data[0, 0, :3]).round(6)
+    array([2., 2., 2.])
     """
 
     period: float
@@ -247,6 +255,13 @@ def multisine(
     ------
     ModelError
         When a number is out of range or no line lies in the band.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> signals = fx.identification.multisine(2, rate=1e3, period=0.5, rng=1)
+    >>> signals.shape  # experiments, inputs, samples
+    (2, 2, 500)
     """
     count, periods = whole(count, "count"), whole(periods, "periods")
     random = generator(rng)

@@ -59,6 +59,16 @@ class H1Estimator(SpectralMethod):
     ------
     ModelError
         When a value is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> u = np.random.default_rng(0).normal(size=(1, 4000))
+    >>> method = fx.identification.H1Estimator(segment=0.1)  # s
+    >>> frf = fx.estimate_frf(u, 2 * u, rate=1e3, method=method)
+    >>> abs(frf.data[0, 0, :3]).round(6)
+    array([2., 2., 2.])
     """
 
 
@@ -78,6 +88,16 @@ class H2Estimator(SpectralMethod):
     ------
     ModelError
         When a value is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> u = np.random.default_rng(0).normal(size=(1, 4000))
+    >>> method = fx.identification.H2Estimator(segment=0.1)  # s
+    >>> frf = fx.estimate_frf(u, 2 * u, rate=1e3, method=method)
+    >>> abs(frf.data[0, 0, :3]).round(6)
+    array([2., 2., 2.])
     """
 
 
@@ -99,6 +119,16 @@ class HvEstimator(SpectralMethod):
     ------
     ModelError
         When a value is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> u = np.random.default_rng(0).normal(size=(1, 4000))
+    >>> method = fx.identification.HvEstimator(segment=0.1)  # s
+    >>> frf = fx.estimate_frf(u, 2 * u, rate=1e3, method=method)
+    >>> abs(frf.data[0, 0, :3]).round(6)
+    array([2., 2., 2.])
     """
 
 

@@ -83,6 +83,20 @@ def structural_modes(
     References
     ----------
     O'Callahan, Avitabile, Riemer: System equivalent reduction expansion process, IMAC 7, 1989.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], ground=[1e5, 0.0])
+    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.01))
+    >>> sensors = [fx.Sensor(f"y{i}", at=f"{i}:x") for i in (1, 2)]
+    >>> plant = fx.assemble_plant(modes, fx.Ports(u=[fx.Actuator("u1", at="1:x")], y=sensors))
+    >>> frf = fx.frequency_response(plant.Gyu, np.linspace(10.0, 250.0, 400))
+    >>> measured = fx.identify_modes(frf, dofs={"y1": "1:x", "y2": "2:x", "u1": "1:x"})
+    >>> found = fx.identification.structural_modes(measured, model.dofs, rigid=False)
+    >>> found.freq.round(1)
+    array([ 34.5, 147. ])
     """
     instance(measured, IdentifiedModes, "measured", "Pass the answer of identify_modes(frf).")
     instance(dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz), or model.dofs.")

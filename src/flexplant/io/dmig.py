@@ -71,6 +71,20 @@ def read_dmig(
     -----
     Format: MSC Nastran Quick Reference Guide, DMIG. Lengths and masses are in the units of the
     model: `.converted(...)` brings them to SI.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> cards = ["DMIG,KAAX,0,6,2,0,,,2", "DMIG,KAAX,1,1,,1,1,5.0", "DMIG,KAAX,2,1,,2,1,7.0"]
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "stage.pch")
+    ...     with open(path, "w") as file:
+    ...         for card in cards:
+    ...             print(card, file=file)
+    ...     found = fx.io.read_dmig(path)
+    >>> found.dofs.labels, found.K.toarray().diagonal()
+    (('1:x', '2:x'), array([5., 7.]))
     """
     content = file_path(path).read_bytes()
     lines = content.splitlines()

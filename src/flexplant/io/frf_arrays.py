@@ -118,6 +118,16 @@ def read_frf_mat(
         When a variable or the quantity is unknown.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, scipy.io, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "frf.mat")
+    ...     scipy.io.savemat(path, {"freq": [10.0, 20.0], "data": [[[1.0, 2.0]]]})
+    ...     fx.io.read_frf_mat(path)
+    <Frf: u1 -> y1, 2 frequencies 10 .. 20 Hz>
     """
     plain = mat_variables(path)
     for side in ("inputs", "outputs"):

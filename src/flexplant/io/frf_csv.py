@@ -51,6 +51,18 @@ def write_frf_csv(path: str | Path, frf: Frf, *, units: Mapping[str, str] | None
         When it is no Frf.
     OSError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> frf = fx.Frf([10.0, 20.0], [[[1.0, 2.0]]], outputs=["y1"], inputs=["u1"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "frf.csv")
+    ...     fx.io.write_frf_csv(path, frf)
+    ...     again = fx.io.read_frf_csv(path)
+    >>> again["y1", "u1"].real
+    array([1., 2.])
     """
     instance(frf, Frf, "frf", "Pass frequency_response(sys).")
     given = dict(frf.units) | dict(units or {})
@@ -106,6 +118,17 @@ def read_frf_csv(path: str | Path) -> Frf:
         When frequencies do not increase.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> frf = fx.Frf([10.0, 20.0], [[[1.0, 2.0]]], outputs=["y1"], inputs=["u1"])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "frf.csv")
+    ...     fx.io.write_frf_csv(path, frf)
+    ...     fx.io.read_frf_csv(path)
+    <Frf: u1 -> y1, 2 frequencies 10 .. 20 Hz>
     """
     lines = file_path(path).read_text(encoding="utf-8").splitlines()
     comments = [line for line in lines if line.startswith("#")]

@@ -59,6 +59,17 @@ def read_harwell_boeing(
     -----
     Format: I. S. Duff, R. G. Grimes, J. G. Lewis, "Users' Guide for the Harwell-Boeing Sparse
     Matrix Collection", 1992, section 2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, scipy.io, scipy.sparse, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "K.rua")
+    ...     scipy.io.hb_write(path, scipy.sparse.csc_array([[2.0, -1.0], [-1.0, 1.0]]))
+    ...     fx.io.read_harwell_boeing(path).K.toarray()
+    array([[ 2., -1.],
+           [-1.,  1.]])
     """
     return one_matrix_each({"K": stiffness, "M": mass, "D": damping}, _harwell_boeing, dofs)
 

@@ -55,6 +55,17 @@ def read_matlab(
         When sizes differ.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> import os, scipy.io, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "model.mat")
+    ...     scipy.io.savemat(path, {"K": np.eye(2), "M": np.eye(2)})
+    ...     fx.io.read_matlab(path).n_dof
+    2
     """
     path = file_path(path)
     with path.open("rb") as file:
@@ -98,6 +109,16 @@ def read_npz(
         When sizes differ.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, scipy.sparse, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "K.npz")
+    ...     scipy.sparse.save_npz(path, scipy.sparse.eye_array(2, format="csc"))
+    ...     fx.io.read_npz(path).n_dof
+    2
     """
     parts: dict[str, Any] = {}
     for name, path in (("K", stiffness), ("M", mass), ("D", damping)):

@@ -38,6 +38,16 @@ def write_mat(path: str | Path, system: System | StandardPlant) -> None:
         When it is none of these.
     OSError
         When the file cannot be written.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "filter.mat")
+    ...     fx.io.write_mat(path, fx.lowpass(100.0))
+    ...     fx.io.read_mat(path)
+    <StateSpace: 1 states, continuous, in -> out>
     """
     plant = system if isinstance(system, StandardPlant) else None
     g = as_statespace(system.system if isinstance(system, StandardPlant) else system)
@@ -75,6 +85,16 @@ def read_mat(path: str | Path) -> StateSpace | StandardPlant:
         When matrices are missing, or what they hold is no system.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "plant.mat")
+    ...     fx.io.write_mat(path, fx.testbeds.three_masses())
+    ...     fx.io.read_mat(path).y
+    ('y1', 'y2', 'die:ref')
     """
     content = mat_variables(path)
     missing = [name for name in "ABCD" if name not in content]

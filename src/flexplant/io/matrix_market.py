@@ -69,6 +69,16 @@ def read_matrix_market(
     -----
     Format: R. F. Boisvert, R. Pozo, K. A. Remington, "The Matrix Market Exchange Formats: Initial
     Design", NISTIR 5935, 1996. Exponents of Fortran (7.5D+03, 7.5+03) are read as such.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, scipy.io, scipy.sparse, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "K.mtx")
+    ...     scipy.io.mmwrite(path, scipy.sparse.eye_array(2))
+    ...     fx.io.read_matrix_market(path).n_dof
+    2
     """
     return one_matrix_each({"K": stiffness, "M": mass, "D": damping}, _matrix_market, dofs)
 

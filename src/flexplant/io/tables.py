@@ -80,6 +80,19 @@ def read_dofs(
         When a column is missing, a direction is unknown, or a node has no coordinates.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "dofs.csv")
+    ...     with open(path, "w") as file:
+    ...         for line in ("node,direction,x,y,z", "1,x,0,0,0", "2,x,10,0,0"):
+    ...             print(line, file=file)
+    ...     dofs = fx.io.read_dofs(path, length="mm")
+    >>> dofs.labels, dofs.xyz[1].tolist()
+    (('1:x', '2:x'), [0.01, 0.0, 0.0])
     """
     table = _table(path)
     columns = table.columns

@@ -50,6 +50,15 @@ def in_axes(
     ------
     ModelError, ShapeError, LabelError
         When frf is none, a transformation is not static or does not fit, or a number is wrong.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> frf = fx.Frf([10.0], [[[1.0], [3.0]], [[3.0], [1.0]]])
+    >>> half = [[0.5, 0.5], [0.5, -0.5]]
+    >>> fx.loop.in_axes(frf, before=half, after=half, hold=False).data[:, :, 0].real
+    array([[ 2.,  0.],
+           [ 0., -1.]])
     """
     frf = instance(frf, Frf, "frf", "Pass a measured one.")
     first = static_map(before, frf.inputs, "before")

@@ -45,6 +45,16 @@ class ErrorBudget(Value):
         the loop is unstable with them.
     certificate : mapping {str: float}
         Relative differences of the variance computed in other ways.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> budget = fx.close_loop(plant, observer, servo).budget("die:x")
+    >>> dict(zip(budget.names, budget.shares.round(2).tolist()))
+    {'amp': 1.0, 'y1:noise': 0.0, 'y2:noise': 0.0}
     """
 
     channel: str

@@ -63,6 +63,15 @@ def bandwidth(loop: Loop) -> float:
         When the closed loop is not stable, or |S| is nowhere below 0 dB.
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> round(fx.loop.bandwidth(fx.close_loop(plant, observer, servo)), 1)
+    14.1
     """
     parts = taken_apart(loop)
     if parts.is_unstable:

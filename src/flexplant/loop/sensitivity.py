@@ -47,6 +47,17 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
         When channels of plant and controller do not match.
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop, freq = fx.close_loop(plant, observer, servo), [10.0]
+    >>> L, S = fx.loop.loop_gain(loop, freq=freq), fx.loop.sensitivity(loop, freq=freq)
+    >>> bool(abs(S.data - 1 / (1 - L.data)).max() < 1e-9)
+    True
     """
     parts, grid = _prepared(loop, freq)
     return _frf(grid, parts.gain(grid, at), parts, at, at)
@@ -77,6 +88,16 @@ def sensitivity(
         When channels of plant and controller do not match.
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> S = fx.loop.sensitivity(fx.close_loop(plant, observer, servo), freq=[0.1, 900.0])
+    >>> abs(S.data[0, 0]).round(3)  # small at low frequency, one at high
+    array([0., 1.])
     """
     parts, grid = _prepared(loop, freq)
     return _frf(grid, inverted(parts.gain(grid, at)), parts, at, at)
@@ -107,6 +128,16 @@ def complementary_sensitivity(
         When channels of plant and controller do not match.
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> T = fx.loop.complementary_sensitivity(fx.close_loop(plant, observer, servo), freq=[0.1])
+    >>> abs(T.data[0, 0]).round(3)
+    array([1.])
     """
     parts, grid = _prepared(loop, freq)
     L = parts.gain(grid, at)
@@ -134,6 +165,16 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
         When channels of plant and controller do not match.
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> KS = fx.loop.control_sensitivity(fx.close_loop(plant, observer, servo), freq=[10.0])
+    >>> KS.outputs, KS.inputs
+    (('u1',), ('y1', 'y2'))
     """
     parts, grid = _prepared(loop, freq)
     K, P = parts.respond(grid)

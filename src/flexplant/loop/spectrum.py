@@ -33,6 +33,14 @@ class Spectrum(NamedTuple):
         Frequencies.
     psd : (n_freq,) array [unit^2/Hz]
         Its integral over all frequencies is the mean square.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> flat = fx.loop.Spectrum(freq=np.array([0.0, 1.0]), psd=np.array([2.0, 2.0]))
+    >>> float(np.trapezoid(flat.psd, flat.freq))  # the variance
+    2.0
     """
 
     freq: FloatArray

@@ -46,6 +46,18 @@ class SpillOver(Value):
         in what grows, or in the peak of |S| at u where this is `high`; empty otherwise.
     freq : sequence of float [Hz]
         Of that, one for each of these modes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
+    >>> modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> plant = fx.assemble_plant(modes.select([0, 1, 2]), ports).discretized(2e3, delay=1)
+    >>> observer = fx.design_kalman(plant, larger=modes)
+    >>> servo = fx.design_servo(plant, bandwidth=10.0, observer=observer, larger=modes)
+    >>> fx.close_loop(plant, observer, servo, larger=modes).left_out.is_stable
+    True
     """
 
     stability: float

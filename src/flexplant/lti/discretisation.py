@@ -242,6 +242,13 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
     ------
     ModelError
         When `sys` is sampled already, prewarp is not below half the rate, or a pole lies at a.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lag = fx.lti.tf([1.0], [1.0, 1.0])
+    >>> fx.lti.tustin(lag, 10.0).poles().real.round(6)  # (20 - 1) / (20 + 1)
+    array([0.904762])
     """
     g = as_statespace(sys)
     if g.dt and g.n_states:

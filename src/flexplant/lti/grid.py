@@ -53,6 +53,13 @@ def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) 
     ------
     ModelError
         When points or tolerance is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> freq = fx.lti.default_freq(fx.lti.tf([1.0], [1.0, 0.02, 1.0]))
+    >>> bool(abs(freq - 0.15915).min() < 1e-4)  # the resonance is on the grid
+    True
     """
     g = as_statespace(sys)
     tolerance = positive(tolerance, "tolerance")

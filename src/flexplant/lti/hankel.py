@@ -96,6 +96,13 @@ class NormReport(Value):
         Of the peak of the frequency response, or of the pole that makes the norms infinite.
     reasons : sequence of str
         One sentence for each thing that makes a norm infinite; empty when all are finite.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.lti.norm_report(fx.lti.tf([1.0], [1.0, 1.0]))
+    >>> round(found.h2, 6), round(found.hinf, 6), round(found.hankel, 6)
+    (0.707107, 1.0, 0.5)
     """
 
     h2: float

@@ -28,6 +28,15 @@ def append(*systems: System) -> StateSpace:
         When two share a channel name: rename one.
     ModelError
         When sampling times differ.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> first = fx.lti.tf([1.0], [1.0, 1.0]).replace(inputs=["u1"], outputs=["y1"])
+    >>> second = fx.lti.tf([2.0], [1.0, 2.0]).replace(inputs=["u2"], outputs=["y2"])
+    >>> both = fx.lti.append(first, second)
+    >>> both.inputs, both.outputs
+    (('u1', 'u2'), ('y1', 'y2'))
     """
     parts = [as_statespace(sys) for sys in systems]
     return StateSpace(
@@ -53,6 +62,13 @@ def series(first: System, second: System) -> StateSpace:
     ------
     ShapeError
         When the numbers of channels differ.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lag = fx.lti.tf([2.0], [1.0, 1.0])
+    >>> fx.lti.series(lag, lag).dcgain()
+    4.0
     """
     return as_statespace(second) * as_statespace(first)
 
@@ -69,6 +85,13 @@ def parallel(first: System, second: System) -> StateSpace:
     ------
     LabelError
         When the channel names differ.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lag = fx.lti.tf([1.0], [1.0, 1.0])
+    >>> fx.lti.parallel(lag, lag).dcgain()
+    2.0
     """
     return as_statespace(first) + as_statespace(second)
 
@@ -171,6 +194,12 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
         When the numbers of channels do not match.
     ModelError
         When the loop is ill-posed.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.feedback(fx.lti.tf([3.0], [1.0, 0.0])).poles().real
+    array([-3.])
     """
     g = as_statespace(forward)
     h = as_statespace(np.eye(len(g.outputs)) if back is None else back)
@@ -235,6 +264,15 @@ def connect(
         When a block input is driven by nothing, or a name is driven twice.
     ModelError
         When the loop is ill-posed or sampling times differ.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.lti.tf([1.0], [1.0, 0.0]).replace(inputs=["u"], outputs=["y"])
+    >>> law = fx.StateSpace([], [], [], [[-3.0, 3.0]], inputs=["y", "r"], outputs=["u"])
+    >>> loop = fx.lti.connect([plant, law], inputs=["r"], outputs=["y"])
+    >>> loop.poles().real
+    array([-3.])
     """
     parts = [as_statespace(sys) for sys in systems]
     produced = [name for part in parts for name in part.outputs]

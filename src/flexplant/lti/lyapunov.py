@@ -51,6 +51,12 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     References
     ----------
     Smith, Matrix equation XA + BX = C, SIAM J. Appl. Math. 16, 1968.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.solve_stein([[0.5]], [[3.0]]).round(9)  # x = x / 4 + 3
+    array([[4.]])
     """
     A = real_array(A, "A", (None, None))
     A = real_array(A, "A", (A.shape[0], A.shape[0]))
@@ -95,6 +101,12 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
         When entries are not finite or Q is not symmetric.
     SolverError
         When A is not strictly stable or the residual is bad.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.solve_lyapunov([[-2.0]], [[4.0]]).round(9)  # -2 x - 2 x + 4 = 0
+    array([[1.]])
     """
     A = real_array(A, "A", (None, None))
     A = real_array(A, "A", (A.shape[0], A.shape[0]))
@@ -129,6 +141,12 @@ def controllability_gramian(sys: System) -> FloatArray:
     ------
     SolverError
         When the system is not strictly stable.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.controllability_gramian(fx.lti.tf([1.0], [1.0, 1.0])).round(9)
+    array([[0.5]])
     """
     g = as_statespace(sys)
     return _gramian(g, g.A, g.B)
@@ -151,6 +169,12 @@ def observability_gramian(sys: System) -> FloatArray:
     ------
     SolverError
         When the system is not strictly stable.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.observability_gramian(fx.lti.tf([1.0], [1.0, 1.0])).round(9)
+    array([[0.5]])
     """
     g = as_statespace(sys)
     return _gramian(g, g.A.T, g.C.T)

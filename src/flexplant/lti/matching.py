@@ -47,6 +47,12 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     References
     ----------
     Franklin, Powell, Workman, Digital control of dynamic systems, 3rd ed., sec. 6.2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.lti.matched(fx.lti.tf([1.0], [1.0, 1.0]), 10.0).poles().real.round(6)  # exp(-0.1)
+    array([0.904837])
     """
     g = as_statespace(sys)
     h = 1.0 / positive(rate, "rate")

@@ -34,6 +34,13 @@ class ModalForm(Value):
         Norm of what the blocks leave out of ``T^-1 A T``, relative to A, states balanced.
     reason : str
         Why the dense form was kept; empty when the blocks were found.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.modal_form(fx.lti.tf([1.0], [1.0, 3.0, 2.0])).system.A.round(9)
+    array([[-2.,  2.],
+           [ 0., -1.]])
     """
 
     system: StateSpace

@@ -378,6 +378,13 @@ def as_statespace(sys: System | FloatArray) -> StateSpace:
     ------
     ModelError
         When it is neither a system nor a (p, m) array; for a StandardPlant, which holds four.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> from scipy.signal import StateSpace as ScipySystem
+    >>> fx.lti.as_statespace(ScipySystem([[-1.0]], [[1.0]], [[1.0]], [[0.0]])).poles().real
+    array([-1.])
     """
     if isinstance(sys, StateSpace):
         return sys

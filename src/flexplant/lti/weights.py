@@ -92,6 +92,13 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     ------
     ModelError
         When freq is not positive, gain not a number, or the order neither 1 nor 2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> high = fx.lti.highpass(10.0)
+    >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
+    (0.7071, 0.0)
     """
     omega, gain = 2.0 * np.pi * positive(freq, "freq"), _number(gain)
     if order == 1:
@@ -122,6 +129,12 @@ def notch(freq: float, *, depth: float = 0.05, width: float = 0.5) -> StateSpace
     ------
     ModelError
         When an argument is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> round(abs(fx.lti.notch(100.0, depth=0.1)(2j * np.pi * 100.0)), 4)
+    0.1
     """
     omega = 2.0 * np.pi * positive(freq, "freq")
     zeta = positive(width, "width")
@@ -147,6 +160,13 @@ def leadlag(zero: float, pole: float, *, gain: float = 1.0) -> StateSpace:
     ------
     ModelError
         When a frequency is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> lead = fx.lti.leadlag(10.0, 90.0)
+    >>> round(float(np.angle(lead(2j * np.pi * 30.0), deg=True)), 1)
+    53.1
     """
     ratio, gain = positive(pole, "pole") / positive(zero, "zero"), _number(gain)
     return first_order(gain * ratio, gain, 2.0 * np.pi * pole)
@@ -178,6 +198,13 @@ def inverse_sensitivity(
     ------
     ModelError
         Unless floor < 1 < peak, bandwidth > 0 and slope is 1 or 2.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> W = fx.lti.inverse_sensitivity(50.0, peak=2.0)
+    >>> round(1 / abs(W(2j * np.pi * 1e5)), 3)  # |S| may be 2 at high frequency
+    2.0
     """
     if slope not in (1, 2):
         raise ModelError(f"slope must be 1 or 2, got {slope!r}.")
@@ -212,6 +239,13 @@ def pade(delay: float, *, order: int = 2) -> StateSpace:
     ------
     ModelError
         When delay is not positive or the order not a whole number from 1 to 12.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> delay = fx.lti.pade(1e-3)
+    >>> round(abs(delay(200j)), 6), round(float(np.angle(delay(200j))), 4)  # one, and -0.2 rad
+    (1.0, -0.2)
     """
     time = positive(delay, "delay")
     if order not in range(1, 13):

@@ -51,6 +51,14 @@ class AutoMac(ByShapes):
     ``(phi_i' phi_j)^2 / (phi_i' phi_i phi_j' phi_j)``, 0 where all shapes differ, 1 where two look
     alike. It does not count how large the motions are that the sensors see, and of a POI it says
     next to nothing, as `ModeInformation`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 2, fx.placement.AutoMac()).chosen
+    ('s1', 's3')
     """
 
     def of(self, plant: StandardPlant, shapes: Shapes) -> LargestMac:

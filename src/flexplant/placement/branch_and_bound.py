@@ -55,6 +55,14 @@ class BranchAndBound(Search):
     It needs a criterion whose relaxation is convex: `PoiVariance` of the plant's own modes (sum),
     `PoiLqr`, `ClosedLoopH2` of one kind of device, all of ports without a filter or delay of their
     own; `ModeInformation` and log det of Gramians.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 1, method=fx.placement.BranchAndBound(), rng=0).proven
+    True
     """
 
     gap: float = 0.0

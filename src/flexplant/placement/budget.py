@@ -33,6 +33,15 @@ class Budget(Constraint):
         When a number is negative.
     LabelError
         When used, for an unknown name.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> cheap = fx.placement.Budget(2.0, {"s1": 5.0})  # s1 costs 5, the others 1
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[cheap]).chosen
+    ('s3',)
     """
 
     total: float

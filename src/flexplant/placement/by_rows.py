@@ -40,6 +40,15 @@ class ByRows(Search):
     ----------
     Kammer, J. Guidance 14, 1991; Imamovic, PhD thesis, Imperial College, 1998; Manohar, Brunton,
     Kutz, Brunton, IEEE Control Systems 38, 2018.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> goal = fx.placement.ModeInformation(elastic=True)
+    >>> fx.place_sensors(plant, candidates, 2, goal, method=fx.placement.ByRows()).chosen
+    ('s1', 's3')
     """
 
     method: SelectionCriterion = field(default_factory=EffectiveIndependence)

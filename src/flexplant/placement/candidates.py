@@ -21,6 +21,12 @@ class PlantChannel(Value):
         Of the channel.
     side : {"y", "u"}
         Whether it is a sensor or an actuator.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.placement.PlantChannel("y1", "y")
+    PlantChannel(name='y1', side='y')
     """
 
     name: str

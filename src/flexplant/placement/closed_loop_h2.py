@@ -62,6 +62,14 @@ class ClosedLoopH2(Criterion):
         When a name appears twice; when called, for a POI or an axis that the plant lacks.
     ModelError
         When a factor or the effort is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
+    >>> fx.place_actuators(plant, candidates, 1, fx.placement.ClosedLoopH2("die")).chosen
+    ('a2',)
     """
 
     poi: Named = None

@@ -11,7 +11,14 @@ from .rows import LinearRows
 
 
 class Constraint(Value):
-    """The base of all constraints: a new one defines `rows`."""
+    """The base of all constraints: a new one defines `rows`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.placement.MinimumDistance(0.1), fx.placement.Constraint)
+    True
+    """
 
     def rows(self, places: Places) -> LinearRows:
         """Return linear rows in x, which is 1 for chosen candidates and 0 for others."""

@@ -79,6 +79,12 @@ class Criterion(Value):
     """A function from plant to float, smaller is better; the base of those with more to say.
 
     A new criterion defines `__call__`, and where it can `check` and a `scorer` that is faster.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.PoiVariance("die"), fx.placement.Criterion)
+    True
     """
 
     #: what it depends on: sensors "y", actuators "u"

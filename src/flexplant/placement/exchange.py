@@ -37,6 +37,15 @@ class Exchange(Search):
     ------
     ModelError
         When starts is not at least 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> method = fx.placement.Exchange(starts=2)
+    >>> fx.place_sensors(plant, candidates, 2, method=method, rng=0).chosen
+    ('s1', 's3')
     """
 
     starts: int = 10

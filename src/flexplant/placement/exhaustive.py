@@ -25,6 +25,14 @@ class Exhaustive(Search):
     ------
     ModelError
         When limit is no whole number of at least 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 1, method=fx.placement.Exhaustive()).proven
+    True
     """
 
     limit: int = 200_000

@@ -92,6 +92,14 @@ class ModalObservability(ModalGramian):
     ------
     ModelError
         When the measure is none of these; when called, for a plant without elastic modes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 2, fx.placement.ModalObservability()).chosen
+    ('s1', 's3')
     """
 
     sides: ClassVar[str] = "y"
@@ -115,6 +123,14 @@ class ModalControllability(ModalGramian):
     ------
     ModelError
         When the measure is none of these; when called, for a plant without elastic modes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
+    >>> fx.place_actuators(plant, candidates, 1, fx.placement.ModalControllability()).side
+    'u'
     """
 
     sides: ClassVar[str] = "u"

@@ -27,6 +27,15 @@ class Together(Constraint):
     ------
     LabelError
         When a group has fewer than two names; when used, for an unknown name.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> pair = fx.placement.Together([["s1", "s3"]])
+    >>> fx.place_sensors(plant, candidates, 2, constraints=[pair]).chosen
+    ('s1', 's3')
     """
 
     groups: Sequence[Sequence[str]]
@@ -71,6 +80,15 @@ class Mirrored(Constraint):
     ------
     ModelError
         When the axis is none of these or the place no number.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> middle = fx.placement.Mirrored("x", at=1.0)
+    >>> fx.place_sensors(plant, candidates, 2, constraints=[middle]).chosen
+    ('s1', 's3')
     """
 
     axis: str
@@ -112,6 +130,15 @@ class Among(Constraint):
         When a count is no whole number, or at_least is above at_most.
     LabelError
         When these are no names; when used, for an unknown name.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> last = fx.placement.Among(["s3"], at_least=1)
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[last]).chosen
+    ('s3',)
     """
 
     names: Sequence[str]

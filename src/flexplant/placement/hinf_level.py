@@ -35,6 +35,14 @@ class HinfLevel(Criterion):
     ------
     ModelError
         When weights are no mappings, effort or noise not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> level = fx.placement.HinfLevel(z={"die:x": 1e6}, w={"amp": 1.0}, effort=0.1, noise=1e-9)
+    >>> level.effort, level.noise
+    (0.1, 1e-09)
     """
 
     z: Mapping[str, Any] = field(default_factory=dict)

@@ -35,6 +35,15 @@ class KineticEnergy(ByShapes):
     ModelError
         When the model is no structure; when called, where no mass matrix is known or it is of
         another structure.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> masses = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> fx.place_sensors(plant, candidates, 2, fx.placement.KineticEnergy(masses)).chosen
+    ('s1', 's3')
     """
 
     model: Any = None

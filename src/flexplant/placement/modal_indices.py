@@ -38,6 +38,14 @@ class SensorIndices(ByShapes):
     References
     ----------
     Gawronski, Advanced Structural Dynamics and Active Control of Structures, 2004, ch. 5 and 7.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 2, fx.placement.SensorIndices()).chosen
+    ('s1', 's3')
     """
 
     norm: str = "h2"
@@ -82,6 +90,14 @@ class ActuatorIndices(SensorIndices):
     ------
     ModelError
         When the norm is none of these; when called, for a plant made elsewhere.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
+    >>> fx.place_actuators(plant, candidates, 1, fx.placement.ActuatorIndices()).side
+    'u'
     """
 
     sides: ClassVar[str] = "u"

@@ -53,6 +53,14 @@ class ModeInformation(ByShapes):
     ------
     ModelError
         When elastic is neither True nor False; when called, for a plant made elsewhere.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> fx.place_sensors(plant, candidates, 2, fx.placement.ModeInformation(elastic=True)).chosen
+    ('s1', 's3')
     """
 
     sides: ClassVar[str] = "y"

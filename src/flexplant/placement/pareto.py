@@ -35,6 +35,15 @@ class ParetoCurve(Value):
         No choice of that count (within that budget) is better.
     by_cost : bool
         Whether amounts are budgets.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> curve = fx.placement.pareto_curve(plant, candidates, [1, 2])
+    >>> [placement.chosen for placement in curve.placements]
+    [('s1',), ('s1', 's3')]
     """
 
     amounts: FloatArray
@@ -133,6 +142,15 @@ def pareto_curve(
         When there is no choice for any amount.
     CertificateError
         When a score is not confirmed by the other route.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> curve = fx.placement.pareto_curve(plant, candidates, [1, 2])
+    >>> bool(curve.values[1] < curve.values[0])
+    True
     """
     plant = checked_plant(plant)
     if not isinstance(amounts, Sequence | np.ndarray | range) or isinstance(amounts, str):

@@ -56,6 +56,12 @@ class LeftOutModes(Criterion):
         When `of` is none of these; when called, when larger is no structure.
     AssumptionError
         When called, where no modes left out are known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.placement.LeftOutModes(of="sensors")
+    LeftOutModes(of='sensors')
     """
 
     scale: ClassVar[float] = 1e-6

@@ -54,6 +54,14 @@ class PoiLqr(Criterion):
         When an axis appears twice; when called, for a POI or an axis that the plant lacks.
     ModelError
         When a factor or the effort is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Actuator(f"a{i}", at=f"{i}:x", direction="x") for i in (1, 2, 3)]
+    >>> fx.place_actuators(plant, candidates, 1, fx.placement.PoiLqr("die")).chosen  # at the POI
+    ('a2',)
     """
 
     sides = "u"

@@ -196,6 +196,13 @@ class Found:
         The best score after each step, for each start.
     stopped : str
         Why the search ended before it had proven what it should; empty when it did not.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.placement.Found(("s1",), 2.0, 1.5, 7, (3.0, 2.0))
+    >>> found.value - found.bound
+    0.5
     """
 
     chosen: tuple[int, ...]
@@ -207,7 +214,14 @@ class Found:
 
 
 class Search(Value):
-    """A way to search; the base of all of them."""
+    """A way to search; the base of all of them.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.placement.Exchange(), fx.placement.Search)
+    True
+    """
 
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best choice that was found.

@@ -60,6 +60,15 @@ class OverMachines(Wrapping):
     ModelError
         When there are no machines, one of them is no sampled plant, the measure is none of these,
         or the criterion is not callable.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> worst = fx.placement.OverMachines(fx.PoiVariance("die"), [plant, plant])
+    >>> fx.place_sensors(plant, candidates, 1, worst).chosen
+    ('s1',)
     """
 
     machines: Sequence[StandardPlant]
@@ -141,6 +150,16 @@ class AfterLoss(Wrapping):
     ------
     ModelError
         When `of` or the measure is none of these, or the criterion not callable.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> one_may_fail = fx.placement.AfterLoss(fx.PoiVariance("die"))
+    >>> found = fx.place_sensors(plant, candidates, 2, one_may_fail)
+    >>> found.value > fx.place_sensors(plant, candidates, 2).value
+    True
     """
 
     of: str = field(default="sensors", kw_only=True)

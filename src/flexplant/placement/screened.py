@@ -40,6 +40,15 @@ class Screened(Search):
     ------
     ModelError
         When `by` is not callable, or a number is not at least 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> method = fx.placement.Screened(fx.PoiVariance("die"), starts=1)
+    >>> fx.place_sensors(plant, candidates, 1, fx.PoiVariance("die"), method=method, rng=0).chosen
+    ('s1',)
     """
 
     by: Any

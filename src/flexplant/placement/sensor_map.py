@@ -41,6 +41,14 @@ class SensorMap(Value):
         Zones in which nothing was tried.
     unit : str
         Of the square roots of the values, where they are mean squares of a motion.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> found = fx.sensor_map(plant, [(0, 0, 0), (2, 0, 0)], asd=1e-10, direction="x")
+    >>> found.values.shape, bool((found.values <= found.without).all())
+    ((2,), True)
     """
 
     points: FloatArray

@@ -25,6 +25,15 @@ class MinimumDistance(Constraint):
     ------
     ModelError
         When it is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> apart = fx.placement.MinimumDistance(1.5)
+    >>> fx.place_sensors(plant, candidates, 2, constraints=[apart]).chosen
+    ('s1', 's3')
     """
 
     distance: float

@@ -34,6 +34,14 @@ class DeviceWorth(Value):
         Without each one; infinite where the others do not suffice.
     unit : str
         Of the square roots of the values, where they are mean squares of a motion.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> fx.placement.device_worth(plant, fx.place_sensors(plant, candidates, 2)).names
+    ('s1', 's3')
     """
 
     names: Sequence[str]
@@ -89,6 +97,15 @@ def device_worth(
         When the plant or the placement is not what is needed.
     AssumptionError
         When the devices miss a rigid-body mode even together.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> worth = fx.placement.device_worth(plant, fx.place_sensors(plant, candidates, 2))
+    >>> bool(worth.without[0] > worth.without[1])  # s1, beside the disturbance, is worth more
+    True
     """
     plant = checked_plant(plant)
     instance(placement, Placement, "placement", "Pass what place_sensors returned.")

@@ -29,6 +29,15 @@ class Excluded(Constraint):
     ------
     ModelError
         When a zone is something else, or there is none.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> off = fx.placement.Excluded(fx.Disc((0.0, 0.0), radius=0.5))  # where the first mass is
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[off]).chosen
+    ('s3',)
     """
 
     zones: Zone | Sequence[Zone]
@@ -61,6 +70,15 @@ class OffPoi(Constraint):
     ------
     ModelError
         When the radius is no finite number.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> anywhere = fx.placement.OffPoi(-1)  # the middle mass, where the POI is, is free too
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[anywhere]).chosen
+    ('s2',)
     """
 
     radius: float = 0.0
@@ -97,6 +115,15 @@ class Within(Constraint):
     ------
     ModelError
         When a zone or a count is not of its kind, or at_least is above at_most.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> right = fx.placement.Within(fx.Rectangle((1.5, -1.0), (2.5, 1.0)), at_least=1)
+    >>> fx.place_sensors(plant, candidates, 1, constraints=[right]).chosen
+    ('s3',)
     """
 
     zones: Zone | Sequence[Zone]

@@ -68,6 +68,13 @@ def wafer_stage(
     ------
     ModelError
         When a value is out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> machine = fx.testbeds.wafer_stage(elements=(4, 4))
+    >>> machine.poles([4]).freq.round(1)
+    array([246.5])
     """
     given = tuple(elements) if isinstance(elements, tuple | list) else ()
     if len(given) != 2:
@@ -96,6 +103,13 @@ class WaferStage(Value):
         Of its controller.
     delay : int [samples]
         From measurement to actuation.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> machine = fx.testbeds.wafer_stage(elements=(4, 4))
+    >>> machine.rate, machine.delay
+    (10000.0, 1)
     """
 
     truth: FEModel
