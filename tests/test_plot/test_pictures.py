@@ -196,30 +196,6 @@ def test_layout_shows_every_port_where_it_is():
         fx.plot.layout(dofs, desired=["0:z"])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("kind", ["full", "reduced", "complex"])
-def test_mode_shapes(kind):
-    modes = {
-        "full": some_modes,
-        "reduced": lambda: reduced().modes(),
-        "complex": lambda: fitted(reduced(), POLES).model.modes(),
-    }[kind]()
-    ax = fx.plot.mode_shape(modes, 4)
-    x, y, z = ax.get_lines()[0].get_data_3d()
-    assert np.abs(z).max() == pytest.approx(1.0)
-    # torsion: xy about the centre, zero on both centre lines
-    torsion = (x - L / 2) * (y - L / 2)
-    turned = np.corrcoef(np.asarray(z), torsion)[0, 1]
-    assert abs(turned) > 0.98
-    middle = np.isclose(x, L / 2) | np.isclose(y, L / 2)
-    assert np.abs(np.asarray(z)[middle]).max() < 1e-3
-    assert "mode 4, 245." in ax.get_title()
-    assert ink(ax) > 0.05
-    for bad in (0, modes.omega.size + 1):
-        with pytest.raises(ModelError, match=f"no mode {bad}: modes are numbered 1 to"):
-            fx.plot.mode_shape(modes, bad)
-
-
 def test_the_update():
     fit = fitted(reduced(), POLES)
     steps = len(fit.history) + 1

@@ -10,6 +10,8 @@ from .frequency import frf as frf
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
 from .localisation import localisation as localisation
+from .mode_shapes import animate_mode as animate_mode
+from .mode_shapes import mode_shape as mode_shape
 from .nyquist import nyquist as nyquist
 from .placement import pareto_curve as pareto_curve
 from .placement import placed as placed
@@ -21,7 +23,6 @@ from .sensitivity import sensitivities as sensitivities
 from .sensitivity import sensitivity as sensitivity
 from .singular_values import singular_values as singular_values
 from .structure import layout as layout
-from .structure import mode_shape as mode_shape
 from .update_summary import update as update
 from .updating import eigenvalues as eigenvalues
 from .updating import parameters as parameters

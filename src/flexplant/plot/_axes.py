@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.collections import PolyCollection
+from matplotlib.ticker import MaxNLocator
 
 from ..errors import ModelError
 from ..values import FloatArray, in_unit
@@ -90,6 +91,24 @@ def plan(ax: Axes, points: FloatArray) -> float:
     ax.set_aspect("equal")
     finish(ax, x=f"x [{unit}]", y=f"y [{unit}]")
     return factor
+
+
+def solid_axes(xyz: FloatArray, ax: Any, *, beyond: float = 0.0) -> Any:
+    """Return axes in three dimensions of one scale, that reach beyond nodes (n, 3) [m]."""
+    if ax is None:
+        ax = plt.figure(figsize=(7.0, 4.4), layout="constrained").add_subplot(projection="3d")
+    elif not hasattr(ax, "get_zlim"):
+        raise ModelError("ax must be in three dimensions: plt.subplot(projection='3d').")
+    extent = float(np.max(np.ptp(xyz, axis=0)))
+    factor, unit = in_unit(extent, "m")
+    for k, name in enumerate("xyz"):
+        low, high = xyz[:, k].min(), xyz[:, k].max()
+        getattr(ax, f"set_{name}lim")((low - beyond) / factor, (high + beyond) / factor)
+        getattr(ax, f"set_{name}label")(f"{name} [{unit}]", labelpad=8.0)
+        share = (high - low + 2 * beyond) / (extent + 2 * beyond)
+        getattr(ax, f"{name}axis").set_major_locator(MaxNLocator(max(2, round(6 * share))))
+    ax.set_aspect("equal")
+    return ax
 
 
 def legend_below(ax: Axes, columns: int = 3) -> None:

@@ -1,20 +1,20 @@
-"""Pictures of structures: where the channels are, and how modes move."""
+"""Pictures of structures: where the nodes and the channels are."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
-from ..errors import ModelError
 from ..labels import DofSet
-from ..modes import Modes
 from ..plant import Ports
-from ._axes import axes, legend_below, plan
-from ._style import BLACK, BLUE, GREEN, GREY, PURPLE, RED
+from ..values import FloatArray, in_unit
+from ._axes import axes, legend_below, plan, solid_axes
+from ._skin import Skin, skin_of
+from ._style import BLACK, BLUE, GREEN, GREY, LIGHT, PURPLE, RED, Style
 
 
 def layout(
@@ -24,8 +24,11 @@ def layout(
     desired: Iterable[str] = (),
     marked: Mapping[str, Any] | None = None,
     ax: Axes | None = None,
-) -> Axes:
-    """Draw a plate from above: nodes, desired DOFs, actuators, sensors and POIs (paper, Fig. 3).
+) -> Any:
+    """Draw where nodes, desired DOFs, actuators, sensors and POIs are (paper, Fig. 3).
+
+    A plate is drawn from above, a solid in three dimensions with arrows along which its actuators
+    push and its sensors measure.
 
     Parameters
     ----------
@@ -42,8 +45,18 @@ def layout(
 
     Returns
     -------
-    Axes
+    Axes, of a solid Axes3D
+
+    Raises
+    ------
+    LabelError
+        When a DOF is unknown.
+    ModelError
+        When a solid has so many nodes that no picture could show them, or is to be drawn on axes of
+        two dimensions.
     """
+    if np.ptp(dofs.xyz[:, 2]) > 0 and (skin := skin_of(dofs)).is_solid:
+        return _solid(skin, dofs, ports, desired, marked or {}, ax)
     ax = axes(ax, figsize=(6.0, 6.0))
     factor = plan(ax, dofs.xyz)
     nodes = np.unique(dofs.xyz, axis=0) / factor
@@ -53,18 +66,71 @@ def layout(
         xyz = dofs.xyz[dofs.indices(wanted)] / factor
         ax.plot(xyz[:, 0], xyz[:, 1], "x", color=PURPLE, label=f"{len(wanted)} desired DOFs")
     if ports is not None:
-        for kind, listed, marker, color, size in (
-            ("actuators u", ports.u, "o", GREEN, 12),
-            ("sensors y", ports.y, "P", BLUE, 9),
-            ("points of interest", ports.z, "*", RED, 15),
-        ):
-            _mark(ax, dofs, factor, kind, listed, marker=marker, color=color, markersize=size)
+        for kind, listed, look in _kinds(ports):
+            _mark(ax, dofs, factor, kind, listed, **look)
     for text, place in (marked or {}).items():
         point = _point(dofs, place) / factor
         ax.plot(point[0], point[1], "s", color=BLACK, fillstyle="none", markersize=11)
         ax.annotate(text, (point[0], point[1]), (8, -14), textcoords="offset points")
     legend_below(ax)
     return ax
+
+
+def _kinds(ports: Ports) -> tuple[tuple[str, Sequence[Any], Style], ...]:
+    """Return what is marked, and how."""
+    return (
+        ("actuators u", ports.u, {"marker": "o", "color": GREEN, "markersize": 12}),
+        ("sensors y", ports.y, {"marker": "P", "color": BLUE, "markersize": 9}),
+        ("points of interest", ports.z, {"marker": "*", "color": RED, "markersize": 15}),
+    )
+
+
+def _solid(
+    skin: Skin,
+    dofs: DofSet,
+    ports: Ports | None,
+    desired: Iterable[str],
+    marked: Mapping[str, Any],
+    ax: Any,
+) -> Any:
+    """Draw a solid with its ports in three dimensions."""
+    ax = solid_axes(skin.xyz, ax, beyond=0.12 * skin.extent)
+    factor = in_unit(skin.extent, "m")[0]
+    rest = skin.xyz / factor
+    ax.computed_zorder = False  # what is inside and behind shows too
+    faces = Poly3DCollection(rest[skin.triangles], facecolors=LIGHT, alpha=0.2, zorder=1)
+    ax.add_collection3d(faces)
+    ax.add_collection3d(Line3DCollection(rest[skin.edges], colors=GREY, linewidths=0.8, zorder=2))
+    wanted = list(desired)
+    if wanted:
+        xyz = dofs.xyz[dofs.indices(wanted)] / factor
+        ax.plot(*xyz.T, "x", color=PURPLE, label=f"{len(wanted)} desired DOFs")
+    for kind, listed, look in _kinds(ports) if ports is not None else ():
+        points = [_point(dofs, port.at) / factor for port in listed]
+        if not points:
+            continue
+        ax.plot(*np.array(points).T, ls="", fillstyle="none", label=kind, zorder=3, **look)
+        for port, point in zip(listed, points, strict=True):
+            ax.text(*point, f"  {port.name}")
+            along = _along(port)
+            if along is not None:
+                length = 0.12 * skin.extent / factor
+                ax.quiver(*point, *along, length=length, color=look["color"])
+    for text, place in marked.items():
+        point = _point(dofs, place) / factor
+        ax.plot(*point[:, None], "s", color=BLACK, fillstyle="none", markersize=11)
+        ax.text(*point, f"  {text}")
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(frameon=False, loc="upper center", bbox_to_anchor=(0.5, 1.08), ncols=3)
+    return ax
+
+
+def _along(port: Any) -> FloatArray | None:
+    """Return the unit vector that a port acts or measures along; None of rotations and POIs."""
+    direction = getattr(port, "direction", None)
+    if isinstance(port.at, str):
+        direction = port.at.rpartition(":")[2]
+    return np.eye(3)["xyz".index(direction)] if direction in ("x", "y", "z") else None
 
 
 def _mark(
@@ -85,47 +151,3 @@ def _point(dofs: DofSet, at: Any) -> Any:
     if isinstance(at, Mapping):
         return np.mean([_point(dofs, place) for place in at], axis=0)
     return np.asarray(at)
-
-
-def mode_shape(modes: Modes, number: int, *, ax: Any = None, color: str = GREY) -> Any:
-    """Draw the z-displacements of one mode as a surface (paper, Figs. 5 and 6).
-
-    Parameters
-    ----------
-    modes : Modes
-        Of a full or reduced plate.
-    number : int
-        From 1, rigid-body modes included.
-    ax : Axes3D, optional
-        Where to draw.
-    color : str
-        Of the surface.
-
-    Returns
-    -------
-    Axes3D
-
-    Raises
-    ------
-    ModelError
-        When there is no such mode, or no z-DOFs.
-    """
-    if not 1 <= number <= modes.omega.size:
-        raise ModelError(f"there is no mode {number}: modes are numbered 1 to {modes.omega.size}.")
-    rows = np.flatnonzero(np.array(modes.dofs.directions) == "z")
-    if rows.size < 3:
-        raise ModelError("a mode shape needs at least three z-DOFs to draw.")
-    shape = np.asarray(modes.phi)[rows, number - 1]
-    if np.iscomplexobj(shape):  # a nearly real shape, turned so that it is
-        shape = (shape * np.exp(-1j * np.angle(shape[np.argmax(np.abs(shape))]))).real
-    shape = shape / shape[np.argmax(np.abs(shape))]
-    xyz = modes.dofs.xyz[rows]
-    if ax is None:
-        ax = plt.figure(figsize=(6.0, 4.5), layout="constrained").add_subplot(projection="3d")
-    ax.plot_trisurf(
-        xyz[:, 0], xyz[:, 1], shape, color=color, alpha=0.55, edgecolor="0.3", linewidth=0.4
-    )
-    ax.plot(xyz[:, 0], xyz[:, 1], shape, ".", color="0.2", markersize=3)
-    ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z, scaled to 1")
-    ax.set_title(f"mode {number}, {modes.freq[number - 1]:.1f} Hz")
-    return ax

@@ -1,0 +1,137 @@
+"""Mode shapes on plates, solids and beams: the surface, the motion, and the motion over time."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import flexplant as fx
+from flexplant.errors import ModelError
+from flexplant.plot._skin import skin_of
+from stages import L, fitted, reduced, some_modes
+
+ALUMINIUM = {"density": 2700.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
+POLES = np.array([-28.569 + 2883.567j, -39.451 + 3983.308j])
+
+
+@pytest.fixture(autouse=True)
+def _closed():
+    yield
+    plt.close("all")
+
+
+def area(skin):
+    a, b, c = (skin.xyz[skin.triangles[:, k]] for k in range(3))
+    return 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+
+
+def length(skin):
+    return np.linalg.norm(np.diff(skin.xyz[skin.edges], axis=1)[:, 0], axis=1).sum()
+
+
+def test_the_surface_of_a_solid():
+    """Its area and edges are those of the body, found from its nodes alone."""
+    skin = skin_of(block_modes().dofs)
+    assert skin.is_solid
+    assert area(skin) == pytest.approx(0.38, rel=1e-9)
+    assert length(skin) == pytest.approx(3.2, rel=1e-9)
+    corner = fx.solid_block(
+        size=(0.4, 0.4, 0.2), elements=(6, 6, 3), holes=lambda x, y, z: x > 0.2 and y > 0.2,
+        **ALUMINIUM,
+    )  # fmt: skip
+    assert area(skin_of(corner.dofs)) == pytest.approx(0.56, rel=0.01)  # half an element is filled
+
+
+def test_the_surface_of_a_plate_with_a_hole_and_the_line_of_a_beam():
+    inside = {"holes": lambda x, y: abs(x - 0.45) < 0.1 and abs(y - 0.2) < 0.1}
+    plate = fx.kirchhoff_plate(
+        size=(0.6, 0.4), thickness=0.01, elements=(12, 8), **ALUMINIUM, **inside
+    )
+    skin = skin_of(plate.dofs)
+    assert not skin.is_solid
+    assert area(skin) == pytest.approx(0.24 - 0.04, rel=1e-9)
+    assert length(skin) == pytest.approx(2.0 + 0.8, rel=1e-9)
+    beam = fx.beam(
+        length=1.0, elements=5, density=2700, youngs_modulus=70e9, area=1e-4, inertia=1e-9
+    )
+    line = skin_of(beam.dofs)
+    assert not len(line.triangles)
+    assert length(line) == pytest.approx(1.0, rel=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["full", "reduced", "complex"])
+def test_torsion_of_a_plate(kind):
+    modes = {
+        "full": some_modes,
+        "reduced": lambda: reduced().modes(),
+        "complex": lambda: fitted(reduced(), POLES).model.modes(),
+    }[kind]()
+    ax = fx.plot.mode_shape(modes, 4, scale=0.1)
+    edge = np.concatenate(ax.collections[1]._segments3d)
+    x, y, z = 1e-3 * edge.T
+    torsion = (x - L / 2) * (y - L / 2)
+    assert np.abs(z).max() == pytest.approx(0.1 * L, rel=1e-6)
+    assert abs(np.corrcoef(z, torsion)[0, 1]) > 0.98
+    assert ax.get_title() == f"mode 4, {modes.freq[3]:.1f} Hz"
+    assert [ax.get_xlabel(), ax.get_zlabel()] == ["x [mm]", "z [mm]"]
+    assert ax.figure.axes[1].get_ylabel() == "displacement, largest 1 [-]"
+    for bad in (0, modes.omega.size + 1):
+        with pytest.raises(ModelError, match=f"no mode {bad}: modes are numbered 1 to"):
+            fx.plot.mode_shape(modes, bad)
+
+
+def block_modes():
+    block = fx.solid_block(size=(0.4, 0.3, 0.1), elements=(4, 3, 1), **ALUMINIUM)
+    return fx.solve_modes(block, count=8)
+
+
+def test_a_solid_moves_in_all_directions_on_both_sides():
+    """Through a period a mode goes from one end of its way to the other and back."""
+    modes = block_modes()
+    skin = skin_of(modes.dofs)
+    moving = fx.plot.animate_mode(modes, 7, frames=4, scale=0.2)
+    moving._fig.canvas.draw()
+    ax = moving._fig.axes[0]
+    faces = next(c for c in ax.collections if hasattr(c, "_faces"))
+    rest = 1e3 * skin.xyz[skin.triangles]
+    seen = []
+    for k in range(4):
+        moving._func(k)
+        seen.append(np.array([face[:3] for face in faces._faces]))
+    np.testing.assert_allclose(seen[1], seen[3], atol=1e-9)
+    np.testing.assert_allclose(seen[0] + seen[2], seen[1] + seen[3], atol=1e-9)
+    motion = skin.motion(modes.phi[:, 6])
+    largest = np.linalg.norm(motion, axis=1).max()
+    corners = np.array([seen[0].min(axis=(0, 1)), seen[0].max(axis=(0, 1))])
+    moved = 1e3 * (skin.xyz + 0.2 * 0.4 * motion / largest)[skin.triangles]
+    np.testing.assert_allclose(corners, [moved.min(axis=(0, 1)), moved.max(axis=(0, 1))], rtol=1e-9)
+    assert np.ptp(rest[..., 2]) < np.ptp(moved[..., 2])
+
+
+@pytest.mark.slow
+def test_a_moving_mode_is_saved(tmp_path):
+    from PIL import Image
+
+    path = tmp_path / "mode.gif"
+    fx.plot.animate_mode(block_modes(), 7, frames=4).save(path, writer="pillow", dpi=40)
+    with Image.open(path) as image:
+        assert image.n_frames == 4
+        one = np.asarray(image.convert("L"), dtype=float)
+        image.seek(2)
+        assert np.abs(np.asarray(image.convert("L"), dtype=float) - one).max() > 50
+
+
+def test_the_ports_of_a_solid_where_they_are():
+    modes = block_modes()
+    ports = fx.Ports(
+        u=[fx.Actuator("push", at=(0.05, 0.05, 0.0), direction="z")],
+        y=[fx.Sensor("side", at=modes.dofs.nearest((0.4, 0.3, 0.1), "x"))],
+        z=[fx.Poi("die", at=(0.2, 0.1, 0.1))],
+    )
+    ax = fx.plot.layout(modes.dofs, ports=ports)
+    marked = {line.get_label(): np.ravel(line.get_data_3d()) for line in ax.get_lines()}
+    np.testing.assert_allclose(marked["actuators u"], [50.0, 50.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(marked["sensors y"], [400.0, 300.0, 100.0])
+    np.testing.assert_allclose(marked["points of interest"], [200.0, 100.0, 100.0])
+    assert {"push", "side", "die"} <= {text.get_text().strip() for text in ax.texts}
+    with pytest.raises(ModelError, match="three dimensions"):
+        fx.plot.layout(modes.dofs, ax=plt.subplots()[1])
