@@ -6,7 +6,7 @@ import pytest
 
 import flexplant as fx
 from flexplant.errors import ModelError
-from flexplant.plot._skin import skin_of
+from flexplant.plot._surface import surface_of
 from stages import L, fitted, reduced, some_modes
 
 ALUMINIUM = {"density": 2700.0, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
@@ -30,7 +30,7 @@ def length(skin):
 
 def test_the_surface_of_a_solid():
     """Its area and edges are those of the body, found from its nodes alone."""
-    skin = skin_of(block_modes().dofs)
+    skin = surface_of(block_modes().dofs)
     assert skin.is_solid
     assert area(skin) == pytest.approx(0.38, rel=1e-9)
     assert length(skin) == pytest.approx(3.2, rel=1e-9)
@@ -38,7 +38,9 @@ def test_the_surface_of_a_solid():
         size=(0.4, 0.4, 0.2), elements=(6, 6, 3), holes=lambda x, y, z: x > 0.2 and y > 0.2,
         **ALUMINIUM,
     )  # fmt: skip
-    assert area(skin_of(corner.dofs)) == pytest.approx(0.56, rel=0.01)  # half an element is filled
+    assert area(surface_of(corner.dofs)) == pytest.approx(
+        0.56, rel=0.01
+    )  # half an element is filled
 
 
 def test_the_surface_of_a_plate_with_a_hole_and_the_line_of_a_beam():
@@ -46,13 +48,13 @@ def test_the_surface_of_a_plate_with_a_hole_and_the_line_of_a_beam():
     plate = fx.kirchhoff_plate(
         size=(0.6, 0.4), thickness=0.01, elements=(12, 8), **ALUMINIUM, **inside
     )
-    skin = skin_of(plate.dofs)
+    skin = surface_of(plate.dofs)
     assert not skin.is_solid
     assert area(skin) == pytest.approx(0.24 - 0.04, rel=0.06)  # of four corners half elements
     beam = fx.beam(
         length=1.0, elements=5, density=2700, youngs_modulus=70e9, area=1e-4, inertia=1e-9
     )
-    line = skin_of(beam.dofs)
+    line = surface_of(beam.dofs)
     assert not len(line.triangles)
     assert length(line) == pytest.approx(1.0, rel=1e-9)
 
@@ -86,7 +88,7 @@ def block_modes():
 def test_a_solid_moves_in_all_directions_on_both_sides():
     """Through a period a mode goes from one end of its way to the other and back."""
     modes = block_modes()
-    skin = skin_of(modes.dofs)
+    skin = surface_of(modes.dofs)
     moving = fx.plot.animate_mode(modes, 7, frames=4, scale=0.2)
     moving._fig.canvas.draw()
     ax = moving._fig.axes[0]

@@ -14,8 +14,8 @@ from ..errors import ModelError
 from ..modes import Modes
 from ..values import ComplexArray, FloatArray, in_unit, instance, positive, whole
 from ._axes import solid_axes
-from ._skin import skin_of
 from ._style import BLACK, GREY
+from ._surface import surface_of
 
 _COLOURS = "viridis"
 #: triangles that are drawn quickly; of a coarse mesh each is drawn in parts, whose colours differ
@@ -125,7 +125,7 @@ class _Moving:
             raise ModelError(
                 f"there is no mode {number}: modes are numbered 1 to {modes.omega.size}."
             )
-        self.skin = skin_of(modes.dofs)
+        self.skin = surface_of(modes.dofs)
         motion = real_motion(self.skin.motion(np.asarray(modes.phi)[:, number - 1]))
         size = float(np.max(np.linalg.norm(motion, axis=1)))
         if not size:

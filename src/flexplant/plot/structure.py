@@ -13,8 +13,8 @@ from ..labels import DofSet
 from ..plant import Ports
 from ..values import FloatArray, in_unit
 from ._axes import axes, legend_below, plan, solid_axes
-from ._skin import Skin, skin_of
 from ._style import BLACK, BLUE, GREEN, GREY, LIGHT, PURPLE, RED, Style
+from ._surface import Surface, surface_of
 
 
 def layout(
@@ -55,7 +55,7 @@ def layout(
         When a solid has so many nodes that no picture could show them, or is to be drawn on axes of
         two dimensions.
     """
-    if np.ptp(dofs.xyz[:, 2]) > 0 and (skin := skin_of(dofs)).is_solid:
+    if np.ptp(dofs.xyz[:, 2]) > 0 and (skin := surface_of(dofs)).is_solid:
         return _solid(skin, dofs, ports, desired, marked or {}, ax)
     ax = axes(ax, figsize=(6.0, 6.0))
     factor = plan(ax, dofs.xyz)
@@ -86,7 +86,7 @@ def _kinds(ports: Ports) -> tuple[tuple[str, Sequence[Any], Style], ...]:
 
 
 def _solid(
-    skin: Skin,
+    skin: Surface,
     dofs: DofSet,
     ports: Ports | None,
     desired: Iterable[str],

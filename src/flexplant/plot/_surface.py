@@ -25,7 +25,7 @@ _WHOLE = 0.6
 _EDGE = 0.8
 
 
-class Skin(NamedTuple):
+class Surface(NamedTuple):
     """The surface of a structure.
 
     Parameters
@@ -61,7 +61,7 @@ class Skin(NamedTuple):
         return moved
 
 
-def skin_of(dofs: DofSet) -> Skin:
+def surface_of(dofs: DofSet) -> Surface:
     """Return the surface of a structure, by Delaunay's triangulation of its nodes.
 
     Edges much longer than the distance between nodes are left out: holes and notches stay open
@@ -86,10 +86,10 @@ def skin_of(dofs: DofSet) -> Skin:
     if rank < 2 or numbers.size < rank + 1:
         order = np.argsort(xyz @ np.array([1.0, 1e-3, 1e-6]))
         chain = np.column_stack([order[:-1], order[1:]])
-        return Skin(xyz, rows, np.zeros((0, 3), dtype=np.int64), chain)
+        return Surface(xyz, rows, np.zeros((0, 3), dtype=np.int64), chain)
     flat = _plane(xyz) if rank == 2 else xyz
     triangles = _triangulated(flat)
-    return Skin(xyz, rows, triangles, _edges(xyz, triangles))
+    return Surface(xyz, rows, triangles, _edges(xyz, triangles))
 
 
 def _rank(xyz: FloatArray) -> int:
