@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import uuid
-import zipfile
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -169,12 +168,20 @@ def load(path: str | Path) -> Any:
     with Path(path).open("rb") as file:
         try:
             archive = np.load(file, allow_pickle=False)
-        except (ValueError, EOFError, zipfile.BadZipFile):
+        except Exception:  # no archive of arrays, whatever its bytes led to
             raise foreign from None
         if not isinstance(archive, np.lib.npyio.NpzFile) or _HEADER not in archive:
             raise foreign
-        arrays = {name: archive[name] for name in archive.files}
-    return _decode(json.loads(str(arrays[_HEADER])), arrays)
+        try:
+            arrays = {name: archive[name] for name in archive.files}
+            return _decode(json.loads(str(arrays[_HEADER])), arrays)
+        except FlexplantError:
+            raise
+        except Exception as error:
+            raise FlexplantError(
+                f"{str(path)!r} is damaged ({type(error).__name__}: {error!s:.80}). Save the value "
+                "again."
+            ) from None
 
 
 def _encode(item: Any, arrays: dict[str, Any]) -> Any:

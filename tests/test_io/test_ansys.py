@@ -2,7 +2,6 @@
 
 import sys
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -51,9 +50,9 @@ class TestSample:
             fx.io.read_ansys(examples.rstfile)
 
 
-def stand_in(monkeypatch, K, M, table, **header):
-    full = SimpleNamespace(load_km=lambda sort: (np.asarray(table), K, M), _header=header)
-    monkeypatch.setattr(ansys, "_opened", lambda path: full)
+def stand_in(monkeypatch, K, M, table, damped=False):
+    full = {"table": np.asarray(table), "K": K, "M": M, "damped": damped}
+    monkeypatch.setattr(ansys, "in_child", lambda function, path: ("value", full))
 
 
 def local_pair():
@@ -65,7 +64,7 @@ def local_pair():
 def test_rows_are_sorted_named_and_placed(monkeypatch, tmp_path):
     K, M = local_pair()
     table = [(9, 2), (9, 0), (9, 1), (4, 0), (4, 1), (4, 2)]
-    stand_in(monkeypatch, sp.csc_matrix(np.triu(K)), sp.csc_matrix(np.triu(M)), table, ptrDMP=5)
+    stand_in(monkeypatch, sp.csc_matrix(np.triu(K)), sp.csc_matrix(np.triu(M)), table, damped=True)
     (tmp_path / "nodes.txt").write_text("4 1 0 0\n9 0 2 0\n")
     found = fx.io.read_ansys("x.full", nodes=tmp_path / "nodes.txt")
     assert found.dofs.labels == ("4:x", "4:y", "4:z", "9:x", "9:y", "9:z")
@@ -113,7 +112,7 @@ def test_what_is_no_structure_is_refused(monkeypatch, K, M, kinds, match):
 
 def test_a_missing_extra_gives_the_line_to_type(monkeypatch, tmp_path):
     (tmp_path / "x.full").write_bytes(b"")
-    monkeypatch.setitem(sys.modules, "ansys.mapdl", None)
+    monkeypatch.setattr(sys, "path", [place for place in sys.path if "site-packages" not in place])
     with pytest.raises(FlexplantError, match=r"pip install 'flexplant\[ansys\]'"):
         fx.io.read_ansys(tmp_path / "x.full")
 

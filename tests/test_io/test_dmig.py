@@ -195,7 +195,6 @@ def test_grids_in_coordinate_systems(tmp_path):
     # system 6 at 90 degrees: along the y of 5, which is -x
     assert nodes.xyz[3] == pytest.approx([-1.0, 2.0, 4.0])
     assert nodes.xyz[4] == pytest.approx([2**0.5, 2**0.5, 0.0])
-    assert nodes.scalar == {8, 9, 10}
     # node 4, spherical at the equator: outward, down, around
     s = 0.5**0.5
     assert pytest.approx(np.array([[s, s, 0], [0, 0, -1], [-s, s, 0]])) == nodes.axes[4].T
@@ -306,3 +305,34 @@ def test_the_common_door_hands_on_what_this_reader_takes(tmp_path):
         fx.read_model(written(tmp_path, "1 1 2.0\n", "K.m"), scalar_direction="z")
     with pytest.raises(FlexplantError, match="is a folder"):
         fx.read_model(tmp_path)
+
+
+def test_included_files_are_followed_or_named(tmp_path):
+    (tmp_path / "parts").mkdir()
+    deck = "BEGIN BULK\n{}\nGRID,1,,1.,0.,0.\nENDDATA\n"
+    for form in ("INCLUDE 'parts/a.blk'", 'include "parts/a.blk"', "INCLUDE 'parts/\na.blk'"):
+        written(tmp_path, deck.format(form), "x.bdf")
+        # the second is in the folder of the file that names it, the third in that of the first
+        (tmp_path / "parts" / "a.blk").write_text("INCLUDE 'b.blk'\nGRID,2,,2.,0.,0.\n")
+        (tmp_path / "parts" / "b.blk").write_text("INCLUDE 'c.blk'\nGRID,3,,3.,0.,0.\n")
+        written(tmp_path, "GRID,4,,4.,0.,0.\n", "c.blk")
+        nodes = read_nodes(tmp_path / "x.bdf")
+        assert {node: place[0] for node, place in nodes.xyz.items()} == {1: 1, 2: 2, 3: 3, 4: 4}
+    (tmp_path / "parts" / "b.blk").write_text("$ one\nGRID,3,,3.x,0.,0.\n")
+    with pytest.raises(FlexplantError, match=r"GRID 3"):
+        read_nodes(tmp_path / "x.bdf")
+    (tmp_path / "parts" / "b.blk").write_text("$ one\nINCLUDE 'gone.blk'\n")
+    with pytest.raises(
+        FlexplantError, match=r"b\.blk', line 2: the INCLUDEd file 'gone\.blk' is not"
+    ):
+        read_nodes(tmp_path / "x.bdf")
+    (tmp_path / "parts" / "b.blk").write_text("INCLUDE 'a.blk'\n")
+    with pytest.raises(FlexplantError, match="includes itself"):
+        read_nodes(tmp_path / "x.bdf")
+
+
+@needs_data
+def test_nodes_of_a_real_run_are_in_the_file_it_includes():
+    nodes = read_nodes(SHARED / "results" / "beam_modes.dat")
+    text = (SHARED / "results" / "cbar_cbeam.blk").read_text()
+    assert len(nodes.xyz) == len(re.findall(r"^GRID", text, flags=re.MULTILINE)) > 3

@@ -8,6 +8,7 @@ import pytest
 import scipy.io
 import scipy.sparse as sp
 
+import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io.op4 import read_op4, read_op4_matrices
 
@@ -238,3 +239,43 @@ def test_what_is_no_op4(op4, tmp_path):
         read_op4(path)
     with pytest.raises(FileNotFoundError):
         read_op4(tmp_path / "none.op4")
+
+
+@pytest.mark.parametrize("kind", [3, 4])
+def test_complex_text_whose_last_record_counts_words(tmp_path, kind):
+    """Sparse, of either form: the count of the last, meaningless record is of words or numbers."""
+    words = 4 if kind == 4 else 2
+    numbers = " 1.500000000E+00-2.500000000E+00\n"
+    for big in (False, True):
+        head = f"{2:8}{-3 if big else 3:8}{2:8}{kind:8}{'C':8}1P,5E16.9\n"
+        string = f"{words + 1:8}{2:8}\n" if big else f"{65536 * (words + 1) + 2:12}\n"
+        text = f"{head}{2:8}{0:8}{words + (2 if big else 1):8}\n{string}{numbers}"
+        text += f"{3:8}{1:8}{2:8}\n 1.000000000E+00\n"
+        (tmp_path / "c.op4").write_text(text + text.replace("C   ", "D   "))
+        found = read_op4_matrices(tmp_path / "c.op4")
+        for name in "CD":
+            assert found[name].toarray().tolist() == [[0, 0], [0, 1.5 - 2.5j], [0, 0]]
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+def test_superelements_whose_damping_is_a_null_of_one_entry(tmp_path):
+    path = tmp_path / "inboard.op4"
+    content = (SHARED / "extseout" / "inboard.op4").read_bytes()
+    assert content.count(b"BXX1    ") == 1
+    path.write_bytes(content.replace(b"BXX1    ", b"BXX     "))
+    assert read_op4_matrices(path)["BXX"].shape == (1, 1)
+    found = read_op4(path)
+    assert found.n_dof == 32
+    assert found.D is None
+    # a real one is taken, unless none is wanted
+    path.write_bytes(content.replace(b"MXX     ", b"BXX     "))
+    assert read_op4(path).D is not None
+    assert read_op4(path, damping=None).D is None
+    assert fx.read_matrices(path).D is not None
+    assert fx.read_matrices(path, damping=None).D is None
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+def test_names_in_words_of_eight_bytes():
+    names = list(read_op4_matrices(SHARED / "extseout" / "nas2cam_notall6_msc2017.op4"))
+    assert names[:4] == ["SE_START", "LAMBDA", "MAA", "KAA"]

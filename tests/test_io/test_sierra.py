@@ -1,11 +1,15 @@
 """MATLAB text of Sierra/SD: triplets, the map of rows, the mesh."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.io
 
 from flexplant.errors import FlexplantError, ModelError, ShapeError
 from flexplant.io.sierra import read_sierra
+
+SHARED = Path("/work/shared/data/fe/sierra")
 
 K = np.array([[4.0, -1.5, 0.25], [-1.5, 3.0, 0.0], [0.25, 0.0, 5.0]])
 M = np.diag([1.0, 2.0, 3.0])
@@ -105,3 +109,42 @@ def test_cut_files(tmp_path):
     for cut in range(text.index("[") + 1, text.index("]")):
         with pytest.raises(FlexplantError, match="cut off"):
             read_sierra(written(tmp_path, text[:cut]))
+
+
+def assigned(entries, name="x"):
+    lines = [f"{name}({i}) = {value};\n" for i, value in enumerate(entries, 1) if value]
+    return f"function {name} = ASetMap_a()\n{name} = zeros({len(entries)}, 1);\n" + "".join(lines)
+
+
+def test_maps_that_are_filled_entry_by_entry(tmp_path):
+    """As Sierra writes them: nine entries a node, and the numbers of the nodes in a file beside."""
+    k = written(tmp_path, table(K))
+    nine = [*MAP[:8], 0, *MAP[8:], 0]
+    for entries in (nine, MAP):
+        a = written(tmp_path, assigned(entries), "a_ASetMap.m")
+        assert read_sierra(k, dof_map=a).dofs.labels == ("2:x", "1:z", "2:ry")
+    gid = written(tmp_path, assigned([30, 10]), "a_gid.m")
+    found = read_sierra(k, dof_map=a, exodus=gid)
+    assert found.dofs.labels == ("10:x", "30:z", "10:ry")
+    assert not found.located
+    # of 72 entries: nine nodes of 8, or eight of 9
+    a = written(tmp_path, assigned([1, 2, 3, *[0] * 69]), "a_ASetMap.m")
+    with pytest.raises(ShapeError, match="8 or 9 of them is not clear"):
+        read_sierra(k, dof_map=a)
+    for wrong in ("x(1) = 1;\nx(0) = 2;", "x(1) = 1;\nx(99) = 2;", "x(1) = 1;\ny = 3;"):
+        text = f"x = zeros(18, 1);\n{wrong}\n"
+        with pytest.raises(FlexplantError, match="damaged"):
+            read_sierra(k, dof_map=written(tmp_path, text, "a.m"))
+
+
+@pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
+def test_a_real_map_and_its_list_of_nodes(tmp_path):
+    """630 nodes, three DOFs each."""
+    diagonal = "".join(f"{i} {i} 2.0\n" for i in range(1, 1891))
+    k = written(tmp_path, f"K = [\n{diagonal}];\n")
+    files = {"dof_map": SHARED / "block_c_ASetMap.m", "exodus": SHARED / "block_c_gid.m"}
+    dofs = read_sierra(k, **files).dofs
+    assert dofs.labels[:4] == ("580:x", "580:y", "580:z", "586:x")
+    assert len(dofs) == 1890
+    assert np.unique(dofs.nodes).size == 630
+    assert set(dofs.directions) == {"x", "y", "z"}

@@ -15,8 +15,8 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .formats import Format
-from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
-from .paths import file_path
+from .numbers import cut_short, decimal, printed_digits, rows_of_numbers, wrong_line
+from .paths import check_size, file_path
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
 _HELD = 1e35
@@ -85,6 +85,7 @@ def read_abaqus(
         np.concatenate([code for part in there for code in (part.rows, part.columns)])
     )
     if not there[0].named:
+        check_size(int(order[-1] >> 4), file_path(stiffness).stat().st_size, stiffness)
         order = np.arange(16, 16 * (order[-1] >> 4) + 1, 16)
     K, M, D = (None if part is None else part.matrix(order) for part in parts)
     assert K is not None  # noqa: S101 - its file is no option
@@ -194,9 +195,7 @@ def _triplets(path: str | Path) -> _Triplets:
             "pressure, 11 temperature. Use other elements."
         )
     words = [_WORD.findall(line)[-1] for line in data[:: max(1, len(data) // 1000)]]
-    last = _WORD.findall(data[-1])[-1].lstrip(b"+-")
-    if not content.endswith((b"\n", b"\r")) and len(last) < len(words[0].lstrip(b"+-")):
-        # a number without its last digits still is a number
+    if cut_short(content.replace(b",", b" "), words):
         raise _wrong(path, lines, data[-1], width)
     return _Triplets(
         str(path),

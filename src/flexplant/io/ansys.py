@@ -13,8 +13,9 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray, IntArray
-from .assembled import assembled, missing_extra, quiet
-from .formats import Format
+from .assembled import assembled, missing_extra
+from .child import in_child
+from .formats import Elsewhere, Format, is_text
 from .paths import file_path
 from .tables import read_nodes_table
 
@@ -68,10 +69,13 @@ def read_ansys(
         When there is no such file.
     """
     path = file_path(path)
-    full = _opened(path)
-    header = getattr(full, "_header", {})
-    with quiet():
-        table, K, M = full.load_km(sort=False)
+    full = _read("ansys_full", path)
+    if "class" in full:
+        raise FlexplantError(
+            f"{path.name!r} is an ANSYS {full['class']}, not a .full file: it holds no matrices of "
+            "the whole structure. It may serve as nodes=..."
+        )
+    table, K, M = full["table"], full["K"], full["M"]
     if K is None or M is None:
         raise ModelError(
             f"{path.name!r} holds no {'stiffness' if K is None else 'mass'} matrix. Write the file "
@@ -85,7 +89,7 @@ def read_ansys(
             "from 0: temperature, pressure, voltage, warping). Export the structural part alone."
         )
     notes = []
-    if header.get("ptrDMP"):
+    if full["damped"]:
         notes.append("the damping matrix in the file is not read: give damping by mode")
     numbers = np.asarray(table[:, 0], dtype=np.int64)
     order = np.lexsort((kinds, numbers))
@@ -123,33 +127,23 @@ def cosines_of(angles: Any) -> FloatArray:
     return np.asarray(about_y @ about_x @ about_z, dtype=np.float64)
 
 
-def _opened(path: Path) -> Any:
-    if not path.is_file():
-        raise FileNotFoundError(f"no such file: {str(path)!r}")
-    try:
-        with quiet():
-            from ansys.mapdl import reader
-    except ImportError:
-        raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}") from None
-    try:
-        with quiet():
-            full = reader.read_binary(str(path))
-    except NotImplementedError as error:
+def _read(function: str, path: Path) -> dict[str, Any]:
+    """Return what a function of `foreign` finds in an ANSYS file."""
+    kind, found = in_child(function, path)
+    if kind in ("ImportError", "ModuleNotFoundError"):
+        raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}")
+    if kind == "NotImplementedError":
         raise ModelError(
-            f"{path.name!r}: {error}. Write a consistent, symmetric pair: LUMPM,OFF; no contact "
+            f"{path.name!r}: {found}. Write a consistent, symmetric pair: LUMPM,OFF; no contact "
             "with friction, no rotating frame."
-        ) from None
-    except Exception as error:
-        raise FlexplantError(
-            f"{path.name!r} cannot be read as an ANSYS binary file ({type(error).__name__}: "
-            f"{error}). A .full file was expected."
-        ) from None
-    if not hasattr(full, "load_km"):
-        raise FlexplantError(
-            f"{path.name!r} is an ANSYS {type(full).__name__}, not a .full file: it holds no "
-            "matrices of the whole structure. It may serve as nodes=..."
         )
-    return full
+    if kind != "value":
+        raise FlexplantError(
+            f"{path.name!r} cannot be read as an ANSYS {path.suffix} file ({kind}: {found!s:.120}). It "
+            "is damaged, cut off or another format: write it again."
+        )
+    content: dict[str, Any] = found
+    return content
 
 
 def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatArray]]:
@@ -162,18 +156,10 @@ def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatAr
     if path.suffix.lower() not in (".rst", ".cdb"):
         known, xyz = read_nodes_table(path)
         return at_nodes(wanted, known, xyz, str(path)), {}
-    if not path.is_file():
-        raise FileNotFoundError(f"no such file: {str(path)!r}")
-    from ansys.mapdl import reader
-
-    with quiet():
-        if path.suffix.lower() == ".rst":
-            mesh = reader.read_binary(str(path)).mesh
-        else:
-            mesh = reader.Archive(str(path), parse_vtk=False)
-    known = np.asarray(mesh.nnum, dtype=np.int64)
-    places = np.asarray(mesh.nodes, dtype=np.float64)[:, :3]
-    angles = np.asarray(mesh.node_angles, dtype=np.float64)
+    mesh = _read("ansys_mesh", path)
+    known = np.asarray(mesh["nodes"], dtype=np.int64)
+    places = np.asarray(mesh["xyz"], dtype=np.float64)[:, :3]
+    angles = np.asarray(mesh["angles"], dtype=np.float64)
     turned: dict[int, FloatArray] = {}
     if angles.ndim == 2 and angles.shape[1] == 3:
         for row in np.flatnonzero(np.abs(angles).max(axis=1) > _STRAIGHT).tolist():
@@ -182,3 +168,9 @@ def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatAr
 
 
 FULL = Format((".full",), read_ansys, mesh=(".rst", ".cdb"), mesh_option="nodes")
+MARKUP = Elsewhere((".rst",), "text (reStructuredText?), no results of ANSYS", is_text)
+ELEMENTS = Elsewhere(
+    (".emat", ".esav", ".mode", ".db", ".dbb"),
+    "single elements, or data of ANSYS' own. Matrices: a modal analysis with WRFULL,1 writes the "
+    "assembled ones as .full, read_ansys",
+)

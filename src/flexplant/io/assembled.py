@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -12,12 +11,14 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
 from ..structure.precision import digits_of
+from .foreign import sound
+from .formats import USUAL
 from .numbers import printed_digits
-from .paths import file_path
+from .paths import file_path, parsing
 from .tables import read_dofs
 
 #: the names under which K, M and D are looked for, in any case
-USUAL: Mapping[str, tuple[str, ...]] = {
+USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "K": ("k", "k0", "kaa", "kgg", "kaax", "kmat", "stiffness", "stiff", "kff", "kred"),
     "M": ("m", "m0", "maa", "mgg", "maax", "mmat", "mass", "mff", "mred"),
     "D": ("d", "c", "d0", "c0", "baa", "bgg", "b", "baax", "cmat", "damping", "damp"),
@@ -50,6 +51,8 @@ def assembled(
     said = list(notes)
     for name, given in parts.items():
         if given is not None:
+            with parsing(source):
+                sound(given)
             done[name], note = completed(given, name)
             said += [note] if note else []
     named = read_dofs(dofs) if isinstance(dofs, str | Path) else dofs
@@ -96,6 +99,8 @@ def chosen(
 ) -> dict[str, str | None]:
     """Return which of the names of a file are K, M and D; those named must be there.
 
+    "usual" stands for one that has a usual name, as does None, but for D: None leaves it out.
+
     Raises
     ------
     ModelError
@@ -104,7 +109,10 @@ def chosen(
     there = list(names)
     found: dict[str, str | None] = {}
     for part, name in wanted.items():
-        if name is not None:
+        if part == "D" and name is None:
+            found[part] = None
+            continue
+        if name not in (None, USUAL):
             if name not in there:
                 raise ModelError(
                     f"{source!r} has no variable {name!r}: it holds {there[:10]}. Names are "
@@ -115,7 +123,7 @@ def chosen(
         # the shortest path first: K before model.K
         usual = [
             name
-            for usual_name in USUAL[part]
+            for usual_name in USUAL_NAMES[part]
             for name in sorted(there, key=lambda text: (text.count("."), text))
             if name.rsplit(".", 1)[-1].lower() == usual_name
         ]
@@ -147,8 +155,3 @@ def missing_extra(package: str, extra: str, what: str) -> FlexplantError:
     return FlexplantError(
         f"{what} needs {package}, which is not installed. Type: pip install 'flexplant[{extra}]'"
     )
-
-
-def quiet() -> warnings.catch_warnings[None]:
-    """Return a context in which what a foreign reader warns of is not passed on."""
-    return warnings.catch_warnings(action="ignore")

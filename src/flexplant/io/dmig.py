@@ -13,10 +13,10 @@ from ..errors import FlexplantError, LabelError, ModelError, unknown_label
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
-from .formats import Format
+from .formats import USUAL, Format
 from .nastran import Nodes, nastran_float, read_nodes
 from .nastran_names import named_matrices
-from .numbers import fixed_numbers, printed_digits
+from .numbers import cut_short, fixed_numbers, printed_digits
 from .paths import damaged, file_path
 
 _ENDINGS = ("AAX", "AA", "GG", "2GG", "2PP", "")
@@ -28,7 +28,7 @@ def read_dmig(
     bdf: str | Path | None = None,
     stiffness: str | None = None,
     mass: str | None = None,
-    damping: str | None = None,
+    damping: str | None = USUAL,
     scalar_direction: str | None = None,
 ) -> FEMatrices:
     """Return the matrices of a Nastran punch file (DMIG cards), their rows named by node.
@@ -45,8 +45,8 @@ def read_dmig(
         move in local directions (field CD) are turned into the basic system.
     stiffness, mass, damping : str, optional
         Names of the matrices; when not given, the one of the usual names (KAAX, KAA, KGG, K2GG;
-        MAAX, ...; BAAX, ...) that is there. Structural damping (K4AAX) is no viscous damping and
-        is not read.
+        MAAX, ...; BAAX, ...) that is there. `damping=None`: none. Structural damping (K4AAX) is no
+        viscous damping and is not read.
     scalar_direction : {"x", "y", "z", "rx", "ry", "rz"}, optional
         What scalar points (component 0) move in; without it they are refused.
 
@@ -89,9 +89,7 @@ def read_dmig(
     content = file_path(path).read_bytes()
     lines = content.splitlines()
     blocks = _blocks(lines, str(path))
-    ends = content.endswith((b"\n", b"\r"))
-    if blocks and not ends and len(lines[-1].rstrip()) < len(lines[-2].rstrip()):
-        # a number without its last digits still is a number
+    if blocks and cut_short(content, [line[8:].split()[-1] for line in lines[-9:-1] if line[8:]]):
         raise _wrong(str(path), len(lines) - 1, lines[-1], "a whole line")
     if not blocks:
         raise FlexplantError(

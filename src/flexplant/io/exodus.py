@@ -185,7 +185,13 @@ def opened(path: str | Path) -> ExodusFile:
                 f"{str(path)!r} is a netCDF-4 file, which needs h5py. Install it: "
                 "pip install 'flexplant[hdf5]'."
             ) from None
-        kinds: tuple[type[Exception], ...] = (OSError, RuntimeError, ValueError)
+        kinds: tuple[type[Exception], ...] = (
+            OSError,
+            RuntimeError,
+            ValueError,
+            KeyError,
+            TypeError,
+        )
         return ExodusFile(str(path), lambda: h5py.File(path, "r"), kinds)
     kinds = (TypeError, ValueError, OSError, KeyError, IndexError, AssertionError, EOFError)
     return ExodusFile(
@@ -244,7 +250,7 @@ class ExodusFile:
         FlexplantError
             When there is none, or it cannot be read.
         """
-        if name not in self._names():
+        if not self.holds(name):
             raise self._wrong(f"it has no {name!r}")
         try:
             array = np.array(self._names()[name][()] if self._hdf() else self._names()[name][:])
@@ -252,22 +258,29 @@ class ExodusFile:
             raise self._wrong(error) from None
         return array.astype(array.dtype.newbyteorder("="))
 
+    def holds(self, name: str) -> bool:
+        """Return whether there is a variable of a name."""
+        try:
+            return name in self._names()
+        except self.kinds as error:
+            raise self._wrong(error) from None
+
     def _hdf(self) -> bool:
         return not hasattr(self.file, "variables")
 
     def nodes(self) -> tuple[FloatArray, Any]:
         """Return coordinates (n, 3) and node numbers (n,)."""
-        if "coord" in self._names():
+        if self.holds("coord"):
             rows = list(self.array("coord"))
         else:
-            rows = [self.array(f"coord{a}") for a in "xyz" if f"coord{a}" in self._names()]
+            rows = [self.array(f"coord{a}") for a in "xyz" if self.holds(f"coord{a}")]
         if not rows:
             raise self._wrong("it has no coordinates of nodes")
         rows += [np.zeros_like(rows[0])] * (3 - len(rows))
         xyz = real_array(np.stack(rows, axis=1), "coordinates", (None, 3))
         ids = np.arange(1, xyz.shape[0] + 1)
         for name in ("node_num_map", "node_map"):
-            if name in self._names():
+            if self.holds(name):
                 ids = self.array(name).astype(np.int64)
                 break
         if ids.size != xyz.shape[0]:
@@ -276,7 +289,7 @@ class ExodusFile:
 
     def variables(self) -> list[str]:
         """Return the names of the nodal variables."""
-        if "name_nod_var" not in self._names():
+        if not self.holds("name_nod_var"):
             raise self._wrong("it has no nodal variables, hence no shapes")
         table = self.array("name_nod_var")
         return [
@@ -286,7 +299,7 @@ class ExodusFile:
 
     def shapes(self, place: int) -> Any:
         """Return a nodal variable (steps, nodes) by its place (from 0)."""
-        if "vals_nod_var" in self._names():
+        if self.holds("vals_nod_var"):
             return cast(Any, self.array("vals_nod_var"))[:, place]
         return self.array(f"vals_nod_var{place + 1}")
 

@@ -9,6 +9,8 @@ from pathlib import Path
 
 from ..structure import FEMatrices
 
+#: stands for the matrix that has a usual name, where one is there
+USUAL = "usual"
 #: this many bytes at the beginning of a file must show its format
 HEAD = 20000
 
@@ -44,13 +46,35 @@ class Format:
         taken = tuple(inspect.signature(self.read).parameters)[1:]
         return tuple("nodes" if name == self.mesh_option else name for name in taken)
 
+    @property
+    def several(self) -> bool:
+        """Whether its files hold several matrices, of which those with usual names are taken."""
+        damping = inspect.signature(self.read).parameters.get("damping")
+        return damping is not None and damping.default == USUAL
+
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """Files without matrices, and who reads them."""
+    """Files without matrices, and what to do with them.
+
+    Parameters
+    ----------
+    suffixes : tuple of str
+        Endings of their names, in lower case.
+    reader : str
+        What they hold, and who reads them or what to write instead.
+    begins : callable, optional
+        Decides from the first `HEAD` bytes; any when not given.
+    """
 
     suffixes: tuple[str, ...]
     reader: str
+    begins: Callable[[bytes], bool] = lambda head: True
+
+
+def is_text(head: bytes) -> bool:
+    """Return whether a file begins as text."""
+    return bool(head) and not head.translate(None, delete=bytes(range(32, 256)) + b"\t\r\n\f")
 
 
 def ends(path: Path, suffixes: tuple[str, ...]) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 from ..errors import FlexplantError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf
 from .mat_variables import mat_variables
-from .paths import file_path
+from .paths import file_path, parsing
 
 _OPTIONAL = ("inputs", "outputs", "quantity", "coherence", "variance")
 
@@ -66,17 +65,16 @@ def read_frf_npz(
     >>> read_frf_npz(path).quantity
     'velocity'
     """
-    with file_path(path).open("rb") as file:
-        try:
-            archive = np.load(file, allow_pickle=False)
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise ValueError("one array only")
-            content = {name: archive[name] for name in archive.files}
-        except (ValueError, EOFError, OSError, KeyError, zipfile.BadZipFile) as error:
-            raise FlexplantError(
-                f"{str(path)!r} cannot be read as a .npz file of plain arrays ({error!s:.80}). "
-                "Write it with numpy.savez(path, freq=..., data=...)."
-            ) from None
+    do = "Write plain arrays with numpy.savez(path, freq=..., data=...)."
+    with file_path(path).open("rb") as file, parsing(path, do):
+        archive = np.load(file, allow_pickle=False)
+        if not isinstance(archive, np.lib.npyio.NpzFile):
+            raise ValueError("one array only")
+        content = {name: archive[name] for name in archive.files}
+        for array in content.values():
+            if array.dtype.kind == "U":
+                # letters beyond those of Unicode would fail where they are printed
+                array.astype(array.dtype.newbyteorder("=")).tobytes().decode("utf-32")
     if "__flexplant__" in content:
         raise FlexplantError(
             f"{str(path)!r} was saved by flexplant: flexplant.load(path) reads it."

@@ -15,7 +15,7 @@ from ..lti.frequency import Frf
 from ..store import written
 from ..values import FloatArray, instance
 from .numbers import decimal
-from .paths import file_path
+from .paths import file_path, text_of
 
 _FREQ = "frequency [Hz]"
 _ARROW = " <- "
@@ -130,7 +130,7 @@ def read_frf_csv(path: str | Path) -> Frf:
     ...     fx.io.read_frf_csv(path)
     <Frf: u1 -> y1, 2 frequencies 10 .. 20 Hz>
     """
-    lines = file_path(path).read_text(encoding="utf-8").splitlines()
+    lines = text_of(file_path(path), "utf-8").splitlines()
     comments = [line for line in lines if line.startswith("#")]
     said = dict(re.findall(r"^#\s*(\w+):\s*(.*?)\s*$", "\n".join(comments), re.MULTILINE))
     quantity = said.get("quantity", "unknown")

@@ -13,11 +13,15 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import one_matrix_each, text_digits
+from .foreign import sound
 from .formats import Format
-from .numbers import fixed_numbers, spaced_numbers
+from .numbers import cut_short, fixed_numbers, spaced_numbers
+from .paths import check_size, damaged, parsing
 
 #: lines whose digits are counted
 _SAMPLE = 4000
+#: characters of a line at most; lines of cards have 80
+_LINE = 4096
 _FORMAT = re.compile(r"\(?\s*(?:\d+P\s*,?\s*)?(\d*)\s*([IEFDG])\s*(\d+)", re.IGNORECASE)
 
 
@@ -75,7 +79,8 @@ def read_harwell_boeing(
 
 
 def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
-    lines = path.read_bytes().splitlines()
+    content = path.read_bytes()
+    lines = content.splitlines()
     try:
         counts = [int(lines[1][i : i + 14] or 0) for i in range(0, 56, 14)]
         kind = lines[2][:3].decode("ascii").upper()
@@ -86,6 +91,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
         raise FlexplantError(
             f"{str(path)!r} is no Harwell-Boeing file: its header cannot be read ({error})."
         ) from None
+    check_size(max(n_rows, n_columns), sum(map(len, lines)), path)
     if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
         raise ModelError(
             f"{str(path)!r} is of kind {kind!r}: only real or integer (R, I), symmetric or "
@@ -99,8 +105,10 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     for count, form, size in zip(counts[1:4], forms, needed, strict=True):
         blocks.append(_block(lines[first : first + count], form, size, f"{str(path)!r}", first))
         first += count
-    pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
-    matrix: Any = sp.csc_array((blocks[2], index, pointer), shape=(n_rows, n_columns))
+    with parsing(path), np.errstate(invalid="raise"):
+        pointer, index = (block.astype(np.int64) - 1 for block in blocks[:2])
+        matrix: Any = sp.csc_array((blocks[2], index, pointer), shape=(n_rows, n_columns))
+        sound(matrix)
     matrix.sum_duplicates()
     if kind[1] == "S":
         matrix = sp.csc_array(matrix + sp.tril(matrix, -1).T + sp.triu(matrix, 1).T)
@@ -110,6 +118,8 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     start = 4 + right_hand + counts[1] + counts[2]
     sample = lines[start : start + _SAMPLE // max(per_line, 1) + 1]
     words = [line[i : i + width] for line in sample for i in range(0, len(line.rstrip()), width)]
+    if cut_short(content, words):
+        raise damaged(path, "the last number is shorter than all others")
     return matrix, text_digits(words)
 
 
@@ -118,7 +128,10 @@ def _form(text: str) -> tuple[int, int]:
     match = _FORMAT.search(text)
     if match is None:
         raise ValueError(f"format {text.strip()!r}")
-    return int(match[1] or 1), int(match[3])
+    per_line, width = int(match[1] or 1), int(match[3])
+    if not 0 < per_line * width <= _LINE:
+        raise ValueError(f"format {text.strip()!r}")
+    return per_line, width
 
 
 def _block(lines: list[bytes], form: tuple[int, int], size: int, source: str, before: int) -> Any:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,10 +13,12 @@ from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import assembled, chosen, missing_extra
-from .formats import Format
+from .formats import USUAL, Format
 from .mat_variables import mat_variables
-from .paths import file_path
+from .paths import check_size, file_path, parsing
 
+#: a byte of a compressed file holds no more bytes than this
+_DEFLATED = 1100
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 
@@ -26,7 +27,7 @@ def read_matlab(
     *,
     stiffness: str | None = None,
     mass: str | None = None,
-    damping: str | None = None,
+    damping: str | None = USUAL,
     dofs: DofSet | str | Path | None = None,
 ) -> FEMatrices:
     """Return the matrices of a MATLAB file, version 4 to 7.3.
@@ -37,7 +38,7 @@ def read_matlab(
         The .mat file; version 7.3 (HDF5) needs h5py: ``pip install 'flexplant[hdf5]'``.
     stiffness, mass, damping : str, optional
         Names of the variables, fields of structures as "model.K0". Where not given, the usual names
-        are looked for: K, M and C or D.
+        are looked for: K, M and C or D. `damping=None`: none.
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for: the file does not say.
 
@@ -129,32 +130,29 @@ def read_npz(
 
 
 def _numpy(path: Path, name: str) -> dict[str, Any]:
-    with path.open("rb") as file:
-        try:
-            content: Any = np.load(file, allow_pickle=False)
-        except (ValueError, EOFError, zipfile.BadZipFile) as error:
-            raise FlexplantError(
-                f"{str(path)!r} is no NumPy file of numbers ({error}). Write it with "
-                "scipy.sparse.save_npz(path, K)."
-            ) from None
+    do = "Write it with scipy.sparse.save_npz(path, K)."
+    with path.open("rb") as file, parsing(path, do):
+        content: Any = np.load(file, allow_pickle=False)
         if isinstance(content, np.ndarray):
             return {name: content}
         if "__flexplant__" in content.files:
             raise FlexplantError(f"{str(path)!r} is flexplant's own: flexplant.load(path).")
         arrays = {key: content[key] for key in content.files}
     if "format" in arrays and "shape" in arrays:
-        return {name: sp.load_npz(path)}
+        with parsing(path, do):
+            check_size(int(np.max(arrays["shape"])), path.stat().st_size, path)
+            return {name: sp.load_npz(path)}
     if name != "K":
         if len(arrays) != 1:
             raise FlexplantError(f"{str(path)!r} holds {list(arrays)}: one array was expected.")
         return {name: next(iter(arrays.values()))}
-    names = chosen(arrays, {"K": None, "M": None, "D": None}, path.name)
+    names = chosen(arrays, {"K": None, "M": None, "D": USUAL}, path.name)
     return {part: arrays[key] for part, key in names.items() if key is not None}
 
 
 def _version5(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
     variables: dict[str, Any] = {}
-    for name, value in mat_variables(path, struct_as_record=False).items():
+    for name, value in mat_variables(path).items():
         _flatten(name, value, variables)
     names = chosen(variables, wanted, path.name)
     return {part: variables[key] for part, key in names.items() if key is not None}
@@ -162,12 +160,9 @@ def _version5(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
 
 def _flatten(name: str, value: Any, found: dict[str, Any]) -> None:
     """List square matrices, and those in structures as 'structure.field'."""
-    if isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
-        value = value.ravel()[0]
-    fields = getattr(value, "_fieldnames", None)
-    if fields:
-        for field in fields:
-            _flatten(f"{name}.{field}", getattr(value, field), found)
+    if isinstance(value, dict):
+        for field, item in value.items():
+            _flatten(f"{name}.{field}", item, found)
     elif sp.issparse(value) or (isinstance(value, np.ndarray) and value.dtype.kind in "fiubc"):
         matrix: Any = value
         if matrix.ndim == 2 and matrix.shape[0] == matrix.shape[1]:
@@ -181,7 +176,7 @@ def _version73(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
         raise missing_extra(
             "h5py", "hdf5", f"{path.name!r} is a MATLAB file of version 7.3 (HDF5), and reading it"
         ) from None
-    with h5py.File(path, "r") as file:
+    with parsing(path), h5py.File(path, "r") as file:
         variables: dict[str, Any] = {}
 
         def visit(prefix: str, group: Any) -> None:
@@ -198,15 +193,20 @@ def _version73(path: Path, wanted: Mapping[str, str | None]) -> dict[str, Any]:
 
         visit("", file)
         names = chosen(variables, wanted, path.name)
-        return {part: _hdf5(variables[key]) for part, key in names.items() if key is not None}
+        size = path.stat().st_size
+        return {p: _hdf5(variables[key], path, size) for p, key in names.items() if key is not None}
 
 
-def _hdf5(item: Any) -> Any:
+def _hdf5(item: Any, path: Path, size: int) -> Any:
     """Return a dense (MATLAB stores columns first) or sparse (data, ir, jc) matrix."""
     if "MATLAB_sparse" not in item.attrs:
+        check_size(item.size, _DEFLATED * size, path)
         return np.asarray(item[()]).T
+    for part in item.values():
+        check_size(part.size, _DEFLATED * size, path)
     columns = np.asarray(item["jc"][()], dtype=np.int64)
     shape = (int(item.attrs["MATLAB_sparse"]), columns.size - 1)
+    check_size(shape[0], size, path)
     if "data" not in item:
         return sp.csc_array(shape)
     return sp.csc_array(

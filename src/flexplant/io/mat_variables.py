@@ -2,30 +2,44 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 from typing import Any
 
-import scipy.io
-
 from ..errors import FlexplantError
+from .child import in_child
 from .paths import file_path
 
 
-def mat_variables(path: str | Path, **options: Any) -> dict[str, Any]:
-    """Return {name: value}; options are those of `scipy.io.loadmat`.
+def mat_variables(path: str | Path) -> dict[str, Any]:
+    """Return {name: value}, structures as dicts, cells as arrays of objects.
 
     Raises
     ------
     FlexplantError
         When it is no MATLAB file, or of version 7.3.
+    FileNotFoundError
+        When there is no such file.
     """
-    file: Any  # the type stubs take names of files only
-    with file_path(path).open("rb") as file:
-        try:
-            content = scipy.io.loadmat(file, **options)
-        except Exception as error:  # a damaged file raises whatever its bytes lead to
-            raise FlexplantError(
-                f"{str(path)!r} cannot be read as a MATLAB file ({error!s:.80}). Version 7.3 is "
-                "another format: save it with '-v7'."
-            ) from None
-    return {name: value for name, value in content.items() if not name.startswith("__")}
+    kind, found = "cut off", _cut(file_path(path).read_bytes())
+    if not found:
+        kind, found = in_child("matlab", path, keep=True)
+    if kind != "value":
+        raise FlexplantError(
+            f"{str(path)!r} cannot be read as a MATLAB file ({found!s:.80}). It is damaged or of "
+            "version 7.3, which is another format: save it with '-v7'."
+        )
+    content: dict[str, Any] = found
+    return content
+
+
+def _cut(content: bytes) -> str:
+    """Return what is wrong with the lengths of the variables of a file of version 5, in words."""
+    order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
+    at = 128
+    while order and at < len(content):
+        size = struct.unpack_from(f"{order}I", content[at : at + 8].ljust(8, b"\0"), 4)[0]
+        if at + 8 + size > len(content):
+            return f"a variable at byte {at} of {size} bytes in a file of {len(content)}"
+        at += 8 + size
+    return ""

@@ -19,7 +19,8 @@ from ..structure import FEMatrices
 from ..values import FloatArray
 from .assembled import one_matrix_each, text_digits
 from .formats import Format
-from .numbers import rows_of_numbers, wrong_line
+from .numbers import cut_short, rows_of_numbers, wrong_line
+from .paths import check_size, damaged
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -90,7 +91,8 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise FlexplantError(f"{str(path)!r} cannot be unpacked ({error}): cut short?") from None
     head = _header(content, path)
-    body = content[head.start :]
+    # without what follows the last number: SciPy's fast reader reads beyond a blank at the end
+    body = content[head.start :].rstrip() + b"\n"
     if b"%" in body:
         body = b"\n".join(b"" if line[:1] == b"%" else line for line in body.split(b"\n"))
     if head.listed:
@@ -103,7 +105,10 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     if head.whole:
         return matrix, None
     lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
-    return matrix, text_digits(line.split()[-1] for line in lines if line.strip())
+    words = [line.split()[-1] for line in lines if line.strip()]
+    if cut_short(content, words):
+        raise damaged(path, "the last number is shorter than all others")
+    return matrix, text_digits(words)
 
 
 def _numbers(body: bytes, head: _Header, path: Path) -> FloatArray:
@@ -168,6 +173,7 @@ def _header(content: bytes, path: Path) -> _Header:
     n, m = sizes[:2]
     if symmetry == "symmetric" and n != m:
         raise ShapeError(f"{str(path)!r} is called symmetric and is not square: {n} x {m}.")
+    check_size(max(n, m), len(content), path)
     full = n * (n + 1) // 2 if symmetry == "symmetric" else n * m
     return _Header(
         form == "coordinate",
@@ -185,7 +191,7 @@ def _plain_entries(body: bytes, head: _Header) -> Any | None:
 
     It drops what it cannot parse (`7.5D+03` becomes 7.5): it gets plain lines only.
     """
-    if head.whole or not _PLAIN.fullmatch(body):
+    if head.whole or body.count(b"\n") < head.entries or not _PLAIN.fullmatch(body):
         return None
     sizes = f"{head.shape[0]} {head.shape[1]} {head.entries}"
     first = f"%%MatrixMarket matrix coordinate real general\n{sizes}\n".encode()

@@ -25,7 +25,8 @@ from . import (
     sierra,
     uff,
 )
-from .formats import HEAD, Elsewhere, Format, ends
+from .elsewhere import OTHERS
+from .formats import HEAD, USUAL, Elsewhere, Format, ends
 from .paths import file_path
 from .tables import read_dofs, read_nodes_table
 
@@ -40,7 +41,14 @@ FORMATS: tuple[Format, ...] = (
     abaqus.ABAQUS,
     sierra.SIERRA,
 )
-ELSEWHERE: tuple[Elsewhere, ...] = (exodus.MODES, exodus.MESH, uff.UNIVERSAL)
+ELSEWHERE: tuple[Elsewhere, ...] = (
+    exodus.MODES,
+    exodus.MESH,
+    uff.UNIVERSAL,
+    ansys.MARKUP,
+    ansys.ELEMENTS,
+    *OTHERS,
+)
 
 
 def read_matrices(
@@ -48,7 +56,7 @@ def read_matrices(
     *,
     stiffness: str | None = None,
     mass: str | Path | None = None,
-    damping: str | Path | None = None,
+    damping: str | Path | None = USUAL,
     dofs: DofSet | str | Path | None = None,
     nodes: str | Path | None = None,
     scalar_direction: str | None = None,
@@ -68,7 +76,8 @@ def read_matrices(
     stiffness : str, optional
         Name of the variable, in files that hold several (.mat, .op4, .pch).
     mass, damping : str or Path, optional
-        Their files, or names of variables, likewise.
+        Their files, or names of variables, likewise; where several matrices are in one file those
+        of the usual names are taken when not given. `damping=None`: none.
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for, where the file does not say.
     nodes : str or Path, optional
@@ -116,7 +125,9 @@ def read_matrices(
         "exodus": exodus,
         "rotations": rotations,
     }
-    options = {name: value for name, value in given.items() if value is not None}
+    options = {name: value for name, value in given.items() if value not in (None, USUAL)}
+    if damping is None and form.several:
+        options["damping"] = None
     _check_options(options, form, path.name)
     if known_nodes:
         options[form.mesh_option] = options.pop("nodes")
@@ -140,7 +151,7 @@ def read_model(
     *,
     stiffness: str | None = None,
     mass: str | Path | None = None,
-    damping: str | Path | None = None,
+    damping: str | Path | None = USUAL,
     dofs: DofSet | str | Path | None = None,
     nodes: str | Path | None = None,
     units: Sequence[str | float] = ("m", "kg", "s"),
@@ -164,7 +175,8 @@ def read_model(
     stiffness : str, optional
         Name of the variable, in files that hold several (.mat, .op4, .pch).
     mass, damping : str or Path, optional
-        Their files, or names of variables, likewise.
+        Their files, or names of variables, likewise; where several matrices are in one file those
+        of the usual names are taken when not given. `damping=None`: none.
     dofs : DofSet, or path of a table for `read_dofs`, optional
         What the rows stand for, where the file does not say. Its coordinates are in the unit of
         length of the file, too.
@@ -260,15 +272,15 @@ def _format(path: Path) -> Format:
     for form in FORMATS:
         if ends(path, form.suffixes):
             return form
+    for other in ELSEWHERE:
+        if ends(path, other.suffixes) and other.begins(head):
+            raise FlexplantError(f"{path.name!r} holds no matrices but {other.reader}.")
     for form in FORMATS:
         if ends(path, form.mesh):
             raise FlexplantError(
                 f"{path.name!r} holds no matrices but a mesh or results: give it to "
                 f"{form.read.__name__}(..., {form.mesh_option}=...)."
             )
-    for other in ELSEWHERE:
-        if ends(path, other.suffixes):
-            raise FlexplantError(f"{path.name!r} holds no matrices but {other.reader}.")
     raise FlexplantError(
         f"the format of {path.name!r} is not known, neither by its suffix {path.suffix!r} nor by "
         f"what it begins with. Known suffixes: {', '.join(s for f in FORMATS for s in f.suffixes)}."

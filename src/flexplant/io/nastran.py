@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,10 @@ from ..values import FloatArray
 from .numbers import decimal
 from .paths import file_path
 
-_KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S", "SPOINT")
+_KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S")
+_INCLUDE = re.compile(r"\s*INCLUDE\s+(?:'([^']*)'|\"([^\"]*)\"|([^\s$]+))", re.IGNORECASE)
+#: files within files, at most
+_DEEP = 20
 
 
 @dataclass(frozen=True)
@@ -22,14 +26,13 @@ class Nodes:
 
     xyz: dict[int, FloatArray]
     axes: dict[int, FloatArray]  # columns are the local axes; absent: the basic ones
-    scalar: frozenset[int]
 
 
 def read_nodes(path: str | Path) -> Nodes:
     """Return the nodes of a Nastran bulk data file.
 
-    GRID, GRDSET, SPOINT and CORD2R, CORD2C, CORD2S in free, small or large fields; all other
-    cards are passed over.
+    GRID, GRDSET and CORD2R, CORD2C, CORD2S in free, small or large fields, also in files that it
+    INCLUDEs; all other cards are passed over.
 
     Parameters
     ----------
@@ -39,32 +42,28 @@ def read_nodes(path: str | Path) -> Nodes:
     Raises
     ------
     FlexplantError
-        When a card cannot be read; the line is named.
+        When a card cannot be read, or an INCLUDEd file is not there; the line is named.
     LabelError
         When a coordinate system is not there.
     FileNotFoundError
         When there is no such file.
     """
-    text = file_path(path, "bdf").read_text(encoding="latin-1")
+    lines = _lines(file_path(path, "bdf"))
     grids: dict[int, list[str]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
-    scalar: set[int] = set()
     default = ["", ""]
-    for number, kind, fields in cards(text.splitlines(), _KINDS):
+    for number, kind, fields in cards((line for _, _, line in lines), _KINDS):
         fields = fields + [""] * 12
         try:
             if kind == "GRID":
                 grids[int(fields[0])] = fields
             elif kind == "GRDSET":
                 default = [fields[1], fields[5]]
-            elif kind == "SPOINT":
-                scalar.update(_listed(fields))
             else:
                 systems[int(fields[0])] = (kind, fields)
         except ValueError as error:
-            raise FlexplantError(
-                f"{str(path)!r}, line {number}: {kind} {fields[:8]}: {error}."
-            ) from None
+            file, line, _ = lines[number - 1]
+            raise FlexplantError(f"{file!r}, line {line}: {kind} {fields[:8]}: {error}.") from None
     known = _Systems(systems, str(path))
     xyz, axes = {}, {}
     for node, fields in grids.items():
@@ -76,15 +75,39 @@ def read_nodes(path: str | Path) -> Nodes:
         xyz[node] = known.position(into, place) if into else place
         if moves > 0:
             axes[node] = known.axes(moves, xyz[node])
-    return Nodes(xyz, axes, frozenset(scalar))
+    return Nodes(xyz, axes)
 
 
-def _listed(fields: list[str]) -> Iterator[int]:
-    words = [item for item in fields if item]
-    if len(words) == 3 and words[1].upper() == "THRU":
-        yield from range(int(words[0]), int(words[2]) + 1)
-    else:
-        yield from (int(word) for word in words)
+def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str]]:
+    """Return (file, line number, text) of all lines, those of INCLUDEd files in their place."""
+    found = []
+    continued = ""
+    for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
+        joined = continued + line
+        # the name may go on in the next line, until its quote is closed
+        continued = joined.rstrip() if _goes_on(joined) else ""
+        match = None if continued else _INCLUDE.match(joined)
+        if match is None:
+            if not continued:
+                found.append((str(path), number, joined))
+            continue
+        name = (match[1] or match[2] or match[3] or "").strip()
+        # in the folder of the file that names it, or of the first one
+        places = [file.parent / name for file in (path, *above[:1])]
+        file = next((place for place in places if name and place.is_file()), None)
+        if file is None or len(above) == _DEEP:
+            why = "includes itself" if file else "is not there"
+            raise FlexplantError(
+                f"{str(path)!r}, line {number}: the INCLUDEd file {name!r} {why}, so that its nodes "
+                "would be missing. Put it beside, or give the file that holds the GRID cards."
+            )
+        found += _lines(file, (*above, path))
+    return found
+
+
+def _goes_on(line: str) -> bool:
+    quotes = line.count("'") + line.count('"')
+    return line.lstrip()[:8].upper() == "INCLUDE " and quotes == 1 and len(line) < 1000
 
 
 def nastran_float(text: str) -> float:

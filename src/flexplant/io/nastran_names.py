@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from ..errors import ModelError, unknown_label
+from .formats import USUAL
 
 _LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
 
@@ -23,7 +24,8 @@ def named_matrices(
     found : mapping {name: matrix}
         What the file holds.
     given : mapping {"stiffness", "mass", "damping": name or None}
-        What the caller says; None takes the one that has a usual name.
+        What the caller says. "usual" takes the one that has a usual name, as does None; but no
+        damping is said by None.
     endings : sequence of str
         Of usual names, after the letter K, M or B.
     path : str
@@ -37,7 +39,11 @@ def named_matrices(
         When several may be meant, or there is no stiffness.
     """
     names: list[str | None] = []
-    for what, name in given.items():
+    for what, said in given.items():
+        if what == "damping" and said is None:
+            names.append(None)
+            continue
+        name = None if said == USUAL else said
         check_held(() if name is None else (name,), found, path)
         usual = [_LETTERS[what] + ending for ending in endings]
         there = [one for one in usual if one in found] if name is None else [name]

@@ -11,6 +11,8 @@ import numpy as np
 
 from ..values import FloatArray
 
+#: characters of a number that a program printed, at least; shorter ones may be typed by hand
+_PRINTED = 12
 #: an exponent without its letter: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
 _DECIMAL = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:[eEdDqQ]([+-]?[0-9]+)|([+-][0-9]+))?")
@@ -173,3 +175,30 @@ def printed_digits(words: list[bytes]) -> int:
             whole, part = match[1], match[2]
             found = max(found, len(whole) + len(part if whole else part.lstrip(b"0")))
     return found
+
+
+def cut_short(content: bytes, words: Iterable[bytes]) -> bool:
+    r"""Return whether a text ends, without a line end, in a number shorter than all others.
+
+    A number without its last digits still is a number.
+
+    Parameters
+    ----------
+    content : bytes
+        The text.
+    words : iterable of bytes
+        Numbers of it as printed, some or all.
+
+    Examples
+    --------
+    >>> cut_short(b"1 1.500000E+00\n2 2.5", [b"1.500000E+00"])
+    True
+    >>> cut_short(b"1 1.500000E+00\n2 2.5\n", [b"1.500000E+00"])
+    False
+    """
+    last = content[-80:].split()[-1:]
+    if content.endswith((b"\n", b"\r")) or not last:
+        return False
+    # the last itself may be among them
+    others = [len(word) for word in (w.strip().lstrip(b"+-") for w in words) if word not in last[0]]
+    return bool(others) and len(last[0].lstrip(b"+-")) < min(others) >= _PRINTED

@@ -13,7 +13,7 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure.matrices import FEMatrices
 from ..values import name_list
-from .formats import Format
+from .formats import USUAL, Format
 from .nastran_names import check_held, named_matrices
 from .op4_binary import binary_matrices
 from .op4_text import text_matrices
@@ -29,7 +29,7 @@ def read_op4(
     *,
     stiffness: str | None = None,
     mass: str | None = None,
-    damping: str | None = None,
+    damping: str | None = USUAL,
     dofs: DofSet | None = None,
 ) -> FEMatrices:
     """Return the stiffness, mass and damping matrices of a Nastran OUTPUT4 file.
@@ -42,7 +42,8 @@ def read_op4(
         An .op4 file, binary (32 or 64 bit integers, either byte order) or text.
     stiffness, mass, damping : str, optional
         Names of the matrices; when not given, the one of the usual names (KAA, KAAX, KGG, KXX,
-        KFF, KLL; MAA, ...; BAA, ...) that is there.
+        KFF, KLL; MAA, ...; BAA, ...) that is there. `damping=None`: none. A null matrix of 1 x 1
+        stands for one that is not there (EXTSEOUT writes it).
     dofs : DofSet, optional
         The rows of the matrices.
 
@@ -72,6 +73,7 @@ def read_op4(
     chosen = named_matrices(found, given, _ENDINGS, str(path))
     K, M, D = (_real(found, name, path) for name in chosen)
     assert K is not None  # noqa: S101 - its name is known
+    M, D = (None if _is_absent(part, K.shape[0]) else part for part in (M, D))
     digits = found[str(chosen[0])][2]
     return FEMatrices(K, M, D, dofs=dofs, digits=digits, source=str(path))
 
@@ -91,7 +93,8 @@ def read_op4_matrices(
     Returns
     -------
     dict {name: (m, n) array or csc_array}
-        Sparse where the file holds it sparse; float64, or complex128. A doubled name gets `_2`.
+        Sparse where the file holds it sparse, or a large one is nearly empty; float64, or
+        complex128. A doubled name gets `_2`.
 
     Raises
     ------
@@ -104,6 +107,11 @@ def read_op4_matrices(
     """
     found = _read(path, None if names is None else name_list(names, "matrices"))
     return {name: matrix for name, (matrix, _, _) in found.items()}
+
+
+def _is_absent(matrix: sp.csc_array | None, n: int) -> bool:
+    """Return whether a matrix is the null of 1 x 1 that stands for none."""
+    return matrix is None or (n > 1 and matrix.shape == (1, 1) and not matrix.count_nonzero())
 
 
 def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_array | None:
@@ -137,8 +145,7 @@ def _read(
         parts = list(form_of_file(content, str(path)))
     except MemoryError:
         raise FlexplantError(
-            f"{str(path)!r} names a size that does not fit into memory: the header is damaged, or "
-            "a large matrix is held dense. Write it again, sparse."
+            f"{str(path)!r} holds a matrix that does not fit into memory. Write it again, sparse."
         ) from None
     found: dict[str, tuple[Op4Matrix, int, int | None]] = {}
     matrix: Any

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError
 from ..structure.precision import digits_of
+from .op4_shapes import check_shape, is_thin
 from .paths import damaged
 
 
@@ -93,10 +94,11 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
             due = f"a matrix begins with a record of {6 * size} bytes, got {stop - start}"
             raise damaged(path, f"byte {at}: {due}")
         columns, rows, form, kind = words.integers(start, 4)
-        name = content[start + 4 * size : stop].decode("latin-1").replace("\0", "").strip()
+        name = _name(content[start + 4 * size : stop].decode("latin-1"))
         if columns < 1 or not rows or kind not in (1, 2, 3, 4) or not name.isprintable():
             got = f"{columns} columns, {rows} rows, type {kind}, name {name!r}"
             raise damaged(path, f"byte {start}: no header of a matrix: {got}")
+        check_shape(columns, rows, words.size, path)
         at = stop + marker
         starts: list[int] = []
         stops: list[int] = []
@@ -115,6 +117,14 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
             stops.append(stop)
         matrix = _matrix(words, name, (abs(rows), columns), rows < 0, kind, starts, stops)
         yield name, matrix, form, digits_of(np.zeros(0, dtype=words.real[kind % 2 == 0]))
+
+
+def _name(text: str) -> str:
+    """Return the name in a header; two words of 8 bytes hold 4 letters each, or it stands in one."""
+    clean = text.replace("\0", " ")
+    if len(clean) == 16 and clean[8:].strip() and not clean[4:8].strip():
+        clean = clean[:4] + clean[8:12]
+    return clean.strip()
 
 
 def _matrix(
@@ -138,19 +148,19 @@ def _matrix(
     target = np.complex128 if kind > 2 else np.float64
     value: Any = np.dtype(f"{words.layout.order}c{per}") if kind > 2 else dtype
     heads = [words.integers(start, 3) for start in starts]
-    if shape[0] * shape[1] > 2**44 and not big:
-        raise MemoryError
     if not heads and not big:
-        return np.zeros(shape, dtype=target)
+        thin = is_thin(shape, 0)
+        return sp.csc_array(shape, dtype=target) if thin else np.zeros(shape, dtype=target)
     if heads and all(row > 0 for _, row, _ in heads):
-        dense = np.zeros(shape, dtype=target, order="F")
+        thin = is_thin(shape, words.size // per)
+        dense: Any = sp.lil_array(shape, dtype=target) if thin else np.zeros(shape, target, "F")
         for start, stop, (column, row, _) in zip(starts, stops, heads, strict=True):
             count = (stop - start - 3 * size) // per
             if row - 1 + count > shape[0]:
                 raise _outside(words.path, start, name, row - 1 + count, shape)
             part = np.frombuffer(words.content, value, count, start + 3 * size)
             dense[row - 1 : row - 1 + count, column - 1] = part
-        return dense
+        return sp.csc_array(dense) if thin else dense
     first = np.array(starts, dtype=np.int64) + 3 * size
     counts = np.array([count for _, _, count in heads], dtype=np.int64)
     end = np.minimum(first + counts * size, np.array(stops, dtype=np.int64))

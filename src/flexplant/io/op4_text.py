@@ -11,10 +11,13 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError
 from .numbers import fixed_numbers
+from .op4_shapes import check_shape, is_thin
 from .paths import damaged
 
 #: digits of single precision (types 1 and 3), however many are printed
 _SINGLE = 7
+#: characters of a line at most
+_LINE = 4096
 _FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
 
 
@@ -98,6 +101,10 @@ class _Reader:
                 f"{shown!r}"
             )
         self.per_line, self.width = int(match[2]), int(match[3])
+        if not 0 < self.per_line * self.width <= _LINE:
+            self.at -= 1
+            raise self.wrong(f"numbers as {shown!r}")
+        check_shape(columns, rows, sum(map(len, self.lines)), self.path)
         # Fortran's scale factor 1P puts one digit before the point
         digits = int(match[4]) + (int(match[1]) if match[1] else 0)
         digits = min(digits, _SINGLE) if kind in (1, 3) else digits
@@ -110,8 +117,9 @@ class _Reader:
         while True:
             column, row, count = self.integers(self.line(), key)
             if column > columns:
-                self._take(count if row else 1)
-                self.chunks.pop()
+                # one number without a meaning, whatever its count says
+                if len(self.line()) < self.width:
+                    raise self.wrong("the last number is cut off")
                 break
             if column < 1 or count < 1 or row < 0:
                 self.at -= 1
@@ -178,7 +186,7 @@ class _Reader:
             reached = f"matrix {name} reaches row {int(rows.max()) + 1} of {shape[0]}"
             raise damaged(self.path, f"before line {self.at + 1}: {reached}")
         columns = np.repeat(column - 1, count)
-        if sparse:
+        if sparse or is_thin(shape, numbers.size):
             return sp.csc_array(sp.coo_array((numbers, (rows, columns)), shape=shape))
         dense = np.zeros(shape, dtype=numbers.dtype, order="F")
         dense[rows, columns] = numbers

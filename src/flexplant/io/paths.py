@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -30,3 +32,58 @@ def file_path(path: Any, name: str = "path") -> Path:
 def damaged(path: object, what: object, do: str = "Write it again.") -> FlexplantError:
     """Return the error of a file that is not what its format says; `what` is cut to 200 letters."""
     return FlexplantError(f"{str(path)!r}, {what!s:.200}: the file is damaged. {do}")
+
+
+@contextmanager
+def parsing(path: object, do: str = "Write it again.") -> Iterator[None]:
+    """Turn whatever a parser of another package raises into the error of a damaged file.
+
+    Raises
+    ------
+    FlexplantError
+        When anything is raised but an error of ours.
+    """
+    try:
+        yield
+    except FlexplantError:
+        raise
+    except Exception as error:  # its bytes lead anywhere
+        raise damaged(path, f"{type(error).__name__}: {error}", do) from None
+
+
+def check_size(size: int, held: int, path: object) -> None:
+    """Refuse a number of rows or columns that a damaged count has made.
+
+    Parameters
+    ----------
+    size : int
+        The count.
+    held : int
+        Bytes of the file: rows beyond a million that hold an entry take more bytes than one each.
+    path : object
+        The file, for the message.
+
+    Raises
+    ------
+    FlexplantError
+        When the file cannot hold so many.
+    """
+    if size > max(2**20, held):
+        raise damaged(path, f"a matrix of {size} rows or columns in {held} bytes")
+
+
+def text_of(path: Path, encoding: str = "utf-8-sig") -> str:
+    """Return the text of a file.
+
+    Raises
+    ------
+    FlexplantError
+        When its bytes are no such text.
+    FileNotFoundError
+        When there is no such file.
+    """
+    try:
+        return path.read_text(encoding=encoding)
+    except UnicodeDecodeError as error:
+        what = f"byte {error.start} is no text of UTF-8"
+        raise damaged(path, what, "Is it another format? Save it as plain text, UTF-8.") from None

@@ -11,16 +11,19 @@ import scipy.sparse as sp
 from ..errors import FlexplantError, ModelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
-from ..values import FloatArray
+from ..values import FloatArray, IntArray
 from .abaqus import symmetric
 from .exodus import opened
 from .formats import Format
-from .numbers import printed_digits, rows_of_numbers, wrong_line
-from .paths import file_path
+from .numbers import cut_short, printed_digits, rows_of_numbers, wrong_line
+from .paths import check_size, damaged, file_path
 
 _WORD = re.compile(rb"[^\s,;]+")
-#: the map has so many entries a node: x, y, z, rx, ry, rz and two that are no motion
-_PER_NODE = 8
+#: a map has so many entries a node: x, y, z, rx, ry, rz and two or three that are no motion
+_PER_NODE = (9, 8)
+#: x = zeros(5670, 1); x(1) = 1; x(2) = 2; ...
+_ZEROS = re.compile(rb"=\s*zeros\(\s*(\d{1,12})\s*,\s*1\s*\)")
+_ASSIGNED = re.compile(rb"\w+\(\s*(\d{1,12})\s*\)\s*=\s*(-?\d{1,12})\s*;?\s*")
 
 
 def read_sierra(
@@ -42,10 +45,11 @@ def read_sierra(
     stiffness, mass, damping : str or Path
         The files `Kssr.m`, `Mssr.m` and `Cssr.m` (output option `mfile`).
     dof_map : str or Path, optional
-        `FetiMap_a.m`: eight entries a node (x, y, z, rx, ry, rz and two that are no motion), each
-        the row of the matrices, 0 or less where there is none.
+        `FetiMap_a.m` or `..._ASetMap.m`: eight or nine entries a node (x, y, z, rx, ry, rz and two
+        or three that are no motion), each the row of the matrices, 0 or less where there is none.
     exodus : str or Path, optional
-        The mesh, for numbers and coordinates of the nodes in the order of the map.
+        The mesh, for numbers and coordinates of the nodes in the order of the map; or the list
+        `..._gid.m` of their numbers alone.
     dofs : DofSet, optional
         The rows, where there is no map.
 
@@ -70,6 +74,7 @@ def read_sierra(
     files = [stiffness, *(file for file in (mass, damping) if file is not None)]
     tables = {str(file): _table(file, 3) for file in files}
     n = max(int(table[:, :2].max()) for table, _ in tables.values())
+    check_size(n, sum(file_path(file).stat().st_size for file in files), stiffness)
 
     def matrix(file: str | Path | None) -> sp.csc_array | None:
         if file is None:
@@ -84,7 +89,7 @@ def read_sierra(
 
     located = True
     if dof_map is not None:
-        dofs, located = _named(dof_map, exodus, n), exodus is not None
+        dofs, located = _named(dof_map, exodus, n)
     K = matrix(stiffness)
     assert K is not None  # noqa: S101 - its file is no option
     return FEMatrices(
@@ -132,35 +137,82 @@ def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
             "Write it again with 'mfile'."
         )
     shown = [row[-1] for row in words if row][:: max(1, len(kept) // 1000)]
+    if stop == len(content) and cut_short(content, shown):
+        raise damaged(path, "the last number is shorter than all others")
     return table, printed_digits(shown)
 
 
-def _named(path: str | Path, exodus: str | Path | None, n: int) -> DofSet:
-    places = _table(path, 1)[0].ravel().astype(np.int64)
-    if places.size % _PER_NODE or sorted(places[places > 0].tolist()) != list(range(1, n + 1)):
+def _vector(path: str | Path) -> IntArray:
+    """Return the whole numbers of a vector: one bracketed, or filled entry by entry."""
+    content = file_path(path).read_bytes()
+    size = _ZEROS.search(content)
+    if size is None:
+        return _table(path, 1)[0].ravel().astype(np.int64)
+    count = int(size[1])
+    check_size(count, 9 * len(content), path)
+    body = content[size.end() :].lstrip(b" \t;,").splitlines()
+    lines = [line.split(b"%")[0].strip() for line in body]
+    wrong = next((line for line in lines if line and not _ASSIGNED.fullmatch(line)), None)
+    pairs = np.array([match.groups() for line in lines if (match := _ASSIGNED.match(line))])
+    places, values = pairs.reshape(-1, 2).astype(np.int64).T
+    if wrong is not None or np.any((places < 1) | (places > count)):
+        got = repr((wrong or b"a place out of the vector")[:72].decode("latin-1"))
+        raise damaged(path, f"'x(place) = number;' is due within 1 to {count}, got {got}")
+    vector = np.zeros(count, dtype=np.int64)
+    vector[places - 1] = values
+    return vector
+
+
+def _mesh(path: str | Path | None) -> tuple[FloatArray | None, IntArray | None]:
+    """Return coordinates and numbers of nodes, as far as there are."""
+    if path is None:
+        return None, None
+    if file_path(path).suffix.lower() == ".m":
+        return None, _vector(path)
+    with opened(path) as file:
+        return file.nodes()
+
+
+def _named(path: str | Path, exodus: str | Path | None, n: int) -> tuple[DofSet, bool]:
+    """Return the rows, and whether they have coordinates."""
+    places = _vector(path)
+    if sorted(places[places > 0].tolist()) != list(range(1, n + 1)):
         raise ShapeError(
             f"{str(path)!r} maps {int(np.count_nonzero(places > 0))} of {places.size} entries, but "
-            f"the matrices have {n} rows, and nodes {_PER_NODE} entries. Is it of the same run?"
+            f"the matrices have {n} rows. Is it of the same run?"
         )
-    nodes = places.size // _PER_NODE
-    xyz, ids = np.zeros((nodes, 3)), np.arange(1, nodes + 1)
-    if exodus is not None:
-        with opened(exodus) as file:
-            xyz, ids = file.nodes()
-        if ids.size != nodes:
-            raise ShapeError(
-                f"{str(exodus)!r} has {ids.size} nodes, the map {str(path)!r} {nodes}. Are they of "
-                "the same mesh?"
-            )
     entry = np.flatnonzero(places > 0)[np.argsort(places[places > 0])]
-    kind = entry % _PER_NODE
-    if np.any(kind >= len(DIRECTIONS)):
+    xyz, ids = _mesh(exodus)
+    per = _per_node(path, places.size, entry, None if ids is None else ids.size)
+    nodes = places.size // per
+    ids = np.arange(1, nodes + 1) if ids is None else ids
+    at = entry // per
+    directions = tuple(DIRECTIONS[i] for i in (entry % per).tolist())
+    place = np.zeros((nodes, 3)) if xyz is None else xyz
+    return DofSet(ids[at], directions, place[at]), xyz is not None
+
+
+def _per_node(path: str | Path, size: int, entry: IntArray, nodes: int | None) -> int:
+    """Return how many entries of a map a node has."""
+    fits = [per for per in _PER_NODE if size % per == 0 and nodes in (None, size // per)]
+    moving = [per for per in fits if np.all(entry % per < len(DIRECTIONS))]
+    if len(moving) == 1:
+        return moving[0]
+    if fits and not moving:
         raise ModelError(
-            f"{str(path)!r} maps rows that are no motion of a node (entry {int(kind.max()) + 1}): "
-            "temperature, potential or a Lagrange multiplier are no part of M, D, K."
+            f"{str(path)!r} maps rows that are no motion of a node: temperature, potential or a "
+            "Lagrange multiplier are no part of M, D, K."
         )
-    at = entry // _PER_NODE
-    return DofSet(ids[at], tuple(DIRECTIONS[i] for i in kind.tolist()), xyz[at])
+    raise ShapeError(
+        f"{str(path)!r} has {size} entries"
+        + (
+            ": whether a node has 8 or 9 of them is not clear. Give the mesh: exodus=..."
+            if fits
+            else ", not 8 or 9 a node. Is it of the same run?"
+            if nodes is None
+            else f", not 8 or 9 for each of {nodes} nodes. Are they of the same mesh?"
+        )
+    )
 
 
 SIERRA = Format((".m",), read_sierra)

@@ -16,7 +16,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
 from ..values import FloatArray, IntArray
 from .numbers import decimal
-from .paths import file_path
+from .paths import file_path, text_of
 
 #: what other programs call the six directions
 _DIRECTION = {
@@ -187,7 +187,7 @@ class _Table:
 
 
 def _table(path: str | Path, plain: Sequence[str] = ()) -> _Table:
-    text = file_path(path).read_text(encoding="utf-8-sig")
+    text = text_of(file_path(path))
     numbered = [
         (number, line)
         for number, line in enumerate(text.splitlines(), 1)

@@ -13,6 +13,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import Frf
 from ..values import positive
 from .formats import Elsewhere
+from .paths import damaged
 from .uff_records import (
     check_complete,
     check_systems,
@@ -255,7 +256,10 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
                     "Export these."
                 )
         nodes.append(numbers)
-        places.append(np.stack([np.atleast_1d(part[axis]) for axis in "xyz"], axis=1))
+        axes = [np.atleast_1d(part[axis]) for axis in "xyz"]
+        if any(axis.shape != numbers.shape for axis in axes):
+            raise damaged(path, f"a dataset of {numbers.size} nodes lacks some of their numbers")
+        places.append(np.stack(axes, axis=1))
     count = len(directions)
     ids, xyz = np.concatenate(nodes), np.concatenate(places) / length
     return DofSet(np.repeat(ids, count), tuple(directions) * ids.size, np.repeat(xyz, count, 0))

@@ -1,0 +1,139 @@
+"""Parsers of other packages, which a damaged file may crash: `in_child` runs this file for each.
+
+Nothing of this package is imported here: the process starts in a fraction of a second, and returns
+plain arrays, texts and dicts only.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import sys
+import warnings
+from pathlib import Path
+from typing import Any
+
+#: bytes that any file may need beside a multiple of its size
+_SPARE = 2**26
+
+
+def matlab(path: str) -> dict[str, Any]:
+    """Return {name: value} of a MATLAB file up to version 7; structures become dicts."""
+    import scipy.io.matlab
+
+    # deflated data grow a thousand times at most
+    _bounded(path, 1100)
+    content = scipy.io.matlab.loadmat(path, struct_as_record=False)
+    return {name: _plain(value) for name, value in content.items() if name[:2] != "__"}
+
+
+def ansys_full(path: str) -> dict[str, Any]:
+    """Return the table of rows (node, DOF), K, M and the header of an ANSYS .full file."""
+    from ansys.mapdl import reader
+
+    _bounded(path, 60)
+    full = reader.read_binary(path)
+    if not hasattr(full, "load_km"):
+        return {"class": type(full).__name__}
+    table, K, M = full.load_km(sort=False)
+    return {"table": table, "K": sound(K), "M": sound(M), "damped": bool(full._header["ptrDMP"])}
+
+
+def ansys_mesh(path: str) -> dict[str, Any]:
+    """Return node numbers, coordinates and nodal angles of an ANSYS .rst or .cdb file."""
+    from ansys.mapdl import reader
+
+    _bounded(path, 60)
+    archive = path.lower().endswith(".cdb")
+    mesh = reader.Archive(path, parse_vtk=False) if archive else reader.read_binary(path).mesh
+    return {"nodes": mesh.nnum, "xyz": mesh.nodes, "angles": mesh.node_angles}
+
+
+def _plain(value: Any) -> Any:
+    import numpy as np
+    import scipy.sparse as sp
+
+    fields = getattr(value, "_fieldnames", None)
+    if fields is not None:
+        return {name: _plain(getattr(value, name)) for name in fields}
+    if sp.issparse(value):
+        return sound(value)
+    if isinstance(value, np.ndarray) and value.dtype == object:
+        if value.size == 1 and hasattr(value.flat[0], "_fieldnames"):
+            return _plain(value.flat[0])
+        cells = np.empty(value.shape, dtype=object)
+        for place in np.ndindex(value.shape):
+            cells[place] = _plain(value[place])
+        return cells
+    return np.array(value) if isinstance(value, np.ndarray) else value
+
+
+def sound(matrix: Any) -> Any:
+    """Return a sparse matrix whose pointers and indices were checked, anything else as it is.
+
+    Damaged ones make SciPy write outside of its arrays; its own check passes over empty matrices.
+
+    Raises
+    ------
+    ValueError
+        When they lead out of the matrix.
+    """
+    import numpy as np
+
+    if hasattr(matrix, "indptr"):
+        if np.any(np.diff(matrix.indptr) < 0):
+            raise ValueError("pointers of columns decrease")
+        matrix.check_format(full_check=True)
+    return matrix
+
+
+def _bounded(path: str, times: int) -> None:
+    """Bound the memory that may still be taken, by the size of the file, where the system can."""
+    try:
+        import resource
+
+        size, used = os.path.getsize(path), resource.getrusage(resource.RUSAGE_SELF)
+        pages = int(Path("/proc/self/statm").read_text().split()[5])
+        most = pages * resource.getpagesize() + _SPARE + times * size
+        seconds = int(used.ru_utime + used.ru_stime) + 60 + size // 10**6
+        for what, limit in ((resource.RLIMIT_DATA, most), (resource.RLIMIT_CPU, seconds)):
+            hard = resource.getrlimit(what)[1]
+            within = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+            resource.setrlimit(what, (within, hard))
+    except (ImportError, OSError, ValueError, IndexError):
+        return
+
+
+def run(name: str, path: str) -> tuple[str, Any]:
+    """Return ("value", what a function of this module returns), or the name and text of its error."""
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            return "value", globals()[name](path)
+    except Exception as error:
+        return type(error).__name__, str(error)
+
+
+def answered(request: tuple[list[str], str, str]) -> bytes:
+    """Return the pickled outcome of a request (sys.path, function, file)."""
+    sys.path[:], name, path = request
+    try:
+        return pickle.dumps(run(name, path), protocol=5)
+    except Exception as error:
+        return pickle.dumps((type(error).__name__, str(error)))
+
+
+def main() -> None:
+    """Answer requests from the input until it ends."""
+    answers = os.fdopen(os.dup(1), "wb")
+    os.dup2(2, 1)  # what the parsers print
+    while True:
+        try:
+            request = pickle.load(sys.stdin.buffer)
+        except EOFError:
+            return
+        answers.write(answered(request))
+        answers.flush()
+
+
+if __name__ == "__main__":
+    main()
