@@ -1,7 +1,7 @@
-"""Damages small valid files of every format and reads them: `python fuzz_files.py SECONDS [reader]`.
+"""Damages small valid files of every format and reads them: `fuzz_files.py SECONDS [reader]`.
 
-Each reader is tried in a process of its own for SECONDS of CPU time, its children counted. Printed is
-a JSON line a reader: how many files, how many were still read, foreign errors, a crash, the memory.
+Each reader is tried in a process of its own for SECONDS of CPU time, its children counted. Printed
+is a JSON line a reader: how many files, how many were still read, foreign errors, a crash, memory.
 """
 
 import contextlib
@@ -160,7 +160,7 @@ def sierra():
 
 def sierra_map():
     entries = "".join(f"x({9 * (k // 3) + k % 3 + 1}) = {k + 1};\n" for k in range(5))
-    listed = "\n".join("1 2 3 0 0 0 0 0 4 5 0 0 0 0 0 0".split())
+    listed = "1 2 3 0 0 0 0 0 4 5 0 0 0 0 0 0".replace(" ", "\n")
     return [f"function x = a()\nx = zeros(18, 1);\n{entries}".encode(), f"m = [{listed}];".encode()]
 
 
@@ -211,14 +211,16 @@ def uff(binary=0):
 def uff_shapes():
     import pyuff
 
+    def column(kind, first):
+        return np.array([first, 2.0]) * (1 + 0j if kind == 3 else 1)
+
     nodes = {"type": 15, "node_nums": [1, 2], "def_cs": [0, 0], "disp_cs": [0, 0], "color": [1, 1]}
     nodes |= {axis: [0.0, 1.0] for axis in "xyz"}
     shapes = [
         {
             "type": 55, "model_type": 1, "analysis_type": kind, "data_ch": 3, "spec_data_type": 8,
-            "data_type": 5 if kind == 3 else 2, "r1": np.array([1.0, 2]) * (1 + 0j if kind == 3 else 1),
-            "r2": np.array([0.5, 2]) * (1 + 0j if kind == 3 else 1),
-            "r3": np.array([0.25, 2]) * (1 + 0j if kind == 3 else 1),
+            "data_type": 5 if kind == 3 else 2, "r1": column(kind, 1.0),
+            "r2": column(kind, 0.5), "r3": column(kind, 0.25),
             "n_data_per_node": 3, "node_nums": np.array([1, 2]), "load_case": 1, "mode_n": kind,
             "freq": 12.5, "modal_m": 1.0, "modal_damp_vis": 0.01, "modal_damp_his": 0.0,
             "eig": -1 + 80j, "modal_a": 1 + 0j, "modal_b": 1 + 0j,
@@ -269,6 +271,14 @@ def with_map(path):
     return io.read_sierra(path.parent / "Kssr.m", dof_map=path)
 
 
+def exodus_modes(path):
+    return io.read_exodus_modes(path, rigid_below=1e-9)
+
+
+def frf_mat():
+    return [saved(sio.savemat, {"freq": [1.0, 2], "data": [1j, 2]})]
+
+
 #: {reader: (name of the file, valid contents, the call)}
 READERS = {
     "matrix_market": ("K.mtx", matrix_market, io.read_matrix_market),
@@ -284,8 +294,8 @@ READERS = {
     "abaqus": ("K.mtx", abaqus, io.read_abaqus),
     "sierra": ("K.m", sierra, io.read_sierra),
     "sierra_map": ("map.m", sierra_map, with_map),
-    "exodus": ("m.exo", exodus, partial(io.read_exodus_modes, rigid_below=1e-9)),
-    "exodus_hdf5": ("m.exo", partial(exodus, True), partial(io.read_exodus_modes, rigid_below=1e-9)),
+    "exodus": ("m.exo", exodus, exodus_modes),
+    "exodus_hdf5": ("m.exo", partial(exodus, True), exodus_modes),
     "uff_58": ("m.uff", uff, io.read_frf_uff),
     "uff_58b": ("m.uff", partial(uff, 1), io.read_frf_uff),
     "uff_55": ("m.uff", uff_shapes, io.read_modes_uff),
@@ -293,7 +303,7 @@ READERS = {
     "dofs": ("d.csv", dofs_table, io.read_dofs),
     "frf_csv": ("f.csv", lambda: [saved(io.write_frf_csv, responses())], io.read_frf_csv),
     "frf_npz": ("f.npz", frf_npz, io.read_frf_npz),
-    "frf_mat": ("f.mat", lambda: [saved(sio.savemat, {"freq": [1.0, 2], "data": [1j, 2]})], io.read_frf_mat),
+    "frf_mat": ("f.mat", frf_mat, io.read_frf_mat),
     "mat_system": ("s.mat", system, io.read_mat),
     "load": ("v.npz", lambda: [saved(responses().save)], fx.load),
     "ansys_full": ("f.full", partial(example, "file.full"), io.read_ansys),
@@ -401,6 +411,7 @@ def forked(function, path, *, keep=False):
         process = os.fork()
         if not process:
             with contextlib.suppress(BaseException):
+                foreign.ALONE = True
                 null = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(null, 1)
                 os.dup2(null, 2)
@@ -451,7 +462,8 @@ def tried(name, seconds, folder, seed, result):
             frames = [
                 f for f in traceback.extract_tb(error.__traceback__) if "flexplant" in f.filename
             ]
-            key = f"{type(error).__name__} {Path(frames[-1].filename).name} {frames[-1].lineno}: {error!s:.60}"
+            place = f"{Path(frames[-1].filename).name} {frames[-1].lineno}"
+            key = f"{type(error).__name__} {place}: {error!s:.60}"
             same = next((k for k in strange if k.split(":")[0] == key.split(":")[0]), key)
             strange[same] = strange.get(same, 0) + 1
             if strange[same] == 1:

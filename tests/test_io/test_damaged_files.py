@@ -1,4 +1,4 @@
-"""Damaged files end in an error of ours: no crash, no foreign error, no memory beyond the file's."""
+"""Damaged files end in an error of ours: no crash, no foreign error, little memory."""
 
 import json
 import os
@@ -139,6 +139,8 @@ def test_without_an_interpreter_to_start_files_are_read_here(tmp_path, monkeypat
     monkeypatch.setattr(sys, "executable", "/opt/cad/bin/host")
     assert io.read_matlab(tmp_path / "K.mat").n_dof == 2
     assert (os.getpid(), "matlab") not in child._WAITING
+    resource = pytest.importorskip("resource")
+    assert resource.getrlimit(resource.RLIMIT_DATA)[0] == resource.RLIM_INFINITY
 
 
 def test_a_number_without_its_last_digits(tmp_path):

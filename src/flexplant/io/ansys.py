@@ -139,8 +139,8 @@ def _read(function: str, path: Path) -> dict[str, Any]:
         )
     if kind != "value":
         raise FlexplantError(
-            f"{path.name!r} cannot be read as an ANSYS {path.suffix} file ({kind}: {found!s:.120}). It "
-            "is damaged, cut off or another format: write it again."
+            f"{path.name!r} cannot be read as an ANSYS {path.suffix} file ({kind}: {found!s:.99}). "
+            "It is damaged, cut off or another format: write it again."
         )
     content: dict[str, Any] = found
     return content

@@ -21,13 +21,12 @@ def mat_variables(path: str | Path) -> dict[str, Any]:
     FileNotFoundError
         When there is no such file.
     """
-    kind, found = "cut off", _cut(file_path(path).read_bytes())
-    if not found:
-        kind, found = in_child("matlab", path, keep=True)
+    wrong = _cut(file_path(path).read_bytes())
+    kind, found = ("cut off", {}) if wrong else in_child("matlab", path, keep=True)
     if kind != "value":
         raise FlexplantError(
-            f"{str(path)!r} cannot be read as a MATLAB file ({found!s:.80}). It is damaged or of "
-            "version 7.3, which is another format: save it with '-v7'."
+            f"{str(path)!r} cannot be read as a MATLAB file ({wrong or found!s:.80}). It is "
+            "damaged or of version 7.3, which is another format: save it with '-v7'."
         )
     content: dict[str, Any] = found
     return content

@@ -125,7 +125,9 @@ def read_matrices(
         "exodus": exodus,
         "rotations": rotations,
     }
-    options = {name: value for name, value in given.items() if value not in (None, USUAL)}
+    options: dict[str, Any] = {
+        name: value for name, value in given.items() if value not in (None, USUAL)
+    }
     if damping is None and form.several:
         options["damping"] = None
     _check_options(options, form, path.name)

@@ -98,8 +98,8 @@ def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str
         if file is None or len(above) == _DEEP:
             why = "includes itself" if file else "is not there"
             raise FlexplantError(
-                f"{str(path)!r}, line {number}: the INCLUDEd file {name!r} {why}, so that its nodes "
-                "would be missing. Put it beside, or give the file that holds the GRID cards."
+                f"{str(path)!r}, line {number}: the INCLUDEd file {name!r} {why}: its nodes would "
+                "be missing. Put it beside, or give the file that holds the GRID cards."
             )
         found += _lines(file, (*above, path))
     return found

@@ -120,7 +120,7 @@ def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, 
 
 
 def _name(text: str) -> str:
-    """Return the name in a header; two words of 8 bytes hold 4 letters each, or it stands in one."""
+    """Return the name in a header; words of 8 bytes may hold 4 letters each."""
     clean = text.replace("\0", " ")
     if len(clean) == 16 and clean[8:].strip() and not clean[4:8].strip():
         clean = clean[:4] + clean[8:12]
