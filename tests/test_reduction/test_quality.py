@@ -10,7 +10,7 @@ from flexplant.errors import ModelError
 from flexplant.modes import solve_modes
 from flexplant.reduction import CraigBampton, Guyan, ModalBalanced, ModalTruncation, reduce
 from flexplant.reduction.mode_pairs import paired
-from flexplant.structure import ModalDamping
+from flexplant.structure import Damper, ModalDamping, Rayleigh
 from plates import make_plate
 
 LOW = ModalDamping(0.01)
@@ -53,7 +53,8 @@ def test_every_number_against_dense_matrices(plate):
     np.testing.assert_allclose(found.frf_error[:, 0], gap.max(axis=0) / size.max(axis=0), rtol=1e-4)
     assert found.true_error == pytest.approx(np.linalg.norm(gap, axis=1).max(), rel=1e-4)
     assert found.orthogonality < 1e-9
-    assert "dense solutions at 3 frequencies, loss factor 0.02" in found.route
+    assert "static shapes, loss factor 0.02 in both; direct solutions at 6 freq" in found.route
+    assert found.full_error < 1e-5
     assert len(found.table().splitlines()) == count + 1
     assert repr(found).startswith(f"<ReductionQuality: {count} modes, worst frequency ")
 
@@ -173,15 +174,64 @@ def test_against_modes_and_own_damping(plate):
 
 
 @pytest.mark.slow
-def test_a_large_model_is_solved_sparsely():
+def test_a_large_model_is_solved_by_fronts():
     plate = make_plate(elements=(26, 26))
     kept = [plate.dofs.nearest((x, y, 0)) for x in (0, 0.3, 0.6) for y in (0, 0.3, 0.6)]
     model = reduce(plate, CraigBampton(kept, 25, damping=LOW))
     found = model.quality(plate, band=BAND, inputs=kept[:2])
-    assert "sparse solutions" in found.route
+    assert "direct solutions at 3 frequencies" in found.route
+    assert found.full_error < 1e-4
     assert found.mac.min() > 0.9999
     assert found.frf_error.max() < 0.05
     assert np.all(found.freq_error >= -1e-9)
+
+
+def test_the_worst_error_is_found_at_light_damping(plate):
+    """At resonances and antiresonances of either model and between them: beside a fine grid."""
+    M, K = oracles_structure.plate_matrices(4, 4)
+    kept = [f"{node}:z" for node in range(1, 26, 2)]
+    at = plate.dofs.indices
+    T = oracle.guyan(K, at(kept))
+    b, C = np.eye(75)[:, at(["1:z"])], np.eye(75)[at(["1:z", "13:z"])]
+    full = np.sqrt(la.eigh(K, M, eigvals_only=True)[3:]) / (2 * np.pi)
+    less = np.sqrt(la.eigh(T.T @ K @ T, T.T @ M @ T, eigvals_only=True)[3:]) / (2 * np.pi)
+    band = (100.0, 500.0)
+    own = np.concatenate([full[full < band[1]], less[less < band[1]]])
+    near = (
+        own[:, None] * (1 + np.concatenate([-1e-4 * np.arange(9), 1e-4 * np.arange(9)]))
+    ).ravel()
+    freq = np.unique(np.concatenate([np.linspace(*band, 400), near]))
+    none = np.zeros((1, 1))
+    H, h = (
+        np.array([
+            oracle.response(m, none, k * (1 + 2e-4j), inputs, outputs, 2j * np.pi * f)
+            for f in freq
+        ])
+        for m, k, inputs, outputs in ((M, K, b, C), (T.T @ M @ T, T.T @ K @ T, T.T @ b, C @ T))
+    )  # fmt: skip
+    wanted = np.abs(H - h).max(axis=0) / np.abs(H).max(axis=0)
+    model = reduce(plate, Guyan(kept, damping=ModalDamping(1e-4)))
+    found = model.quality(plate, band=band, inputs="1:z", outputs=["1:z", "13:z"])
+    assert np.all(found.frf_error > 0.99 * wanted)
+    assert found.frf_error.max() > 0.9
+    # resonances 0.5 % apart and 1e-4 wide: neither model has those of the other
+    assert found.resonance_error.max() > 0.9
+    # of 1:z to itself: between two resonances, and shifted by much more than its width
+    assert 0.9 < found.antiresonance_error[0, 0] <= 2.0
+    assert "at antiresonance" in repr(found)
+
+
+def test_a_damper_to_ground_is_judged(plate):
+    damped = plate.with_damping(Rayleigh(0.0, 4e-6)).with_parts([Damper("1:z", 20.0)])
+    model = reduce(damped, CraigBampton(KEPT, 30))
+    found = model.quality(damped, band=BAND, inputs=KEPT[:2])
+    assert found.frf_error.max() < 5e-3
+    assert found.full_error < 1e-4
+    # without it: the width of the resonances is wrong
+    bare = model.replace(D=np.zeros_like(model.D))
+    assert bare.quality(damped, band=BAND, inputs=KEPT[:2]).frf_error.max() > 0.5
+    # a loss factor from a D that leaves no modes at 0
+    assert "loss factor 0.0" in model.quality(plate, band=BAND, inputs=KEPT[:2]).route
 
 
 def test_refusals(plate):

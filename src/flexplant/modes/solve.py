@@ -178,7 +178,8 @@ def modes_reaching(model: FEModel, freq: float, *, least: int = 0) -> Modes:
     known = _solved.get(model)
     modes = known() if known is not None else None
     least = min(least, model.n_dof)
-    if modes is not None and modes.n_modes >= least and (
+    real = modes is not None and not np.iscomplexobj(modes.phi)
+    if modes is not None and real and modes.n_modes >= least and (
         modes.n_modes == model.n_dof or modes.freq[-1] > freq
     ):  # fmt: skip
         return modes

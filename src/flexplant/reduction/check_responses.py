@@ -2,27 +2,27 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, Self
+from typing import Any, Protocol, Self, TypeAlias
 
 import numpy as np
-import scipy.linalg as la
-import scipy.sparse as sp
 
 from ..labels import DofSet
 from ..modes.attachment_vectors import static_response
+from ..modes.direct_check import DirectCheck, antiresonances, checked_response
+from ..modes.dynamic_basis import DynamicBasis
 from ..modes.modes import Modes
-from ..sparse.factor import dense, dynamic_lu
-from ..structure import FEModel
-from ..values import ComplexArray, FloatArray, Matrix
+from ..structure import FEModel, Hysteretic
+from ..values import ComplexArray, FloatArray
 from .bounds import ErrorBound
 
-#: up to this many DOFs responses are solved densely, at many frequencies
-SMALL = 600
-#: check frequencies beside the resonances, of small and of large models
-_GRID = (60, 6)
-#: resonances checked, of small and of large models
-_RESONANCES = (200, 6)
+#: points over the band, beside resonances and antiresonances
+_GRID = 200
+#: direct solutions that check the responses of a small and of a large structure
+_CHECKS, _SMALL = (6, 3), 2000
+#: their difference, of the peak, from which on they join the basis
+_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True, eq=False, repr=False, match_args=False)
@@ -49,55 +49,103 @@ class Reduced(Protocol):
         """Return a copy with some fields changed."""
 
 
-def check_frequencies(low: float, high: float, resonances: FloatArray, small: bool) -> FloatArray:
-    """Return frequencies [Hz] over a band and at resonances in it, fewer for a large model."""
-    which = 0 if small else 1
+#: gives the responses (f, p, q) at frequencies [Hz]
+Find: TypeAlias = Callable[[FloatArray], ComplexArray]
+
+
+class FullResponses:
+    """The responses of a full structure, wherever they are wanted.
+
+    Parameters
+    ----------
+    full : FEModel or Modes
+        The structure.
+    modes : Modes
+        Its modes, beyond the band.
+    B, C : (n, q), (p, n) arrays
+        Loads and outputs.
+    loss : float, optional
+        Loss factor, of a structure without damping.
+    """
+
+    def __init__(
+        self,
+        full: FEModel | Modes,
+        modes: Modes,
+        B: FloatArray,
+        C: FloatArray,
+        loss: float | None,
+    ) -> None:
+        self.full, self.B, self.C, self.loss = full, B, C, loss
+        self.basis: DynamicBasis | None = None
+        if isinstance(full, FEModel):
+            law = None if loss is None else Hysteretic(loss)
+            self.basis = DynamicBasis(full, modes, np.hstack([B, C.T]), law)
+        self.check: DirectCheck | None = None
+
+    def at(self, freq: FloatArray) -> ComplexArray:
+        """Return the responses (f, p, q)."""
+        if not self.B.shape[1]:
+            return np.zeros((freq.size, self.C.shape[0], 0), dtype=np.complex128)
+        if self.basis is not None:
+            return self.basis.response(freq, self.C, self.B)
+        assert isinstance(self.full, Modes)  # noqa: S101 - it is no FEModel
+        return _modal_response(self.full, freq, self.B, self.C, self.loss or 0.0)
+
+    def checked(self, freq: FloatArray) -> None:
+        """Compare the responses in a band with direct solutions, which mend the basis."""
+        if self.basis is not None and self.B.shape[1]:
+            self.basis, _, self.check = checked_response(
+                self.basis,
+                freq,
+                self.C,
+                self.B,
+                checks=_CHECKS[self.full.dofs.xyz.shape[0] > _SMALL],
+                tolerance=_TOLERANCE,
+            )
+
+    def static(self) -> FloatArray:
+        """Return the elastic compliance (p + q, p + q) of [inputs, outputs]; NaN if not known."""
+        loads = np.hstack([self.B, self.C.T])
+        if self.basis is not None:
+            return self.basis.compliance(loads.T, loads)
+        assert isinstance(self.full, Modes)  # noqa: S101 - it is no FEModel
+        if np.iscomplexobj(self.full.phi):
+            return np.full((loads.shape[1],) * 2, np.nan)
+        r = self.full.n_rigid
+        motion = (loads.T @ np.real(self.full.basis))[:, r:] / self.full.basis_omega[r:]
+        return np.asarray(motion @ motion.T)
+
+    def __str__(self) -> str:
+        how = "its D" if self.loss is None else f"loss factor {self.loss:.3g} in both"
+        if self.basis is None:
+            return "the sum over the given modes" + (f", {how}" if self.loss is not None else "")
+        check = f"; {self.check}" if self.check is not None else ""
+        return f"{self.basis.n_modes} modes and {self.basis.n_shapes} static shapes, {how}{check}"
+
+
+def check_frequencies(
+    low: float, high: float, both: Sequence[tuple[Find, FloatArray]]
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return frequencies [Hz] over a band, and of these the resonances and antiresonances.
+
+    Parameters
+    ----------
+    low, high : float [Hz]
+        The band.
+    both : sequence of (responses, resonances)
+        Of the full and of the reduced model.
+    """
     start = low if low > 0 else high / 1000
-    grid = np.geomspace(start, high, _GRID[which])
-    few = resonances
-    if few.size > _RESONANCES[which]:
-        few = few[np.linspace(0, few.size - 1, _RESONANCES[which]).astype(int)]
-    return np.concatenate([grid, few])
+    resonances = np.concatenate([own for _, own in both])
+    resonances = resonances[(resonances >= low) & (resonances <= high)]
+    deep = np.concatenate([antiresonances(find, own, low, high) for find, own in both])
+    return np.concatenate([np.geomspace(start, high, _GRID), resonances, deep]), resonances, deep
 
 
-def full_response(
-    full: FEModel | Modes, modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float
-) -> tuple[ComplexArray, str]:
-    """Return responses (f, p, q) of the full structure, and how they were found."""
-    found = np.zeros((freq.size, C.shape[0], B.shape[1]), dtype=np.complex128)
-    if not B.shape[1]:
-        return found, "no response: no inputs were named"
-    if isinstance(full, Modes):
-        return _modal_response(full, freq, B, C), "the sum over the given modes"
-    M, K, D = full.M, full.K, full.D
-    many = len(full.dofs) > SMALL and sp.issparse(K) and sp.issparse(M)
-    for i, f in enumerate(freq):
-        omega = 2 * np.pi * float(f)
-        stiffness: Any = K * (1 + 1j * loss) if D is None else K + 1j * omega * _as_like(D, K)
-        found[i] = C @ _solved(stiffness - omega**2 * M, B, many)
-    kind = "sparse" if many else "dense"
-    how = "its D" if D is not None else f"loss factor {loss:.3g} in both"
-    return found, f"{kind} solutions at {freq.size} frequencies, {how}"
-
-
-def _as_like(D: Matrix, K: Matrix) -> Any:
-    return D if sp.issparse(K) == sp.issparse(D) else (dense(D) if not sp.issparse(K) else D)
-
-
-def _solved(matrix: Any, B: FloatArray, many: bool) -> ComplexArray:
-    is_sparse = sp.issparse(matrix)
-    if many and is_sparse:
-        lu = dynamic_lu(matrix)
-        loads = B.astype(np.complex128)
-        solved = lu.solve(loads)
-        return np.asarray(solved + lu.solve(loads - matrix @ solved))
-    full = matrix.toarray() if is_sparse else np.asarray(matrix)
-    size = 1.0 / np.sqrt(np.abs(np.diag(full)))
-    scaled = full * size[:, None] * size
-    return np.asarray(la.solve(scaled, B * size[:, None]) * size[:, None], dtype=np.complex128)
-
-
-def _modal_response(modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray) -> ComplexArray:
+def _modal_response(
+    modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray, loss: float
+) -> ComplexArray:
     s = 2j * np.pi * freq[:, None]
     if np.iscomplexobj(modes.phi):
         r = modes.n_rigid
@@ -109,8 +157,7 @@ def _modal_response(modes: Modes, freq: FloatArray, B: FloatArray, C: FloatArray
         total = np.einsum("pk,fk,kq->fpq", C @ phi, one, phi.T @ B)
         total = total + np.einsum("pk,fk,kq->fpq", C @ phi.conj(), two, phi.conj().T @ B)
         return np.asarray(total, dtype=np.complex128)
-    omega, zeta = modes.basis_omega, modes.basis_zeta
-    gain = 1.0 / (omega**2 + 2 * zeta * omega * s + s**2)
+    gain = 1.0 / (modes.basis_squares * (1 + 1j * loss) + modes.basis_rates * s + s**2)
     basis = np.real(modes.basis)
     return np.asarray(np.einsum("pk,fk,kq->fpq", C @ basis, gain, basis.T @ B))
 
@@ -129,28 +176,10 @@ def reduced_response(
     return np.asarray((C * size) @ np.linalg.solve(matrix, (B * size[:, None])[None]))
 
 
-def static_error(
-    full: FEModel | Modes,
-    modes: Modes,
-    reduced: Reduced,
-    B: FloatArray,
-    C: FloatArray,
-    Br: FloatArray,
-    Cr: FloatArray,
-) -> FloatArray:
-    """Return errors (p, q) of the elastic compliance, of the size of its channels."""
-    p, q = C.shape[0], B.shape[1]
-    if not q:
-        return np.zeros((p, q))
-    loads, watched = np.hstack([B, C.T]), np.hstack([Br, Cr.T])
-    if isinstance(full, FEModel):
-        whole_set = loads.T @ static_response(full.M, full.K, full.rigid_body, loads)
-    else:
-        if np.iscomplexobj(full.phi):
-            return np.full((p, q), np.nan)
-        r = modes.n_rigid
-        motion = (loads.T @ np.real(full.basis))[:, r:] / full.basis_omega[r:]
-        whole_set = motion @ motion.T
+def static_error(whole: FloatArray, reduced: Reduced, Br: FloatArray, Cr: FloatArray) -> FloatArray:
+    """Return errors (p, q) of the elastic compliance `whole`, of the size of its channels."""
+    q = Br.shape[1]
+    watched = np.hstack([Br, Cr.T])
     found = watched.T @ static_response(reduced.M, reduced.K, reduced.rigid_body, watched)
-    size = np.sqrt(np.abs(np.diag(whole_set)))
-    return np.asarray(np.abs(found - whole_set)[q:, :q] / np.outer(size[q:], size[:q]))
+    size = np.sqrt(np.abs(np.diag(whole)))
+    return np.asarray(np.abs(found - whole)[q:, :q] / np.outer(size[q:], size[:q]))

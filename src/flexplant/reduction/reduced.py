@@ -27,7 +27,8 @@ from ..values import (
     real_array,
 )
 from .bounds import ErrorBound
-from .quality import ReductionQuality, quality_of
+from .judging import quality_of
+from .quality import ReductionQuality
 
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
 _DEFINITE = 1e-14
@@ -385,8 +386,8 @@ class ReducedModel(Value):
         Parameters
         ----------
         full : FEModel or Modes
-            The full structure. Responses of an FEModel come from its matrices, frequency by
-            frequency, not from modes.
+            The full structure. Responses of an FEModel come from its modes (solved ones in use are
+            taken) and static shapes, which direct solutions with its matrices check.
         band : (float, float) [Hz]
             Where modes and responses are compared.
         inputs, outputs : places
@@ -395,7 +396,8 @@ class ReducedModel(Value):
         count : int, optional
             How many modes are compared; None: those up to the end of the band.
         freq : (m,) array [Hz], optional
-            Check frequencies; None: the resonances in the band, and a grid over it.
+            Check frequencies; None: the resonances and antiresonances of both models in the band,
+            and a grid over it.
         loss : float, optional
             Loss factor of both when the FEModel has no D: ``K (1 + i loss)``. None: twice the mean
             damping ratio of the reduced model, 0.01 when it has none.
