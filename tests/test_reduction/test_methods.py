@@ -30,7 +30,7 @@ from flexplant.reduction import (
     reduce,
     select_dofs,
 )
-from flexplant.structure import FEModel, ModalDamping, Rayleigh
+from flexplant.structure import Damper, FEModel, ModalDamping, Rayleigh
 from flexplant.updating import AddedMass, Eigenvalues, identifiability, update
 from plates import make_plate
 from stages import ports
@@ -361,3 +361,36 @@ def test_the_degrees_of_freedom_to_add_are_named(plate, kept, method):
     assert more
     assert all(label.endswith(":z") for label in more)
     assert reduce(plate, method([*kept, *more])).rigid_body.shape[1] == 3
+
+
+GRID = ["1:z", "5:z", "21:z", "25:z", "13:z", "3:z"]
+EVERY = {
+    "DesiredDofs": DesiredDofs(GRID[:5], static_at="1:z", damping=ModalDamping(0.01)),
+    "ModalTruncation": ModalTruncation(6),
+    "ModalBalanced": ModalBalanced(6, "1:z", damping=ModalDamping(0.01)),
+    "Guyan": Guyan(GRID),
+    "Irs": Irs(GRID),
+    "Serep": Serep([*GRID[:4], "3:z"]),
+    "CraigBampton": CraigBampton(GRID[:4], 6),
+    "Rubin": Rubin(GRID[:4], 6),
+    "MacNeal": MacNeal(GRID[:4], 6),
+    "Krylov": Krylov(GRID[:4], 100.0),
+}
+
+
+@pytest.mark.parametrize("method", EVERY.values(), ids=EVERY)
+def test_every_method_is_called_alike_and_judged(plate, method):
+    """A model with a damper to ground, from the matrices; from Modes where these are enough."""
+    damped = plate.with_damping(Rayleigh(0.0, 2e-6)).with_parts([Damper("1:z", 20.0)])
+    model = reduce(damped, method)
+    assert np.any(model.D)
+    assert np.abs(model.K @ model.rigid_body).max() < 1e-9 * np.abs(model.K).max()
+    found = model.quality(damped, band=(100.0, 400.0), inputs="1:z")
+    assert np.all(np.isfinite(found.frf_error))
+    assert found.full_error < 1e-4
+    assert found.static_error.max() < 0.5
+    if isinstance(method, DesiredDofs):
+        modes = solve_modes(plate, count=4, damping=ModalDamping(0.01), compliance_at="1:z")
+        same = reduce(modes, DesiredDofs(GRID[:5]))
+        np.testing.assert_allclose(same.K, model.K, rtol=0, atol=1e-9 * np.abs(model.K).max())
+        np.testing.assert_allclose(same.D, model.D, rtol=0, atol=1e-9 * np.abs(model.D).max())

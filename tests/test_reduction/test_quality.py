@@ -221,6 +221,7 @@ def test_the_worst_error_is_found_at_light_damping(plate):
     assert "at antiresonance" in repr(found)
 
 
+@pytest.mark.slow
 def test_a_damper_to_ground_is_judged(plate):
     damped = plate.with_damping(Rayleigh(0.0, 4e-6)).with_parts([Damper("1:z", 20.0)])
     model = reduce(damped, CraigBampton(KEPT, 30))

@@ -187,8 +187,10 @@ def test_refusals(plate):
         DesiredDofs(["1:z", "1:z"])
     with pytest.raises(LabelError, match="no DOF '1:q'"):
         reduce(modes, DesiredDofs(["1:q"]))
-    with pytest.raises(ModelError, match="needs Modes"):
+    with pytest.raises(ModelError, match="count must be a whole number from 3"):
         reduce(plate, DesiredDofs(["1:z"]))
+    with pytest.raises(ModelError, match="go with an FEModel"):
+        reduce(modes, DesiredDofs(["1:z"], damping=ModalDamping(0.01)))
     with pytest.raises(ModelError, match="Modes and a method"):
         reduce(modes, ["1:z"])
     e = plate.dofs.row(Z8)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import FlexplantError, ModelError, ShapeError
-from ..labels import DofSet
+from ..labels import DofSet, Place
+from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
-from ..structure import FEModel
+from ..modes.solve import solve_modes
+from ..structure import Damping, FEModel
 from ..structure.negative_stiffness import refuse_unstable
 from ..values import FloatArray, Value
 from .criteria import PivotedQr
-from .projection import labels_given, shown
+from .projection import checked_damping, labels_given, shown
 from .reduced import ReducedModel
 
 #: beyond this, rounding in K* (eps cond^2) spoils the low modes
@@ -34,19 +37,24 @@ class ReductionMethod(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DesiredDofs(ReductionMethod):
-    """Modal reduction in desired physical DOFs (paper, eq. (6) to (8)); takes `Modes`.
+    """Modal reduction in desired physical DOFs (paper, eq. (6) to (8)).
 
     Parameters
     ----------
     dofs : sequence of str, DofSet or DofSelection
         As many labels as there are modes plus attachment vectors. With fewer labels than modes
         and no attachment vectors, the lowest modes are kept, as many as there are labels; the
-        model keeps the others as `truncated`.
+        model keeps the others as `truncated`. Of an FEModel as many modes are solved as there are
+        labels, less the places of `static_at`.
+    static_at : place or sequence of places
+        With an FEModel: where attachment vectors keep the static compliance of what is truncated.
+    damping : ModalDamping or Rayleigh, optional
+        With an FEModel: of modes and vectors, in place of its D.
 
     Raises
     ------
-    LabelError
-        When a label appears twice, or none is given.
+    LabelError, ModelError
+        When a label appears twice, or none is given; when `damping` is no law.
 
     Examples
     --------
@@ -57,9 +65,15 @@ class DesiredDofs(ReductionMethod):
     """
 
     dofs: Iterable[str]
+    static_at: Place | Iterable[Place] = field(default=(), kw_only=True)
+    damping: Damping | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
-        self._set(dofs=labels_given(self.dofs, "desired DOFs"))
+        self._set(
+            dofs=labels_given(self.dofs, "desired DOFs"),
+            static_at=tuple(places(self.static_at)),
+            damping=checked_damping(self.damping),
+        )
 
     def __repr__(self) -> str:
         labels = tuple(self.dofs)
@@ -67,13 +81,7 @@ class DesiredDofs(ReductionMethod):
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""
-        modes = structure
-        if not isinstance(modes, Modes):
-            raise ModelError(
-                "DesiredDofs needs Modes and how many of them are kept, got "
-                f"{type(modes).__name__}: reduce(solve_modes(model, count={len(tuple(self.dofs))}),"
-                " DesiredDofs([...])). Serep(dofs) solves them itself."
-            )
+        modes = self._modes(structure)
         labels = tuple(self.dofs)
         modes.dofs.indices(labels)
         truncated = None
@@ -117,6 +125,18 @@ class DesiredDofs(ReductionMethod):
             n_vectors=modes.n_vectors,
             static_at=modes.vector_dofs,
         )
+
+    def _modes(self, structure: FEModel | Modes) -> Modes:
+        static: Any = self.static_at
+        if isinstance(structure, Modes):
+            if self.damping is not None or static:
+                raise ModelError(
+                    "damping= and static_at= of DesiredDofs go with an FEModel, these Modes have "
+                    "theirs: give solve_modes damping= and compliance_at=."
+                )
+            return structure
+        count = len(tuple(self.dofs)) - len(static)
+        return solve_modes(structure, count=count, damping=self.damping, compliance_at=static)
 
 
 def refused_partition(
@@ -176,8 +196,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     Parameters
     ----------
     model : FEModel or Modes
-        The structure: `DesiredDofs` takes the `Modes` of `solve_modes`, `ModalTruncation` and
-        `ModalBalanced` take either, all others work on the matrices of an `FEModel`.
+        The structure. An `FEModel` goes with every method; the `Modes` of `solve_modes` go with
+        those that need no matrices: `DesiredDofs`, `ModalTruncation` and `ModalBalanced`.
     method : ReductionMethod
         How to reduce: `DesiredDofs` (the paper), `ModalTruncation`, `ModalBalanced`, `Guyan`,
         `Irs`, `Serep`, `CraigBampton`, `Rubin`, `MacNeal` or `Krylov`.
@@ -209,8 +229,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     if not isinstance(model, FEModel | Modes) or not isinstance(method, ReductionMethod):
         raise ModelError(
             f"reduce needs an FEModel or Modes and a method, got {type(model).__name__} and "
-            f"{type(method).__name__}: call reduce(solve_modes(model, count=24), "
-            "DesiredDofs([...])) or reduce(model, Guyan([...]))."
+            f"{type(method).__name__}: call reduce(model, DesiredDofs([...])) or "
+            "reduce(model, Guyan([...]))."
         )
     if not isinstance(method, DesiredDofs):
         refuse_unstable(model, f"reduction by {type(method).__name__}")
