@@ -46,6 +46,14 @@ class NormalForm(Value):
         How many rigid-body modes there are.
     decaying : (u,) array [1/s]
         The decaying poles s2 < 0 of the unstable pairs.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], dampings=[8.0])
+    >>> M, D, K = (part.toarray() for part in (model.M, model.D, model.K))
+    >>> fx.modes.normal_form(M, D, K, model.rigid_body).is_real
+    True
     """
 
     poles: ComplexArray
@@ -120,6 +128,15 @@ def normal_form(
     -----
     Eigenvalues of (K, M) alone give rigid-body modes at rounding, some of them imaginary; here
     they are taken out of the problem first. Rigid-body modes are undamped by convention.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5], dampings=[8.0])
+    >>> M, D, K = (part.toarray() for part in (model.M, model.D, model.K))
+    >>> found = fx.modes.normal_form(M, D, K, model.rigid_body)
+    >>> found.n_rigid, found.zeta.round(5)
+    (1, array([0.     , 0.00894]))
     """
     real = real_form(M, D, K, rigid, motions)
     if D is not None:

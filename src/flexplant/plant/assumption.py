@@ -23,6 +23,13 @@ class Assumption(Value):
         In physical words.
     remedy : str
         What to change; empty when it holds.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> first = fx.testbeds.three_masses().check().assumptions[0]
+    >>> first.holds
+    True
     """
 
     key: str

@@ -23,6 +23,12 @@ class AssumptionReport(Value):
     ----------
     plant : StandardPlant
         The plant, weighted or not.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.testbeds.three_masses().check().ok
+    True
     """
 
     plant: Partition

@@ -99,6 +99,13 @@ class FirstOrder(_Spectrum):
     ------
     ModelError
         When one is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> hum = fx.plant.FirstOrder(rms=0.01, corner=20.0)
+    >>> hum.asd, hum.shape
+    (0.001784124116152771, <StateSpace: 1 states, continuous, u1 -> y1>)
     """
 
     rms: float
@@ -140,6 +147,13 @@ class NarrowBand(_Spectrum):
     ------
     ModelError
         When one is not positive, or zeta not below 1.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> pump = fx.plant.NarrowBand(rms=0.01, freq=48.0)
+    >>> round(fx.h2_norm(pump.shape) * pump.asd / 2**0.5, 6)  # the rms again
+    0.01
     """
 
     rms: float
@@ -188,6 +202,13 @@ class RandomWalk(_Spectrum):
     ------
     ModelError
         When one is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> drift = fx.plant.RandomWalk(drift=1e-3)
+    >>> drift.shape
+    <StateSpace: 1 states, continuous, u1 -> y1>
     """
 
     drift: float

@@ -35,6 +35,14 @@ class Along(Value):
         Rows of a POI, or columns of a force.
     B : (p, n, 1) array
         Columns of a force; without any for a POI.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> along = plant.along("die", [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
+    >>> along.C.shape  # points, channels, states
+    (2, 2, 7)
     """
 
     name: str

@@ -43,6 +43,13 @@ class Assembled(_Unknown, Value):
         Of the inputs u.
     continuous : StandardPlant, optional
         The plant before sampling.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> made = fx.testbeds.three_masses().assembled
+    >>> made.ports, made.delay
+    (<Ports w: amp, u: u1, z: die, y: y1 y2, references: die>, 1.0)
     """
 
     ports: Ports
@@ -76,6 +83,15 @@ class Foreign(_Unknown, Value):
         Of the inputs u.
     continuous : StandardPlant, optional
         The plant before sampling.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> A, B, C = [[-1.0]], [[1.0, 1.0]], [[1.0], [1.0]]
+    >>> sys = fx.StateSpace(A, B, C, [[0, 0], [0, 0]], inputs=["w", "u"], outputs=["z", "y"])
+    >>> plant = fx.StandardPlant.from_statespace(sys, w=["w"], u=["u"], z=["z"], y=["y"])
+    >>> type(plant.origin).__name__
+    'Foreign'
     """
 
     noise_factor: FloatArray | None = None
@@ -98,6 +114,14 @@ class Weighted(_Unknown, Value):
         The block of `through`: from `plain.y` to y.
     scaled : bool
         Whether weights were applied: w and z are then no physical channels.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> weights = fx.stage_weights(plant, 20.0)
+    >>> type(plant.weighted(z=weights.z, w=weights.w).origin).__name__
+    'Weighted'
     """
 
     plain: Any

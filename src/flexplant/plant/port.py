@@ -31,6 +31,12 @@ class Seen(NamedTuple):
     carried : (6,) array
         Over the rigid-body motions of the ground about the origin (x, y, z, rx, ry, rz), in the
         derivative that is measured: 0 of what is measured against the ground.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.Seen(row=np.ones((1, 3)), direct=np.zeros((1, 2))).row.shape
+    (1, 3)
     """
 
     row: FloatArray

@@ -26,6 +26,12 @@ class FastStates(ResidualForm):
 
     The plant stays strictly proper between forces and displacements, so that it can be sampled
     without delay, filtered for white forces and simulated; it costs two states a vector.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.FastStates()
+    FastStates()
     """
 
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
@@ -52,6 +58,13 @@ class Feedthrough(ResidualForm):
     ------
     ModelError
         When above is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses(rate=None).assembled
+    >>> fx.plant.Feedthrough(above=1e3)
+    Feedthrough(above=1000.0)
     """
 
     above: float | None = None

@@ -36,6 +36,12 @@ class RigidForce(ForcePort):
     ------
     LabelError, ModelError
         For a bad name, direction, shape or a negative asd.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.RigidForce("cable", "x", asd=1e-3).unit
+    'N'
     """
 
     name: str

@@ -291,5 +291,12 @@ def standard_plant(given: StandardPlant | System) -> StandardPlant:
         When the labels do not distinguish them.
     ModelError
         When it is neither.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> fx.plant.standard_plant(plant) is plant
+    True
     """
     return StandardPlant.of(given)

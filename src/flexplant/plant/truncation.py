@@ -42,6 +42,16 @@ def larger_plant(
         sampling time or delay.
     LabelError
         When the larger plant has other channels.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0] * 4, stiffnesses=[4e5] * 3)
+    >>> modes = fx.solve_modes(model, count=4, damping=fx.ModalDamping(0.01))
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> plant = fx.assemble_plant(modes.select([0, 1]), ports).discretized(2e3, delay=1)
+    >>> fx.plant.larger_plant(plant, modes).system.n_states - plant.system.n_states
+    4
     """
     plain = standard_plant(plant).unweighted
     if larger is None:

@@ -38,6 +38,13 @@ class ModeVisibility(Value):
         beside that of the elastic mode where this channel is strongest: 1 at best, 0 at a node.
     channels : mapping {"w", "u", "y", "z": str}
         That channel.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.testbeds.three_masses().check().modes
+    >>> [round(mode.freq, 1) for mode in modes]
+    [100.7, 174.3]
     """
 
     mode: int

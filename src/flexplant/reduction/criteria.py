@@ -20,7 +20,14 @@ _UNSEEN = 1e-12
 
 
 class SelectionCriterion(Value):
-    """A way to choose rows of a basis."""
+    """A way to choose rows of a basis.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.reduction.Greedy(), fx.reduction.SelectionCriterion)
+    True
+    """
 
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
@@ -39,6 +46,13 @@ class PivotedQr(SelectionCriterion):
     """QR with column pivoting: each next DOF is the one least explained by those before.
 
     Its value for a DOF is the length of what those before it do not explain.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.select_dofs(modes, 2, criterion=fx.reduction.PivotedQr()).labels
+    ('1:x', '3:x')
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
@@ -70,6 +84,13 @@ class EffectiveIndependence(SelectionCriterion):
     -----
     D. C. Kammer, Sensor placement for on-orbit modal identification and correlation of large space
     structures, J. Guidance, Control and Dynamics 14(2), 1991.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.select_dofs(modes, 2, criterion=fx.reduction.EffectiveIndependence()).labels
+    ('1:x', '3:x')
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
@@ -122,6 +143,13 @@ class Greedy(SelectionCriterion):
     """Each next DOF is the one that leaves the largest smallest singular value of phi_kk.
 
     Its value for a DOF is that singular value when it was taken.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.select_dofs(modes, 2, criterion=fx.reduction.Greedy()).labels
+    ('1:x', '3:x')
     """
 
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:

@@ -28,7 +28,14 @@ _TELLS = 1e-3
 
 
 class ReductionMethod(Value):
-    """A way to go from a structure to a reduced model."""
+    """A way to go from a structure to a reduced model.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.Guyan(["1:x"]), fx.reduction.ReductionMethod)
+    True
+    """
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model."""

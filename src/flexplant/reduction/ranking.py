@@ -48,6 +48,14 @@ class ModeRanking(Value):
         first; two for each mode, close to its `total` when damping is low and modes are apart.
     inputs, outputs : sequence of str
         The channels.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    >>> modes = fx.solve_modes(model, count=3, damping=fx.ModalDamping(0.01))
+    >>> fx.rank_modes(modes, inputs=["1:x"], outputs=["2:x"]).order  # mode 2 is still at "2:x"
+    array([3, 2])
     """
 
     modes: IntArray

@@ -28,6 +28,13 @@ class DofSelection(Value):
         What the criterion says of each DOF, in the order of the labels.
     criterion : SelectionCriterion
         How they were chosen.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=2)
+    >>> fx.select_dofs(modes, 2).labels
+    ('1:x', '3:x')
     """
 
     labels: tuple[str, ...]

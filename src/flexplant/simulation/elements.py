@@ -27,6 +27,17 @@ class Saturation(Value):
     ------
     ModelError
         When a limit is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop, weak = fx.close_loop(plant, observer, servo), {"u1": fx.simulation.Saturation(1e-3)}
+    >>> run = fx.simulate(loop, reference=1e-6, duration=0.1, elements=weak, rng=1)
+    >>> round(float(abs(run["u1:effort"]).max()), 6)
+    0.001
     """
 
     limit: float = np.inf
@@ -57,6 +68,17 @@ class Quantiser(Value):
     ------
     ModelError
         When it is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop, steps = fx.close_loop(plant, observer, servo), {"y1": fx.simulation.Quantiser(1e-9)}
+    >>> counts = fx.simulate(loop, duration=0.1, elements=steps, rng=1)["y1"] / 1e-9
+    >>> bool(abs(counts - counts.round()).max() < 1e-6)
+    True
     """
 
     step: float

@@ -30,6 +30,17 @@ class ErrorMap(Value):
         Largest |MA| and MSD at each point.
     window : float [s]
         Of both.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> found = fx.simulation.error_map(loop, [[1.0, 0.0, 0.0]], duration=0.1, axis="x", rng=1)
+    >>> found.axis, found.unit
+    ('x', 'm')
     """
 
     axis: str
@@ -103,6 +114,17 @@ def error_map(
     ModelError
         When the plant was not assembled from a structure, or as for `simulate` and
         `exposure_errors`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> points = [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]
+    >>> fx.simulation.error_map(loop, points, duration=0.1, axis="x", rng=1).ma.shape
+    (2,)
     """
     given: object = loop
     instance(given, ClosedLoop, "loop", "Use close_loop(plant, ...).")

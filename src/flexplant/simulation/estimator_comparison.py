@@ -31,6 +31,17 @@ class EstimatorComparison(Value):
         Predicted, measured, and the ends of the confidence interval of what was measured.
     level : float
         Of the interval.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> designs = {"static": fx.design_static(plant)}
+    >>> servo = fx.design_servo(plant, bandwidth=10.0, observer=designs["static"])
+    >>> loop = fx.close_loop(plant, designs["static"], servo, *fx.reading_along(designs))
+    >>> run = fx.simulate(loop, duration=0.5, rng=1, runs=5)
+    >>> fx.compare_estimators(designs, run, "die:x", start=0.2).names
+    ('static',)
     """
 
     channel: str

@@ -42,6 +42,14 @@ class ExposureErrors(Value):
         Largest |MA|, the |MA| that 99.7 % of the windows do not exceed; the same of the MSD.
     window : float [s]
         Length of the moving window.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> run = fx.Response(np.arange(100) * 1e-3, np.zeros((1, 100)), ["die:error"])
+    >>> fx.simulation.exposure_errors(run, "die:error", window=0.01).window
+    0.01
     """
 
     channels: tuple[str, ...]
@@ -109,6 +117,15 @@ def exposure_errors(
         When a channel is unknown.
     ShapeError
         When `exposures` are no pairs.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> run = fx.Response(np.arange(1000) * 1e-3, np.full((1, 1000), 2e-9), ["die:error"])
+    >>> found = fx.simulation.exposure_errors(run, "die:error", window=0.01)
+    >>> round(float(found["die:error"].ma) * 1e9, 6)
+    2.0
     """
     _check_run(run)
     names = error_channels(run) if channels is None else name_list(channels, "channels")
@@ -168,6 +185,15 @@ def settling_time(
         When there is no such channel.
     ModelError
         When a limit is not positive, nothing is left after `after`, or the window does not fit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> time = np.arange(1000) * 1e-3
+    >>> run = fx.Response(time, 1e-6 * np.exp(-time / 0.05)[None], ["die:error"])
+    >>> round(float(fx.simulation.settling_time(run, "die:error", ma=1e-8, window=0.01)), 2)
+    0.23
     """
     _check_run(run)
     limit = positive(ma, "ma"), np.inf if msd is None else positive(msd, "msd")

@@ -50,6 +50,14 @@ class Feedforward(Value):
         On position, velocity, acceleration, jerk and snap; one row, or one for each of p places.
     dt : float [s]
         Sampling time of the plant.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> forward = fx.design_feedforward(fx.testbeds.three_masses())
+    >>> forward.up_to("acceleration")  # the mass alone
+    <Feedforward die:ref to 1 actuators>
+      x: acceleration 3
     """
 
     reference: str
@@ -221,6 +229,12 @@ def known_forces(plant: StandardPlant) -> StateSpace:
     ------
     ModelError
         When it is no plant.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.simulation.known_forces(fx.testbeds.three_masses()).outputs
+    ('u1',)
     """
     plant = standard_plant(plant)
     names = [force_name(name) for name in plant.u]

@@ -72,6 +72,17 @@ def inverse_forces(
     ----------
     Van Zundert, Oomen, On inversion-based approaches for feedforward and ILC, Mechatronics 50,
     2018.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo, fx.simulation.known_forces(plant))
+    >>> move = fx.setpoint(1e-4, velocity=5e-3, acceleration=0.5, jerk=100.0, rest=0.05)
+    >>> sorted(fx.simulation.inverse_forces(loop, move, duration=0.2, bandwidth=60.0))
+    ['u1:feedforward']
     """
     instance(loop, ClosedLoop, "loop", "Use close_loop(plant, ...).")
     plant, poi, name = tracked(loop.plant, reference)

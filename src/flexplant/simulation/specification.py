@@ -33,6 +33,16 @@ class Verdict(Value):
         What is reached, and what is allowed; NaN where there is nothing to measure.
     at_least : (n,) bool array
         Whether the limit is a lower one.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> fx.Specification(modulus_margin=0.9).check(loop).failed
+    ('modulus margin',)
     """
 
     names: tuple[str, ...]

@@ -29,6 +29,15 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
         Of numbers, truths or texts.
     failed : sequence of str
         Why each machine has no results; "" where it has.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> def pipeline(machine):
+    ...     return {"root": machine**0.5}
+    >>> table = fx.study([4.0, 9.0], pipeline)
+    >>> sorted(table)
+    ['failed', 'root']
     """
 
     columns: Mapping[str, npt.NDArray[Any]]

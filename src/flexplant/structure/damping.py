@@ -13,7 +13,14 @@ from ..values import FloatArray, Value, flag, positive, real_array, short, whole
 
 
 class Damping(Value):
-    """How a structure is damped, as a damping ratio for any frequency."""
+    """How a structure is damped, as a damping ratio for any frequency.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.ModalDamping(0.01), fx.structure.Damping)
+    True
+    """
 
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios of modes; rigid-body modes (omega = 0) are undamped.

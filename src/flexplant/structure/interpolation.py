@@ -89,6 +89,15 @@ class ScatteredShape(Interpolation):
         Of each DOF.
     margin : float [m]
         How far outside their hull points are still taken.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> xyz = np.array([[0.0, 0, 0], [1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [1.0, 1.0, 1.0]])
+    >>> shape = fx.structure.ScatteredShape(xyz, ["x"] * 5)
+    >>> round(float(shape.row((0.2, 0.2, 0.2), "x").sum()), 9)
+    1.0
     """
 
     xyz: FloatArray

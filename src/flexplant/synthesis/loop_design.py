@@ -39,6 +39,13 @@ class LoopDesign(Value):
         How the loop stands on a model with the modes left out, where these are known.
     notes : sequence of str
         What is worth knowing.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.lti.tf([1.0], [1.0, 0.0, 0.0])
+    >>> fx.design_loops(plant, fx.Pid(9e4) * fx.Lead(50.0)).report.modulus_margin > 0.3
+    True
     """
 
     system: StateSpace

@@ -42,6 +42,13 @@ class ShapedLoop(Value):
         From y (and references) to u; what was verified is in it.
     report : LoopReport
         Crossovers and margins of each axis, the others closed.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> shaped = fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0)
+    >>> shaped.report.is_stable
+    True
     """
 
     shaped: StateSpace
@@ -131,6 +138,13 @@ def shape_loop(
     References
     ----------
     McFarlane, Glover, IEEE Trans. Automatic Control 37, 1992; Hoyle, Hyde, Limebeer, IEEE CDC 1991.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> shaped = fx.synthesis.shape_loop(fx.lti.tf([1.0], [1.0, 1.0, 0.0]), bandwidth=10.0)
+    >>> shaped.controller.system.n_states
+    4
     """
     target, back_off = positive(bandwidth, "bandwidth"), positive(back_off, "back_off")
     rho = positive(weight, "weight")

@@ -107,6 +107,14 @@ def design_structured(
     ----------
     Apkarian, Noll, Nonsmooth H-infinity synthesis, IEEE Trans. Automatic Control 51, 2006. Burke,
     Henrion, Lewis, Overton, HIFOO, IFAC Symposium on Robust Control Design, 2006.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> found = fx.synthesis.design_structured(sys, fx.synthesis.FixedOrder(0), starts=1)
+    >>> found.system.n_states, found.gamma < 1
+    (0, True)
     """
     plants = _plants(plant, u, y)
     if isinstance(structure, type) or not hasattr(structure, "family"):

@@ -86,6 +86,12 @@ class FixedOrder(Value):
         Of a static gain: which entries are free, the others are zero (decentralised feedback).
     start : StateSpace, optional
         A controller y -> u to begin with, of this order; of an earlier design.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.FixedOrder(2)
+    FixedOrder(2)
     """
 
     order: int = 0
@@ -228,6 +234,12 @@ class ObserverGains(Value):
     ``dx/dt = A x + B2 u - L (y - C2 x - D22 u), u = F x``, with the A, B2, C2 of the (weighted)
     plant; the first gains are those of LQG. A sampled plant's observer is that of its bilinear
     equivalent.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.ObserverGains()
+    ObserverGains()
     """
 
     def __repr__(self) -> str:
@@ -297,6 +309,16 @@ class Parametrised:
     ------
     ModelError, ShapeError
         When make is no function, or start no array.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> def gain(p):
+    ...     return fx.StateSpace([], [], [], [[p[0]]], inputs=["out:error"], outputs=["in"])
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> structure = fx.synthesis.Parametrised(gain, start=[1.0])
+    >>> fx.synthesis.design_structured(sys, structure, starts=1).gamma < 1
+    True
     """
 
     def __init__(

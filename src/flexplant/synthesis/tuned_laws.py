@@ -47,6 +47,12 @@ class TunedLaws(Value):
     ------
     LabelError
         When one of these names is unknown.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.TunedLaws(fx.Pid(1.0) * fx.Lead(50.0), free=("p",)).free
+    ('p',)
     """
 
     laws: Element | Mapping[str, Element]

@@ -64,6 +64,14 @@ class Sensitivities(Value):
         ``S_ab = d lambda_a / d p_b``.
     parameters : sequence of q str
         Names.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> fx.updating.eigenvalue_sensitivities(drawing, [fx.AddedMass("3:x")], modes=[2]).parameters
+    ('mass at 3:x',)
     """
 
     modes: tuple[int, ...]
@@ -114,6 +122,15 @@ def eigenvalue_sensitivities(
     ModelError
         When the matrices are indefinite at `values`, or several parameters split repeated modes
         along different vectors, so that no derivatives to them all exist.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> found = fx.updating.eigenvalue_sensitivities(drawing, [fx.AddedMass("3:x")], modes=[2])
+    >>> found.S.imag.round(2)  # -omega phi^2 / 2 rad/s per kg
+    array([[-158.11]])
     """
     listed = checked_parameters(parameters)
     family = Family(model, listed)

@@ -31,6 +31,16 @@ class History(Value):
     fraction : (i + 1,) array
         The part of the Gauss-Newton step that was taken; 1 but where the safeguard halved it,
         0 for the start.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
+    >>> history = fx.update(drawing, [fx.AddedMass("3:x")], [poles]).history
+    >>> bool(abs(history.error[-1]) < abs(history.error[0]))
+    True
     """
 
     parameters: FloatArray
@@ -67,6 +77,17 @@ class Starts(Value):
         Parameters at the start and at the end, NaN where a search failed.
     cost : (s,) array
         Half the sum of squares at the end, infinite where a search failed.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
+    >>> mass = [fx.AddedMass("3:x", bounds=(0.0, 1.0))]
+    >>> fit = fx.update(drawing, mass, [poles], starts=3)
+    >>> fit.starts.end.round(4).ravel()
+    array([0.1186, 0.1186, 0.1186])
     """
 
     begin: FloatArray

@@ -117,6 +117,13 @@ class StageWeights(Value):
         None leaves the channel out.
     text : str
         What they mean.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> weights = fx.stage_weights(fx.testbeds.three_masses(), 20.0)
+    >>> sorted(weights.z)
+    ['die:error', 'die:x', 'u1:effort']
     """
 
     z: Mapping[str, Any]

@@ -43,6 +43,12 @@ class GroundSpring(Value):
     ------
     LabelError, ModelError
         For a bad place or direction, a stiffness of 0 or a negative damping.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.plant.GroundSpring("1:x", -2e3, direction="x").stiffness  # a magnet that attracts
+    -2000.0
     """
 
     at: Place
@@ -99,6 +105,14 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
         would be overdamped; of complex ones also when one would be unstable.
     LabelError
         When a place is not on the structure.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5]), count=2)
+    >>> held = fx.plant.suspend(modes, [fx.plant.GroundSpring("1:x", 1e3, direction="x")])
+    >>> held.n_rigid, held.freq[:1].round(2)
+    (0, array([3.56]))
     """
     listed = [springs] if isinstance(springs, GroundSpring) else list(springs)
     if not listed or not all(isinstance(spring, GroundSpring) for spring in listed):

@@ -39,6 +39,18 @@ class Delta(Value):
         mode; or a parameter of the fit, its value plus scale delta.
     scale : float
         Change at delta = 1: relative, of a parameter in its own unit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615j], modes=[2], covariance=[[1.0, 0.0], [0.0, 4.0]])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> plant = fx.assemble_plant(fit.model, ports).discretized(2e3, delay=1)
+    >>> sorted({delta.kind for delta in plant.uncertain(fit).deltas})
+    ['freq']
     """
 
     name: str
@@ -129,6 +141,18 @@ class UncertainPlant(Value, Generic[P]):
         Where the uncertainty comes from; `sample` draws its parameters.
     parameters : sequence of Parameter
         Those of the fit.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615j], modes=[2], covariance=[[1.0, 0.0], [0.0, 4.0]])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> plant = fx.assemble_plant(fit.model, ports).discretized(2e3, delay=1)
+    >>> len(plant.uncertain(fit).sample(1, 5))  # machines that it may be
+    5
     """
 
     plant: P

@@ -48,6 +48,13 @@ class ModelCheck(Value):
         Of the first elastic mode; NaN when it is not known.
     source : str or None
         What was checked.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> report = fx.check(fx.chain(masses=[1.0, 2.0], stiffnesses=[100.0]))
+    >>> report.ok, report.n_rigid, float(report.mass[0])
+    (True, 1, 3.0)
     """
 
     lines: tuple[tuple[str, str, str, str], ...]

@@ -81,6 +81,13 @@ class PlateShape(GridShape):
         Number of elements in x and y.
     present : (ny, nx) array of bool, optional
         Which elements exist; None: all.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> shape = fx.structure.PlateShape((1.0, 1.0), 0.01, (2, 2))
+    >>> round(float(shape.row((0.3, 0.2, 0.0), "z")[::3].sum()), 9)
+    1.0
     """
 
     size: tuple[float, float]
@@ -183,6 +190,12 @@ class BeamShape(GridShape):
         Of the beam.
     elements : int
         Their number.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.structure.BeamShape(2.0, 4)
+    <BeamShape 2 m, 4 elements>
     """
 
     length: float
@@ -229,6 +242,13 @@ class BlockShape(GridShape):
         Number of elements in x, y and z.
     present : (nz, ny, nx) array of bool, optional
         Which elements exist; None: all.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> shape = fx.structure.BlockShape((1.0, 1.0, 1.0), (2, 2, 2))
+    >>> round(float(shape.row((0.3, 0.2, 0.1), "x").sum()), 9)
+    1.0
     """
 
     size: tuple[float, float, float]

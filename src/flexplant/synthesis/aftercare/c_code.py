@@ -112,6 +112,18 @@ def write_c(controller: Any, path: Any, *, name: str | None = None) -> tuple[Pat
         When the name is no C identifier.
     ModelError
         When the controller is continuous, or the path no `.c` file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, tempfile
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     _ = fx.synthesis.write_c(servo, os.path.join(folder, "servo.c"))
+    ...     sorted(os.listdir(folder))
+    ['servo.c', 'servo.h']
     """
     K = as_statespace(controller)
     if not K.dt and K.n_states:

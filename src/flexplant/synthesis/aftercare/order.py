@@ -131,6 +131,15 @@ def reduce_controller(
     ----------
     Zhou, Doyle, Glover, Robust and Optimal Control, 1996, section 19.2. Anderson, Liu, Controller
     reduction: concepts and approaches, IEEE Trans. Autom. Control 34, 1989.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> controller = fx.design_h2(plant)
+    >>> smaller = fx.synthesis.reduce_controller(plant, controller, order=6)
+    >>> smaller.system.n_states, fx.close_loop(plant, smaller).is_stable
+    (4, True)
     """
     given = standard_plant(plant)
     K = as_statespace(controller)

@@ -57,6 +57,14 @@ def discretise_controller(
     -----
     FlexplantWarning
         When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> law = fx.lti.tf([-1e4, -2e6], [1.0, 1e3]).replace(inputs=["y1"], outputs=["u1"])
+    >>> fx.synthesis.discretise_controller(plant, law).system.dt
+    0.0005
     """
     given = instance(plant, StandardPlant, "plant", "Make it by assemble_plant(...).discretized().")
     K = as_statespace(controller)

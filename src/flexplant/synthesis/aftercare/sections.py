@@ -44,6 +44,15 @@ def second_order_sections(controller: Any) -> Mapping[tuple[str, str], FloatArra
         When the sections differ from the channel by more than 1e-6 of its largest gain.
     ModelError
         When the controller is continuous.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> list(fx.synthesis.second_order_sections(servo))
+    [('u1', 'die:ref'), ('u1', 'die:hat')]
     """
     K = as_statespace(controller)
     if not K.dt and K.n_states:

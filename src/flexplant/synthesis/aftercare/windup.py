@@ -53,6 +53,15 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     ----------
     Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless transfer
     method, Automatica 23, 1987. Astrom, Wittenmark, Computer-Controlled Systems, 1997, section 9.4.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> fx.synthesis.anti_windup_form(servo).inputs
+    ('die:ref', 'die:hat', 'u1')
     """
     K = as_statespace(controller)
     L = _hanus(K) if recovery is None else _observer(K, positive(recovery, "recovery"))

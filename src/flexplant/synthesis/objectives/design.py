@@ -101,6 +101,14 @@ def design_lmi(
     ----------
     Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI optimization, IEEE
     Trans. Autom. Control 42, 1997.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> found = fx.synthesis.design_lmi(sys, minimize=fx.synthesis.Hinf())
+    >>> found.gamma < 1
+    True
     """
     given = standard_plant(plant)
     _checked(given, minimize, subject_to, whole(max_states, "max_states"))

@@ -61,6 +61,13 @@ class H2(_ChannelNorm):
         Channels; all when not given.
     below : float, optional
         What it has to stay below; none for what is minimised.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> sys = fx.plant.mixed_sensitivity(fx.lti.tf([1.0], [1.0, 1.0]), S=fx.lowpass(0.1), KS=0.1)
+    >>> fx.synthesis.design_lmi(sys, minimize=fx.synthesis.H2()).gamma < 1
+    True
     """
 
     def measured(self, closed: StateSpace) -> float:
@@ -78,6 +85,12 @@ class Hinf(_ChannelNorm):
         Channels; all when not given.
     below : float, optional
         What it has to stay below; none for what is minimised.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.Hinf(w=["amp"], z=["die:x"], below=1.0)
+    Hinf(w=['amp'], z=['die:x'], below=1)
     """
 
     def measured(self, closed: StateSpace) -> float:
@@ -100,6 +113,12 @@ class PeakGain(_ChannelNorm):
         What it has to stay below; none for what is minimised.
     decay : float [rad/s], optional
         Rate at which the reachable set is taken to shrink; several are tried when not given.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.PeakGain(w=["amp"], z=["die:x"], below=1.0)
+    PeakGain(w=['amp'], z=['die:x'], below=1)
     """
 
     decay: float | None = None
@@ -126,6 +145,12 @@ class PoleRegion(Value):
         Smallest damping ratio, continuous plants.
     bandwidth : float [Hz], optional
         Largest magnitude over 2 pi, continuous plants: no faster poles than the sampling bears.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.PoleRegion(decay=10.0, damping=0.1)
+    PoleRegion(decay=10.0, damping=0.1, bandwidth=None)
     """
 
     decay: float = 0.0

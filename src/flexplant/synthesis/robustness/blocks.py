@@ -25,6 +25,12 @@ class RepeatedScalar(Value):
         Whether delta is a real number (a parameter) or a complex one.
     name : str
         For messages.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.RepeatedScalar(2).w
+    2
     """
 
     size: int = 1
@@ -55,6 +61,12 @@ class FullBlock(Value):
         Numbers of its outputs, which drive the plant, and of its inputs.
     name : str
         For messages.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> fx.synthesis.FullBlock(2, 3)
+    FullBlock(w=2, z=3, name='')
     """
 
     w: int = 1

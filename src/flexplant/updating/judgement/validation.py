@@ -46,6 +46,19 @@ class Validation(Value):
         place.
     before, after : Correlation
         Of the unused data with the model before and after.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> heavier = fx.chain(masses=[1.0, 1.0, 1.2], stiffnesses=[4e5, 4e5])
+    >>> poles = fx.solve_modes(heavier, count=3).poles
+    >>> known = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[1]], modes=[2]))
+    >>> unused = fx.Eigenvalues(fx.MeasuredModes(poles=poles[[2]], modes=[3]))
+    >>> found = fx.validate(drawing, [fx.AddedMass("3:x")], [known], [unused])
+    >>> abs(found.before.freq_error).round(3), abs(found.after.freq_error).round(6)
+    (array([0.014]), array([0.]))
     """
 
     fit: UpdateResult
@@ -172,6 +185,14 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
     ------
     ModelError
         When the residual has no parts, or one side would be empty.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[630.0j, 1095.0j], modes=[2, 3]))
+    >>> fitted, unused = fx.updating.split(poles, rng=0)
+    >>> len(fitted.measured.poles), len(unused.measured.poles)
+    (1, 1)
     """
     measured = getattr(residual, "measured", None)
     parts = getattr(residual, "lines", None)

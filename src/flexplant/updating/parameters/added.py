@@ -22,6 +22,12 @@ class Parameter(Value):
 
     A subclass has a unique `name`, a `unit` and its `matrices`; `bounds` (lowest, highest) and
     `prior` (mean, standard deviation) may say what is known of p beforehand.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.AddedMass("1:x"), fx.updating.Parameter)
+    True
     """
 
     name: str

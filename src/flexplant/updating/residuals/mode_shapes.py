@@ -159,6 +159,14 @@ class ShapeCorrelation(ModeShapes):
     ------
     ModelError, ShapeError, LabelError
         As `ModeShapes`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> shape = {"shapes": [[1.0], [0.0], [-1.0]], "dofs": ["1:x", "2:x", "3:x"]}
+    >>> measured = fx.MeasuredModes(poles=[630.0j], modes=[2], **shape)
+    >>> fx.updating.ShapeCorrelation(measured)
+    <ShapeCorrelation: modes 2 at 3 places, noise not known>
     """
 
     def bound(self, family: Family) -> Bound:

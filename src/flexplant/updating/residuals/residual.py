@@ -15,7 +15,15 @@ from ..point_model import Point
 
 
 class Residual(Value):
-    """A measurement that the model should reproduce."""
+    """A measurement that the model should reproduce.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> poles = fx.MeasuredModes(poles=[630.0j], modes=[2])
+    >>> isinstance(fx.Eigenvalues(poles), fx.updating.Residual)
+    True
+    """
 
     @property
     def loaded(self) -> tuple[tuple[Place, str], ...]:

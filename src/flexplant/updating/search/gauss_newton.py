@@ -35,6 +35,16 @@ class GaussNewton(UpdateMethod):
     truncate : float
         Singular values of the (column-scaled) sensitivities below this part of the largest are
         left out of a step: truncated SVD. Zero: all are used, and a singular S raises.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
+    >>> method = fx.updating.GaussNewton()
+    >>> fx.update(drawing, [fx.AddedMass("3:x")], [poles], method=method).converged
+    True
     """
 
     truncate: float = field(default=0.0, kw_only=True)

@@ -37,6 +37,18 @@ class Lasso(PenalisedMethod):
     References
     ----------
     Tibshirani: Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B 58, 1996.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.5], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> heavier = fx.chain(masses=[1.0, 1.0, 1.7], stiffnesses=[4e5, 4e5])
+    >>> measured = fx.MeasuredModes(poles=fx.solve_modes(heavier, count=3).poles[1:], modes=[2, 3])
+    >>> masses = [fx.AddedMass(f"{i}:x") for i in (1, 2, 3)]
+    >>> method = fx.updating.Lasso(weight=1e-4)
+    >>> fx.update(drawing, masses, [fx.Eigenvalues(measured)], method=method).values.round(2)
+    array([0. , 0. , 0.2])
     """
 
     weight: float | None = field(default=None, kw_only=True)

@@ -31,6 +31,16 @@ class Tikhonov(PenalisedMethod):
     References
     ----------
     Hansen: Analysis of discrete ill-posed problems by means of the L-curve, SIAM Review 34, 1992.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
+    >>> ends = [fx.AddedMass("1:x"), fx.AddedMass("3:x")]  # alike: the smallest change has both
+    >>> fx.update(drawing, ends, [poles], method=fx.updating.Tikhonov(weight=1e-3)).values.round(3)
+    array([0.058, 0.058])
     """
 
     weight: float | None = field(default=None, kw_only=True)

@@ -48,6 +48,16 @@ class TrustRegion(UpdateMethod):
     ----------
     Branch, Coleman, Li: A subspace, interior, and conjugate gradient method for large-scale
     bound-constrained minimization problems, SIAM J. Sci. Comput. 21, 1999.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> poles = fx.Eigenvalues(fx.MeasuredModes(poles=[615.0j], modes=[2]))
+    >>> bounded = [fx.AddedMass("3:x", bounds=(0.0, 0.1))]
+    >>> fx.update(drawing, bounded, [poles], method=fx.updating.TrustRegion()).values.round(4)
+    array([0.1])
     """
 
     loss: Loss = field(default="linear", kw_only=True)

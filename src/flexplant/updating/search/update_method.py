@@ -53,6 +53,12 @@ class UpdateMethod(Value):
     """A way to minimise the residuals.
 
     A new method is a subclass with a `search`, in a module of its own.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> isinstance(fx.updating.GaussNewton(), fx.updating.UpdateMethod)
+    True
     """
 
     #: most steps when nothing else is said
