@@ -71,10 +71,6 @@ class Component(NamedTuple):
         names = self.model.coordinates if self.is_reduced else self.model.dofs.labels
         return tuple(f"{self.name}/{name}" for name in names)
 
-    def coordinate_row(self, row: FloatArray) -> FloatArray:
-        """Return a row over all DOFs as one over the coordinates."""
-        return np.asarray(row @ self.model.T) if self.is_reduced else row
-
 
 def components_of(models: Any, placed: Any) -> list[Component]:
     """Return the components of a machine where they stand.

@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, LabelError, ModelError
 from ..labels import DIRECTIONS
-from ..values import FloatArray, instance
+from ..values import FloatArray, IntArray, instance
 from .component import Component
 from .ends import JointEnd
 from .joint import Joint
@@ -20,6 +20,14 @@ from .joint import Joint
 BALANCED = 1e-9
 #: part of a joint's row that static shapes of a reduced component may miss
 _STATIC = 1e-3
+
+
+class Felt(NamedTuple):
+    """What a joint feels of a component: ``values @ q[columns]`` of all its DOFs."""
+
+    component: int
+    columns: IntArray
+    values: FloatArray
 
 
 class Link(NamedTuple):
@@ -31,8 +39,8 @@ class Link(NamedTuple):
         Which.
     axis : str
         Of x, y, z, rx, ry, rz.
-    ends : tuple of (int, (n_full,) array)
-        Components and what is felt of all their DOFs: the stretch is the sum.
+    ends : tuple of Felt
+        What is felt of its components: the stretch is the sum.
     stiffness, rate : float
         Zero of a rigid one.
     carried : (6,) array
@@ -41,7 +49,7 @@ class Link(NamedTuple):
 
     joint: Joint
     axis: str
-    ends: tuple[tuple[int, FloatArray], ...]
+    ends: tuple[Felt, ...]
     stiffness: float
     rate: float
     carried: FloatArray
@@ -49,7 +57,7 @@ class Link(NamedTuple):
     @property
     def owners(self) -> tuple[int, ...]:
         """The components it joins."""
-        return tuple(index for index, _ in self.ends)
+        return tuple(end.component for end in self.ends)
 
 
 def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
@@ -87,18 +95,23 @@ def _links(joint: Any, parts: Sequence[Component], size: float) -> list[Link]:
     found = []
     for axis, stiffness, rate in zip(axes, *joint.values(axes), strict=True):
         row = first.row(axis, point)
-        ends, carried = [(first.index, row)], np.zeros(6)
+        ends, carried = [_felt(first.index, row)], np.zeros(6)
         if second is not None:
             other = -second.row(axis, point)
-            ends.append((second.index, other))
+            ends.append(_felt(second.index, other))
             carried = first.carried(row) + second.carried(other)
             if first.index == second.index:
-                ends = [(first.index, row + other)]
+                ends = [_felt(first.index, row + other)]
             _check_balance(joint, axis, carried, size)
-        if not any(part.any() for _, part in ends):
+        if not any(end.columns.size for end in ends):
             raise ModelError(f"both ends of {joint!r} are one place: it would do nothing.")
         found.append(Link(joint, axis, tuple(ends), float(stiffness), float(rate), carried))
     return found
+
+
+def _felt(index: int, row: FloatArray) -> Felt:
+    columns = np.flatnonzero(row)
+    return Felt(index, columns, row[columns])
 
 
 def _axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
@@ -137,12 +150,15 @@ def rows_of(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
     starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
     data, rows, columns = [np.zeros(0)], [np.zeros(0, np.int64)], [np.zeros(0, np.int64)]
     for i, link in enumerate(links):
-        for index, full in link.ends:
-            row = parts[index].coordinate_row(full)
-            some = np.flatnonzero(row)
-            data.append(row[some])
+        for end in link.ends:
+            part, some, values = parts[end.component], end.columns, end.values
+            if part.is_reduced:
+                felt = values @ part.T[some]
+                some = np.flatnonzero(felt)
+                values = felt[some]
+            data.append(values)
             rows.append(np.full(some.size, i))
-            columns.append(starts[index] + some)
+            columns.append(starts[end.component] + some)
     entries = (np.concatenate(data), (np.concatenate(rows), np.concatenate(columns)))
     return sp.csr_array(entries, shape=(len(links), int(starts[-1])))
 
@@ -152,12 +168,14 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
     for index, part in enumerate(parts):
         if not part.is_reduced or part.n == len(part.dofs):
             continue
-        loads = [row for link in links for owner, row in link.ends if owner == index]
-        names = [f"{link.joint!r} ({link.axis})" for link in links if index in link.owners]
-        if not loads:
+        felt = [(link, end) for link in links for end in link.ends if end.component == index]
+        if not felt:
             continue
+        names = [f"{link.joint!r} ({link.axis})" for link, _ in felt]
+        wanted = np.zeros((len(felt), len(part.dofs)))
+        for row, (_, end) in zip(wanted, felt, strict=True):
+            row[end.columns] = end.values
         known = part.static_rows
-        wanted = np.array(loads)
         left = wanted
         if known.size:
             left = wanted - (wanted @ np.linalg.pinv(known)) @ known

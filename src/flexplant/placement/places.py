@@ -73,7 +73,7 @@ def places_of(plant: StandardPlant, candidates: Sequence[Any]) -> Places:
 
     def points(at: Any) -> FloatArray:
         if isinstance(at, str):
-            return np.array(dofs.xyz[[dofs.index(at)]], dtype=np.float64)
+            return np.array(dofs.location(at)[None], dtype=np.float64)
         if isinstance(at, Mapping):
             return np.vstack([points(place) for place in at])
         return np.array([at], dtype=np.float64)

@@ -129,6 +129,6 @@ def _xy(parameter: PointParameter, dofs: DofSet) -> FloatArray:
     """Return where a parameter acts, the mean of its weights' places."""
     at = parameter.at
     if isinstance(at, str):
-        return np.asarray(dofs.xyz[dofs.index(at), :2])
+        return np.asarray(dofs.location(at)[:2])
     row = np.abs(dofs.row(at, parameter.direction))
     return np.asarray(row @ dofs.xyz[:, :2] / row.sum())

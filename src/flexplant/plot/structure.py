@@ -147,7 +147,7 @@ def _mark(
 
 def _point(dofs: DofSet, at: Any) -> Any:
     if isinstance(at, str):
-        return dofs.xyz[dofs.index(at)]
+        return dofs.location(at)
     if isinstance(at, Mapping):
         return np.mean([_point(dofs, place) for place in at], axis=0)
     return np.asarray(at)

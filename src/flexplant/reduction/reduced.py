@@ -28,6 +28,7 @@ from ..values import (
 )
 from .bounds import ErrorBound
 from .judging import quality_of
+from .massless import static_followers
 from .quality import ReductionQuality
 
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
@@ -200,26 +201,15 @@ class ReducedModel(Value):
             When a massless coordinate is damped or has no stiffness.
         """
         light = self.massless
-        flexibility = np.zeros((self.n_dof, self.n_dof))
         if not light.size:
-            return self, np.eye(self.n_dof), flexibility
-        heavy = np.setdiff1d(np.arange(self.n_dof), light)
-        if np.any(self.D[light]):
-            raise ModelError("a massless coordinate is damped: give it a mass, or no damper.")
-        try:
-            inverse = la.inv(self.K[np.ix_(light, light)])
-        except la.LinAlgError as error:
-            raise ModelError("a massless coordinate has no stiffness: nothing holds it.") from error
-        flexibility[np.ix_(light, light)] = 0.5 * (inverse + inverse.T)
-        follow = np.zeros((self.n_dof, heavy.size))
-        follow[heavy] = np.eye(follow.shape[1])
-        follow[light] = -inverse @ self.K[np.ix_(light, heavy)]
+            return self, np.eye(self.n_dof), np.zeros((self.n_dof, self.n_dof))
+        heavy, follow, flexibility, K = static_followers(self.D, self.K, light)
         names = np.array(tuple(self.coordinates), dtype=object)[heavy].tolist()
         kept = [label for label in names if label in self.dofs]
         model = self.replace(
             M=self.M[np.ix_(heavy, heavy)],
             D=self.D[np.ix_(heavy, heavy)],
-            K=_symmetric(follow.T @ self.K @ follow),
+            K=K,
             T=self.T @ follow,
             dofs=self.dofs.select(kept),
             rigid_body=self.rigid_body[heavy],
@@ -411,7 +401,3 @@ class ReducedModel(Value):
         """
         refuse_unstable(self, "a comparison of responses")
         return quality_of(self, full, band, inputs, outputs, count, freq, loss)
-
-
-def _symmetric(matrix: FloatArray) -> FloatArray:
-    return np.asarray(0.5 * (matrix + matrix.T), dtype=np.float64)

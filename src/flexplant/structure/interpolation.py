@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import LabelError
+from ..errors import LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..values import FloatArray, IntArray, instance, positive, real_array
 from .model import FEModel
@@ -49,7 +49,7 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     Raises
     ------
     ModelError
-        When it is neither, or margin is negative.
+        When it is neither, a joined machine, or margin is negative.
 
     Notes
     -----
@@ -70,6 +70,11 @@ def interpolated(item: Interpolated, *, margin: float = 0.0) -> Interpolated:
     """
     dofs = item.dofs if isinstance(item, FEModel) else item
     instance(dofs, DofSet, "dofs", "Pass an FEModel or its dofs.")
+    if dofs.components:
+        raise ModelError(
+            f"the nodes of {', '.join(dofs.components)} move independently: interpolate each "
+            "component before they are joined."
+        )
     shape = ScatteredShape(dofs.xyz, dofs.directions, positive(margin, "margin", zero=True))
     between = dofs.replace(interpolation=shape)
     if isinstance(item, FEModel):
