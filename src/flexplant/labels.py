@@ -251,7 +251,7 @@ class DofSet(Value):
         keep = self._owned(component)
         if nodes is not None:
             wanted = node_numbers(nodes if isinstance(nodes, Iterable) else [nodes])
-            missing = np.setdiff1d(wanted, self.nodes)
+            missing = np.setdiff1d(wanted, self.nodes[keep])
             if missing.size:
                 raise LabelError(
                     f"no DOF at nodes {missing[:6].tolist()}: {self!r}. dofs.nodes lists them, "

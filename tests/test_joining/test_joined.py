@@ -16,6 +16,7 @@ from flexplant.joining.component import components_of
 
 PLATE = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
 SOLID = {"density": 2700, "youngs_modulus": 70e9, "poisson_ratio": 0.3}
+KINDS = ("z", "rx", "ry")
 RIGHT = {"right": fx.Pose(shift=(0.3, 0, 0))}
 
 
@@ -68,13 +69,15 @@ def test_two_halves_are_one_plate():
     found = machine.joining
     assert (found.n_rigid, found.rank, found.constraints) == (3, 15, 15)
     assert dict(found.rigid) == {"left": 3, "right": 3}
-    assert found.pieces == (("left", "right"),)
+    assert dict(found.pieces) == {"left, right": 3}
     assert max(found.gap, found.balance, found.inertia_error, found.rigid_force) < 1e-13
     # the second end follows the first, and stays known as a place
     assert "left/3:z" in machine.dofs
     assert "right/1:z" not in machine.dofs
     np.testing.assert_array_equal(machine.row("right/1:z"), machine.row("left/3:z"))
     np.testing.assert_array_equal(machine.dofs.location("right/1:z"), [0.3, 0, 0])
+    with pytest.raises(LabelError, match=r"no DOF at nodes \[1\]"):
+        machine.dofs.where(nodes=1, component="right")
     with pytest.raises(LabelError, match="follows others"):
         machine.dofs.index("right/1:z")
     assert machine.dofs.nearest((0.6, 0.6, 0), "z") == "right/15:z"
@@ -104,6 +107,12 @@ def test_a_machine_goes_through_a_file_and_is_held(tmp_path):
     same = whole.fixed(whole.dofs.where(box=[(0, -1, -1), (0, 1, 1)]).labels)
     np.testing.assert_allclose(elastic(held, 8), elastic(same, 8), rtol=1e-10)
     np.testing.assert_array_equal(held.row("right/1:z"), held.row("left/3:z"))
+    # held before they are joined: the same, with the inertia of the held DOFs
+    left = plate(2, 0.3).fixed([f"{i}:{a}" for i in edge(plate(2, 0.3), 0.0) for a in KINDS])
+    models = {"left": left, "right": plate(2, 0.3)}
+    first = fx.joined(models, seam(models["right"]), placed=RIGHT)
+    np.testing.assert_allclose(elastic(first, 8), elastic(same, 8), rtol=1e-10)
+    np.testing.assert_allclose(first.held_inertia, held.held_inertia, atol=1e-15)
     with pytest.raises(LabelError, match=r"no DOF 'frame/1:z'.*Close matches"):
         machine.row("frame/1:z")
 
@@ -195,7 +204,7 @@ def test_joints_with_lever_arms_and_springs_are_those_of_dense_algebra():
 def test_reduced_components_to_their_truncation():
     """Craig-Bampton on one side: errors fall with the modes; without vectors, a warning."""
     whole, half = elastic(plate(4), 9), plate(2, 0.3)
-    boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in ("z", "rx", "ry")]
+    boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in KINDS]
     errors = []
     for method in (fx.CraigBampton(boundary, 2), fx.CraigBampton(boundary, 30)):
         rom = fx.reduce(half, method)
@@ -203,6 +212,8 @@ def test_reduced_components_to_their_truncation():
             warnings.simplefilter("error")
             machine = fx.joined({"left": half, "right": rom}, seam(half), placed=RIGHT)
         assert isinstance(machine, fx.ReducedModel)
+        seam_row = machine.row((0.3, 0.25, 0.0))  # a point of both is one motion
+        assert seam_row == pytest.approx(machine.row({(0.2999999999, 0.25, 0.0): 1.0}), abs=1e-6)
         found = machine.modes()
         assert found.n_rigid == machine.joining.n_rigid == 3
         assert np.all(found.freq[:3] == 0)
@@ -228,7 +239,7 @@ def test_reduced_components_to_their_truncation():
 def test_a_reduced_machine_is_a_model_like_any():
     """Labels, plants, an update of a joint's stiffness, a machine in a machine."""
     half = plate(2, 0.3)
-    boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in ("z", "rx", "ry")]
+    boundary = [f"{i}:{axis}" for i in edge(half, 0.0) for axis in KINDS]
     rom = fx.reduce(half, fx.CraigBampton(boundary, 6, damping=fx.ModalDamping(0.01)))
     corner = half.dofs.nearest((0, 0, 0))
     springs = [
@@ -247,13 +258,13 @@ def test_a_reduced_machine_is_a_model_like_any():
     unknown = fx.AddedStiffness("left/1:z", to="right/1:z")
     fit = fx.update(machine, [unknown], [fx.Eigenvalues(measured)])
     assert fit.values[0] == pytest.approx(4e5, rel=1e-6)
-    assert fit.model.joining.pieces == (("left", "right"),)
+    assert dict(fit.model.joining.pieces) == {"left, right": 4}
     wafer = fx.chain(masses=[1.0, 0.5], stiffnesses=[1e7]).with_damping(fx.Rayleigh(0.0, 1e-6))
     outer = fx.joined(
         {"machine": machine, "wafer": wafer},
         placed={"wafer": fx.Pose(rotation=(0, np.pi / 2, 0))},
     )
-    assert outer.joining.n_rigid == 5
+    assert dict(outer.joining.pieces) == {"machine": 4, "wafer": 1}
     assert "machine/left/1:z" in outer.full_dofs
     assert outer.full_dofs.components == ("machine/left", "machine/right", "wafer")
     assert outer.modes().n_rigid == 5

@@ -29,7 +29,8 @@ class JoiningCertificate(Value):
         there.
     balance : float
         Largest resultant of the forces of a joint between two components, relative: what a motion
-        of the whole machine stretches it.
+        of the whole machine stretches it. Springs may have one (they are warned of), rigid joints
+        have none.
     mass : float [kg]
         Of the machine; NaN without displacements.
     inertia_error : float
@@ -39,8 +40,9 @@ class JoiningCertificate(Value):
         Axes of rigid joints, and how many of them are independent.
     rigid : mapping {str: int}
         Rigid-body motions of each component before it was joined.
-    pieces : tuple of tuple of str
-        The components of each part of the machine that joints hold together.
+    pieces : mapping {str: int}
+        Rigid-body motions of each part of the machine that joints hold together, by the names of
+        its components, "stage, frame".
     n_rigid : int
         Rigid-body motions of the machine.
     rigid_force : float
@@ -57,17 +59,20 @@ class JoiningCertificate(Value):
     constraints: int
     rank: int
     rigid: Mapping[str, int]
-    pieces: tuple[tuple[str, ...], ...]
+    pieces: Mapping[str, int]
     n_rigid: int
     rigid_force: float
     patches: Mapping[str, float]
 
     def __post_init__(self) -> None:
-        self._set(rigid=self.rigid, patches=self.patches)
+        self._set(rigid=self.rigid, pieces=self.pieces, patches=self.patches)
 
     def __repr__(self) -> str:
         before = ", ".join(f"{name} {count}" for name, count in self.rigid.items())
-        pieces = f"{len(self.pieces)} piece{'s' * (len(self.pieces) != 1)}"
+        pieces = "one piece"
+        if len(self.pieces) > 1:
+            listed = [f"{names}: {count}" for names, count in self.pieces.items()]
+            pieces = f"{len(listed)} pieces ({'; '.join(listed)})"
         independent = f"{self.rank} of {self.constraints} rigid constraints independent"
         errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
         head = f"{self.n_rigid} rigid-body motions (alone: {before}), {pieces}"
@@ -114,7 +119,8 @@ def certified(
     opening, most = (np.asarray(part.todense()).ravel() for part in (opening, most))
     gap = float(np.max(opening / np.where(most > 0, most, 1.0), initial=0.0))
     size = np.array([1.0] * 3 + [machine_size(parts)] * 3)
-    stretched = [np.abs(link.carried / size).max() for link in links if link.joint.is_rigid]
+    felt = [(link.joint.is_rigid, float(np.abs(link.carried / size).max())) for link in links]
+    balance = max((part for is_rigid, part in felt if is_rigid), default=0.0)
     motions = np.vstack([part.model.rigid_motions() for part in parts])
     apart = sum(
         part.model.rigid_motions().T @ part.model.inertia(part.model.rigid_motions())
@@ -123,18 +129,18 @@ def certified(
     error = _inertia_error(np.asarray(apart), motions[done.kept], matrices["M"])
     found = JoiningCertificate(
         gap=gap,
-        balance=float(max(stretched, default=0.0)),
+        balance=max((part for _, part in felt), default=0.0),
         mass=float(max(np.diag(np.asarray(apart))[:3])) or float("nan"),
         inertia_error=error,
         constraints=B.shape[0],
         rank=done.rank,
         rigid={part.name: int(part.model.rigid_body.shape[1]) for part in parts},
-        pieces=tuple(tuple(parts[i].name for i in group) for group in groups),
+        pieces=_by_piece(parts, groups, rigid, done.kept),
         n_rigid=rigid.shape[1],
         rigid_force=_force(matrices["K"], rigid),
         patches=patches,
     )
-    if not max(gap, found.balance, error, found.rigid_force) < _LIMIT:
+    if not max(gap, balance, error, found.rigid_force) < _LIMIT:
         raise CertificateError(
             f"the joined machine fails its check (limit {_LIMIT:g}): {found!r}. Join fewer axes, "
             "or look for joints that nearly repeat each other."
@@ -146,6 +152,16 @@ def certified(
             "matrices. Look for a wrong unit of a stiffness, or leave the joint out."
         )
     return found
+
+
+def _by_piece(
+    parts: Sequence[Component], groups: Sequence[IntArray], rigid: FloatArray, kept: IntArray
+) -> dict[str, int]:
+    """Return how many rigid-body motions move each piece."""
+    owner = np.repeat(np.arange(len(parts)), [part.n for part in parts])[kept]
+    moved = [np.any(rigid[np.isin(owner, group)] != 0, axis=0) for group in groups]
+    names = [", ".join(parts[i].name for i in group) for group in groups]
+    return {name: int(np.count_nonzero(some)) for name, some in zip(names, moved, strict=True)}
 
 
 def _force(K: Any, motions: FloatArray) -> float:

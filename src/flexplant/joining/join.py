@@ -254,8 +254,6 @@ def _reduced(
     parts: Sequence[Component], done: Elimination, fields: dict[str, Any], rigid: FloatArray
 ) -> ReducedModel:
     full = _all_dofs(parts)
-    shape = JoinedShape(tuple(part.name for part in parts), tuple(part.dofs for part in parts))
-    full = full.replace(interpolation=shape)
     names = np.array([label for part in parts for label in part.coordinates], dtype=object)
     left = names[done.kept].tolist()
     physical = np.concatenate(
@@ -263,7 +261,11 @@ def _reduced(
     )[done.kept]
     # DOFs first, generalised coordinates after them
     order = np.argsort(~physical, kind="stable")
-    T = la.block_diag(*(dense(part.T) for part in parts)) @ done.T[:, order].toarray()
+    T = frozen(la.block_diag(*(dense(part.T) for part in parts)) @ done.T[:, order].toarray())
+    shape = JoinedShape(
+        tuple(part.name for part in parts), tuple(part.dofs for part in parts), motions=T
+    )
+    full = full.replace(interpolation=shape)
     listed = [left[i] for i in order.tolist()]
     square = np.ix_(order, order)
     return ReducedModel(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -87,14 +88,18 @@ class JoinedShape(Interpolation):
         Their DOFs with their shapes, where they are placed.
     expansion : (n_all, n) sparse array, optional
         All DOFs of all components, one after the other, by those that are left. None: all are.
+    motions : (n_all, k) array, optional
+        All motions of a reduced machine: by these, places of two components move alike or not.
     """
 
     names: tuple[str, ...]
     parts: tuple[DofSet, ...]
     expansion: sp.csc_array | None = None
+    motions: FloatArray | None = None
 
     def __post_init__(self) -> None:
-        self._set(names=tuple(self.names), parts=tuple(self.parts), expansion=self.expansion)
+        self._set(names=tuple(self.names), parts=tuple(self.parts))
+        self._set(expansion=self.expansion, motions=self.motions)
 
     def __repr__(self) -> str:
         return f"<JoinedShape of {', '.join(self.names)}>"
@@ -121,7 +126,8 @@ class JoinedShape(Interpolation):
                 f"{direction!r}. {' '.join(failed)}"
             )
         rows = list(found.values())
-        if any(np.abs(row - rows[0]).max() > _SAME * np.abs(rows[0]).max() for row in rows[1:]):
+        seen = rows if self.motions is None else [row @ self.motions for row in rows]
+        if any(np.abs(one - seen[0]).max() > _SAME * np.abs(seen[0]).max() for one in seen[1:]):
             one, other = list(found)[:2]
             raise LabelError(
                 f"the point {tuple(np.asarray(xyz).tolist())} is on {one!r} and on {other!r}, "
@@ -150,5 +156,9 @@ class JoinedShape(Interpolation):
             found[start : start + sizes[index]] = row
             return found
         rows = np.flatnonzero(row)
-        taken: Any = sp.csr_array(self.expansion[start + rows])
-        return np.asarray(row[rows] @ taken)
+        return np.asarray(row[rows] @ self._by_rows[start + rows])
+
+    @cached_property
+    def _by_rows(self) -> Any:
+        expansion: Any = self.expansion
+        return sp.csr_array(expansion)
