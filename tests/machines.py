@@ -1,5 +1,7 @@
 """A small machine with everything in it, made by hand from its modes."""
 
+import time
+
 import numpy as np
 
 from flexplant.lti import StateSpace
@@ -117,3 +119,9 @@ def matrices(plant):
 def block(g):
     """Return a block as the dict that the oracles take."""
     return {"A": g.A, "B": g.B, "C": g.C, "D": g.D, "inputs": g.inputs, "outputs": g.outputs}
+
+
+def slow_machine(item):
+    """Return a row of a study after a while."""
+    time.sleep(0.1)
+    return {"twice": 2.0 * item}

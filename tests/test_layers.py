@@ -15,7 +15,7 @@ ROOT = Path(flexplant.__file__).parent
 ROOMS = (
     (
         *("errors", "values", "notebook", "store", "certificates", "versions"),
-        *("surviving", "parallel", "checkpoint", "work"),
+        *("surviving", "progress", "parallel", "checkpoint", "work"),
         *("places", "dof_columns", "dof_index", "labels"),
     ),
     "lti",

@@ -6,19 +6,18 @@ and linear algebra runs on one thread while items are computed (its rounding dep
 
 from __future__ import annotations
 
-import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Executor
+from concurrent.futures import Executor, Future, wait
 from contextlib import contextmanager
 from functools import cache
 from time import perf_counter
-from types import TracebackType
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from .errors import ModelError, SolverError
+from .progress import Progress as Progress
 from .surviving import DIED, Died, survived
 
 Item = TypeVar("Item")
@@ -28,8 +27,6 @@ Result = TypeVar("Result")
 CHUNK = 0.5
 #: items computed here before the rest is sent take this long [s]: they show how long one takes
 PROBE = 0.05
-#: shorter work than this [s] shows no bar
-PATIENCE = 2.0
 
 
 @cache
@@ -71,46 +68,27 @@ def one_thread() -> Iterator[None]:
                 _original.restore_original_limits()
 
 
-class Progress:
-    """A bar for long work: after two seconds, on a terminal only, unless forced.
+def interruptible(function: Callable[[], Result]) -> Result:
+    """Return ``function()``, which Ctrl-C ends at once although compiled code does not look for it.
 
-    Parameters
-    ----------
-    total : int
-        Number of items.
-    description : str
-        What is done.
-    progress : bool, optional
-        True shows it at once and anywhere, False never; None decides.
+    It runs in a thread of its own, on one thread of BLAS, while this one waits. Interrupted, it is
+    left alone and ends with the limit of time that it has.
     """
+    if threading.current_thread() is not threading.main_thread():  # signals reach the main thread
+        return function()
+    outcome: Future[Result] = Future()
 
-    def __init__(self, total: int, description: str, *, progress: bool | None = None) -> None:
-        self.bar: Any = None
-        #: items counted
-        self.done = 0
-        if progress or (progress is None and sys.stderr.isatty()):
-            from tqdm import tqdm
+    def run() -> None:
+        try:
+            with one_thread():
+                outcome.set_result(function())
+        except BaseException as error:
+            outcome.set_exception(error)
 
-            delay = 0.0 if progress else PATIENCE
-            self.bar = tqdm(total=total, desc=description, delay=delay, leave=bool(progress))
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        if self.bar is not None:
-            self.bar.close()
-
-    def advance(self, items: int = 1) -> None:
-        """Count some items as done."""
-        self.done += items
-        if self.bar is not None:
-            self.bar.update(items)
+    threading.Thread(target=run, daemon=True).start()
+    while not outcome.done():
+        wait([outcome], timeout=CHUNK)
+    return outcome.result()
 
 
 def mapped(
@@ -220,7 +198,7 @@ def _send(
 
 
 def _chunk(function: Callable[..., Result], calls: Sequence[tuple[Any, ...]]) -> list[Result]:
-    with one_thread():
+    with one_thread(), Progress(None, "chunk", progress=False):  # no bars inside
         return [_call(function, call) for call in calls]
 
 

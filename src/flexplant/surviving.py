@@ -35,11 +35,13 @@ def survived(
     left, own = dict(calls), executor
     while left:
         lost: list[int] = []
-        for number, result in _pooled(function, left, own, lost):
-            del left[number]
-            yield number, result
-        if own is not executor:
-            own.shutdown(cancel_futures=True)
+        try:
+            for number, result in _pooled(function, left, own, lost):
+                del left[number]
+                yield number, result
+        finally:  # interrupted too: no process stays
+            if own is not executor:
+                own.shutdown(cancel_futures=True)
         for number in lost:  # one of them ended the process
             yield number, _alone(function, left.pop(number))
         if left:

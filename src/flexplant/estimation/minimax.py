@@ -12,6 +12,7 @@ from ..lti.lyapunov import scale_of
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, UncertainPlant
+from ..progress import Progress, tick
 from ..values import FloatArray, short, whole
 from .channels import same_pois
 from .error import error_variances
@@ -26,6 +27,8 @@ _WIDTHS = (0.1, 0.01, 0.001)
 _AGREEMENT = 1e-6
 #: step of a state's variance per innovation's, where the POIs do not say how large it may be
 _PART = 0.03
+#: what a bar calls the variances that are computed
+STEPS = "steps of the search"
 
 
 @one_thread()
@@ -34,6 +37,7 @@ def design_minimax_filter(
     machines: Sequence[StandardPlant],
     *,
     iterations: int = 200,
+    progress: bool | None = None,
 ) -> RobustFilter:
     """Return the filter on one plant's matrices whose worst error over machines is smallest.
 
@@ -57,6 +61,8 @@ def design_minimax_filter(
         Sampled alike, with the same ports: `plant.uncertain(fit).sample(rng, 20)`.
     iterations : int
         At most so many for each width.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -106,7 +112,8 @@ def design_minimax_filter(
     errors = [machine_error(plant, model, other, start, scale, unit) for other in others]
     spread = kalman.covariance.diagonal() / scale**2
     units = _Units.of(part(start).sight, model.innovation(P), spread, (scale, unit))
-    found, slope = _searched(errors, part, units, start, steps)
+    with Progress(None, STEPS, progress=progress):
+        found, slope = _searched(errors, part, units, start, steps)
     values = np.array([error.value(part(found)) for error in errors])
     system = filter_system(plant, model, found.K, found.L_z, "minimax_filter")
     truth = _means(others, system, sizes)
@@ -212,6 +219,7 @@ def _searched(
     best: list[tuple[float, Gains]] = []
 
     def smooth(x: FloatArray, width: float) -> tuple[float, FloatArray]:
+        tick(STEPS)
         change = units.change(x)
         at = Gains(start.K + change.K, start.L_z + change.L_z)
         try:

@@ -9,6 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
+from ..progress import Progress, tick
 from ..values import ComplexArray, FloatArray, positive, real_array, whole
 from .diagram import built_diagram
 from .identify import checked_orders
@@ -28,6 +29,9 @@ SAME, LOOSE = 0.02, 0.6
 #: differences to the next order of a stable pole, and its MAC with it
 TOLERANCES = (0.01, 0.3, 0.9)
 
+#: what a bar calls the pieces of the record
+PARTS = "parts of the record"
+
 
 def identify_output_only(
     outputs: Any,
@@ -37,6 +41,7 @@ def identify_output_only(
     orders: Iterable[int] | None = None,
     lags: int | None = None,
     blocks: int = 20,
+    progress: bool | None = None,
 ) -> MeasuredModes:
     r"""Return poles and shapes from responses alone, to excitation that nobody measured.
 
@@ -69,6 +74,8 @@ def identify_output_only(
         Block rows and columns of H; two periods of the lowest frequency when not given.
     blocks : int
         In which the record is cut, from 8; each should be longer than the slowest decay.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -126,25 +133,26 @@ def identify_output_only(
             f"{parts} blocks of {long} samples are too short for {count} lags: measure longer, or "
             "give fewer blocks= or lags=."
         )
-    each = np.array([_hankel(block, count) for block in _blocks(y, parts)])
-    mean = each.mean(axis=0)
-    U, sizes, _ = la.svd(mean)
-    inside = (low, high)
-    results = [_poles(U, sizes, y.shape[1], order, step, inside) for order in listed]
-    chosen = built_diagram(results, np.array(inside), TOLERANCES).automatic().poles
-    bases = [la.svd((parts * mean - one) / (parts - 1)) for one in each]
-    best: tuple[OrderPoles, FloatArray, Any] | None = None
-    for result in results:
-        found = _those(result, chosen)
-        if found.poles.size <= (0 if best is None else best[2].size):
-            continue
-        again = (
-            _poles(left, values, y.shape[1], result.order, step, (0.0, np.inf))
-            for left, values, _ in bases
-        )
-        spread, kept = _spread(found, list(again))
-        if best is None or kept.size > best[2].size:
-            best = found, spread, kept
+    with Progress(2 * parts, PARTS, progress=progress):
+        each = np.array([_hankel(block, count) for block in _blocks(y, parts)])
+        mean = each.mean(axis=0)
+        U, sizes, _ = la.svd(mean)
+        inside = (low, high)
+        results = [_poles(U, sizes, y.shape[1], order, step, inside) for order in listed]
+        chosen = built_diagram(results, np.array(inside), TOLERANCES).automatic().poles
+        bases = [_without(mean, one, parts) for one in each]
+        best: tuple[OrderPoles, FloatArray, Any] | None = None
+        for result in results:
+            found = _those(result, chosen)
+            if found.poles.size <= (0 if best is None else best[2].size):
+                continue
+            again = (
+                _poles(left, values, y.shape[1], result.order, step, (0.0, np.inf))
+                for left, values, _ in bases
+            )
+            spread, kept = _spread(found, list(again))
+            if best is None or kept.size > best[2].size:
+                best = found, spread, kept
     if best is None or not best[2].size:
         raise SolverError(
             f"no pole between {low:g} and {high:g} Hz is the same in all parts of the record. "
@@ -167,8 +175,15 @@ def _blocks(y: FloatArray, parts: int) -> list[FloatArray]:
     return [piece - piece.mean(axis=1, keepdims=True) for piece in pieces]
 
 
+def _without(mean: FloatArray, one: FloatArray, parts: int) -> Any:
+    """Return the singular value decomposition of the mean without one of the parts."""
+    tick(PARTS)
+    return la.svd((parts * mean - one) / (parts - 1))
+
+
 def _hankel(y: FloatArray, count: int) -> FloatArray:
     """Return H (count n, count n) of one piece."""
+    tick(PARTS)
     n, long = y.shape
     size = 1 << int(np.ceil(np.log2(2 * long)))
     Y = np.fft.rfft(y, size, axis=1)

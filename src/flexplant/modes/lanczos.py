@@ -8,6 +8,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import SolverError
+from ..progress import tick
 from ..sparse.factor import by_rows
 from ..values import FloatArray, Matrix, Rng
 
@@ -17,6 +18,8 @@ BLOCK = 12
 FOUND = 1e-8
 #: residual at which the value, in error by its square, is known to rounding
 VALUE = 1e-6
+#: what a bar calls the blocks that extend the basis
+STEPS = "modes, steps of Lanczos"
 #: steps between two restarts
 _STEPS = 12
 _RESTARTS = 60
@@ -150,6 +153,7 @@ class BlockLanczos:
         grown_T[-width:, -width:] = 0.5 * (along[-width:] + along[-width:].T)
         self._T = grown_T
         self.steps += 1
+        tick(STEPS)
         theta, mix = la.eigh(self._T)
         theta, mix = theta[::-1], mix[:, ::-1]
         return theta, mix, np.linalg.norm(over @ mix[-width:], axis=0)

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError
 from ..labels import Place
+from ..progress import Progress
 from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
 from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import absolute, rounding_of
@@ -20,6 +21,7 @@ from ..structure.negative_stiffness import signed_root, signed_square
 from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .damped_modes import damped_modes, is_rayleigh, wider
+from .lanczos import STEPS
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
 from .shifted import modes_below, stiffness_factor
@@ -48,6 +50,7 @@ def solve_modes(
     compliance_at: Place | Iterable[Place] = (),
     compliance_damping: Damping | float | None = None,
     factor: Pardiso | None = None,
+    progress: bool | None = None,
 ) -> Modes:
     """Return the lowest modes of a structure, mass-normalised, rigid-body modes exactly at 0.
 
@@ -69,6 +72,8 @@ def solve_modes(
         Of the attachment vectors; None: damped like the modes.
     factor : Pardiso, optional
         Solver of a large sparse model in place of the library's own.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -118,12 +123,13 @@ def solve_modes(
             "with compliance_at, then suspend(modes, springs)."
         )
     names = labels_of(at, model.dofs)
-    # one factor for the modes and for the attachment vectors, while it is held here
-    factored = stiffness_factor(model, factor) if at and _is_large(model) else None
     # complex modes of a large model are found in a basis of more undamped ones
     perhaps = damping is None and model.D is not None and _is_large(model)
     more = wider(kept, top, model.n_dof) if perhaps and not is_rayleigh(model) else (kept, top)
-    omega, phi, certificate = _undamped(model, *more, factor)
+    with Progress(None, STEPS, progress=progress):
+        # one factor for the modes and for the attachment vectors, while it is held here
+        factored = stiffness_factor(model, factor) if at and _is_large(model) else None
+        omega, phi, certificate = _undamped(model, *more, factor)
     orthonormality, residual = _check(model, omega, phi)
     certificate["orthonormality"] = orthonormality
     if model.rigid_body.shape[1]:

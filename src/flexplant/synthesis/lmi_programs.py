@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -10,6 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import InfeasibleError, SolverError
+from ..parallel import interruptible
 from .lmi_plant import Plant, half, null_space
 from .lmi_solution import Matrices, dual_bound, reconstructed
 
@@ -141,7 +143,8 @@ def solve_program(
     data, chain, inverse = problem.get_problem_data("CLARABEL", solver_opts={})
     reached: Any = None
     for attempt in ATTEMPTS:
-        raw = chain.solve_via_data(problem, data, solver_opts={**settings, **attempt})
+        options = {**settings, **attempt}
+        raw = interruptible(partial(chain.solve_via_data, problem, data, solver_opts=options))
         status = str(raw.status)
         how = f"Clarabel: {status} after {raw.iterations} iterations"
         if "PrimalInfeasible" in status:

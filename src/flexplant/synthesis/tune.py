@@ -16,6 +16,7 @@ from ..lti.grid import resonance_grid
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
+from ..progress import Progress
 from ..values import ComplexArray, FloatArray, positive, whole
 from .law import Law
 from .loop_design import LoopDesign, axes_controller, axes_of, made
@@ -46,6 +47,7 @@ def tune_loops(
     peak: float = TARGET,
     rigid: int | None = None,
     larger: Any = None,
+    progress: bool | None = None,
 ) -> LoopDesign:
     """Return the laws of highest bandwidth that keep |S| of each axis below a peak.
 
@@ -66,6 +68,8 @@ def tune_loops(
         has. 0 on springs whose modes lie within the lines.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -96,10 +100,12 @@ def tune_loops(
         rigid = len(axes.names) if measured else _free_modes(axes.plant)
     rigid = whole(rigid, "rigid", minimum=0)
     frf = axes.plant if measured else _response(axes.plant)
-    found = {
-        name: _Axis(name, frf.freq, frf.data[i, i], axes.rate, peak, rigid > 0).best()
-        for i, name in enumerate(axes.names)
-    }
+    found = {}
+    with Progress(len(axes.names), "axes", progress=progress) as bar:
+        for i, name in enumerate(axes.names):
+            axis = _Axis(name, frf.freq, frf.data[i, i], axes.rate, peak, rigid > 0)
+            found[name] = axis.best()
+            bar.advance()
     for step in range(_STEPS):
         laws = {name: one.law(one.bandwidth * 0.97**step) for name, one in found.items()}
         report = report_loops((axes.plant, axes_controller(axes, laws)), at="y", rigid=rigid)

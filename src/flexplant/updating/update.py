@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantWarning, ModelError, SolverError
+from ..progress import Progress
 from ..structure.model import FEModel
 from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
@@ -19,6 +20,7 @@ from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
 from .rounds import corrected, moved
 from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod, checked_residuals
+from .search.update_method import ITERATIONS
 from .searching import from_one_start, from_starts
 from .sensitivities import checked_parameters, checked_values
 from .starts import all_starts, summary
@@ -45,6 +47,7 @@ def update(
     max_iterations: int | None = None,
     tolerance: float = 1e-10,
     full: FEModel | None = None,
+    progress: bool | None = None,
     rounds: int = 4,
 ) -> UpdateResult:
     """Find the parameters with which the model reproduces the measurement.
@@ -107,6 +110,8 @@ def update(
     rounds : int
         Of defect correction, at most; fewer where one moves the estimate by less than 0.01
         standard deviations.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -177,30 +182,31 @@ def update(
     objective = Objective(used, listed, given, prior=takes_part)
     begins = all_starts(objective, start, starts, rng)
     cold = start is None and starts is None and not method.penalised
-    try:
-        if cold:
-            best, begins, ends = from_one_start(
-                objective, begins[0], method, max_iterations, enough, rng
+    with Progress(None, ITERATIONS, progress=progress):
+        try:
+            if cold:
+                best, begins, ends = from_one_start(
+                    objective, begins[0], method, max_iterations, enough, rng
+                )
+            else:
+                best, ends = from_starts(objective, begins, method, max_iterations, enough)
+        except (ModelError, SolverError):
+            check_units(objective, begins[0])
+            raise
+        check_units(objective, begins[0], best.trail.poles[0])
+        estimates = [best.p]
+        if basis is not None:
+            best, estimates = corrected(
+                objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
             )
-        else:
-            best, ends = from_starts(objective, begins, method, max_iterations, enough)
-    except (ModelError, SolverError):
-        check_units(objective, begins[0])
-        raise
-    check_units(objective, begins[0], best.trail.poles[0])
-    estimates = [best.p]
-    if basis is not None:
-        best, estimates = corrected(
-            objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
+    if basis is not None and moved(objective, best.p, estimates[-2]) > UNSETTLED:
+        warnings.warn(
+            f"defect correction has not settled: round {len(estimates) - 1} still moved the "
+            f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
+            "Give more rounds=, or a reduced model with more modes.",
+            FlexplantWarning,
+            stacklevel=2,
         )
-        if moved(objective, best.p, estimates[-2]) > UNSETTLED:
-            warnings.warn(
-                f"defect correction has not settled: round {len(estimates) - 1} still moved the "
-                f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
-                "Give more rounds=, or a reduced model with more modes.",
-                FlexplantWarning,
-                stacklevel=2,
-            )
     if not best.converged:
         error = best.trail.error
         warnings.warn(

@@ -14,6 +14,7 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...progress import Progress
 from ...values import FloatArray, whole
 from ..controller import Controller
 from ..hinf import design_hinf
@@ -50,6 +51,7 @@ def design_mu(
     iterations: int = 4,
     order: int = 1,
     larger: Any = None,
+    progress: bool | None = None,
 ) -> Controller:
     """Return a controller whose weighted gain stays small on every machine of an uncertainty.
 
@@ -72,6 +74,8 @@ def design_mu(
         Most states of D for each Delta and side.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -105,23 +109,25 @@ def design_mu(
     best: _DkStep | None = None
     found: list[float] = []
     failure: FlexplantError | None = None
-    for number in range(most + 1):
-        try:
-            K = _designed(plant, scales, method, nominal=not number)
-            step = _judged(uncertain, K, w, z)
-        except FlexplantError as error:
-            failure = error
-            if number or not isinstance(error, AssumptionError | SolverError):
+    with Progress(most + 1, "steps of D-K", progress=progress) as bar:
+        for number in range(most + 1):
+            bar.advance(int(number > 0))
+            try:
+                K = _designed(plant, scales, method, nominal=not number)
+                step = _judged(uncertain, K, w, z)
+            except FlexplantError as error:
+                failure = error
+                if number or not isinstance(error, AssumptionError | SolverError):
+                    break
+                scales = _DFilters.none(plant)
+                continue
+            found.append(step.mu)
+            settled = best is not None and number > 1 and step.mu > (1.0 - _SETTLED) * best.mu
+            if best is None or step.mu < best.mu:
+                best = step
+            if settled:
                 break
-            scales = _DFilters.none(plant)
-            continue
-        found.append(step.mu)
-        settled = best is not None and number > 1 and step.mu > (1.0 - _SETTLED) * best.mu
-        if best is None or step.mu < best.mu:
-            best = step
-        if settled:
-            break
-        scales = _scales_of(plant, step.loop, states)
+            scales = _scales_of(plant, step.loop, states)
     if best is None:
         raise failure or SolverError("no step of the D-K iteration gave a controller. Report it.")
     left_out = spill_over(uncertain.plant, [best.controller], larger)

@@ -16,12 +16,13 @@ from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...progress import Progress
 from ...values import ComplexArray, FloatArray, Value, generator
 from .blocks import FullBlock, places
 from .lower import power_iteration
 from .machine import machine, neglected_delta, values_of
 from .perturbation import Perturbation, matrix_of
-from .sweep import Covered, covered
+from .sweep import INTERVALS, Covered, covered
 from .uncertain_loop import UncertainLoop, uncertain_loop
 
 #: frequencies that start a search, starts at each, rounds over all real Deltas
@@ -75,7 +76,12 @@ class WorstCaseGain(Value):
 
 @one_thread()
 def worst_case_gain(
-    uncertain: UncertainPlant[Any], *blocks: Any, w: Any, z: Any, rng: Any = 0
+    uncertain: UncertainPlant[Any],
+    *blocks: Any,
+    w: Any,
+    z: Any,
+    rng: Any = 0,
+    progress: bool | None = None,
 ) -> WorstCaseGain:
     """Return bounds on the largest gain from w to z over an uncertainty, and the worst machine.
 
@@ -93,6 +99,8 @@ def worst_case_gain(
         Channels of the gain; weights are numbers or systems of one input and output.
     rng : int, SeedSequence, Generator or None
         Of the search.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -125,7 +133,8 @@ def worst_case_gain(
     listed = [*loop.blocks, FullBlock(m, p, name="performance")]
     inside = np.zeros(len(listed), dtype=bool)
     inside[-1] = True
-    found = covered(loop.system, listed, inside.tolist(), loop.heights)
+    with Progress(None, INTERVALS, progress=progress):
+        found = covered(loop.system, listed, inside.tolist(), loop.heights)
     if not np.isfinite(found.level):
         raise AssumptionError(
             "machines of the uncertainty may be unstable (at "

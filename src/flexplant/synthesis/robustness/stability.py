@@ -13,6 +13,7 @@ from ...loop import ClosedLoop, SpillOver
 from ...parallel import one_thread
 from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
+from ...progress import Progress
 from ...values import FloatArray, Value, generator, whole
 from .blocks import FullBlock, places
 from .lower import (
@@ -23,7 +24,7 @@ from .lower import (
 )
 from .machine import machine, neglected_delta, values_of
 from .mu import sought
-from .sweep import covered
+from .sweep import INTERVALS, covered
 from .uncertain_loop import UncertainLoop, uncertain_loop
 
 #: mu below this is not resolved
@@ -112,6 +113,7 @@ def robust_stability(
     larger: Any = None,
     machines: int = 20,
     rng: Any = 0,
+    progress: bool | None = None,
 ) -> RobustStability:
     """Return bounds on the uncertainty that a loop endures: mu of its real and neglected Deltas.
 
@@ -132,6 +134,8 @@ def robust_stability(
         How many are drawn, each Delta at an end of its interval.
     rng : int, SeedSequence, Generator or None
         Of the machines and of the search for the worst.
+    progress : bool, optional
+        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
     Returns
     -------
@@ -156,7 +160,8 @@ def robust_stability(
     count = whole(machines, "machines", minimum=0)
     chance = generator(rng)
     loop = uncertain_loop(uncertain, blocks)
-    found = covered(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2)
+    with Progress(None, INTERVALS, progress=progress):
+        found = covered(loop.system, loop.blocks, heights=loop.heights, least=_RESOLVED**2)
     upper = float(np.sqrt(found.level))
     worst = _worst(loop, found, upper, chance)
     certificate = _tried(loop, upper, count, chance)

@@ -18,12 +18,15 @@ from ...errors import SolverError
 from ...lti.responses import responder
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
+from ...progress import tick
 from ...values import ComplexArray, FloatArray
 from .blocks import Block, Scalings, places
 from .upper import centred, reached_level, simple_bound, upper_level
 
 #: relative distance of the level to the largest upper bound found at a frequency
 _ABOVE = 5e-3
+#: what a bar calls the intervals of frequency that are covered
+INTERVALS = "intervals of frequency"
 #: intervals at most; larger systems are covered by sampling instead of Hamiltonians
 _INTERVALS, _LARGE = 3000, 260
 #: sampling within an interval, in half widths of the resonances, and for the rest of it
@@ -101,6 +104,7 @@ class _Cover:
         count = 0
         while self.gaps:
             count += 1
+            tick(INTERVALS)
             if count > _INTERVALS:
                 raise SolverError(
                     f"the frequency axis was not covered by {_INTERVALS} intervals; what is left "

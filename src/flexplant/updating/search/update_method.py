@@ -7,8 +7,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ...progress import tick
 from ...values import FloatArray, Value, positive
 from .objective import Objective
+
+#: what a bar calls the steps of all searches
+ITERATIONS = "update, iterations"
 
 
 @dataclass
@@ -22,6 +26,7 @@ class Trail:
 
     def add(self, objective: Objective, p: FloatArray, fraction: float) -> None:
         """Add the point at `p`, where the objective is."""
+        tick(ITERATIONS)
         point = objective.at(p)
         self.p.append(np.array(p))
         self.poles.append(objective.poles(point))

@@ -1,0 +1,212 @@
+"""Long work shows a bar where somebody sees it, is silent in pipes, and can be interrupted."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+import types
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import pytest
+
+from flexplant import progress
+from flexplant.parallel import Progress, interruptible, mapped
+from flexplant.progress import tick
+
+HERE = Path(__file__).parent
+
+#: what takes long, made small: each with the name of its bar
+WORK = """
+import numpy as np, sys
+import flexplant as fx
+from flexplant import progress
+from stages import RATE, Z8, ports, reduced, some_modes
+
+rng = np.random.default_rng(0)
+block = fx.solid_block(size=(0.4, 0.3, 0.1), elements=(12, 9, 4), density=2700,
+                       youngs_modulus=70e9, poisson_ratio=0.33)
+rom = reduced()
+at = rom.full_dofs.nearest(Z8, "z")
+poles = fx.testbeds.wafer_stage().poles([6, 7]).replace(covariance=0.1 * np.eye(4))
+unknowns = [fx.AddedMass(at, bounds=(0.0, 2.0)), fx.AddedDamping(at, bounds=(-20.0, 20.0))]
+small = fx.assemble_plant(some_modes(count=8, attached=False), ports())
+weights = fx.stage_weights(small, 50.0)
+weighted = small.through(fx.reference_errors(small)).weighted(z=weights.z, w=weights.w)
+noise = rng.standard_normal((4, 16000))
+WORK = {
+    "modes, steps of Lanczos": lambda: fx.solve_modes(block, count=30),
+    "update, iterations": lambda: fx.update(rom, unknowns, [fx.Eigenvalues(poles)], starts=20),
+    "parts of the record": lambda: fx.identification.identify_output_only(
+        noise, rate=1e3, band=(20.0, 200.0), orders=range(4, 12, 2)),
+    "steps of the bisection": lambda: fx.design_hinf(weighted, fx.Riccati()),
+}
+def tried(work):
+    try:
+        return work()
+    except fx.FlexplantError as error:  # noise has no modes
+        return error
+"""
+
+
+def child(code, stream):
+    """Run code in a process of its own, its streams given."""
+    paths = os.pathsep.join([str(HERE), *sys.path])
+    env = {**os.environ, "PYTHONPATH": paths, "OMP_NUM_THREADS": "2"}
+    return subprocess.Popen(
+        [sys.executable, "-W", "ignore", "-c", WORK + code], env=env, stdout=stream, stderr=stream
+    )
+
+
+SHOWN = """
+progress.PATIENCE = 0.0
+for work in WORK.values():
+    tried(work)
+print("done")
+"""
+
+
+@pytest.mark.slow
+def test_bars_on_a_terminal_and_none_in_a_pipe():
+    pty, termios = pytest.importorskip("pty"), pytest.importorskip("termios")
+    ours, theirs = pty.openpty()
+    termios.tcsetwinsize(theirs, (24, 100))
+    process = child(SHOWN, theirs)
+    os.close(theirs)
+    seen = b""
+    while True:
+        try:
+            part = os.read(ours, 65536)
+        except OSError:  # the other end is closed
+            break
+        if not part:
+            break
+        seen += part
+    os.close(ours)
+    assert process.wait(timeout=300) == 0
+    text = seen.decode()
+    for name in ("modes, steps", "update, iter", "parts of the", "steps of the bis"):
+        assert name in text
+    piped = child(SHOWN, subprocess.PIPE)
+    assert piped.communicate(timeout=300) == (b"done\n", b"")
+
+
+INTERRUPTED = """
+import json, multiprocessing, os, signal, threading
+from concurrent.futures import ProcessPoolExecutor
+from threadpoolctl import threadpool_info
+import machines
+
+def study():
+    with ProcessPoolExecutor(2) as executor:
+        return fx.study(list(range(200)), machines.slow_machine, executor=executor,
+                        checkpoint=sys.argv[1] if len(sys.argv) > 1 else None)
+
+def threads():
+    return [pool["num_threads"] for pool in threadpool_info()]
+
+before, found = threads(), {}
+for name, work in {**WORK, "machines": study}.items():
+    if name == "parts of the record":
+        work = lambda: [WORK["parts of the record"]() for _ in range(50)]
+    timer = threading.Timer(0.1, os.kill, (os.getpid(), signal.SIGINT))
+    timer.start()
+    try:
+        while True:  # until the signal comes
+            tried(work)
+    except KeyboardInterrupt:
+        timer.join()
+    found[name] = {
+        "threads": threads() == before,
+        "bars": len(progress._inside()),
+        "children": len(multiprocessing.active_children()),
+        "alive": threading.active_count(),
+    }
+modes = fx.solve_modes(block, count=30)
+same = np.array_equal(modes.phi, fx.solve_modes(block, count=30).phi)
+print(json.dumps({"found": found, "same": bool(same)}))
+"""
+
+
+@pytest.mark.slow
+def test_interrupted_work_leaves_nothing_behind():
+    """By the signal of Ctrl-C: threads of BLAS, bars and processes are as before."""
+    process = child(INTERRUPTED, subprocess.PIPE)
+    out, err = process.communicate(timeout=300)
+    assert process.returncode == 0, err.decode()
+    answer = json.loads(out)
+    assert len(answer["found"]) == 5 and answer["same"]
+    for name, left in answer["found"].items():
+        assert left == {"threads": True, "bars": 0, "children": 0, "alive": 1}, name
+
+
+def test_a_notebook_is_somebody(monkeypatch, capsys):
+    class ZMQInteractiveShell:
+        """What IPython calls the shell of a notebook."""
+
+    shell = types.SimpleNamespace(get_ipython=ZMQInteractiveShell)
+    monkeypatch.setitem(sys.modules, "IPython", shell)
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+    with Progress(3, "modes") as bar:
+        bar.advance()
+    said = capsys.readouterr()
+    assert "modes" in said.out and not said.err
+    shell.get_ipython = lambda: None
+    with Progress(3, "modes") as bar:
+        bar.advance()
+    assert capsys.readouterr() == ("", "")
+
+
+def test_the_outermost_work_has_the_bar(monkeypatch, capsys):
+    """Also for what runs in the threads of a pool; a tick counts for its own work only."""
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "PATIENCE", 0.0)
+
+    def inner(item):
+        with Progress(2, "inner") as bar:
+            tick("outer")
+            tick("inner")
+        return bar.done
+
+    with ThreadPoolExecutor(2) as pool, Progress(10, "outer") as outer:
+        assert mapped(inner, range(4)) == [1] * 4
+        assert mapped(inner, range(4), executor=pool) == [1] * 4
+        tick("outer")
+    assert outer.done == 1
+    said = capsys.readouterr().err
+    assert "outer" in said and "inner" not in said and "items" not in said
+
+
+def test_what_compiled_code_does_not_look_for():
+    """A program of semidefinite matrices is left at once; results and errors come through."""
+    started, over = threading.Event(), threading.Event()
+
+    def program():
+        started.set()
+        return over.wait(60.0)
+
+    def interrupt():
+        started.wait(60.0)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    threading.Thread(target=interrupt, daemon=True).start()
+    with pytest.raises(KeyboardInterrupt):
+        interruptible(program)
+    over.set()
+    assert interruptible(lambda: 3) == 3
+    with pytest.raises(ZeroDivisionError):
+        interruptible(lambda: 1 // 0)
+
+
+def test_a_bar_is_drawn_while_the_first_item_takes_its_time(monkeypatch, capsys):
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(progress, "PATIENCE", 0.02)
+    with Progress(1, "one long program"):
+        for _ in range(500):
+            time.sleep(0.01)
+            if "one long program" in capsys.readouterr().err:
+                return
+    raise AssertionError("no bar")
