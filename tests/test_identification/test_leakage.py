@@ -15,6 +15,7 @@ from flexplant.identification import (
     identify_modes,
     multisine,
 )
+from flexplant.identification.window_terms import hann_ratio
 from flexplant.io import read_frf_csv, write_frf_csv
 from flexplant.lti import Frf
 from flexplant.store import load
@@ -123,6 +124,44 @@ def test_fits_over_hann_lines_claim_what_they_are_off_by():
     spread = np.sqrt(np.mean(np.var(scores, axis=0, ddof=1)))
     assert spread == pytest.approx(1.0, abs=0.15)
     assert np.mean(misfits) == pytest.approx(1.0, abs=0.03)
+
+
+def test_what_the_window_makes_of_a_pole_against_a_sum():
+    """The response times the autocorrelation of the window, summed, and its slope differenced."""
+    T, n, h = 2.0, 40_000, 1e-5
+    w = ss.get_window("hann", n)
+    lag = ss.correlate(w, w)[n - 1 :] / np.sum(w**2)
+    time = (np.arange(n) + 0.5) * T / n
+    lag = (lag + np.append(lag[1:], 0.0)) / 2
+    for gap in (0.05 + 3j, 1e-3 + 1e-3j, 0.01 + np.pi * 1j, 0.4 - np.pi * 1j, 2 + 40j):
+        value, slope = hann_ratio(np.array([gap]), T)
+        seen = gap * np.sum(lag * np.exp(-gap * time)) * T / n
+        assert abs(value[0] - seen) < 1e-5 * abs(seen)
+        ahead, behind = (hann_ratio(np.array([gap + d]), T)[0] for d in (h, -h))
+        assert abs(slope - (ahead - behind) / (2 * h))[0] < 1e-6 * abs(slope[0])
+
+
+@pytest.mark.parametrize(("lines", "off"), [(0.5, 0.1), (4.0, 0.02)])
+def test_damping_is_that_of_the_machine_through_the_window(lines, off):
+    """A resonance of half a line became two or three poles, one of four lines was 10 % wider."""
+    rate, segment = 400.0, 4.0
+    zeta = lines / segment / (2 * 50.0)
+    rng = np.random.default_rng(3)
+    u = rng.normal(size=100_000)
+    y = moved(u, FREQS, zeta, PHI, rate)
+    y += 0.05 * np.std(y) * rng.normal(size=y.shape)
+    frf = estimate_frf(u, y, rate, method=H1Estimator(segment=segment))
+    found = identify_modes(frf, band=(20.0, 130.0), hold=rate, orders=range(2, 16))
+    assert len(found) == 2
+    assert found.segment == segment
+    error = found.poles - pole(FREQS, zeta)
+    assert np.abs(error.real / found.std.real).max() < 3.5
+    assert np.abs(found.zeta / zeta - 1).max() < off
+    peak = np.argmax(np.abs(frf.data[0, 0]))
+    shown = [found.frf(frf.freq[[peak]], as_measured=seen).data[0, 0, 0] for seen in (True, False)]
+    ratio = np.abs(shown) / np.abs(frf.data[0, 0, peak])
+    assert ratio[0] == pytest.approx(1.0, abs=off + 0.03)
+    assert ratio[1] > 1.04  # the machine's own resonance is higher
 
 
 @pytest.mark.slow

@@ -5,6 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from ..values import ComplexArray, FloatArray
+from .window_terms import hann_ratio
+
+
+def seen_terms(
+    poles: ComplexArray, s: ComplexArray, hold: float | None, segment: float | None
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return `pole_terms` as lines of Hann-windowed segments [s] show them; None: as they are."""
+    value, slope = pole_terms(poles, s, hold)
+    if segment is None:
+        return value, slope
+    ratio, change = hann_ratio(s[None, :] - poles[:, None], segment)
+    return value * ratio, slope * ratio - value * change
 
 
 def pole_terms(

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import ModelError
 from ..lti.frequency import Frf, checked_freq
 from ..values import ComplexArray, FloatArray
-from .basis import axis, pole_terms, residual_terms
+from .basis import axis, residual_terms, seen_terms
 from .diagram import StabilisationDiagram
 from .measured import MeasuredModes
 
@@ -40,6 +40,8 @@ class IdentifiedModes(MeasuredModes):
         The largest frequency.
     hold : float [Hz], optional
         Rate of the zero-order hold in the measurement.
+    segment : float [s], optional
+        Length of the Hann-windowed segments through which the poles were fitted.
     unreported : complex array
         Poles just outside the band that help the fit, then their shapes and participation.
     mass_normalised : bool
@@ -73,6 +75,7 @@ class IdentifiedModes(MeasuredModes):
     lower: int = field(kw_only=True)
     top: float = field(kw_only=True)
     hold: float | None = field(default=None, kw_only=True)
+    segment: float | None = field(default=None, kw_only=True)
     unreported: tuple[ComplexArray, ComplexArray, ComplexArray] = field(kw_only=True)
     mass_normalised: bool = field(default=False, kw_only=True)
     misfit: float = field(kw_only=True)
@@ -90,13 +93,16 @@ class IdentifiedModes(MeasuredModes):
             shape_covariance=self.shape_covariance,
         )
 
-    def frf(self, freq: FloatArray) -> Frf:
+    def frf(self, freq: FloatArray, *, as_measured: bool = False) -> Frf:
         """Return the identified response (displacement per input), to compare or to extend.
 
         Parameters
         ----------
         freq : (n_freq,) array [Hz]
             Positive; outside the identified band the residual terms do not hold.
+        as_measured : bool
+            As the lines of the windowed segments show it, where the poles were fitted so: with
+            lower and wider resonances than those of the machine.
 
         Raises
         ------
@@ -112,8 +118,9 @@ class IdentifiedModes(MeasuredModes):
         poles = np.concatenate([self.poles, poles])
         shapes = np.concatenate([self.shapes, shapes], axis=1)
         participation = np.concatenate([self.participation, participation], axis=1)
-        plus, _ = pole_terms(poles, s, self.hold)
-        minus, _ = pole_terms(poles.conj(), s, self.hold)
+        segment = self.segment if as_measured else None
+        plus, _ = seen_terms(poles, s, self.hold, segment)
+        minus, _ = seen_terms(poles.conj(), s, self.hold, segment)
         data = np.einsum("ok,ik,kf->oif", shapes, participation, plus)
         data += np.einsum("ok,ik,kf->oif", shapes.conj(), participation.conj(), minus)
         upper = self.terms.shape[2] - self.lower

@@ -14,7 +14,7 @@ from ..parallel import Progress, one_thread
 from ..values import instance, positive, real_array, short, whole
 from .diagram import PoleSelection, StabilisationDiagram
 from .identified import IdentifiedModes
-from .leakage import leakage_warned, no_pole
+from .leakage import hann_segment, leakage_warned, no_pole, seen_better
 from .line_weights import PreparedLines, prepared
 from .pole_split import backed, relocated, separated
 from .pole_test import freedom, supported
@@ -128,6 +128,10 @@ def identify_modes(
     (repeated, or too close for the diagram) is taken apart where that lowers chi-square by more
     than noise does.
 
+    Lines of Hann-windowed segments show a resonance widened by the window: where that explains them
+    better (H1 of random excitation), each term ``1/(s - lambda)`` is fitted as such lines show it,
+    so that damping is that of the machine down to resonances of half a line.
+
     Parameters
     ----------
     frf : Frf
@@ -167,7 +171,8 @@ def identify_modes(
     -----
     FlexplantWarning
         When the residual of a stretch of lines is more than noise: a missed or merged mode; or
-        when a resonance is narrower than about four lines of windowed segments.
+        when a resonance is narrower than half a line of Hann-windowed segments, or than about four
+        where the window is not fitted through.
 
     Raises
     ------
@@ -247,13 +252,19 @@ def _identified(
     for _ in range(1 if ready.known else 2):
         # with all residual terms, so that no pole is kept or moved to stand in for one
         lines = Lines(ready.freq, ready.data, ready.weight, lower, tried[-1], rate, ready.known)
-        lines = replace(lines, inflation=ready.inflation, variance_freedom=frf.freedom)
+        lines = replace(
+            lines,
+            inflation=ready.inflation,
+            variance_freedom=frf.freedom,
+            segment=hann_segment(frf),
+        )
         if start is None:
             poles, part = supported(lines, poles, part)
             if not poles.size:
                 raise no_pole(frf, _unsupported(low, high))
         # poles that turn out to be none may keep it from settling: judged at the end
         fit = refined(lines, poles, part, steps=max_iterations, strict=start is not None)
+        lines, fit = seen_better(lines, fit, poles, part, steps=max_iterations)
         if start is None:
             light = np.flatnonzero(-fit.poles.real < BROADEST * np.abs(fit.poles))
             fewer, part = supported(lines, fit.poles[light], fit.participation[:, light])
@@ -281,7 +292,7 @@ def _identified(
     fit = refined(lines, fit.poles, fit.participation, steps=max_iterations, fine=True)
     warned(left)
     found = answer(frf, ready, lines, fit, (low, high), labels, diagram)
-    leakage_warned(frf, found.poles)
+    leakage_warned(frf, found)
     return found
 
 

@@ -12,7 +12,7 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..values import ComplexArray, FloatArray
-from .basis import axis, pole_terms, residual_terms
+from .basis import axis, residual_terms, seen_terms
 
 #: largest entry of a participation vector beside the one held at 1
 RUNAWAY = 5.0
@@ -39,6 +39,8 @@ class Lines:
     inflation: float = 1.0
     #: complex degrees of freedom of an estimated variance, None where it is exact or the fit's own
     variance_freedom: float | None = None
+    #: length [s] of the Hann-windowed segments that the fit takes account of
+    segment: float | None = None
 
     @cached_property
     def smooth(self) -> ComplexArray:
@@ -196,8 +198,8 @@ class _Projected:
         m = poles.size
         self.lines, self.pivots, self.m = lines, pivots, m
         self.participation = participation
-        self.plus, self.slope = pole_terms(poles, s, lines.hold)
-        self.minus, self.slope_minus = pole_terms(poles.conj(), s, lines.hold)
+        self.plus, self.slope = seen_terms(poles, s, lines.hold, lines.segment)
+        self.minus, self.slope_minus = seen_terms(poles.conj(), s, lines.hold, lines.segment)
         self.shapes = np.zeros((n_out, m), dtype=np.complex128)
         self.triangles: list[tuple[FloatArray, FloatArray]] = []
         #: per output the basis of the shapes' columns, free of residual terms, and the error

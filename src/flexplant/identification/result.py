@@ -69,6 +69,7 @@ def answer(
         lower=lines.lower,
         top=float(lines.freq[-1]),
         hold=lines.hold,
+        segment=lines.segment,
         unreported=(fit.poles[outside], shapes[:, outside], part[:, outside]),
         mass_normalised=normalised,
         misfit=misfit,

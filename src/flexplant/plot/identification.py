@@ -99,7 +99,7 @@ def identified(
     band = modes.freq.min() * 0.8, max(modes.top, float(modes.freq.max()))
     inside = (frf.freq >= band[0]) & (frf.freq <= band[1])
     freq = frf.freq[inside]
-    known, fit = frf[output, input][inside], modes.frf(freq)[output, input]
+    known, fit = frf[output, input][inside], modes.frf(freq, as_measured=True)[output, input]
     factor, unit = shown_in(ax.yaxis, float(np.max(np.abs(known))), frf.unit(output, input))
 
     def draw(values: FloatArray | ComplexArray, label: str, style: Style) -> None:
