@@ -148,8 +148,7 @@ def consistency(
 
     References
     ----------
-    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, ch.
-    5.4; Ljung, Box, Biometrika 65, 1978; Bartlett, Stochastic Processes, 1955.
+    [BarShalom2001]_, ch. 5.4; [LjungBox1978]_; [Bartlett1955]_.
 
     Examples
     --------

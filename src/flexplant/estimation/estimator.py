@@ -213,8 +213,7 @@ class KalmanEstimator(Value):
 
         References
         ----------
-        Anderson, Moore, Optimal Filtering, 1979, ch. 7; de Jong, The diffuse Kalman filter, Ann.
-        Statist. 19, 1991.
+        [AndersonMoore1979]_, ch. 7; [deJong1991]_.
         """
         place = None
         if path is not None:

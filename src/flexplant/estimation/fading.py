@@ -49,8 +49,7 @@ def excess(
 
     References
     ----------
-    Lainiotis, Partitioned linear estimation algorithms: discrete case, IEEE Trans. Autom. Control
-    20, 1975.
+    [Lainiotis1975]_.
     """
     more = P - steady.P
     if Z.shape[1]:

@@ -64,7 +64,7 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
 
     References
     ----------
-    Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999, ch. 4.
+    [Hassibi1999]_, ch. 4.
 
     Examples
     --------

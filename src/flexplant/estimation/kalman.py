@@ -90,7 +90,7 @@ def design_kalman(
 
     References
     ----------
-    Anderson, Moore, Optimal Filtering, 1979, ch. 4.
+    [AndersonMoore1979]_, ch. 4.
 
     Examples
     --------

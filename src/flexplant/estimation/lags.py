@@ -53,6 +53,10 @@ class FixedLag(Value):
     ModelError
         When it is no whole number from 1.
 
+    References
+    ----------
+    [AndersonMoore1979]_, chapter 7.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -72,6 +76,10 @@ class FixedLag(Value):
 @dataclass(frozen=True, eq=False)
 class Smoother(Value):
     """From all measurements of the record: the fixed-interval smoother x[k|N-1].
+
+    References
+    ----------
+    [AndersonMoore1979]_, chapter 7.
 
     Examples
     --------

@@ -85,9 +85,8 @@ def design_minimax_filter(
 
     References
     ----------
-    Geromel, Optimal linear filtering under parameter uncertainty, IEEE Trans. Signal Processing
-    47, 1999 (the finite set of machines); the dual Stein equation for the gradient: Levine, Athans,
-    IEEE Trans. Automatic Control 15, 1970.
+    [Geromel1999]_ (the finite set of machines); [LevineAthans1970]_ (the dual Stein equation
+    for the gradient).
 
     Examples
     --------

@@ -239,7 +239,7 @@ def design_multirate(
 
     References
     ----------
-    Bittanti, Colaneri, Periodic Systems, Springer, 2009, ch. 6 and 9.
+    [BittantiColaneri2009]_, ch. 6 and 9.
 
     Examples
     --------

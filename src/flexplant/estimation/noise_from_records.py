@@ -77,8 +77,7 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
 
     References
     ----------
-    Whittle, Arkiv foer Matematik 2, 1953; Odelson, Rajamani, Rawlings, A new autocovariance
-    least-squares method for estimating noise covariances, Automatica 42, 2006.
+    [Whittle1953]_; [Odelson2006]_.
 
     Examples
     --------

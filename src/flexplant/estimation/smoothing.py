@@ -28,9 +28,7 @@ def smoothed(passage: Passage, sight: Sight) -> tuple[FloatArray, FloatArray]:
 
     References
     ----------
-    Bryson, Frazier, Smoothing for linear and nonlinear dynamic systems, 1963; for unknown first
-    states de Jong, Smoothing and interpolation with the state-space model, J. Amer. Stat. Assoc.
-    84, 1989.
+    [BrysonFrazier1963]_; [deJong1989]_ (unknown first states).
     """
     hat, variance = passage.hat.copy(), passage.variance.copy()
     model = passage.steady.model

@@ -122,7 +122,7 @@ def design_static(
 
     References
     ----------
-    The paper, section 5: "the static geometric relation".
+    [paper]_, section 5: "the static geometric relation".
 
     Examples
     --------

@@ -136,9 +136,7 @@ def design_input_estimator(
 
     References
     ----------
-    Gillijns, De Moor, Unbiased minimum-variance input and state estimation for linear discrete-time
-    systems, Automatica 43, 2007, 111-116; ... with direct feedthrough, 934-937. Kitanidis, Unbiased
-    minimum-variance linear state estimation, Automatica 23, 1987.
+    [GillijnsDeMoor2007a]_; [GillijnsDeMoor2007b]_ (direct feedthrough); [Kitanidis1987]_.
 
     Examples
     --------

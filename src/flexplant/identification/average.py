@@ -44,6 +44,10 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     ModelError
         When there are fewer than two, they differ in quantity or do not differ at all.
 
+    References
+    ----------
+    [PintelonSchoukens2012]_, chapter 2.
+
     Examples
     --------
     >>> import flexplant as fx

@@ -77,8 +77,8 @@ def estimate_frf(
 
     References
     ----------
-    Bendat, Piersol, "Random Data", 4th ed., 2010, ch. 6-7 and 9 (estimators, coherence, variance).
-    Pintelon, Schoukens, "System Identification", 2012, ch. 2, 3 and 7 (periodic, under feedback).
+    [BendatPiersol2010]_, ch. 6, 7 and 9 (estimators, coherence, variance);
+    [PintelonSchoukens2012]_, ch. 2, 3 and 7 (periodic, under feedback).
 
     Examples
     --------

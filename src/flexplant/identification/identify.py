@@ -69,8 +69,7 @@ def stabilisation_diagram(
 
     References
     ----------
-    Peeters, Van der Auweraer, Guillaume, Leuridan, "The PolyMAX frequency-domain method: a new
-    standard for modal parameter estimation?", Shock and Vibration 11 (2004) 395-409.
+    [Peeters2004]_.
 
     Examples
     --------
@@ -183,11 +182,7 @@ def identify_modes(
 
     References
     ----------
-    Golub, Pereyra, "Separable nonlinear least squares: the variable projection method and its
-    applications", Inverse Problems 19 (2003) R1-R26.
-    Pintelon, Schoukens, "System Identification: A Frequency Domain Approach", 2012, ch. 9.
-    Pintelon, Guillaume, Schoukens, "Uncertainty calculation in (operational) modal analysis",
-    Mechanical Systems and Signal Processing 21 (2007) 2359-2373.
+    [GolubPereyra2003]_; [PintelonSchoukens2012]_, ch. 9; [Pintelon2007]_.
 
     Examples
     --------

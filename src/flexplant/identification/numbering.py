@@ -68,8 +68,7 @@ def numbered(
 
     References
     ----------
-    Allemang, "The Modal Assurance Criterion - twenty years of use and abuse", Sound and Vibration
-    37 (2003) 14-21.
+    [Allemang2003]_.
 
     Examples
     --------

@@ -98,9 +98,7 @@ def identify_output_only(
 
     References
     ----------
-    Peeters, De Roeck: Reference-based stochastic subspace identification for output-only modal
-    analysis, Mech. Syst. Signal Process. 13, 1999. Reynders, Pintelon, De Roeck: Uncertainty
-    bounds on modal parameters obtained from stochastic subspace identification, ibid. 22, 2008.
+    [PeetersDeRoeck1999]_; [Reynders2008]_ (bounds).
 
     Examples
     --------

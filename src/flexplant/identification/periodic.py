@@ -33,6 +33,10 @@ class Periodic(Value):
     band : (low, high) [Hz], optional
         Lines to use; by default all lines that are excited.
 
+    References
+    ----------
+    [PintelonSchoukens2012]_, chapter 2.
+
     Examples
     --------
     >>> import flexplant as fx

@@ -60,6 +60,10 @@ class H1Estimator(SpectralMethod):
     ModelError
         When a value is out of range.
 
+    References
+    ----------
+    [BendatPiersol2010]_, chapter 9.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -88,6 +92,10 @@ class H2Estimator(SpectralMethod):
     ------
     ModelError
         When a value is out of range.
+
+    References
+    ----------
+    [BendatPiersol2010]_, chapter 9.
 
     Examples
     --------
@@ -119,6 +127,10 @@ class HvEstimator(SpectralMethod):
     ------
     ModelError
         When a value is out of range.
+
+    References
+    ----------
+    [BendatPiersol2010]_, chapter 9.
 
     Examples
     --------

@@ -82,7 +82,7 @@ def structural_modes(
 
     References
     ----------
-    O'Callahan, Avitabile, Riemer: System equivalent reduction expansion process, IMAC 7, 1989.
+    [OCallahan1989b]_.
 
     Examples
     --------

@@ -28,10 +28,9 @@ def joined_frfs(frfs: Mapping[str, Frf], joints: Iterable[Joint] | Joint) -> Frf
     ``Y - Y B^T (B Y B^T + Z)^-1 B Y``, Y being block-diagonal, B the stretches of the joints and Z
     what they give way: dual coupling by Lagrange multipliers (LM-FBS).
 
-    Notes
-    -----
-    D. de Klerk, D. J. Rixen, S. N. Voormeeren, General framework for dynamic substructuring:
-    history, review and classification of techniques, AIAA Journal 46(5), 2008.
+    References
+    ----------
+    [deKlerk2008]_.
     """
     _same_lines(frfs)
     links = frf_links(_listed(joints), {name: _collocated(frf) for name, frf in frfs.items()})
@@ -89,10 +88,9 @@ def uncoupled(machine: Frf, known: Mapping[str, Frf], joints: Iterable[Joint] | 
         When the interface is so badly conditioned that errors of a measurement would hide the
         answer.
 
-    Notes
-    -----
-    S. N. Voormeeren, D. J. Rixen, A family of substructure decoupling techniques based on a dual
-    assembly approach, Mechanical Systems and Signal Processing 27, 2012.
+    References
+    ----------
+    [VoormeerenRixen2012]_.
 
     Examples
     --------

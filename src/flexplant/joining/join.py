@@ -102,9 +102,9 @@ def joined(
         static shape for the load of a joint, joints nearly repeat each other, or a component has
         no damping where others have.
 
-    Notes
-    -----
-    R. R. Craig, A. J. Kurdila, Fundamentals of structural dynamics, 2nd ed., Wiley, 2006, ch. 17.
+    References
+    ----------
+    [CraigKurdila2006]_, ch. 17.
 
     Examples
     --------

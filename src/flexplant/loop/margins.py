@@ -29,6 +29,10 @@ def modulus_margin(loop: Loop) -> float:
     LabelError, ModelError
         When channels do not match, or `loop` is of another type.
 
+    References
+    ----------
+    [Skogestad2005]_, section 2.4 (its inverse, the peak of S).
+
     Examples
     --------
     >>> import flexplant as fx

@@ -89,6 +89,10 @@ def sensitivity(
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
 
+    References
+    ----------
+    [Skogestad2005]_, section 3.2.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -129,6 +133,10 @@ def complementary_sensitivity(
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
 
+    References
+    ----------
+    [Skogestad2005]_, section 3.2.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -165,6 +173,10 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
         When channels of plant and controller do not match.
     ModelError, ShapeError
         When `freq` is not an array of positive frequencies.
+
+    References
+    ----------
+    [Skogestad2005]_, section 3.2.
 
     Examples
     --------

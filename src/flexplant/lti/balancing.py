@@ -112,9 +112,7 @@ def balanced(
 
     References
     ----------
-    Enns, Model reduction with balanced realizations, CDC 1984. Liu, Anderson, Singular
-    perturbation approximation of balanced systems, Int. J. Control 50, 1989. Laub, Heath, Paige,
-    Ward, Computation of system balancing transformations, IEEE Trans. Autom. Control 32, 1987.
+    [Enns1984]_; [LiuAnderson1989]_; [Laub1987]_.
 
     Examples
     --------

@@ -60,6 +60,10 @@ def discretized(
     FlexplantWarning
         When all modes lie above half the rate.
 
+    References
+    ----------
+    [Franklin1998]_, section 4.3.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -242,6 +246,10 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
     ------
     ModelError
         When `sys` is sampled already, prewarp is not below half the rate, or a pole lies at a.
+
+    References
+    ----------
+    [Franklin1998]_, section 6.1.
 
     Examples
     --------

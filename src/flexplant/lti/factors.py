@@ -48,8 +48,7 @@ def _factor(A: FloatArray, B: FloatArray) -> FloatArray:
 
     References
     ----------
-    Hammarling, Numerical solution of the stable, non-negative definite Lyapunov equation, IMA J.
-    Numer. Anal. 2, 1982.
+    [Hammarling1982]_.
     """
     n = A.shape[0]
     if not n:

@@ -36,6 +36,10 @@ def hankel_values(sys: System) -> FloatArray:
     SolverError
         When the system is not strictly stable: its Gramians are infinite.
 
+    References
+    ----------
+    [Glover1984]_.
+
     Examples
     --------
     >>> from flexplant.lti import StateSpace
@@ -71,6 +75,10 @@ def hankel_norm(sys: System) -> float:
     ------
     ModelError
         When `sys` is no system.
+
+    References
+    ----------
+    [Glover1984]_.
 
     Examples
     --------

@@ -121,6 +121,10 @@ def lft(P: System, K: System) -> StateSpace:
     ModelError
         When the loop is ill-posed (I - D22 DK singular) or sampling times differ.
 
+    References
+    ----------
+    [ZhouDoyleGlover1996]_, chapter 10.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -194,6 +198,10 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
         When the numbers of channels do not match.
     ModelError
         When the loop is ill-posed.
+
+    References
+    ----------
+    [Skogestad2005]_, section 3.2.
 
     Examples
     --------

@@ -50,7 +50,7 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
 
     References
     ----------
-    Smith, Matrix equation XA + BX = C, SIAM J. Appl. Math. 16, 1968.
+    [Smith1968]_.
 
     Examples
     --------
@@ -142,6 +142,10 @@ def controllability_gramian(sys: System) -> FloatArray:
     SolverError
         When the system is not strictly stable.
 
+    References
+    ----------
+    [ZhouDoyleGlover1996]_, section 3.8.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -169,6 +173,10 @@ def observability_gramian(sys: System) -> FloatArray:
     ------
     SolverError
         When the system is not strictly stable.
+
+    References
+    ----------
+    [ZhouDoyleGlover1996]_, section 3.8.
 
     Examples
     --------

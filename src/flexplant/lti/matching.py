@@ -46,7 +46,7 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
 
     References
     ----------
-    Franklin, Powell, Workman, Digital control of dynamic systems, 3rd ed., sec. 6.2.
+    [Franklin1998]_, sec. 6.2.
 
     Examples
     --------

@@ -50,8 +50,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
 
     References
     ----------
-    Tombs, Postlethwaite, Truncated balanced realization of a stable non-minimal state-space
-    system, Int. J. Control 46, 1987.
+    [TombsPostlethwaite1987]_.
 
     Examples
     --------

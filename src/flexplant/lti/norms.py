@@ -59,6 +59,10 @@ def h2_norm(sys: System) -> float:
     CertificateError
         When the two Gramians give different norms.
 
+    References
+    ----------
+    [ZhouDoyleGlover1996]_, section 4.6.
+
     Examples
     --------
     >>> print(f"{h2_norm(StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])):.3f}")
@@ -112,6 +116,10 @@ def hinf_norm(sys: System, *, progress: bool | None = None) -> float:
     ModelError
         When `sys` is no system.
 
+    References
+    ----------
+    [BruinsmaSteinbuch1990]_.
+
     Examples
     --------
     >>> resonance = StateSpace([[0, 1], [-1, -0.02]], [[0], [1]], [[1, 0]], [[0]])
@@ -154,10 +162,7 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
 
     References
     ----------
-    Boyd, Balakrishnan, A regularity result for the singular values of a transfer matrix and a
-    quadratically convergent algorithm for computing its L-infinity norm, Syst. Control Lett. 15,
-    1990. Bruinsma, Steinbuch, A fast algorithm to compute the H-infinity norm of a transfer
-    function matrix, Syst. Control Lett. 14, 1990.
+    [BoydBalakrishnan1990]_; [BruinsmaSteinbuch1990]_.
 
     Examples
     --------

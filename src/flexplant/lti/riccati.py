@@ -115,8 +115,7 @@ def solve_dare(
 
     References
     ----------
-    Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time algebraic
-    Riccati equations, Int. J. Control 77, 2004.
+    [Chu2004]_.
 
     Examples
     --------
@@ -160,8 +159,7 @@ def solve_care(
 
     References
     ----------
-    Chu, Fan, Lin, A structure-preserving doubling algorithm for continuous-time algebraic Riccati
-    equations, Linear Algebra Appl. 396, 2005.
+    [Chu2005]_.
 
     Examples
     --------
@@ -210,6 +208,10 @@ def control_dare(
     SolverError
         When no strictly stabilising solution exists or the residual stays bad.
 
+    References
+    ----------
+    [Chu2004]_.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -255,6 +257,10 @@ def control_care(
         For bad sizes, entries that are not finite, a singular R.
     SolverError
         When no strictly stabilising solution exists or the residual stays bad.
+
+    References
+    ----------
+    [Chu2005]_.
 
     Examples
     --------

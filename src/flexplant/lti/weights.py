@@ -199,6 +199,10 @@ def inverse_sensitivity(
     ModelError
         Unless floor < 1 < peak, bandwidth > 0 and slope is 1 or 2.
 
+    References
+    ----------
+    [Skogestad2005]_, section 2.8.
+
     Examples
     --------
     >>> import flexplant as fx

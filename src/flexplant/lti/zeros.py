@@ -39,8 +39,7 @@ def invariant_zeros(g: Any) -> ComplexArray:
 
     References
     ----------
-    Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable systems, Automatica 18,
-    1982.
+    [EmamiNaeiniVanDooren1982]_.
     """
     A, B, C, D = _even(*_scaled(g))
     A, B, C, D = _compressed(A, B, C, D)
@@ -111,8 +110,7 @@ def axis_zeros(g: Any) -> ComplexArray:
 
     References
     ----------
-    Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable systems, Automatica 18,
-    1982; the random mixing replaces their compression.
+    [EmamiNaeiniVanDooren1982]_; the random mixing replaces their compression.
     """
     n, m = g.n_states, len(g.inputs)
     A, B, C, D = _scaled(g)

@@ -84,10 +84,9 @@ def damped_modes(
     ModelError
         As `normal_form`.
 
-    Notes
-    -----
-    G. L. G. Sleijpen, J. G. L. Booten, D. R. Fokkema, H. A. van der Vorst, Jacobi-Davidson type
-    methods for generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.
+    References
+    ----------
+    [Sleijpen1996]_.
     """
     V, r = phi, model.rigid_body.shape[1]
     factor: StiffnessFactor | None = None

@@ -94,6 +94,10 @@ def solve_modes(
     LabelError
         When a place is unknown.
 
+    References
+    ----------
+    [paper]_, equations (2)-(5); [Grimes1994]_ (large models).
+
     Examples
     --------
     >>> from flexplant.structure import kirchhoff_plate

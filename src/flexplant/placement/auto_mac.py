@@ -52,6 +52,10 @@ class AutoMac(ByShapes):
     alike. It does not count how large the motions are that the sensors see, and of a POI it says
     next to nothing, as `ModeInformation`.
 
+    References
+    ----------
+    [Allemang2003]_.
+
     Examples
     --------
     >>> import flexplant as fx

@@ -38,8 +38,7 @@ class ByRows(Search):
 
     References
     ----------
-    Kammer, J. Guidance 14, 1991; Imamovic, PhD thesis, Imperial College, 1998; Manohar, Brunton,
-    Kutz, Brunton, IEEE Control Systems 38, 2018.
+    [Kammer1991]_; [Imamovic1998]_; [Manohar2018]_.
 
     Examples
     --------

@@ -93,6 +93,10 @@ class ModalObservability(ModalGramian):
     ModelError
         When the measure is none of these; when called, for a plant without elastic modes.
 
+    References
+    ----------
+    [Gawronski2004]_, chapter 4.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -123,6 +127,10 @@ class ModalControllability(ModalGramian):
     ------
     ModelError
         When the measure is none of these; when called, for a plant without elastic modes.
+
+    References
+    ----------
+    [Gawronski2004]_, chapter 4.
 
     Examples
     --------

@@ -36,6 +36,10 @@ class KineticEnergy(ByShapes):
         When the model is no structure; when called, where no mass matrix is known or it is of
         another structure.
 
+    References
+    ----------
+    [Kammer1991]_.
+
     Examples
     --------
     >>> import flexplant as fx

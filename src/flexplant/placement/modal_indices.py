@@ -37,7 +37,7 @@ class SensorIndices(ByShapes):
 
     References
     ----------
-    Gawronski, Advanced Structural Dynamics and Active Control of Structures, 2004, ch. 5 and 7.
+    [Gawronski2004]_, ch. 5 and 7.
 
     Examples
     --------

@@ -54,6 +54,10 @@ class ModeInformation(ByShapes):
     ModelError
         When elastic is neither True nor False; when called, for a plant made elsewhere.
 
+    References
+    ----------
+    [Kammer1991]_.
+
     Examples
     --------
     >>> import flexplant as fx

@@ -70,6 +70,10 @@ class PoiVariance(Criterion):
         When a factor is not positive, the measure or the lag is none of these, larger is no
         structure, or is given with own_modes or a lag.
 
+    References
+    ----------
+    [AndersonMoore1979]_, chapter 4.
+
     Examples
     --------
     >>> PoiVariance("die", {"z": 1.0, "rx": 0.013})

@@ -53,7 +53,7 @@ def assemble_plant(
 
     References
     ----------
-    The paper, equations (1)-(8) and Fig. 2.
+    [paper]_, equations (1)-(8) and Fig. 2.
 
     Examples
     --------

@@ -50,7 +50,7 @@ def mixed_sensitivity(
 
     References
     ----------
-    Kwakernaak, Robust control and H-infinity optimization, Automatica 29, 1993.
+    [Kwakernaak1993]_.
 
     Examples
     --------

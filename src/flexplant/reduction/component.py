@@ -53,10 +53,9 @@ class CraigBampton(ReductionMethod):
     LabelError, ModelError
         For bad labels or numbers.
 
-    Notes
-    -----
-    R. R. Craig, M. C. C. Bampton, Coupling of substructures for dynamic analyses, AIAA Journal
-    6(7), 1968.
+    References
+    ----------
+    [CraigBampton1968]_.
 
     Examples
     --------
@@ -232,10 +231,9 @@ class Rubin(_FreeInterface):
     LabelError, ModelError
         For bad labels or numbers.
 
-    Notes
-    -----
-    S. Rubin, Improved component-mode representation for structural dynamic analysis, AIAA Journal
-    13(8), 1975.
+    References
+    ----------
+    [Rubin1975]_.
 
     Examples
     --------
@@ -291,9 +289,9 @@ class MacNeal(_FreeInterface):
     LabelError, ModelError
         For bad labels or numbers.
 
-    Notes
-    -----
-    R. H. MacNeal, A hybrid method of component mode synthesis, Computers & Structures 1(4), 1971.
+    References
+    ----------
+    [MacNeal1971]_.
 
     Examples
     --------

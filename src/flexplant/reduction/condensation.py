@@ -108,9 +108,9 @@ class Guyan(ReductionMethod):
     LabelError
         When a label appears twice, or none is given.
 
-    Notes
-    -----
-    R. J. Guyan, Reduction of stiffness and mass matrices, AIAA Journal 3(2), 1965.
+    References
+    ----------
+    [Guyan1965]_.
 
     Examples
     --------
@@ -171,11 +171,12 @@ class Irs(ReductionMethod):
 
     Notes
     -----
-    J. C. O'Callahan, A procedure for an improved reduced system (IRS) model, IMAC 7, 1989; M. I.
-    Friswell, S. D. Garvey, J. E. T. Penny, Model reduction using dynamic and iterated IRS
-    techniques, J. Sound and Vibration 186(2), 1995, and The convergence of the iterated IRS
-    method, 211(1), 1998. Each mode converges like the ratio of its omega^2 to the lowest one of
-    the structure with the kept DOFs held.
+    Each mode converges like the ratio of its omega^2 to the lowest one of the structure with
+    the kept DOFs held.
+
+    References
+    ----------
+    [OCallahan1989a]_; [FriswellGarveyPenny1995]_; [FriswellGarveyPenny1998]_.
 
     Examples
     --------
@@ -279,8 +280,11 @@ class Serep(ReductionMethod):
 
     Notes
     -----
-    J. C. O'Callahan, P. Avitabile, R. Riemer, System equivalent reduction expansion process, IMAC
-    7, 1989. With fewer modes than DOFs its M* is singular, which no plant can take: refused.
+    With fewer modes than DOFs its M* is singular, which no plant can take: refused.
+
+    References
+    ----------
+    [OCallahan1989b]_.
 
     Examples
     --------

@@ -47,6 +47,10 @@ class PivotedQr(SelectionCriterion):
 
     Its value for a DOF is the length of what those before it do not explain.
 
+    References
+    ----------
+    [Manohar2018]_.
+
     Examples
     --------
     >>> import flexplant as fx
@@ -80,10 +84,9 @@ class EffectiveIndependence(SelectionCriterion):
     lowest goes, and Q^-1 follows by a rank-one downdate. Fewer DOFs than modes are chosen by
     `PivotedQr` from the last k.
 
-    Notes
-    -----
-    D. C. Kammer, Sensor placement for on-orbit modal identification and correlation of large space
-    structures, J. Guidance, Control and Dynamics 14(2), 1991.
+    References
+    ----------
+    [Kammer1991]_.
 
     Examples
     --------

@@ -56,12 +56,9 @@ class Krylov(ReductionMethod):
     LabelError, ModelError
         For bad places, frequencies or numbers.
 
-    Notes
-    -----
-    Z. Bai, Y. Su, Dimension reduction of large-scale second-order dynamical systems via a
-    second-order Arnoldi method, SIAM J. Scientific Computing 26(5), 2005; B. Salimbahrami, B.
-    Lohmann, Order reduction of large scale second-order systems using Krylov subspace methods,
-    Linear Algebra and its Applications 415, 2006.
+    References
+    ----------
+    [BaiSu2005]_; [SalimbahramiLohmann2006]_.
 
     Examples
     --------

@@ -63,6 +63,10 @@ class DesiredDofs(ReductionMethod):
     LabelError, ModelError
         When a label appears twice, or none is given; when `damping` is no law.
 
+    References
+    ----------
+    [paper]_, equations (6)-(8).
+
     Examples
     --------
     >>> import flexplant as fx
@@ -223,6 +227,10 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
         are complex.
     LabelError
         When a DOF is unknown.
+
+    References
+    ----------
+    [paper]_, equations (6)-(8).
 
     Examples
     --------

@@ -144,11 +144,9 @@ def rank_modes(
     LabelError
         When a place is unknown.
 
-    Notes
-    -----
-    C. Z. Gregory, Reduction of large flexible spacecraft models using internal balancing theory,
-    J. Guidance 7(6), 1984; W. Gawronski, Advanced Structural Dynamics and Active Control of
-    Structures, Springer, 2004, chapter 4.
+    References
+    ----------
+    [Gregory1984]_; [Gawronski2004]_, chapter 4.
 
     Examples
     --------

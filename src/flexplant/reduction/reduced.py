@@ -85,6 +85,10 @@ class ReducedModel(Value):
     ShapeError, ModelError
         When sizes do not match or entries are not finite.
 
+    References
+    ----------
+    [paper]_, equations (6)-(8).
+
     Examples
     --------
     >>> import flexplant as fx

@@ -204,7 +204,10 @@ class ModalBalanced(ReductionMethod):
     band `ErrorBound.below(freq)` is tighter. Twice the
     sum of neglected Hankel values (K. Glover, 1984) bounds the truncation of the exactly balanced
     model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
-    W. Gawronski, Advanced Structural Dynamics and Active Control of Structures, 2004, chapter 6.
+
+    References
+    ----------
+    [Gawronski2004]_, chapter 6; [Glover1984]_.
 
     Examples
     --------

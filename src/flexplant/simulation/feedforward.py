@@ -192,8 +192,7 @@ def design_feedforward(
 
     References
     ----------
-    Boerlage, Tousain, Steinbuch, Jerk derivative feedforward control for motion systems, American
-    Control Conference, 2004.
+    [Boerlage2004]_.
 
     Examples
     --------

@@ -70,8 +70,7 @@ def inverse_forces(
 
     References
     ----------
-    Van Zundert, Oomen, On inversion-based approaches for feedforward and ILC, Mechatronics 50,
-    2018.
+    [VanZundertOomen2018]_.
 
     Examples
     --------

@@ -100,8 +100,7 @@ def learn_feedforward(
 
     References
     ----------
-    Van de Wijdeven, Bosgra, Using basis functions in iterative learning control: analysis and
-    design theory, International Journal of Control 83, 2010.
+    [VandeWijdevenBosgra2010]_.
     """
     _check(start, loop, move)
     orders = term_numbers(terms)

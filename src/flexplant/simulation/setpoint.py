@@ -67,8 +67,7 @@ def setpoint(
 
     References
     ----------
-    Lambrechts, Boerlage, Steinbuch, Trajectory planning and feedforward design for
-    electromechanical motion systems, Control Engineering Practice 13, 2005.
+    [Lambrechts2005]_.
 
     Examples
     --------

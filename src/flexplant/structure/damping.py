@@ -200,6 +200,10 @@ class Rayleigh(Damping):
     ModelError
         When alpha or beta is negative.
 
+    References
+    ----------
+    [CraigKurdila2006]_, section 10.4.
+
     Examples
     --------
     >>> Rayleigh(alpha=2.0, beta=0.0).zeta([0.0, 100.0])

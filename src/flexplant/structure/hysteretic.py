@@ -37,7 +37,7 @@ class Hysteretic(Damping):
 
     References
     ----------
-    D. J. Ewins, Modal Testing, 2nd ed., sections 2.4 and 2.7.
+    [Ewins2000]_, sections 2.4 and 2.7.
 
     Examples
     --------

@@ -69,6 +69,10 @@ class FEModel(Placed, Value):
         When K comes in single precision and its rounding holds rigid-body motions, or endangers
         the first elastic eigenvalue; or no DOF is as fast as a machine's: swapped K and M?
 
+    References
+    ----------
+    [paper]_, equation (1).
+
     Examples
     --------
     >>> dofs = DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]])

@@ -109,6 +109,10 @@ class Lead(SingleElement):
     ratio : float
         Pole over zero; below 1 it is a lag.
 
+    References
+    ----------
+    [Franklin1998]_, section 5.
+
     Examples
     --------
     >>> import flexplant as fx

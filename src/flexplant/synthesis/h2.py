@@ -96,7 +96,7 @@ def design_h2(
 
     References
     ----------
-    Zhou, Doyle, Glover, Robust and Optimal Control, 1996, theorems 14.7 and 21.14.
+    [ZhouDoyleGlover1996]_, theorems 14.7 and 21.14.
 
     Examples
     --------

@@ -89,8 +89,7 @@ def design_hinf(
 
     References
     ----------
-    Glover, Doyle, State-space formulae for all stabilizing controllers that satisfy an
-    H-infinity-norm bound, Systems & Control Letters 11, 1988.
+    [GloverDoyle1988]_.
 
     Examples
     --------

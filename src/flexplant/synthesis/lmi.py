@@ -55,10 +55,8 @@ class Lmi(Value):
 
     References
     ----------
-    Gahinet, Apkarian, A linear matrix inequality approach to H-infinity control, Int. J. Robust
-    Nonlinear Control 4, 1994 (the smallest gamma). Scherer, Gahinet, Chilali, Multiobjective
-    output-feedback control via LMI optimization, IEEE Trans. Autom. Control 42, 1997 (the
-    controller, section IV; its Â is eliminated here).
+    [GahinetApkarian1994]_ (the smallest gamma); [Scherer1997]_ (the controller, section IV; its
+    Â is eliminated here).
 
     Examples
     --------

@@ -217,6 +217,10 @@ def design_loops(
     FlexplantWarning
         When the loop is unstable, or is with the modes left out.
 
+    References
+    ----------
+    [Skogestad2005]_, section 3.4 (decoupling).
+
     Examples
     --------
     >>> import flexplant as fx

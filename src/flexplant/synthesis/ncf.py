@@ -86,8 +86,7 @@ def design_ncf(
 
     References
     ----------
-    McFarlane, Glover, A loop-shaping design procedure using H-infinity synthesis, IEEE Trans.
-    Automatic Control 37, 1992.
+    [McFarlaneGlover1992]_.
 
     Examples
     --------

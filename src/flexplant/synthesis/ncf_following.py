@@ -44,9 +44,7 @@ def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[Sta
 
     References
     ----------
-    Hoyle, Hyde, Limebeer, An H-infinity approach to two degree of freedom design, IEEE CDC 1991.
-    Limebeer, Kasenally, Perkins, On the design of robust two degree of freedom controllers,
-    Automatica 29, 1993.
+    [Hoyle1991]_; [Limebeer1993]_.
     """
     p, m = len(shaped.outputs), len(shaped.inputs)
     if model.dt or model.D.shape != (p, p) or not model.is_stable:

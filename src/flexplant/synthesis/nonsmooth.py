@@ -74,8 +74,7 @@ def bfgs(
 
     References
     ----------
-    Lewis, Overton, Nonsmooth optimization via quasi-Newton methods, Mathematical Programming 141,
-    2013.
+    [LewisOverton2013]_.
     """
     value, gradient = function(x)
     H, values = np.eye(x.size), [value]
@@ -156,8 +155,7 @@ def sampled_minimum(
 
     References
     ----------
-    Burke, Lewis, Overton, A robust gradient sampling algorithm for nonsmooth, nonconvex
-    optimization, SIAM J. Optimization 15, 2005.
+    [Burke2005]_.
     """
     count = int(min(_MOST, _SAMPLES * x.size + 1))
     evaluations, slope, reached = 0, np.inf, np.inf

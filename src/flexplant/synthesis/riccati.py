@@ -64,6 +64,10 @@ class Riccati(Value):
     ModelError
         When a value is not positive.
 
+    References
+    ----------
+    [GloverDoyle1988]_.
+
     Examples
     --------
     >>> import flexplant as fx

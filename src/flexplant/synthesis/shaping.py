@@ -137,7 +137,7 @@ def shape_loop(
 
     References
     ----------
-    McFarlane, Glover, IEEE Trans. Automatic Control 37, 1992; Hoyle, Hyde, Limebeer, IEEE CDC 1991.
+    [McFarlaneGlover1992]_; [Hoyle1991]_.
 
     Examples
     --------

@@ -105,8 +105,7 @@ def design_structured(
 
     References
     ----------
-    Apkarian, Noll, Nonsmooth H-infinity synthesis, IEEE Trans. Automatic Control 51, 2006. Burke,
-    Henrion, Lewis, Overton, HIFOO, IFAC Symposium on Robust Control Design, 2006.
+    [ApkarianNoll2006]_; [Burke2006]_.
 
     Examples
     --------

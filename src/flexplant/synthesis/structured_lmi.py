@@ -77,10 +77,7 @@ class StructuredLmi(Value):
 
     References
     ----------
-    Gahinet, Apkarian, A linear matrix inequality approach to H-infinity control, Int. J. Robust
-    Nonlinear Control 4, 1994. Helmberg, Rendl, Vanderbei, Wolkowicz, An interior-point method for
-    semidefinite programming, SIAM J. Optim. 6, 1996. Iwasaki, Skelton, All controllers for the
-    general H-infinity control problem, Automatica 30, 1994 (the eliminated variables).
+    [GahinetApkarian1994]_; [Helmberg1996]_; [IwasakiSkelton1994]_ (the eliminated variables).
 
     Examples
     --------

@@ -47,9 +47,7 @@ def corrected(
 
     References
     ----------
-    Stetter: The defect correction principle and discretization methods, Numer. Math. 29, 1978.
-    Alexandrov, Lewis: An overview of first-order model management for engineering optimization,
-    Optim. Eng. 2, 2001 (the derivative).
+    [Stetter1978]_; [AlexandrovLewis2001]_ (the derivative).
     """
     first = end.trail.p[0]
     estimates = [end.p]

@@ -123,6 +123,10 @@ def eigenvalue_sensitivities(
         When the matrices are indefinite at `values`, or several parameters split repeated modes
         along different vectors, so that no derivatives to them all exist.
 
+    References
+    ----------
+    [paper]_, equation (11).
+
     Examples
     --------
     >>> import flexplant as fx

@@ -138,7 +138,7 @@ def update(
 
     References
     ----------
-    The paper, section 3.
+    [paper]_, section 3.
 
     Examples
     --------

@@ -110,6 +110,10 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
     ModelError
         When the plant was not assembled from a structure, or it is held.
 
+    References
+    ----------
+    [Gawronski2004]_, chapter 3 (modes by their shapes at actuators and sensors).
+
     Examples
     --------
     >>> import flexplant as fx

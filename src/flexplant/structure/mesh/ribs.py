@@ -63,8 +63,8 @@ class Rib(Value):
 
     References
     ----------
-    Torsion of a rectangle: Timoshenko and Goodier, Theory of Elasticity, sec. 109 (a fit within
-    0.5 %): ``J = w^3 h (1/3 - 0.21 w/h (1 - (w/h)^4 / 12))`` for w <= h.
+    Torsion of a rectangle: [TimoshenkoGoodier1970]_, sec. 109 (a fit within 0.5 %): ``J = w^3 h
+    (1/3 - 0.21 w/h (1 - (w/h)^4 / 12))`` for w <= h.
 
     Examples
     --------

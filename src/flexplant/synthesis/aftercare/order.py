@@ -129,8 +129,7 @@ def reduce_controller(
 
     References
     ----------
-    Zhou, Doyle, Glover, Robust and Optimal Control, 1996, section 19.2. Anderson, Liu, Controller
-    reduction: concepts and approaches, IEEE Trans. Autom. Control 34, 1989.
+    [ZhouDoyleGlover1996]_, section 19.2; [AndersonLiu1989]_.
 
     Examples
     --------

@@ -51,8 +51,7 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
 
     References
     ----------
-    Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless transfer
-    method, Automatica 23, 1987. Astrom, Wittenmark, Computer-Controlled Systems, 1997, section 9.4.
+    [Hanus1987]_; [AstromWittenmark1997]_, section 9.4.
 
     Examples
     --------

@@ -99,8 +99,7 @@ def design_lmi(
 
     References
     ----------
-    Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI optimization, IEEE
-    Trans. Autom. Control 42, 1997.
+    [Scherer1997]_.
 
     Examples
     --------

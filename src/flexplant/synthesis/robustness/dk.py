@@ -97,8 +97,7 @@ def design_mu(
 
     References
     ----------
-    Doyle, Lenz, Packard, Design examples using mu-synthesis, CDC 1986. Zhou, Doyle, Glover, Robust
-    and Optimal Control, 1996, section 11.4.
+    [Doyle1986]_; [ZhouDoyleGlover1996]_, section 11.4.
     """
     if not w or not z:
         raise ModelError("name the channels of performance: w={'d': 1.0}, z={'tip:x': weight}.")

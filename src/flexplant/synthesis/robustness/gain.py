@@ -119,8 +119,7 @@ def worst_case_gain(
 
     References
     ----------
-    Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
-    uncertainty, Systems & Control Letters 18, 1992.
+    [FanTits1992]_.
     """
     chance = generator(rng)
     if not w or not z:

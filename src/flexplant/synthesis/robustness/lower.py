@@ -34,8 +34,7 @@ def power_iteration(
 
     References
     ----------
-    Young, Doyle, Computation of mu with real and complex uncertainties, CDC 1990. Packard, Doyle,
-    The complex structured singular value, Automatica 29, 1993.
+    [Young1990]_; [PackardDoyle1993]_.
     """
     n = M.shape[1]
     b, w = (_unit(_drawn(rng, n)) for _ in range(2))

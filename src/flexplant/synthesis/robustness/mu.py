@@ -110,10 +110,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
 
     References
     ----------
-    Fan, Tits, Doyle, Robustness in the presence of mixed parametric uncertainty and unmodeled
-    dynamics, IEEE Trans. Autom. Control 36, 1991. Young, Doyle, CDC 1990. Lawrence, Tits, Van
-    Dooren, A fast algorithm for the computation of an upper bound on the mu-norm, Automatica 36,
-    2000.
+    [Fan1991]_; [Young1990]_; [Lawrence2000]_.
 
     Examples
     --------

@@ -155,7 +155,7 @@ def robust_stability(
 
     References
     ----------
-    Zhou, Doyle, Glover, Robust and Optimal Control, 1996, chapter 11.
+    [ZhouDoyleGlover1996]_, chapter 11.
     """
     count = whole(machines, "machines", minimum=0)
     chance = generator(rng)

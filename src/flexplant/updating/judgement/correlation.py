@@ -39,7 +39,7 @@ def mac(X: Any, Y: Any) -> FloatArray:
 
     References
     ----------
-    Allemang, Brown: A correlation coefficient for modal vector analysis, IMAC 1982.
+    [AllemangBrown1982]_.
 
     Examples
     --------
@@ -70,7 +70,7 @@ def frac(H: Any, G: Any) -> FloatArray:
 
     References
     ----------
-    Heylen, Lammens: FRAC, a consistent way of comparing frequency response functions, 1996.
+    [HeylenLammens1996]_.
 
     Examples
     --------
@@ -108,8 +108,7 @@ def fdac(H: Any, G: Any) -> FloatArray:
 
     References
     ----------
-    Pascual, Golinval, Razeto: A frequency domain correlation technique for model correlation and
-    updating, IMAC 1997.
+    [Pascual1997]_.
 
     Examples
     --------

@@ -91,8 +91,7 @@ def localise(
 
     References
     ----------
-    Chen, Chen: Extended Bayesian information criteria for model selection with large model spaces,
-    Biometrika 95, 2008.
+    [ChenChen2008]_.
 
     Examples
     --------

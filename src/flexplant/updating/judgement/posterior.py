@@ -134,7 +134,7 @@ def sample_posterior(
 
     References
     ----------
-    Goodman, Weare: Ensemble samplers with affine invariance, Comm. App. Math. Comp. Sci. 5, 2010.
+    [GoodmanWeare2010]_.
 
     Examples
     --------

@@ -42,6 +42,10 @@ class Eigenvalues(Residual):
     LabelError
         When the poles have no mode numbers.
 
+    References
+    ----------
+    [paper]_, equations (9)-(12).
+
     Examples
     --------
     >>> Eigenvalues(MeasuredModes([-28.5 + 2870j, -39.3 + 3970j], modes=[6, 7]))

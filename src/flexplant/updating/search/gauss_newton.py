@@ -36,6 +36,10 @@ class GaussNewton(UpdateMethod):
         Singular values of the (column-scaled) sensitivities below this part of the largest are
         left out of a step: truncated SVD. Zero: all are used, and a singular S raises.
 
+    References
+    ----------
+    [paper]_, equations (13) and (14).
+
     Examples
     --------
     >>> import flexplant as fx

@@ -36,7 +36,7 @@ class Lasso(PenalisedMethod):
 
     References
     ----------
-    Tibshirani: Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B 58, 1996.
+    [Tibshirani1996]_.
 
     Examples
     --------

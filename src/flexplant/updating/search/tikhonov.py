@@ -30,7 +30,7 @@ class Tikhonov(PenalisedMethod):
 
     References
     ----------
-    Hansen: Analysis of discrete ill-posed problems by means of the L-curve, SIAM Review 34, 1992.
+    [Hansen1992]_.
 
     Examples
     --------

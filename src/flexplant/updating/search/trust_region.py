@@ -46,8 +46,7 @@ class TrustRegion(UpdateMethod):
 
     References
     ----------
-    Branch, Coleman, Li: A subspace, interior, and conjugate gradient method for large-scale
-    bound-constrained minimization problems, SIAM J. Sci. Comput. 21, 1999.
+    [Branch1999]_.
 
     Examples
     --------

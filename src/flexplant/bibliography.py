@@ -1,0 +1,184 @@
+"""The sources of what is computed, by the keys that docstrings cite: ``[Guyan1965]_``.
+
+.. [paper] "Finite Element Model Reduction and Model Updating of structures for Control": the method
+   that this library is built on.
+.. [AlexandrovLewis2001] Alexandrov, Lewis, An overview of first-order model management for
+   engineering optimization, Optim. Eng. 2, 2001.
+.. [Allemang2003] Allemang, The modal assurance criterion: twenty years of use and abuse, Sound and
+   Vibration 37, 2003, 14-21.
+.. [AllemangBrown1982] Allemang, Brown, A correlation coefficient for modal vector analysis, IMAC 1,
+   1982.
+.. [AndersonLiu1989] Anderson, Liu, Controller reduction: concepts and approaches, IEEE Trans.
+   Autom. Control 34, 1989.
+.. [AndersonMoore1979] Anderson, Moore, Optimal Filtering, Prentice Hall, 1979.
+.. [ApkarianNoll2006] Apkarian, Noll, Nonsmooth H-infinity synthesis, IEEE Trans. Autom. Control 51,
+   2006.
+.. [AstromWittenmark1997] Astrom, Wittenmark, Computer-Controlled Systems, 3rd ed., Prentice Hall,
+   1997.
+.. [BaiSu2005] Bai, Su, Dimension reduction of large-scale second-order dynamical systems via a
+   second-order Arnoldi method, SIAM J. Sci. Comput. 26, 2005.
+.. [BarShalom2001] Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
+   Navigation, Wiley, 2001.
+.. [Bartlett1955] Bartlett, An Introduction to Stochastic Processes, Cambridge, 1955.
+.. [BendatPiersol2010] Bendat, Piersol, Random Data, 4th ed., Wiley, 2010.
+.. [BittantiColaneri2009] Bittanti, Colaneri, Periodic Systems, Springer, 2009.
+.. [Boerlage2004] Boerlage, Tousain, Steinbuch, Jerk derivative feedforward control for motion
+   systems, American Control Conference, 2004.
+.. [BoydBalakrishnan1990] Boyd, Balakrishnan, A regularity result for the singular values of a
+   transfer matrix and a quadratically convergent algorithm for computing its L-infinity norm, Syst.
+   Control Lett. 15, 1990.
+.. [Branch1999] Branch, Coleman, Li, A subspace, interior, and conjugate gradient method for
+   large-scale bound-constrained minimization problems, SIAM J. Sci. Comput. 21, 1999.
+.. [BruinsmaSteinbuch1990] Bruinsma, Steinbuch, A fast algorithm to compute the H-infinity norm of a
+   transfer function matrix, Syst. Control Lett. 14, 1990.
+.. [BrysonFrazier1963] Bryson, Frazier, Smoothing for linear and nonlinear dynamic systems, Optimum
+   System Synthesis Conference, 1963.
+.. [Burke2005] Burke, Lewis, Overton, A robust gradient sampling algorithm for nonsmooth, nonconvex
+   optimization, SIAM J. Optim. 15, 2005.
+.. [Burke2006] Burke, Henrion, Lewis, Overton, HIFOO: a Matlab package for fixed-order controller
+   design and H-infinity optimization, IFAC Symposium on Robust Control Design, 2006.
+.. [ChenChen2008] Chen, Chen, Extended Bayesian information criteria for model selection with large
+   model spaces, Biometrika 95, 2008.
+.. [Chu2004] Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
+   algebraic Riccati equations, Int. J. Control 77, 2004.
+.. [Chu2005] Chu, Fan, Lin, A structure-preserving doubling algorithm for continuous-time algebraic
+   Riccati equations, Linear Algebra Appl. 396, 2005.
+.. [CraigBampton1968] Craig, Bampton, Coupling of substructures for dynamic analyses, AIAA J. 6,
+   1968.
+.. [CraigKurdila2006] Craig, Kurdila, Fundamentals of Structural Dynamics, 2nd ed., Wiley, 2006.
+.. [deJong1989] de Jong, Smoothing and interpolation with the state-space model, J. Amer. Stat.
+   Assoc. 84, 1989.
+.. [deJong1991] de Jong, The diffuse Kalman filter, Ann. Statist. 19, 1991.
+.. [deKlerk2008] de Klerk, Rixen, Voormeeren, General framework for dynamic substructuring: history,
+   review and classification of techniques, AIAA J. 46, 2008.
+.. [Doyle1986] Doyle, Lenz, Packard, Design examples using mu-synthesis, IEEE CDC, 1986.
+.. [EmamiNaeiniVanDooren1982] Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable
+   systems, Automatica 18, 1982.
+.. [Enns1984] Enns, Model reduction with balanced realizations, IEEE CDC, 1984.
+.. [Ewins2000] Ewins, Modal Testing, 2nd ed., Research Studies Press, 2000.
+.. [Fan1991] Fan, Tits, Doyle, Robustness in the presence of mixed parametric uncertainty and
+   unmodeled dynamics, IEEE Trans. Autom. Control 36, 1991.
+.. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
+   uncertainty, Syst. Control Lett. 18, 1992.
+.. [Franklin1998] Franklin, Powell, Workman, Digital Control of Dynamic Systems, 3rd ed.,
+   Addison-Wesley, 1998.
+.. [FriswellGarveyPenny1995] Friswell, Garvey, Penny, Model reduction using dynamic and iterated IRS
+   techniques, J. Sound and Vibration 186, 1995.
+.. [FriswellGarveyPenny1998] Friswell, Garvey, Penny, The convergence of the iterated IRS method, J.
+   Sound and Vibration 211, 1998.
+.. [GahinetApkarian1994] Gahinet, Apkarian, A linear matrix inequality approach to H-infinity
+   control, Int. J. Robust Nonlinear Control 4, 1994.
+.. [Gawronski2004] Gawronski, Advanced Structural Dynamics and Active Control of Structures,
+   Springer, 2004.
+.. [Geromel1999] Geromel, Optimal linear filtering under parameter uncertainty, IEEE Trans. Signal
+   Process. 47, 1999.
+.. [GillijnsDeMoor2007a] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
+   linear discrete-time systems, Automatica 43, 2007, 111-116.
+.. [GillijnsDeMoor2007b] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
+   linear discrete-time systems with direct feedthrough, Automatica 43, 2007, 934-937.
+.. [Glover1984] Glover, All optimal Hankel-norm approximations of linear multivariable systems and
+   their L-infinity error bounds, Int. J. Control 39, 1984.
+.. [GloverDoyle1988] Glover, Doyle, State-space formulae for all stabilizing controllers that
+   satisfy an H-infinity-norm bound, Syst. Control Lett. 11, 1988.
+.. [GolubPereyra2003] Golub, Pereyra, Separable nonlinear least squares: the variable projection
+   method and its applications, Inverse Problems 19, 2003, R1-R26.
+.. [GoodmanWeare2010] Goodman, Weare, Ensemble samplers with affine invariance, Comm. App. Math.
+   Comp. Sci. 5, 2010.
+.. [Gregory1984] Gregory, Reduction of large flexible spacecraft models using internal balancing
+   theory, J. Guid. Control Dyn. 7, 1984.
+.. [Grimes1994] Grimes, Lewis, Simon, A shifted block Lanczos algorithm for solving sparse symmetric
+   generalized eigenproblems, SIAM J. Matrix Anal. Appl. 15, 1994.
+.. [Guyan1965] Guyan, Reduction of stiffness and mass matrices, AIAA J. 3, 1965.
+.. [Hammarling1982] Hammarling, Numerical solution of the stable, non-negative definite Lyapunov
+   equation, IMA J. Numer. Anal. 2, 1982.
+.. [Hansen1992] Hansen, Analysis of discrete ill-posed problems by means of the L-curve, SIAM Review
+   34, 1992.
+.. [Hanus1987] Hanus, Kinnaert, Henrotte, Conditioning technique, a general anti-windup and bumpless
+   transfer method, Automatica 23, 1987.
+.. [Hassibi1999] Hassibi, Sayed, Kailath, Indefinite-Quadratic Estimation and Control, SIAM, 1999.
+.. [Helmberg1996] Helmberg, Rendl, Vanderbei, Wolkowicz, An interior-point method for semidefinite
+   programming, SIAM J. Optim. 6, 1996.
+.. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
+   functions, Identification in Engineering Systems, 1996.
+.. [Hoyle1991] Hoyle, Hyde, Limebeer, An H-infinity approach to two degree of freedom design, IEEE
+   CDC, 1991.
+.. [Imamovic1998] Imamovic, Validation of large structural dynamics models using modal test data,
+   PhD thesis, Imperial College, 1998.
+.. [IwasakiSkelton1994] Iwasaki, Skelton, All controllers for the general H-infinity control
+   problem, Automatica 30, 1994.
+.. [Kammer1991] Kammer, Sensor placement for on-orbit modal identification and correlation of large
+   space structures, J. Guid. Control Dyn. 14, 1991.
+.. [Kitanidis1987] Kitanidis, Unbiased minimum-variance linear state estimation, Automatica 23,
+   1987.
+.. [Kwakernaak1993] Kwakernaak, Robust control and H-infinity optimization, Automatica 29, 1993.
+.. [Lainiotis1975] Lainiotis, Partitioned linear estimation algorithms: discrete case, IEEE Trans.
+   Autom. Control 20, 1975.
+.. [Lambrechts2005] Lambrechts, Boerlage, Steinbuch, Trajectory planning and feedforward design for
+   electromechanical motion systems, Control Eng. Pract. 13, 2005.
+.. [Laub1987] Laub, Heath, Paige, Ward, Computation of system balancing transformations, IEEE Trans.
+   Autom. Control 32, 1987.
+.. [Lawrence2000] Lawrence, Tits, Van Dooren, A fast algorithm for the computation of an upper bound
+   on the mu-norm, Automatica 36, 2000.
+.. [LevineAthans1970] Levine, Athans, On the determination of the optimal constant output feedback
+   gains for linear multivariable systems, IEEE Trans. Autom. Control 15, 1970.
+.. [LewisOverton2013] Lewis, Overton, Nonsmooth optimization via quasi-Newton methods, Math.
+   Program. 141, 2013.
+.. [Limebeer1993] Limebeer, Kasenally, Perkins, On the design of robust two degree of freedom
+   controllers, Automatica 29, 1993.
+.. [LiuAnderson1989] Liu, Anderson, Singular perturbation approximation of balanced systems, Int. J.
+   Control 50, 1989.
+.. [LjungBox1978] Ljung, Box, On a measure of lack of fit in time series models, Biometrika 65,
+   1978.
+.. [MacNeal1971] MacNeal, A hybrid method of component mode synthesis, Computers & Structures 1,
+   1971.
+.. [Manohar2018] Manohar, Brunton, Kutz, Brunton, Data-driven sparse sensor placement for
+   reconstruction, IEEE Control Systems 38, 2018.
+.. [McFarlaneGlover1992] McFarlane, Glover, A loop-shaping design procedure using H-infinity
+   synthesis, IEEE Trans. Autom. Control 37, 1992.
+.. [OCallahan1989a] O'Callahan, A procedure for an improved reduced system (IRS) model, IMAC 7,
+   1989.
+.. [OCallahan1989b] O'Callahan, Avitabile, Riemer, System equivalent reduction expansion process
+   (SEREP), IMAC 7, 1989.
+.. [Odelson2006] Odelson, Rajamani, Rawlings, A new autocovariance least-squares method for
+   estimating noise covariances, Automatica 42, 2006.
+.. [PackardDoyle1993] Packard, Doyle, The complex structured singular value, Automatica 29, 1993.
+.. [Pascual1997] Pascual, Golinval, Razeto, A frequency domain correlation technique for model
+   correlation and updating, IMAC 15, 1997.
+.. [Peeters2004] Peeters, Van der Auweraer, Guillaume, Leuridan, The PolyMAX frequency-domain
+   method: a new standard for modal parameter estimation?, Shock and Vibration 11, 2004, 395-409.
+.. [PeetersDeRoeck1999] Peeters, De Roeck, Reference-based stochastic subspace identification for
+   output-only modal analysis, Mech. Syst. Signal Process. 13, 1999.
+.. [Pintelon2007] Pintelon, Guillaume, Schoukens, Uncertainty calculation in (operational) modal
+   analysis, Mech. Syst. Signal Process. 21, 2007, 2359-2373.
+.. [PintelonSchoukens2012] Pintelon, Schoukens, System Identification: A Frequency Domain Approach,
+   2nd ed., Wiley, 2012.
+.. [Reynders2008] Reynders, Pintelon, De Roeck, Uncertainty bounds on modal parameters obtained from
+   stochastic subspace identification, Mech. Syst. Signal Process. 22, 2008.
+.. [Rubin1975] Rubin, Improved component-mode representation for structural dynamic analysis, AIAA
+   J. 13, 1975.
+.. [SalimbahramiLohmann2006] Salimbahrami, Lohmann, Order reduction of large scale second-order
+   systems using Krylov subspace methods, Linear Algebra Appl. 415, 2006.
+.. [Scherer1997] Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI
+   optimization, IEEE Trans. Autom. Control 42, 1997.
+.. [Skogestad2005] Skogestad, Postlethwaite, Multivariable Feedback Control, 2nd ed., Wiley, 2005.
+.. [Sleijpen1996] Sleijpen, Booten, Fokkema, van der Vorst, Jacobi-Davidson type methods for
+   generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.
+.. [Smith1968] Smith, Matrix equation XA + BX = C, SIAM J. Appl. Math. 16, 1968.
+.. [Stetter1978] Stetter, The defect correction principle and discretization methods, Numer. Math.
+   29, 1978.
+.. [Tibshirani1996] Tibshirani, Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B
+   58, 1996.
+.. [TimoshenkoGoodier1970] Timoshenko, Goodier, Theory of Elasticity, 3rd ed., McGraw-Hill, 1970.
+.. [TombsPostlethwaite1987] Tombs, Postlethwaite, Truncated balanced realization of a stable
+   non-minimal state-space system, Int. J. Control 46, 1987.
+.. [VandeWijdevenBosgra2010] Van de Wijdeven, Bosgra, Using basis functions in iterative learning
+   control: analysis and design theory, Int. J. Control 83, 2010.
+.. [VanZundertOomen2018] Van Zundert, Oomen, On inversion-based approaches for feedforward and ILC,
+   Mechatronics 50, 2018.
+.. [VoormeerenRixen2012] Voormeeren, Rixen, A family of substructure decoupling techniques based on
+   a dual assembly approach, Mech. Syst. Signal Process. 27, 2012.
+.. [Whittle1953] Whittle, The analysis of multiple stationary time series, and Estimation and
+   information in stationary time series, Arkiv foer Matematik 2, 1953.
+.. [Young1990] Young, Doyle, Computation of mu with real and complex uncertainties, IEEE CDC, 1990.
+.. [ZhouDoyleGlover1996] Zhou, Doyle, Glover, Robust and Optimal Control, Prentice Hall, 1996.
+"""
