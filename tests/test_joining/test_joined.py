@@ -11,7 +11,8 @@ import scipy.sparse as sp
 import flexplant as fx
 import oracles_joining as oracles
 from flexplant.errors import CertificateError, FlexplantWarning, LabelError, ModelError
-from flexplant.joining import certificate, join
+from flexplant.joining import certificate
+from flexplant.joining import join as join_module
 from flexplant.joining.component import components_of
 
 PLATE = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
@@ -156,6 +157,28 @@ def test_solids_at_any_angle():
     point = np.array([0.1, 0, 0]) + R @ [0.3, 0.1, 0.05]
     turned_row = machine.row(point, "x") @ machine.rigid_motions()
     np.testing.assert_allclose(turned_row[:3], [1, 0, 0], atol=1e-12)
+
+
+def test_matching_meshes_with_few_digits():
+    """Nodes of one place found; gaps of 1e-7 of the machine leave its rigid-body motions free."""
+    whole = fx.solid_block(size=(0.4, 0.2, 0.1), elements=(4, 2, 1), **SOLID)
+    half = fx.solid_block(size=(0.2, 0.2, 0.1), elements=(2, 2, 1), **SOLID)
+    models = {"left": half, "right": half}
+    placed = {"right": fx.Pose((0.2 + 4e-8, -3e-8, 2e-8))}
+    joints = fx.joining.coincident_joints(models, placed=placed)
+    assert [repr(joint) for joint in joints[:2]] == [
+        "<Joint left/3 - right/1 along x, y, z, rigid>",
+        "<Joint left/6 - right/4 along x, y, z, rigid>",
+    ]
+    machine = fx.joined(models, joints, placed=placed)
+    assert machine.n_dof == whole.n_dof
+    assert machine.rigid_body.shape[1] == 6
+    np.testing.assert_allclose(elastic(machine, 16), elastic(whole, 16), rtol=1e-5)
+    assert len(fx.joining.coincident_joints(models, placed=placed, box=[(0, 0, 0), (1, 1, 0)])) == 3
+    with pytest.raises(ModelError, match="no nodes of left, right are within"):
+        fx.joining.coincident_joints(models, placed={"right": fx.Pose((1.0, 0, 0))})
+    with pytest.raises(ModelError, match="near several"):
+        fx.joining.coincident_joints(models, placed=placed, tolerance=0.15)
 
 
 def test_joints_with_lever_arms_and_springs_are_those_of_dense_algebra():
@@ -331,7 +354,7 @@ def edge_z(model, z):
     return list(dict.fromkeys(found.tolist()))
 
 
-def test_what_is_refused():
+def test_what_is_refused(monkeypatch):
     models, placed = stage_on_frame()
 
     def join(*joints, **more):
@@ -361,6 +384,10 @@ def test_what_is_refused():
         join(models={"stage": fx.solve_modes(models["stage"], count=8)})
     with pytest.raises(LabelError, match="cannot name a component"):
         join(models={"st:age": models["stage"]})
+    rom = fx.reduce(models["stage"], fx.CraigBampton(["1:x", "1:y", "1:z", "4:y", "4:z", "9:z"]))
+    monkeypatch.setattr(join_module, "_LARGEST", 20)
+    with pytest.raises(ModelError, match=r"are too many .* Reduce the large components first"):
+        join(models=models | {"stage": rom})
     damped = {"stage": models["stage"].with_damping(fx.Rayleigh(0.0, 1e-6))}
     with pytest.warns(FlexplantWarning, match=re.escape("components ['frame'] have no D")):
         join(models=models | damped)
@@ -369,14 +396,14 @@ def test_what_is_refused():
 def test_the_certificate_can_fail(monkeypatch):
     """A gap, and a count that is wrong, are found."""
     half = plate(2, 0.3)
-    good = join.rows_of
+    good = join_module.rows_of
 
     def wrong(some, parts):
         found = good(some, parts)
         found.data[:1] *= 1.001
         return found
 
-    monkeypatch.setattr(join, "rows_of", wrong)
+    monkeypatch.setattr(join_module, "rows_of", wrong)
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
     monkeypatch.undo()

@@ -1,6 +1,7 @@
 """Components joined: placed, coupled by joints and patches, certified; measured FRFs too."""
 
 from .certificate import JoiningCertificate as JoiningCertificate
+from .coincident import coincident_joints as coincident_joints
 from .frf_coupling import uncoupled as uncoupled
 from .join import joined as joined
 from .joint import Joint as Joint

@@ -19,6 +19,8 @@ _RANK = 1e-8
 _DOUBTFUL = 1e-5
 #: how much later components come first among those that follow; far above rounding
 _LATER, _WITHIN = 1e-2, 1e-4
+#: of the heaviest in its constraint: a coordinate that may follow without looking for a better one
+_HEAVY = 0.3
 #: relative: entries of the expansion below this are rounding
 _ROUNDING = 1e-15
 
@@ -44,8 +46,9 @@ class Elimination(NamedTuple):
 def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Elimination:
     """Return the motions that fulfil ``B q = 0``.
 
-    Coordinates that no constraint names are left alone, and constraints that share no coordinate
-    are solved apart, so that sparse matrices stay sparse.
+    Coordinates that no constraint names are left alone, one that a single constraint names follows
+    it, and of the others, constraints that share no coordinate are solved apart: sparse matrices
+    stay sparse.
 
     Parameters
     ----------
@@ -57,26 +60,59 @@ def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Eliminatio
         Of equally good ones, the later follows: the number of the component.
     """
     n = B.shape[1]
+    lead = _own_followers(B, size, order)
+    plain = lead >= 0
+    first = _by_blocks(B[~plain], size, order)
+    # those that one constraint alone names follow it, whatever the others say
+    leads = lead[plain]
+    some = sp.csr_array(B[plain])
+    pivot = some[np.arange(leads.size), leads]
+    rest = sp.csr_array(sp.diags_array(-1.0 / pivot) @ some) if leads.size else some
+    still = np.ones(n)
+    still[leads] = 0.0
+    place = sp.csr_array((np.ones(leads.size), (leads, np.arange(leads.size))), (n, leads.size))
+    follow = sp.diags_array(still) + place @ rest @ sp.diags_array(still)
+    left = still[first.kept] > 0
+    T = sp.csc_array(follow @ first.T[:, np.flatnonzero(left)])
+    return Elimination(T, first.kept[left], first.rank + leads.size)
+
+
+def _own_followers(B: Any, size: FloatArray, order: IntArray) -> IntArray:
+    """Return for each constraint (m,) the coordinate that it alone names, or -1."""
+    part = sp.coo_array(B)
+    rows, columns = part.coords
+    weight = np.abs(part.data) / size[columns]
+    most = np.zeros(B.shape[0])
+    np.maximum.at(most, rows, weight)
+    alone = np.bincount(columns, minlength=B.shape[1])[columns] == 1
+    alone &= weight >= _HEAVY * most[rows]
+    found = np.full(B.shape[0], -1, dtype=np.int64)
+    chosen = np.flatnonzero(alone)
+    chosen = chosen[np.lexsort((columns[chosen], order[columns[chosen]]))]
+    found[rows[chosen]] = columns[chosen]  # of several, the last one stays
+    return found
+
+
+def _by_blocks(B: Any, size: FloatArray, order: IntArray) -> Elimination:
+    """Return the motions that fulfil constraints, solved apart where they share no coordinate."""
+    n = B.shape[1]
     touched = np.unique(B.indices).astype(np.int64)
-    entries: list[tuple[IntArray, IntArray, FloatArray]] = []
-    rank = 0
-    for rows, columns in _blocks(B, touched):
-        block = B[rows][:, columns].toarray()
-        lead, X = _solved(block, size[columns], order[columns])
-        rest = np.setdiff1d(np.arange(columns.size), lead)
+    follow, rows, columns, values = [np.zeros(0, np.int64)], [], [], []
+    for some, own in _blocks(B, touched):
+        lead, X = _solved(B[some][:, own].toarray(), size[own], order[own])
+        rest = np.setdiff1d(np.arange(own.size), lead)
         i, j = np.nonzero(X)
-        entries.append((columns[lead[i]], columns[rest[j]], X[i, j]))
-        rank += lead.size
-        entries.append((columns[lead], np.zeros(0, np.int64), np.zeros(0)))
-    follow = np.concatenate([np.zeros(0, np.int64), *(e[0] for e in entries[1::2])])
-    kept = np.setdiff1d(np.arange(n), follow)
+        follow.append(own[lead])
+        rows.append(own[lead[i]])
+        columns.append(own[rest[j]])
+        values.append(X[i, j])
+    gone = np.concatenate(follow)
+    kept = np.setdiff1d(np.arange(n), gone)
     place = np.zeros(n, dtype=np.int64)
     place[kept] = np.arange(kept.size)
-    rows = np.concatenate([kept, *(e[0] for e in entries[::2])])
-    columns = np.concatenate([place[kept], *(place[e[1]] for e in entries[::2])])
-    values = np.concatenate([np.ones(kept.size), *(e[2] for e in entries[::2])])
-    T = sp.csc_array((values, (rows, columns)), shape=(n, kept.size))
-    return Elimination(T, kept, rank)
+    entries = np.concatenate([np.ones(kept.size), *values])
+    where = (np.concatenate([kept, *rows]), place[np.concatenate([kept, *columns])])
+    return Elimination(sp.csc_array((entries, where), shape=(n, kept.size)), kept, gone.size)
 
 
 def _blocks(B: Any, touched: IntArray) -> list[tuple[IntArray, IntArray]]:

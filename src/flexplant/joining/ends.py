@@ -12,10 +12,12 @@ from ..labels import DIRECTIONS
 from ..structure.rigid import rigid_motions
 from ..values import FloatArray
 from .component import Component
-from .patch import Patch
+from .patch import Patch, mean_motions
 
 #: lever arms below this part of the machine's size are none
 _NO_ARM = 1e-9
+#: up to this part, a node without rotations turns as the nodes next to it do
+_SHORT_ARM, _NEIGHBOURS = 1e-4, 12
 
 
 class JointEnd:
@@ -107,6 +109,10 @@ class JointEnd:
         if not self._rows:
             raise LabelError(f"the joint at {self.text} is nowhere: {failed}")
 
+    def is_near(self, point: FloatArray) -> bool:
+        """Return whether a point is so near that coordinates with few digits explain its gap."""
+        return bool(np.linalg.norm(point - self.point) <= _SHORT_ARM * self._size)
+
     def row(self, axis: str, point: FloatArray) -> FloatArray:
         """Return the motion (n,) along an axis at a point that moves with this end.
 
@@ -133,14 +139,34 @@ class JointEnd:
             share = float(np.cross(np.eye(3)[k], arm) @ along)
             if abs(share) <= _NO_ARM * self._size:
                 continue
-            if turn not in self._rows:
+            turned = self._rows.get(turn)
+            if turned is None and self.is_near(point):
+                turned = self._turn_of_neighbours(turn)
+            if turned is None:
                 raise LabelError(
                     f"the lever arm ({', '.join(f'{x:g}' for x in arm)}) m of the joint at "
                     f"{self.text} needs its rotation {turn}, which it has not. Give point=, where "
                     "the joint acts, on its side, or join a Patch of nodes, which has mean "
                     "rotations."
                 )
-            found = found + share * self._rows[turn]
+            found = found + share * turned
+        return found
+
+    def _turn_of_neighbours(self, turn: str) -> FloatArray | None:
+        """Return the mean rotation (n,) of the nodes next to this end, None where there is none.
+
+        Coordinates with few digits leave gaps between nodes that are meant to be one.
+        """
+        dofs = self._dofs
+        first = np.unique(dofs.node_index, return_index=True)[1]
+        distance = np.linalg.norm(dofs.xyz[first] - self.point, axis=1)
+        near = first[np.argsort(distance, kind="stable")[:_NEIGHBOURS]]
+        rows = np.flatnonzero(np.isin(dofs.node_index, dofs.node_index[near]) & (dofs.kinds < 3))
+        mean, _, made = mean_motions(dofs._taken(rows), self.point, np.ones(rows.size))
+        if turn not in made:
+            return None
+        found = np.zeros(len(dofs))
+        found[rows] = mean[DIRECTIONS.index(turn)]
         return found
 
     def carried(self, row: FloatArray) -> FloatArray:

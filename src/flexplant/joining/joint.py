@@ -39,7 +39,8 @@ class Joint(Value):
         Of dampers.
     point : (3,) array [m], optional
         Where the joint acts: both ends reach there with lever arms, by their rotations. None: at
-        the first end. DOFs have no lever arm.
+        the first end. DOFs have no lever arm; a node without rotations turns with its neighbours,
+        for arms up to 1e-4 of the machine's size, such as few digits of coordinates leave.
 
     Raises
     ------

@@ -92,6 +92,8 @@ def _links(joint: Any, parts: Sequence[Component], size: float) -> list[Link]:
     second = None if joint.second is None else JointEnd(parts, joint.second, size)
     axes = _axes(joint, first, second)
     point = first.point if joint.point is None else np.asarray(joint.point, dtype=np.float64)
+    if joint.point is None and second is not None and second.is_near(point):
+        point = second.point  # the second end follows, by the rotations of the first
     found = []
     for axis, stiffness, rate in zip(axes, *joint.values(axes), strict=True):
         row = first.row(axis, point)

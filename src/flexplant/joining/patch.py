@@ -102,20 +102,26 @@ class Patch(Value):
             Which of the six it determines.
         """
         rows = self.rows(dofs)
-        some = dofs._taken(rows)
-        A = rigid_motions(some.replace(xyz=some.xyz - point))
-        radius = float(np.abs(A[:, 3:]).max(initial=0.0)) or 1.0
-        scale = np.array([1.0] * 3 + [radius] * 3)
-        root = np.sqrt(self._weight_of(dofs, rows))[:, None]
-        spread = root * A / scale
-        inverse = np.linalg.pinv(spread, rcond=_RANK)
-        made = np.linalg.norm(inverse @ spread - np.eye(6), axis=0) < _RANK
-        by_node = (inverse * root.T) / scale[:, None]
-        by_node[~made] = 0.0
-        return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]
+        return mean_motions(dofs._taken(rows), point, self._weight_of(dofs, rows))
 
     def _weight_of(self, dofs: DofSet, rows: IntArray) -> FloatArray:
         if self.weights is None:
             return np.ones(rows.size)
         known = dict(zip(tuple(self.nodes or ()), np.asarray(self.weights).tolist(), strict=True))
         return np.array([known[node] for node in dofs.nodes[rows].tolist()])
+
+
+def mean_motions(
+    some: DofSet, point: FloatArray, weights: FloatArray
+) -> tuple[FloatArray, FloatArray, list[str]]:
+    """Return the mean motions of some displacements (m,) at a point; see `Patch.mean`."""
+    A = rigid_motions(some.replace(xyz=some.xyz - point, interpolation=None))
+    radius = float(np.abs(A[:, 3:]).max(initial=0.0)) or 1.0
+    scale = np.array([1.0] * 3 + [radius] * 3)
+    root = np.sqrt(weights)[:, None]
+    spread = root * A / scale
+    inverse = np.linalg.pinv(spread, rcond=_RANK)
+    made = np.linalg.norm(inverse @ spread - np.eye(6), axis=0) < _RANK
+    by_node = (inverse * root.T) / scale[:, None]
+    by_node[~made] = 0.0
+    return by_node, A, [name for name, there in zip(DIRECTIONS, made, strict=True) if there]
