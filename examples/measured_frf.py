@@ -1,4 +1,4 @@
-"""From a noisy measurement to a model with known parameters and known doubt.
+"""From a noisy measurement to a model whose parameters are known, and how well they are.
 
 Run it: ``python examples/measured_frf.py``. The virtual machine floats under a slow servo and is
 shaken by multisines; its frequency responses (FRFs) give poles, the poles say what its drawing has
@@ -66,7 +66,7 @@ def measured(machine: Any) -> fx.Frf:
 
 
 def poles(frf: fx.Frf) -> tuple[fx.identification.IdentifiedModes, fx.MeasuredModes]:
-    """Return the identified modes of the sensors that are used, and those the drawing knows."""
+    """Return the identified modes of the sensors that are used, and those that the drawing has."""
     found = fx.identify_modes(frf.select(outputs=FITTED), band=BAND, hold=RATE)
     at = {name: SENSORS[name] for name in FITTED}
     return found, fx.numbered(found, drawing, at=at, partial=True, least_mac=0.8)
@@ -149,8 +149,8 @@ def bridge(noise: float = 0.0) -> str:
     model = fx.ReducedModel(*matrices, np.eye(n), dofs, dofs, np.zeros((n, 0)), "none")
     squares = test.lambdaExp * (1 + 0.5 * noise * rng.normal(size=3))
     shapes = test.psiExp + noise * rng.normal(size=test.psiExp.shape)
-    doubt = {"covariance": 2 * (0.25 * noise) ** 2 * squares} if noise else {}
-    poles = fx.MeasuredModes(1j * np.sqrt(squares), modes=[1, 2, 3], **doubt)
+    noisy = {"covariance": 2 * (0.25 * noise) ** 2 * squares} if noise else {}
+    poles = fx.MeasuredModes(1j * np.sqrt(squares), modes=[1, 2, 3], **noisy)
     at = [f"{i}:z" for i in test.measDOFs]
     data = [fx.Eigenvalues(poles), fx.ModeShapes(poles, shapes, at, std=noise or None)]
     names = [f"a{i}" for i in range(1, len(given.K_j) + 1)]
@@ -161,7 +161,7 @@ def bridge(noise: float = 0.0) -> str:
     error = fit.values - truth
     said = f"rms error {np.sqrt(np.mean(error**2)):.1e} of {np.sqrt(np.mean(np.square(truth))):.2f}"
     if noise:
-        said += f", per its own doubt {np.sqrt(np.mean((error / fit.std) ** 2)):.2f}"
+        said += f", per its own std {np.sqrt(np.mean((error / fit.std) ** 2)):.2f}"
     return f"{len(fit.history)} steps, {said}"
 
 
@@ -201,9 +201,9 @@ def table(result: dict[str, Any]) -> str:
         text.append(f"mass by {name}: {len(seen.candidates)} places tried, alike: {alike}")
     text.append(f"the mass is at {result['place']}; z8 is {z8}, by symmetry poles cannot tell")
     text += ["", f"{'':12s}{'update':>10s}{'+- (1 std)':>12s}{'truth':>10s}{'error/std':>11s}"]
-    for (name, truth), value, doubt in zip(TRUTH.items(), fit.values, fit.std, strict=True):
-        off = (value - truth) / doubt
-        text.append(f"{name:12s}{value:10.5f}{doubt:12.5f}{truth:10.5f}{off:+11.2f}")
+    for (name, truth), value, std in zip(TRUTH.items(), fit.values, fit.std, strict=True):
+        off = (value - truth) / std
+        text.append(f"{name:12s}{value:10.5f}{std:12.5f}{truth:10.5f}{off:+11.2f}")
     text += ["", f"{'FRF error (per noise)':36s}{'drawing':>19s}{'updated':>19s}"]
     for name, before in result["merit"]["drawing"].items():
         both = (before, result["merit"]["updated"][name])

@@ -38,7 +38,7 @@ _SCORING, _RIDGE = 40, 1e-9
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Consistency(Value):
-    """What the innovations say about the model of an estimator.
+    """Tests of the innovations of an estimator: level, whiteness, spectrum and likely cause.
 
     Parameters
     ----------

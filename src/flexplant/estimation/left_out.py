@@ -27,7 +27,7 @@ _SHAPE = 0.02
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOut(Value):
-    """What the modes that a plant lacks do to its sensors y and POIs z.
+    """Effect of the modes left out of a plant on its sensors y and POIs z.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ _SCREENED, _SCORED = 600, 40
 
 @dataclass(frozen=True, eq=False)
 class BranchAndBound(Search):
-    """Branches of similar candidates, each bounded by convex relaxation: a proof, or a gap.
+    """Branch and bound with convex relaxations: the optimum with a proof, or a gap.
 
     The candidates are cut in groups of similar ones, and a branch holds the choices with so many
     of each group. It is left where no choice in it can be better than the best one found; small

@@ -16,7 +16,7 @@ from .rows import LinearRows
 
 @dataclass(frozen=True, eq=False)
 class Budget(Constraint):
-    """The costs of the chosen candidates together are at most this.
+    """An upper limit on the total cost of the chosen candidates.
 
     Parameters
     ----------

@@ -17,7 +17,7 @@ from .problem import Found, Problem, Search
 
 @dataclass(frozen=True, eq=False)
 class ByRows(Search):
-    """A choice of rows of mode shapes, as `select_dofs` makes it: it needs `ModeInformation`.
+    """Selection of rows of mode shapes by the methods of `select_dofs`, for `ModeInformation`.
 
     Parameters
     ----------

@@ -36,7 +36,7 @@ from .separation import Separation, of_actuators, of_sensors
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ClosedLoopH2(Criterion):
-    """Least mean square of POIs' motion and the effort it takes, with the estimate as it is.
+    """Smallest mean square of POI motion and effort in closed loop, with the estimate (LQG).
 
     The cost of LQG: ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising
     controllers of y, the square of an H2 norm. With S and F of the control Riccati equation, W the

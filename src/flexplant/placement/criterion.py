@@ -76,7 +76,7 @@ class OnPlant(Scorer):
 
 
 class Criterion(Value):
-    """A function from plant to float, smaller is better; the base of those with more to say.
+    """A function from a plant to a number, smaller is better; the base class of criteria.
 
     A new criterion defines `__call__`, and where it can `check` and a `scorer` that is faster.
 

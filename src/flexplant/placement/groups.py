@@ -115,7 +115,7 @@ class Mirrored(Constraint):
 
 @dataclass(frozen=True, eq=False)
 class Among(Constraint):
-    """So many of the chosen among these names: at most two accelerometers, one kind at a place.
+    """Limits on how many of some named candidates are chosen, such as two accelerometers at most.
 
     Parameters
     ----------

@@ -37,7 +37,7 @@ class Share(Scorer):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LeftOutModes(Criterion):
-    """How much devices see or move of modes left out of the plant, beside those that are in it.
+    """Share of the modes left out of the plant in what devices measure or excite.
 
     ``sum_i sum_k phi_ik^2 / (4 zeta_k omega_k^3)`` over the elastic modes left out, over the same
     sum for those of the plant: squared H2 norms of the modes. A controller that is fast there

@@ -32,7 +32,7 @@ from .quadratic import quadratic
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PoiLqr(Criterion):
-    """Least mean square of a POI's motion and the effort it takes: for actuators.
+    """Smallest mean square of POI motion and effort by state feedback (LQR): for actuators.
 
     ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising state
     feedbacks, with the plant's disturbances and delay of u. More actuators never make it larger.

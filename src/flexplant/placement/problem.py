@@ -182,7 +182,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The result of a search.
+    """The result of a search: chosen names, value, bound, evaluations.
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ class Found:
 
 
 class Search(Value):
-    """A way to search; the base of all of them.
+    """The base class of search methods.
 
     Examples
     --------

@@ -14,7 +14,7 @@ from .rows import LinearRows
 
 @dataclass(frozen=True, eq=False)
 class MinimumDistance(Constraint):
-    """No two chosen candidates closer to each other than this.
+    """A smallest distance between any two chosen candidates.
 
     Parameters
     ----------

@@ -18,7 +18,7 @@ from .rows import LinearRows
 
 @dataclass(frozen=True, eq=False)
 class Excluded(Constraint):
-    """No candidate with a point inside any of the zones, seen from above.
+    """Zones in which no candidate is chosen, seen from above.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class OffPoi(Constraint):
 
 @dataclass(frozen=True, eq=False)
 class Within(Constraint):
-    """So many of the chosen inside the zones, seen from above; all of them when no count is given.
+    """Limits on how many chosen candidates lie in zones, seen from above; by default all do.
 
     Parameters
     ----------

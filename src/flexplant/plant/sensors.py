@@ -87,7 +87,7 @@ class Sensor(SensorPort):
 
 @dataclass(frozen=True, eq=False)
 class Poi(Value):
-    """A Point Of Interest: motions that no sensor measures, in z as `name:axis`.
+    """A Point Of Interest: motions to be controlled that no sensor measures, in z as `name:axis`.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ _UNSEEN = 1e-12
 
 
 class SelectionCriterion(Value):
-    """A way to choose rows of a basis.
+    """The base class of criteria for the choice of rows of a basis.
 
     Examples
     --------

@@ -28,7 +28,7 @@ _TELLS = 1e-3
 
 
 class ReductionMethod(Value):
-    """A way to go from a structure to a reduced model.
+    """The base class of methods from a structure to a reduced model.
 
     Examples
     --------

@@ -74,7 +74,7 @@ class EstimatorComparison(Value):
 
 
 def reading_along(designs: Mapping[str, Estimator]) -> tuple[StateSpace, ...]:
-    """Return the estimators as blocks that read along in a loop: their outputs drive nothing.
+    """Return estimators as blocks of a loop that receive its signals and drive nothing.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def compare_estimators(
     start: float = 0.0,
     level: float = 0.95,
 ) -> EstimatorComparison:
-    """Return what estimators predict of their own error beside what runs of a machine show.
+    """Return the errors that estimators predict beside those measured in runs of a machine.
 
     Parameters
     ----------

@@ -22,7 +22,7 @@ _RESOLVED = 1e-8
 
 @dataclass(frozen=True, eq=False, repr=False)
 class LearnedFeedforward(Value):
-    """A feedforward whose gains were learnt, and how the error went down; prints as a table.
+    """A feedforward with learnt gains, and the error of each trial; prints as a table.
 
     Parameters
     ----------

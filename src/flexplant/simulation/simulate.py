@@ -51,7 +51,7 @@ def simulate(
     start: npt.ArrayLike | None = None,
     progress: bool | None = None,
 ) -> Response:
-    """Return what a sampled closed loop does in time.
+    """Return the time response of a sampled closed loop.
 
     Within a sample: the sensors are read, the blocks update, the commands go out and are held
     until the next sample (after the plant's delay). White disturbances act on the plant with the

@@ -20,7 +20,7 @@ _OF_RUNS = ("ma", "msd", "rms", "peak", "settling", "effort")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Verdict(Value):
-    """What a loop reaches beside what is specified; prints as a table.
+    """Achieved values beside the specified limits; prints as a table.
 
     In a test: ``verdict = specification.check(loop, run)``, then
     ``assert verdict.passed, str(verdict)``, whose message is the table.

@@ -29,7 +29,7 @@ def study(
     rng: Any = None,
     progress: bool | None = None,
 ) -> StudyTable:
-    """Return the table of what a pipeline finds for each machine.
+    """Return the results of a pipeline for each machine, as a table.
 
     A machine that raises gets a row with its reason, the others go on. The table is the same to
     the bit whatever executes it: seeds belong to machines, linear algebra runs on one thread.

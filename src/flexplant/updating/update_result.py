@@ -69,7 +69,7 @@ class History(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Starts(Value):
-    """What several starts led to.
+    """Results of an update from several starting points.
 
     Parameters
     ----------
@@ -109,7 +109,7 @@ class Starts(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class UpdateResult(Value):
-    """What `update` found.
+    """Result of `update`: parameters, their covariance and the updated model.
 
     Parameters
     ----------

@@ -107,7 +107,7 @@ class NeglectedModes(Value):
 def neglected_modes(
     plant: Partition | System, larger: Partition | System | Structure, *, resonances: int = 24
 ) -> NeglectedModes:
-    """Return weights that bound what a larger model has and a plant has not, from w, u to z, y.
+    """Return weights that bound the difference of a larger model and a plant, (w, u) to (z, y).
 
     ``sigma_max(W^-1 (G_larger - G) diag(scales)) <= 1`` from 0 Hz up. The square of each weight is
     ``p_0 + sum_k p_k / |s^2 + 2 zeta_k omega_k s + omega_k^2|^2`` at ``s = i omega``, p by linear

@@ -16,7 +16,7 @@ _LARGEST = 1e8
 
 
 def anti_windup_form(controller: Any, *, recovery: float | None = None) -> StateSpace:
-    """Return the controller with the applied u as further inputs, the same while nothing limits.
+    """Return the controller with the applied u as inputs, unchanged until an actuator saturates.
 
     ::
 

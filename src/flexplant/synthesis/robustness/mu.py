@@ -75,7 +75,7 @@ class MuBounds(Value):
 
 @one_thread()
 def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> MuBounds:
-    """Return bounds of the structured singular value: one over the smallest Delta that is singular.
+    """Return bounds of the structured singular value: 1 / min |Delta| with I - M Delta singular.
 
     ::
 

@@ -37,7 +37,7 @@ _BEYOND = 1e-3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RobustStability(Value):
-    """How large an uncertainty a loop endures, and the smallest found that makes it unstable.
+    """Bounds on the uncertainty under which a loop is stable, and the smallest that is not.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ def robust_stability(
     rng: Any = 0,
     progress: bool | None = None,
 ) -> RobustStability:
-    """Return bounds on the uncertainty that a loop endures: mu of its real and neglected Deltas.
+    """Return bounds on the uncertainty under which a loop is stable: mu of all its Deltas.
 
     Real Deltas (frequencies, damping, parameters) stay real, neglected modes are one full complex
     block. The bound holds between grid points; a sampled loop is examined as it is sampled and

@@ -129,7 +129,7 @@ def fdac(H: Any, G: Any) -> FloatArray:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Correlation(Value):
-    """How alike a model and a measurement are.
+    """Agreement of a model and a measurement: frequencies, damping, MAC, FRAC and FDAC.
 
     Parameters
     ----------

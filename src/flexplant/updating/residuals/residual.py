@@ -15,7 +15,7 @@ from ..point_model import Point
 
 
 class Residual(Value):
-    """A measurement that the model should reproduce.
+    """The base class of residuals: a measurement that the model should reproduce.
 
     Examples
     --------

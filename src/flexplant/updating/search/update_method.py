@@ -55,7 +55,7 @@ class SearchEnd:
 
 
 class UpdateMethod(Value):
-    """A way to minimise the residuals.
+    """The base class of methods that minimise the residuals.
 
     A new method is a subclass with a `search`, in a module of its own.
 
