@@ -30,6 +30,9 @@ from flexplant.errors import FlexplantError
 from flexplant.io import ansys, foreign, mat_variables
 from flexplant.io.nastran import read_nodes
 
+sys.path.insert(0, str(Path(__file__).parent))
+from op2_files import op2, punch
+
 RNG = np.random.default_rng(0)
 K = np.diag([4.0, 5.0, 6.0, 7.0, 8.0]) - np.eye(5, k=1) - np.eye(5, k=-1) + RNG.normal() * 0
 WHOLE = (0, 1, -1, 2, 7, 8, 64, 2**15, 2**16, 2**24, 2**30, 2**31 - 1, -(2**31), 2**40, 2**62)
@@ -279,6 +282,23 @@ def frf_mat():
     return [saved(sio.savemat, {"freq": [1.0, 2], "data": [1j, 2]})]
 
 
+def modes_of(path, **options):
+    return io.read_modes(path, zeta=0.01, rigid_below=1e-3, **options)
+
+
+def result_file(*, punched=False):
+    xyz, values = {7: (0.0, 0.0, 0.0), 9: (0.5, 0.25, 0.0)}, RNG.normal(size=(2, 2, 6))
+    if punched:
+        return [punch(values, [4.0, 9.0], list(xyz)).encode()]
+    given = (xyz, {9: 5}, values, [4.0, 9.0], [1.0, 2.0])
+    return [op2(*given), op2(*given, size=8), op2(*given, order=">")]
+
+
+def punched_modes(path):
+    (path.parent / "n.csv").write_text("node,x,y,z\n7,0,0,0\n9,1,0,0\n")
+    return modes_of(path, nodes=path.parent / "n.csv")
+
+
 #: {reader: (name of the file, valid contents, the call)}
 READERS = {
     "matrix_market": ("K.mtx", matrix_market, io.read_matrix_market),
@@ -296,6 +316,10 @@ READERS = {
     "sierra_map": ("map.m", sierra_map, with_map),
     "exodus": ("m.exo", exodus, exodus_modes),
     "exodus_hdf5": ("m.exo", partial(exodus, True), exodus_modes),
+    "op2": ("m.op2", result_file, modes_of),
+    "punch": ("m.pch", partial(result_file, punched=True), punched_modes),
+    "uff_modes": ("m.unv", uff_shapes, modes_of),
+    "ansys_rst": ("m.rst", partial(example, "file.rst"), modes_of),
     "uff_58": ("m.uff", uff, io.read_frf_uff),
     "uff_58b": ("m.uff", partial(uff, 1), io.read_frf_uff),
     "uff_55": ("m.uff", uff_shapes, io.read_modes_uff),

@@ -1,6 +1,7 @@
 """Readers and writers of foreign formats; for our own values use `.save` and `flexplant.load`.
 
-`read_model` and `read_matrices` find the format themselves; the reader of one format says more.
+`read_model`, `read_matrices` and `read_modes` find the format themselves; the reader of one format
+says more.
 
 ====================  ====================  =======================================================
 format                reader                what is read
@@ -14,6 +15,7 @@ Nastran OUTPUT4       read_op4              .op4: text, binary, dense, sparse, b
 Nastran punch         read_dmig             .pch: DMIG in all fields; GRID, CORD2x of the bulk data
 Abaqus                read_abaqus           .mtx: *MATRIX OUTPUT as text; *NODE of the input file
 Sierra                read_sierra           .m: K, M as text; nodes of an Exodus file
+modes                 read_modes            .op2, .pch, .rst, .exo, .uff: of a solved model
 Exodus                read_exodus_modes     .exo, .e: modes (classic netCDF; HDF5 with an extra)
 universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 15, 2411 with `flexplant[uff]`
 tables                read_dofs             .csv, text: node, direction, x, y, z
@@ -40,6 +42,7 @@ from .models import read_matrices as read_matrices
 from .models import read_model as read_model
 from .op4 import read_op4 as read_op4
 from .op4 import read_op4_matrices as read_op4_matrices
+from .result_modes import read_modes as read_modes
 from .sierra import read_sierra as read_sierra
 from .tables import read_dofs as read_dofs
 from .uff import read_frf_uff as read_frf_uff

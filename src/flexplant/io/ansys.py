@@ -69,7 +69,7 @@ def read_ansys(
         When there is no such file.
     """
     path = file_path(path)
-    full = _read("ansys_full", path)
+    full = read_parsed("ansys_full", path)
     if "class" in full:
         raise FlexplantError(
             f"{path.name!r} is an ANSYS {full['class']}, not a .full file: it holds no matrices of "
@@ -127,8 +127,16 @@ def cosines_of(angles: Any) -> FloatArray:
     return np.asarray(about_y @ about_x @ about_z, dtype=np.float64)
 
 
-def _read(function: str, path: Path) -> dict[str, Any]:
-    """Return what a function of `foreign` finds in an ANSYS file."""
+def read_parsed(function: str, path: Path) -> dict[str, Any]:
+    """Return what a function of `foreign` finds in an ANSYS file.
+
+    Raises
+    ------
+    FlexplantError
+        When the package is missing, or the file cannot be read.
+    ModelError
+        When the package does not support what is in the file.
+    """
     kind, found = in_child(function, path)
     if kind in ("ImportError", "ModuleNotFoundError"):
         raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}")
@@ -156,7 +164,7 @@ def _placed(nodes: Any, wanted: IntArray) -> tuple[FloatArray, dict[int, FloatAr
     if path.suffix.lower() not in (".rst", ".cdb"):
         known, xyz = read_nodes_table(path)
         return at_nodes(wanted, known, xyz, str(path)), {}
-    mesh = _read("ansys_mesh", path)
+    mesh = read_parsed("ansys_mesh", path)
     known = np.asarray(mesh["nodes"], dtype=np.int64)
     places = np.asarray(mesh["xyz"], dtype=np.float64)[:, :3]
     angles = np.asarray(mesh["angles"], dtype=np.float64)

@@ -94,7 +94,7 @@ def read_dmig(
     if not blocks:
         raise FlexplantError(
             f"{str(path)!r} has no DMIG cards. Request them in the run: PARAM,EXTOUT,DMIGPCH or "
-            "EXTSEOUT(DMIGPCH)."
+            "EXTSEOUT(DMIGPCH). Eigenvectors are read by flexplant.io.read_modes."
         )
     wanted = {"stiffness": stiffness, "mass": mass, "damping": damping}
     names = named_matrices(blocks, wanted, _ENDINGS, str(path))

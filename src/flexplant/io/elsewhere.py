@@ -6,6 +6,11 @@ from .formats import Elsewhere
 
 OTHERS: tuple[Elsewhere, ...] = (
     Elsewhere(
+        (".op2",),
+        "results, of which flexplant.io.read_modes reads the modes. Matrices: EXTSEOUT(ASMBULK, "
+        "EXTID=1, DMIGOP4) in the case control writes them as .op4, read_op4",
+    ),
+    Elsewhere(
         (".f06", ".f04", ".out"),
         "what a run printed, with too few digits. Matrices: EXTSEOUT(ASMBULK, EXTID=1, DMIGOP4) in "
         "the case control writes them as .op4, read_op4",

@@ -12,12 +12,13 @@ from typing import Any, Self, cast
 import numpy as np
 import scipy.io
 
-from ..errors import FlexplantError, LabelError, ModelError, ShapeError
+from ..errors import FlexplantError, LabelError, ShapeError
 from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
-from ..values import FloatArray, Matrix, one_of, positive, real_array
+from ..values import FloatArray, Matrix, one_of, real_array
 from .formats import Elsewhere
 from .paths import file_path
+from .shapes import check_mass, frequencies
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
 
@@ -71,6 +72,32 @@ def read_exodus_modes(
     -----
     Format: Schoof and Yarberry, "EXODUS II: A Finite Element Data Model", SAND92-2137.
     """
+    omega, phi, dofs = read_shapes(path, times, variables)
+    omega, n_rigid, order = frequencies(omega, rigid_below, str(path))
+    damping = np.broadcast_to(np.asarray(zeta, dtype=np.float64), omega.shape).copy()
+    damping[:n_rigid] = 0.0
+    phi = phi[:, order]
+    if M is not None:
+        mass: Any = M
+        if mass.shape != (phi.shape[0], phi.shape[0]):
+            raise ShapeError(
+                f"M must have shape ({phi.shape[0]}, {phi.shape[0]}), node by node, got "
+                f"{mass.shape}. Give that of the same nodes and directions."
+            )
+        check_mass(phi, mass, str(path))
+    return Modes(omega, damping, phi, dofs, n_rigid)
+
+
+def read_shapes(
+    path: str | Path, times: str = "frequency", variables: Mapping[str, str] | None = None
+) -> tuple[FloatArray, FloatArray, DofSet]:
+    """Return frequencies [rad/s], shapes and DOFs of a file; arguments as in `read_exodus_modes`.
+
+    Raises
+    ------
+    FlexplantError, LabelError, FileNotFoundError
+        As there.
+    """
     one_of(times, "times", ("frequency", "omega", "eigenvalue"))
     with opened(path) as file:
         xyz, ids = file.nodes()
@@ -88,51 +115,11 @@ def read_exodus_modes(
     names = list(chosen)
     phi = np.stack(shapes).transpose(2, 0, 1).reshape(n * len(names), k)
     dofs = DofSet(np.repeat(ids, len(names)), tuple(names) * n, np.repeat(xyz, len(names), axis=0))
-    omega, n_rigid, order = _frequencies(values, times, rigid_below, str(path))
-    damping = np.broadcast_to(np.asarray(zeta, dtype=np.float64), (k,)).copy()
-    damping[:n_rigid] = 0.0
-    phi = phi[:, order]
-    if M is not None:
-        _check_mass(phi, M, str(path))
-    return Modes(omega, damping, phi, dofs, n_rigid)
-
-
-def _frequencies(values: FloatArray, times: str, rigid_below: float | None, path: str) -> Any:
     if not np.all(np.isfinite(values)):
-        raise FlexplantError(f"{path!r} has NaN in the place of time: write it again.")
+        raise FlexplantError(f"{str(path)!r} has NaN in the place of time: write it again.")
     if times == "eigenvalue":
-        omega = np.sign(values) * np.sqrt(np.abs(values))
-    else:
-        omega = values * (2 * np.pi if times == "frequency" else 1.0)
-    limit = None if rigid_below is None else 2 * np.pi * positive(rigid_below, "rigid_below")
-    rigid = np.abs(omega) < limit if limit is not None else omega == 0
-    order = np.argsort(np.where(rigid, -1.0, omega), kind="stable")
-    omega, rigid = omega[order], rigid[order]
-    elastic = omega[~rigid]
-    if elastic.size and (elastic[0] < 0 or (elastic[0] < 1e-3 * elastic[-1] and limit is None)):
-        raise ModelError(
-            f"{path!r} has modes at {np.array2string(elastic[:6] / 2 / np.pi, precision=3)} Hz: "
-            "some of them seem to be rigid-body modes that came out near zero. Say which: "
-            "rigid_below=... [Hz] sets those below to exactly 0 (a tiny one keeps them all)."
-        )
-    return np.where(rigid, 0.0, omega), int(np.count_nonzero(rigid)), order
-
-
-def _check_mass(phi: FloatArray, M: Matrix, path: str) -> None:
-    mass: Any = M
-    if mass.shape != (phi.shape[0], phi.shape[0]):
-        raise ShapeError(
-            f"M must have shape ({phi.shape[0]}, {phi.shape[0]}), node by node, got {mass.shape}."
-        )
-    gram = phi.T @ np.asarray(mass @ phi)
-    off = np.abs(gram - np.eye(gram.shape[0]))
-    if off.max() > 1e-4:  # shapes may be in single precision
-        mode = int(np.argmax(off.max(axis=0)))
-        raise ModelError(
-            f"the shapes of {path!r} are not mass-normalised with M: phi^T M phi of mode "
-            f"{mode + 1} is {gram[mode, mode]:.6g}, the largest entry off by {off.max():.3g}. "
-            "Write them mass-normalised, or check the units and the order of M."
-        )
+        return np.sign(values) * np.sqrt(np.abs(values)), phi, dofs
+    return values * (2 * np.pi if times == "frequency" else 1.0), phi, dofs
 
 
 def _chosen(names: list[str], given: Mapping[str, str] | None, path: str) -> dict[str, int]:
@@ -304,5 +291,5 @@ class ExodusFile:
         return self.array(f"vals_nod_var{place + 1}")
 
 
-MODES = Elsewhere((".exo", ".e"), "modes: flexplant.io.read_exodus_modes reads them")
+MODES = Elsewhere((".exo", ".e"), "modes: flexplant.io.read_modes reads them")
 MESH = Elsewhere((".g",), "a mesh: give it to read_sierra(..., exodus=...)")

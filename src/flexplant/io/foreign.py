@@ -51,6 +51,29 @@ def ansys_mesh(path: str) -> dict[str, Any]:
     return {"nodes": mesh.nnum, "xyz": mesh.nodes, "angles": mesh.node_angles}
 
 
+def ansys_modes(path: str) -> dict[str, Any]:
+    """Return frequencies [Hz], shapes in global directions and nodes of an ANSYS .rst file."""
+    import numpy as np
+    from ansys.mapdl import reader
+
+    _bounded(path, 60)
+    results = reader.read_binary(path)
+    freq = np.asarray(results.time_values)
+    solutions = [results.nodal_solution(step) for step in range(freq.size)]
+    if any(not np.array_equal(ids, solutions[0][0]) for ids, _ in solutions):
+        raise ValueError("the modes are at different nodes")
+    return {
+        "freq": freq,
+        "ids": solutions[0][0],
+        "shapes": np.array([shape for _, shape in solutions]),
+        "kinds": [str(kind) for kind in results.result_dof(0)],
+        "nodes": results.mesh.nnum,
+        "xyz": results.mesh.nodes,
+        "analysis": int(results._resultheader["kan"]),
+        "cyclic": int(results._resultheader["nSector"]) > 1,
+    }
+
+
 def _plain(value: Any) -> Any:
     import numpy as np
     import scipy.sparse as sp

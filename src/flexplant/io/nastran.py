@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -64,15 +65,43 @@ def read_nodes(path: str | Path) -> Nodes:
         except ValueError as error:
             file, line, _ = lines[number - 1]
             raise FlexplantError(f"{file!r}, line {line}: {kind} {fields[:8]}: {error}.") from None
-    known = _Systems(systems, str(path))
-    xyz, axes = {}, {}
+    parsed: dict[int, list[Any]] = {}
     for node, fields in grids.items():
         try:
-            place = np.array([nastran_float(item) for item in fields[2:5]])
+            place = [nastran_float(item) for item in fields[2:5]]
             into, moves = int(fields[1] or default[0] or 0), int(fields[5] or default[1] or 0)
         except ValueError as error:
             raise FlexplantError(f"{str(path)!r}, GRID {node}: {error}.") from None
-        xyz[node] = known.position(into, place) if into else place
+        parsed[node] = [into, place, moves]
+    return nodes_of(parsed, systems, str(path))
+
+
+def nodes_of(
+    grids: Mapping[int, Sequence[Any]],
+    systems: dict[int, tuple[str, list[str]]],
+    path: str,
+) -> Nodes:
+    """Return nodes of (system of the place, place, system of the displacements) by number.
+
+    Parameters
+    ----------
+    grids : mapping {node: (CP, (x1, x2, x3), CD)}
+        The nodes.
+    systems : dict {number: (kind, fields)}
+        CORD2R, CORD2C, CORD2S: number, base, and nine coordinates of three points.
+    path : str
+        The file, for messages.
+
+    Raises
+    ------
+    FlexplantError, LabelError, ModelError
+        When a coordinate system is not there, or cannot be made.
+    """
+    known = _Systems(systems, path)
+    xyz, axes = {}, {}
+    for node, (into, place, moves) in grids.items():
+        point = np.array(place, dtype=np.float64)
+        xyz[node] = known.position(into, point) if into else point
         if moves > 0:
             axes[node] = known.axes(moves, xyz[node])
     return Nodes(xyz, axes)

@@ -71,6 +71,8 @@ class Modes(Placed, Value):
         `rigid_rounding` [Hz] (the frequency up to which rounding of K's entries could hold a
         rigid-body motion, ``sqrt(eps |R|^T |K| |R|) / (2 pi)``: softer suspensions look free) and,
         for a large model, the modes `counted` (Sturm) and `found` below the frequency `shift` [Hz].
+    notes : sequence of str
+        What to know of modes that a file held: what was assumed, changed, and is missing.
 
     Raises
     ------
@@ -99,6 +101,7 @@ class Modes(Placed, Value):
     residual: FloatArray = field(default_factory=_nothing)
     rounding: FloatArray = field(default_factory=_nothing)
     certificate: Mapping[str, float] = field(default_factory=dict)
+    notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         omega = real_array(self.omega, "omega", (None,))
@@ -140,6 +143,7 @@ class Modes(Placed, Value):
                 str(name): float(real_array(value, f"certificate {name}", ()))
                 for name, value in self.certificate.items()
             },
+            notes=tuple(str(note) for note in self.notes),
         )
 
     def __repr__(self) -> str:
@@ -172,6 +176,7 @@ class Modes(Placed, Value):
                 f",\n  rounding of K may change {which} by up to {self.rounding.max():.1g} of the "
                 "frequency"
             )
+        checked += "".join(f",\n  {note}" for note in self.notes)
         return f"<Modes: {self.n_modes}{kind} of {len(self.dofs)} DOFs{held}{extra}{checked}>"
 
     @property

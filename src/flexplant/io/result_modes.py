@@ -1,0 +1,128 @@
+"""Modes of the result files of all finite-element programs."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import FlexplantError, LabelError, ModelError
+from ..modes import Modes
+from ..structure import FEMatrices, FEModel
+from ..structure.units import units as unit_system
+from ..values import FloatArray, instance, short
+from . import ansys_modes, exodus_modes, op2, punch_modes, uff_modes
+from .formats import HEAD, ends
+from .paths import file_path
+from .shapes import ModesFormat, check_mass, modes_of
+
+FORMATS: tuple[ModesFormat, ...] = (
+    op2.OUTPUT2,
+    punch_modes.PUNCH,
+    ansys_modes.RESULTS,
+    exodus_modes.EXODUS,
+    uff_modes.UNIVERSAL_MODES,
+)
+
+
+def read_modes(
+    path: str | Path,
+    *,
+    zeta: float | FloatArray | None,
+    nodes: str | Path | None = None,
+    rigid_below: float | None = None,
+    units: Sequence[str | float] = ("m", "kg", "s"),
+    matrices: FEMatrices | FEModel | None = None,
+) -> Modes:
+    """Return the modes that a finite-element program computed, whichever wrote the file.
+
+    For models that are too large to be solved here: shapes at all nodes become Modes, and these a
+    plant or a reduced model. By suffix: Nastran .op2, and .pch of DISPLACEMENT(PUNCH); ANSYS .rst;
+    Exodus .exo, .e (frequencies in Hz in the place of time); universal files .uff, .unv of normal
+    modes.
+
+    Residual attachment vectors are not in such files, and cannot be made without M and K: the
+    static motion that the modes left out have is missing, which `notes` say. Nastran and ANSYS
+    write residual vectors as further modes of high frequency (RESVEC), which bring most of it back.
+
+    Parameters
+    ----------
+    path : str or Path
+        The file.
+    zeta : float, (k,) array or None
+        Damping ratios, which only universal files hold: None takes those of the file. Rigid-body
+        modes have none.
+    nodes : str or Path, optional
+        Where the nodes are, if not in the file: the bulk data of Nastran (.bdf, .dat), a universal
+        file, or a table `node, x, y, z`.
+    rigid_below : float [Hz], optional
+        Modes below this are rigid-body modes, and set to exactly 0.
+    units : (length, mass, time)
+        Of the file: ("mm", "t", "s") for instance; the modes are in SI.
+    matrices : FEMatrices or FEModel, optional
+        In SI, with the same nodes: the shapes are checked to be mass-normalised with its M.
+
+    Returns
+    -------
+    Modes
+        In global directions, with unit generalised masses where the file has them (LAMA, dataset
+        55) and else as they are. `certificate["mass"]` is the largest entry of phi^T M phi - I
+        where `matrices` are given.
+
+    Raises
+    ------
+    FlexplantError
+        When the format is not known, holds no modes, or the file is damaged.
+    ModelError
+        When damping is not said, modes are near zero and `rigid_below` does not say what they are,
+        several sets of modes are there, or the shapes are not mass-normalised with `matrices`.
+    LabelError
+        When a node has no place or its coordinate system is not there.
+    FileNotFoundError
+        When there is no such file.
+    """
+    path = file_path(path)
+    sizes = tuple(units) if not isinstance(units, str) else ()
+    if len(sizes) != 3:
+        raise ModelError(
+            f"units must be three, of length, mass and time, got {short(units)}: "
+            "give ('mm', 't', 's') for instance."
+        )
+    with path.open("rb") as file:
+        head = file.read(HEAD).lower()
+    form = next((f for f in FORMATS if ends(path, f.suffixes) and f.begins(head)), None)
+    if form is None:
+        known = ", ".join(suffix for f in FORMATS for suffix in f.suffixes)
+        raise FlexplantError(
+            f"{path.name!r} is no file of modes that is read here; known are {known}. Matrices are "
+            "read by read_model."
+        )
+    shapes = form.read(path, None if nodes is None else file_path(nodes, "nodes"))
+    system = unit_system(*sizes)
+    modes = modes_of(shapes, zeta=zeta, rigid_below=rigid_below, system=system, path=str(path))
+    if matrices is None:
+        return modes
+    instance(matrices, FEMatrices | FEModel, "matrices", "read_matrices(...) reads them.")
+    return modes.replace(certificate={"mass": _with_mass(modes, matrices, str(path))})
+
+
+def _with_mass(modes: Modes, matrices: FEMatrices | FEModel, path: str) -> float:
+    """Return how far the shapes are from mass-normalised with the M of a model."""
+    if matrices.M is None or matrices.dofs is None:
+        raise ModelError(
+            "matrices need M, and names of their rows, to check the shapes with. Give them: "
+            "read_matrices(..., mass=, dofs=)."
+        )
+    row = {label: i for i, label in enumerate(modes.dofs.labels)}
+    known = set(matrices.dofs.labels)
+    lost = [label for label in row if label not in known]
+    if lost:
+        raise LabelError(
+            f"the modes of {path!r} move {len(lost)} DOFs that the matrices do not have, the first "
+            f"{lost[:4]}. Are both of one model, with the same supports?"
+        )
+    # a row that no mode moves was left out
+    found = [row.get(label, -1) for label in matrices.dofs.labels]
+    phi = np.vstack([np.real(modes.phi), np.zeros(modes.n_modes)])[found]
+    return check_mass(phi, matrices.M, path)
