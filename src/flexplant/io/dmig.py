@@ -89,7 +89,9 @@ def read_dmig(
     content = file_path(path).read_bytes()
     lines = content.splitlines()
     blocks = _blocks(lines, str(path))
-    if blocks and cut_short(content, [line[8:].split()[-1] for line in lines[-9:-1] if line[8:]]):
+    if blocks and cut_short(
+        content, [line[8:].split()[-1] for line in lines[-9:-1] if line[8:].split()]
+    ):
         raise _wrong(str(path), len(lines) - 1, lines[-1], "a whole line")
     if not blocks:
         raise FlexplantError(
@@ -197,7 +199,7 @@ def _blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
         if name in blocks:
             raise _wrong(path, head, lines[head], f"one matrix {name} only, here is a second")
         size = fields[7].strip() if len(fields) > 7 else ""
-        announced = int(size) if size.isdigit() else 0
+        announced = int(size) if size.isdecimal() and size.isascii() else 0
         blocks[name] = _block(lines, first, last, (name, form, kind, announced), path)
     return blocks
 

@@ -152,15 +152,24 @@ def _matrix(
         thin = is_thin(shape, 0)
         return sp.csc_array(shape, dtype=target) if thin else np.zeros(shape, dtype=target)
     if heads and all(row > 0 for _, row, _ in heads):
+        parts: list[Any] = []
         thin = is_thin(shape, words.size // per)
-        dense: Any = sp.lil_array(shape, dtype=target) if thin else np.zeros(shape, target, "F")
+        dense = np.zeros((0, 0) if thin else shape, dtype=target, order="F")
         for start, stop, (column, row, _) in zip(starts, stops, heads, strict=True):
             count = (stop - start - 3 * size) // per
             if row - 1 + count > shape[0]:
                 raise _outside(words.path, start, name, row - 1 + count, shape)
             part = np.frombuffer(words.content, value, count, start + 3 * size)
-            dense[row - 1 : row - 1 + count, column - 1] = part
-        return sp.csc_array(dense) if thin else dense
+            if thin:
+                parts.append(
+                    (part, np.arange(row - 1, row - 1 + count), np.full(count, column - 1))
+                )
+            else:
+                dense[row - 1 : row - 1 + count, column - 1] = part
+        if not thin:
+            return dense
+        data, rows, places = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return sp.csc_array(sp.coo_array((data.astype(target), (rows, places)), shape=shape))
     first = np.array(starts, dtype=np.int64) + 3 * size
     counts = np.array([count for _, _, count in heads], dtype=np.int64)
     end = np.minimum(first + counts * size, np.array(stops, dtype=np.int64))

@@ -125,6 +125,9 @@ class _Reader:
                 self.at -= 1
                 raise self.wrong(f"column {column} of {name} from row {row} with {count} values")
             if row:
+                if count % per:
+                    self.at -= 1
+                    raise self.wrong(f"{count} numbers of a complex column of {name}")
                 self._take(count)
                 self.strings.append((column, row, count // per))
             else:
@@ -148,7 +151,7 @@ class _Reader:
                 (number,) = self.integers(line, (len(line),))
                 length, row = (number >> 16) - 1, number & 0xFFFF
                 left -= length + 1
-            if length < 1 or left < 0 or row < 1 or length % words:
+            if length < 1 or left < 0 or row < 1 or length % (words * per):
                 self.at -= 1
                 raise self.wrong(f"a string of {length} words from row {row}")
             self._take(length // words)

@@ -35,7 +35,7 @@ def read_modes(
     units: Sequence[str | float] = ("m", "kg", "s"),
     matrices: FEMatrices | FEModel | None = None,
 ) -> Modes:
-    """Return the modes that a finite-element program computed, whichever wrote the file.
+    r"""Return the modes that a finite-element program computed, whichever wrote the file.
 
     For models that are too large to be solved here: shapes at all nodes become Modes, and these a
     plant or a reduced model. By suffix: Nastran .op2, and .pch of DISPLACEMENT(PUNCH); ANSYS .rst;
@@ -81,6 +81,21 @@ def read_modes(
         When a node has no place or its coordinate system is not there.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    A file of one mode at one node, as Nastran punches it:
+
+    >>> import tempfile
+    >>> folder = Path(tempfile.mkdtemp())
+    >>> head = "$EIGENVECTOR\n$EIGENVALUE =  0.4000000E+05  MODE =     1\n"
+    >>> row = "".join(f"{number:18.6E}" for number in (0.0, 0.0, 2.0))
+    >>> text = f"{head}{7:10}       G{row}\n{'-CONT-':18}{3 * f'{0.0:18.6E}'}\n"
+    >>> _ = (folder / "run.pch").write_text(text)
+    >>> _ = (folder / "run.bdf").write_text("GRID,7,,0.1,0.2,0.\n")
+    >>> modes = read_modes(folder / "run.pch", zeta=0.01, nodes=folder / "run.bdf")
+    >>> modes.dofs.labels, modes.omega, modes.phi
+    (('7:z',), array([200.]), array([[2.]]))
     """
     path = file_path(path)
     sizes = tuple(units) if not isinstance(units, str) else ()
