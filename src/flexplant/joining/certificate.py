@@ -16,6 +16,8 @@ from .links import Link, machine_size, rows_of
 
 #: largest gap, imbalance and error of the inertia, relative
 _LIMIT = 1e-7
+#: a rigid-body motion that a reduced component misses by less is one of its own
+_MADE = 1e-8
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -121,16 +123,11 @@ def certified(
     size = np.array([1.0] * 3 + [machine_size(parts)] * 3)
     felt = [(link.joint.is_rigid, float(np.abs(link.carried / size).max())) for link in links]
     balance = max((part for is_rigid, part in felt if is_rigid), default=0.0)
-    motions = np.vstack([part.model.rigid_motions() for part in parts])
-    apart = sum(
-        part.model.rigid_motions().T @ part.model.inertia(part.model.rigid_motions())
-        for part in parts
-    )
-    error = _inertia_error(np.asarray(apart), motions[done.kept], matrices["M"])
+    apart, error = _inertia(parts, matrices["M"], done.kept)
     found = JoiningCertificate(
         gap=gap,
         balance=max((part for _, part in felt), default=0.0),
-        mass=float(max(np.diag(np.asarray(apart))[:3])) or float("nan"),
+        mass=float(max(np.diag(apart)[:3])) or float("nan"),
         inertia_error=error,
         constraints=B.shape[0],
         rank=done.rank,
@@ -170,7 +167,20 @@ def _force(K: Any, motions: FloatArray) -> float:
     return float(np.max(force / np.where(most > 0, most, 1.0), initial=0.0))
 
 
-def _inertia_error(apart: FloatArray, motions: FloatArray, M: Any) -> float:
-    whole = motions.T @ np.asarray(M @ motions)
+def _inertia(parts: Sequence[Component], M: Any, kept: IntArray) -> tuple[FloatArray, float]:
+    """Return the inertia (6, 6) of all components, and how far that of the machine is off.
+
+    Motions that a reduced component cannot make (it is held, say) have no inertia of the whole.
+    """
+    own = [part.model.rigid_motions() for part in parts]
+    apart = np.zeros((6, 6))
+    missed = np.zeros(6)
+    for part, motions in zip(parts, own, strict=True):
+        apart += motions.T @ part.model.inertia(motions)
+        if part.is_reduced:
+            missed = np.maximum(missed, part.model.missed_motions())
+    whole = np.vstack(own)[kept]
     size = np.sqrt(np.maximum(np.diag(apart), 1e-300))
-    return float(np.abs((whole - apart) / np.outer(size, size)).max())
+    error = np.abs(whole.T @ np.asarray(M @ whole) - apart) / np.outer(size, size)
+    made = missed < _MADE
+    return apart, float(error[np.ix_(made, made)].max(initial=0.0))

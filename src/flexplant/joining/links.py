@@ -180,6 +180,8 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
         known = part.static_rows
         left = wanted
         if known.size:
+            some = np.flatnonzero(np.any(known, axis=0) | np.any(wanted, axis=0))
+            known, left, wanted = known[:, some], left[:, some], wanted[:, some]
             left = wanted - (wanted @ np.linalg.pinv(known)) @ known
         part_left = np.linalg.norm(left, axis=1) / np.linalg.norm(wanted, axis=1)
         lost = [name for name, share in zip(names, part_left, strict=True) if share > _STATIC]
