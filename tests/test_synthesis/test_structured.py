@@ -187,6 +187,7 @@ def test_laws_are_tuned_to_a_local_minimum():
     radius = found.certificate["radius"]
     assert found.certificate["decrease left"] < 1e-4
     family = found.structure.family(plant, prepared(plant.system, plant.u, plant.y))
+    assert not np.isfinite(family.matrices(family.first + 8.0).D).all()  # corners end at half rate
     loop = ScaledLoop(prepared(plant.system, plant.u, plant.y), family.order)
     for _ in range(40):
         step = rng.standard_normal(family.first.size)

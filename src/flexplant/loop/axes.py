@@ -7,9 +7,13 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import ModelError, ShapeError
+from ..lti.between_lines import between_lines
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import ComplexArray, FloatArray, flag, instance, positive
+
+#: degrees of freedom above which a variance is taken as it is
+_FREEDOM = 20.0
 
 
 def in_axes(
@@ -44,7 +48,8 @@ def in_axes(
     Returns
     -------
     Frf
-        Without the statistics of the measurement.
+        With the variance of the measurement, where variance or coherence is known: see
+        `line_variance`; without its other statistics.
 
     Raises
     ------
@@ -65,6 +70,9 @@ def in_axes(
     last = static_map(after, frf.outputs, "after")
     chosen = frf.select(outputs=last.inputs, inputs=first.outputs)
     data = np.einsum("ay,yuf,ub->abf", last.D, chosen.data, first.D)
+    variance = line_variance(chosen)
+    if variance is not None:
+        variance = _carried(last.D, first.D, variance, chosen.correlation)
     freq, late = frf.freq, positive(delay, "delay", zero=True)
     held = flag(hold, "hold")
     if rate is None and late:
@@ -77,8 +85,71 @@ def in_axes(
                 "Hz: a loop cannot be judged there. Check that rate is in Hz, or measure lower."
             )
         data = _sampled(frf.freq, data, freq, rate, late, held)
+        if variance is not None:
+            aliased = _aliased(frf.freq, variance, freq, rate)
+            variance = aliased if held else variance[..., : freq.size]
     units = {**chosen.channel_units, **first.units, **last.units}
-    return Frf(freq, data, first.inputs, last.outputs, quantity=frf.quantity, units=units)
+    return Frf(
+        freq,
+        data,
+        first.inputs,
+        last.outputs,
+        quantity=frf.quantity,
+        variance=variance,
+        units=units,
+    )
+
+
+def line_variance(frf: Frf) -> FloatArray | None:
+    """Return E|error|^2 of the entries of a measured Frf, None where nothing says how large it is.
+
+    Its variance; of few runs, which differ by chance, the mean over neighbouring lines. Else by
+    coherence, ``|G|^2 (1 - c) / (c n)`` (Bendat and Piersol, Random Data, 4th ed., 9.1), n the
+    averages, `freedom` + 1; 2 where that is not known, the fewest that have a coherence.
+    """
+    if frf.variance is not None:
+        few = 0 if frf.freedom is None else int(np.ceil(_FREEDOM / frf.freedom))
+        return _near_mean(frf.variance, few)
+    if frf.coherence is None:
+        return None
+    averages = 2.0 if frf.freedom is None else frf.freedom + 1.0
+    sure = np.maximum(frf.coherence, 1e-6)
+    return np.asarray(np.abs(frf.data) ** 2 * (1.0 - np.minimum(sure, 1.0)) / (sure * averages))
+
+
+def _near_mean(values: FloatArray, reach: int) -> FloatArray:
+    """Return the mean over so many lines to either side."""
+    if not reach or values.shape[-1] <= 2 * reach:
+        return values
+    total = np.cumsum(values, axis=-1, dtype=np.float64)
+    total = np.concatenate([np.zeros((*values.shape[:-1], 1)), total], axis=-1)
+    places = np.arange(values.shape[-1])
+    low, high = np.maximum(places - reach, 0), np.minimum(places + reach + 1, values.shape[-1])
+    return np.asarray((total[..., high] - total[..., low]) / (high - low))
+
+
+def _carried(
+    after: FloatArray, before: FloatArray, variance: FloatArray, correlation: ComplexArray | None
+) -> FloatArray:
+    """Return the variance of ``after G before``; errors of different inputs are independent."""
+    if correlation is None:
+        return np.asarray(np.einsum("ay,yuf,ub->abf", after**2, variance, before**2))
+    size = np.sqrt(variance)
+    parts = np.einsum(
+        "ay,ax,yuf,xuf,yxf,ub->abf", after, after, size, size, correlation.real, before**2
+    )
+    return np.asarray(np.maximum(parts, 0.0))
+
+
+def _aliased(lines: FloatArray, variance: FloatArray, freq: FloatArray, rate: float) -> FloatArray:
+    """Return the variance of `_sampled`: aliases add theirs."""
+    total = np.zeros((*variance.shape[:2], freq.size))
+    for moved in _images(lines, freq, rate):
+        at = np.abs(moved)
+        hold = np.sinc(moved / rate) ** 2
+        for i, j in np.ndindex(variance.shape[:2]):
+            total[i, j] += hold * np.interp(at, lines, variance[i, j], left=0.0, right=0.0)
+    return total
 
 
 def _sampled(
@@ -96,17 +167,29 @@ def _sampled(
     if not held:
         turned = np.exp(-2j * np.pi * freq * late / rate)
         return np.asarray(data[:, :, : freq.size] * turned)
-    reach = int(np.ceil(lines[-1] / rate))
     total = np.zeros((*data.shape[:2], freq.size), dtype=complex)
-    for k in range(-reach, reach + 1):
-        moved = freq + k * rate
+    for moved in _images(lines, freq, rate):
         at = np.abs(moved)
-        G = np.array(
-            [[np.interp(at, lines, one, left=0.0, right=0.0) for one in row] for row in data]
-        )
+        known = (at >= lines[0]) & (at <= lines[-1])
+        G = np.zeros(total.shape, dtype=complex)
+        G[..., known] = _between(lines, data, at[known])
         hold = np.sinc(moved / rate) * np.exp(-2j * np.pi * moved * (0.5 + late) / rate)
         total += np.where(moved < 0.0, G.conj(), G) * hold
     return total
+
+
+def _between(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> ComplexArray:
+    """Return the response at frequencies within the lines."""
+    if lines.size < 4:
+        each = [[np.interp(freq, lines, one) for one in row] for row in data]
+        return np.asarray(each, dtype=np.complex128)
+    return between_lines(lines, data, freq)[0]
+
+
+def _images(lines: FloatArray, freq: FloatArray, rate: float) -> list[FloatArray]:
+    """Return the frequencies, negative ones too, that a sampler shows at some frequencies."""
+    reach = int(np.ceil(lines[-1] / rate))
+    return [freq + k * rate for k in range(-reach, reach + 1)]
 
 
 def static_map(given: System | FloatArray | None, names: Sequence[str], side: str) -> StateSpace:

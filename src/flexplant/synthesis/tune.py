@@ -2,35 +2,31 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from functools import cached_property
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..errors import ModelError, SolverError
 from ..loop import report_loops
-from ..loop.nyquist import continued, nyquist_count
 from ..lti.frequency import Frf, frequency_response
 from ..lti.grid import resonance_grid
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..progress import Progress
-from ..values import ComplexArray, FloatArray, positive, whole
+from ..values import FloatArray, positive, whole
+from .axis_law import AxisLaw
 from .law import Law
-from .loop_design import LoopDesign, axes_controller, axes_of, made
-from .servo_axis import Axis
-from .servo_loop import TARGET, ServoLoop, highest
+from .law_search import FoundLaw, LawSearch
+from .loop_design import Axes, LoopDesign, axes_controller, axes_of, made
+from .measured_axis import MeasuredAxis
+from .servo_loop import TARGET
 
-#: shapes that are tried one after the other: factor of the lead, roll-off beside the bandwidth
-_SHAPES = ((4.0, 8.0), (3.0, None), (6.0, None), (None, 4.0), (None, 16.0))
-#: corner of the integrator beside the bandwidth
-_INTEGRATOR = 0.1
-#: bandwidths that are tried for each, and steps of 3 % down while the axes disturb each other
-_TRIALS, _STEPS = 20, 20
-#: resonances that may be notched, and how far they rise above the line of the rigid body
-_RESONANCES, _RISE = 12, 2.0
+#: steps down, and their factor, while the axes disturb each other a little; margin, beside that
+#: needed, below which that is no cure; rounds in which each adapts to the others, to a peak so
+#: much lower
+_STEPS, _SLOWER, _FAR, _ROUNDS, _STRICTER = 4, 0.99, 0.95, 4, 0.97
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
 _ZERO = 1e-6
 
@@ -46,16 +42,25 @@ def tune_loops(
     hold: bool = True,
     peak: float = TARGET,
     rigid: int | None = None,
+    notches: int = 3,
     larger: Any = None,
     progress: bool | None = None,
 ) -> LoopDesign:
     """Return the laws of highest bandwidth that keep |S| of each axis below a peak.
 
-    Each axis gets ``k (1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)`` as `design_servo`
-    does, with notches at resonances where they serve. For several r and corners of the low-pass
-    the bandwidth w_b, near which the loop first crosses 1, is raised until |S| reaches the peak or
-    the loop is no longer stable (by the Nyquist count); at most to the first resonance, 0.19 of the
-    rate or a quarter of the highest line. No model is needed: the plant may be an Frf.
+    Each axis gets ``k (1 + w_i / s) (1 + a s / w_b) / (1 + s / (b w_b)) F(s)`` with a low-pass and
+    notches in F. w_b, where the loop of the rigid body alone crosses 1, is made as large as
+    ``|1 + L| >= 1 / peak`` allows, beyond resonances too; a, b, the corner of the low-pass and
+    frequency, depth and width of the notches are found on the way, from many starts: the best of
+    them, without proof that no other law does better. w_i is w_b / 10, no zero lies below it, no
+    corner above 0.45 of the rate or the last line.
+
+    No model is needed: the plant may be an Frf. A line is taken to lie anywhere within two standard
+    deviations, by its variance, else its coherence (averages by `freedom`; unless given as if of
+    two), else by how lines scatter. Where a resonance turns between two lines, the circle through
+    its neighbours is followed; where lines do not resolve it, the loop gain has to be small there.
+    Peaks that fall between two lines unseen are not known: the lines have to be closer than a
+    mode is wide. Above the last line the plant is unknown, and the loop gain there at most 0.1.
 
     Parameters
     ----------
@@ -66,6 +71,8 @@ def tune_loops(
     rigid : int, optional
         Rigid-body modes that the axes show; unless given as many as axes, of a model those that it
         has. 0 on springs whose modes lie within the lines.
+    notches : int
+        At most so many for each axis; one has to raise the bandwidth by 2 %.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
     progress : bool, optional
@@ -99,161 +106,101 @@ def tune_loops(
     if rigid is None:
         rigid = len(axes.names) if measured else _free_modes(axes.plant)
     rigid = whole(rigid, "rigid", minimum=0)
+    most = whole(notches, "notches", minimum=0)
     frf = axes.plant if measured else _response(axes.plant)
-    found = {}
+    tuner = _Tuner(axes, frf, float(peak), rigid, most)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
-        for i, name in enumerate(axes.names):
-            axis = _Axis(name, frf.freq, frf.data[i, i], axes.rate, peak, rigid > 0)
-            found[name] = axis.best()
-            bar.advance()
-    for step in range(_STEPS):
-        laws = {name: one.law(one.bandwidth * 0.97**step) for name, one in found.items()}
-        report = report_loops((axes.plant, axes_controller(axes, laws)), at="y", rigid=rigid)
-        if report.is_stable and all(one.modulus_margin >= 1.0 / peak for one in report.loops):
-            design = made(axes, laws, rigid, 0, None, larger)
-            ended = [one.ended for one in found.values() if one.bandwidth >= 0.95 * one.top]
-            return design.replace(notes=(*design.notes, *ended))
-    slower = 100.0 * (1.0 - 0.97**_STEPS)
-    raise SolverError(
-        f"each axis alone holds |S| below {peak:g}, all together do not, even {slower:.0f} % "
-        f"slower: {report.reason or 'they disturb each other'}. Decouple the axes better "
-        "(before=, after=), or close them one after the other with design_loops."
-    )
+        reached = tuner.together(tuner.each_alone(bar)) or tuner.settled(tuner.one_by_one())
+    if reached is None:
+        raise SolverError(
+            f"each axis alone holds |S| below {peak:g}, all together do not: they disturb each "
+            "other. Decouple the axes better (before=, after=), or close them one after the other "
+            "with design_loops."
+        )
+    design = made(axes, reached.laws, rigid, 0, None, larger)
+    return design.replace(notes=(*design.notes, *reached.notes))
+
+
+class _Reached(NamedTuple):
+    """Laws that hold the peak in all axes together, and what to say of them."""
+
+    laws: dict[str, Law]
+    notes: list[str]
 
 
 @dataclass(frozen=True)
-class _Axis:
-    """One axis of the plant; of its law the bandwidth, the lead's factor, roll-off by bandwidth."""
+class _Tuner:
+    """The axes of a plant, each with its response."""
 
-    name: str
-    freq: FloatArray
-    G: ComplexArray
-    rate: float
+    axes: Axes
+    frf: Frf
     peak: float
-    free: bool
-    lead: float = 4.0
-    rolloff: float = 8.0
-    bandwidth: float = 0.0
+    rigid: int
+    notches: int
 
-    @cached_property
-    def top(self) -> float:
-        """The highest bandwidth [Hz]: the line of the rigid body ends at the first resonance."""
-        ends = [0.25 * self.freq[-1], *self._resonances, *([0.19 * self.rate] if self.rate else [])]
-        return float(min(ends))
+    def each_alone(self, bar: Progress) -> list[tuple[AxisLaw, FoundLaw]]:
+        """Return the best law of each axis, the others open."""
+        found = []
+        for i in range(len(self.axes.names)):
+            found.append(self._tuned(i, {}))
+            bar.advance()
+        return found
 
-    @property
-    def ended(self) -> str:
-        """A note for a bandwidth that the top ends, not the peak."""
-        return (
-            f"{self.name}: not |S| but the first resonance, the rate or the last line "
-            f"({self.freq[-1]:.4g} Hz) ended the search, at {self.top:.4g} Hz"
-        )
+    def one_by_one(self) -> list[tuple[AxisLaw, FoundLaw]]:
+        """Return the best law of each axis, those before it closed."""
+        found: list[tuple[AxisLaw, FoundLaw]] = []
+        for i in range(len(self.axes.names)):
+            found.append(self._tuned(i, {k: one.law for k, (_, one) in enumerate(found)}))
+        return found
 
-    def best(self) -> _Axis:
-        """Return the axis with the shape and bandwidth that hold the peak.
-
-        Raises
-        ------
-        SolverError
-            When none does.
-        """
-        top, low = self.top, max(4.0 * float(self.freq[0]), 3.0 * self._suspension)
-        best = replace(self, bandwidth=low)
-        for lead, rolloff in _SHAPES:
-            one = replace(best, lead=lead or best.lead, rolloff=rolloff or best.rolloff)
-            trials = np.geomspace(top, best.bandwidth, _TRIALS) if top > low else np.zeros(0)
-            reached = highest(trials[:-1].tolist(), one.holds)
+    def settled(self, found: list[tuple[AxisLaw, FoundLaw]]) -> _Reached | None:
+        """Return laws that hold the peak together, each adapted in turn to all the others."""
+        for _ in range(_ROUNDS):
+            reached = self.together(found)
             if reached is not None:
-                best = replace(one, bandwidth=reached)
-        if best.bandwidth > low:
-            return best
-        if self.free:
-            need = (
-                "a rigid body, its motion per force, at the lowest lines. Give rigid=0 when it is"
-            )
-            need += " on springs"
-        else:
-            need = f"a mass above its springs' mode, taken to be at {self._suspension:.4g} Hz. Give"
-            need += " rigid= when the body is free"
-        reach = f"from {low:.3g} to {top:.3g} Hz" if top > low else f"above {low:.3g} Hz"
-        raise SolverError(
-            f"axis {self.name!r}: no bandwidth {reach} is stable with |S| below "
-            f"{20 * np.log10(self.peak):.2g} dB. The axis has to be {need}; raise the rate, lower "
-            "the delay, or measure at lower frequencies."
-        )
+                return reached
+            for i in range(len(found)):
+                others = {k: one.law for k, (_, one) in enumerate(found) if k != i}
+                law = AxisLaw(self._axis(i, others), _STRICTER * self.peak)
+                again = LawSearch(law, self.notches).raised(found[i][1].numbers)
+                found[i] = (law, again) if again else found[i]
+        return self.together(found)
 
-    def holds(self, bandwidth: float) -> bool:
-        """Return whether a bandwidth keeps the peak, with the notches that serve it."""
-        inertia, late = self._line(bandwidth)
-        axis = self._plain(bandwidth)
-        if not inertia or _rigid_peak(axis, late) > self.peak:
-            return False
-        loop = ServoLoop(self.freq, inertia * self.G[:, None, None], self._resonances)
-        axis = loop.notched(axis, lambda one: self._is_stable(one, inertia))
-        return loop.peak(axis) <= self.peak and self._is_stable(axis, inertia)
+    def _tuned(self, i: int, closed: dict[int, Law]) -> tuple[AxisLaw, FoundLaw]:
+        law = AxisLaw(self._axis(i, closed), self.peak)
+        return law, LawSearch(law, self.notches).best()
 
-    def law(self, bandwidth: float) -> Law:
-        """Return the law of a bandwidth [Hz]."""
-        inertia, _ = self._line(bandwidth)
-        loop = ServoLoop(self.freq, inertia * self.G[:, None, None], self._resonances)
-        axis = loop.notched(self._plain(bandwidth), lambda one: self._is_stable(one, inertia))
-        return axis.law * inertia
+    def _axis(self, i: int, closed: dict[int, Law]) -> MeasuredAxis:
+        """Return one axis with others closed.
 
-    def _plain(self, bandwidth: float) -> Axis:
-        rolloff = self.rolloff * bandwidth
-        rolloff = min(rolloff, 0.4 * self.rate) if self.rate else rolloff
-        slow = _INTEGRATOR * bandwidth
-        return Axis(bandwidth, rolloff, slow, (), self.rate, self.lead, prewarped=True)
-
-    def _line(self, bandwidth: float) -> tuple[float, float]:
-        """Return the inertia, with its sign, and the lateness [s] of the lines below a bandwidth.
-
-        ``G = exp(-s late) / (inertia s^2)`` there; 0 without a line.
+        ``G_i - G_iJ C_J (I + G_JJ C_J)^-1 G_Ji`` is what its law acts on, J the others.
         """
-        near = (self.freq >= 0.25 * bandwidth) & (self.freq <= bandwidth)
-        if not np.any(near):
-            return 0.0, 0.0
-        omega = 2.0 * np.pi * self.freq[near]
-        turned = -self.G[near] * omega**2
-        sign = 1.0 if np.median(turned.real) >= 0.0 else -1.0
-        late = float(np.median(-np.angle(sign * turned) / omega))
-        return sign / float(np.median(np.abs(turned))), max(late, 0.0)
+        P, J = np.moveaxis(self.frf.data, -1, 0), list(closed)
+        G = P[:, i, i]
+        if J:
+            C = np.stack([law.response(self.frf.freq) for law in closed.values()], axis=-1)
+            inner = np.eye(len(J)) + P[:, J][:, :, J] * C[:, None, :]
+            reached = np.linalg.solve(inner, P[:, J, i, None])[..., 0]
+            G = G - np.sum(P[:, i, J] * C * reached, axis=-1)
+        variance = None if self.frf.variance is None else self.frf.variance[i, i]
+        name, free = self.axes.names[i], self.rigid > 0
+        return MeasuredAxis(name, self.frf.freq, G, self.axes.rate, free, variance)
 
-    @cached_property
-    def _peaks(self) -> FloatArray:
-        """The frequencies [Hz] of the highest peaks above the line of the rigid body."""
-        size = np.abs(self.G) * self.freq**2
-        inner = (size[1:-1] >= size[:-2]) & (size[1:-1] > size[2:])
-        peaks = 1 + np.flatnonzero(inner & (size[1:-1] > _RISE * np.median(size)))
-        if self.rate:
-            peaks = peaks[self.freq[peaks] < 0.45 * self.rate]
-        order = np.argsort(-np.abs(self.G[peaks]), kind="stable")[:_RESONANCES]
-        return self.freq[peaks[order]]
-
-    @property
-    def _suspension(self) -> float:
-        """The frequency [Hz] of the springs that hold the body; 0 when free."""
-        return 0.0 if self.free else float(self._peaks.min(initial=self.freq[-1]))
-
-    @property
-    def _resonances(self) -> FloatArray:
-        return self._peaks[self._peaks > self._suspension]
-
-    def _is_stable(self, axis: Axis, inertia: float) -> bool:
-        def respond(freq: FloatArray) -> ComplexArray:
-            return -inertia * axis.response(freq)[None, None]
-
-        slope = 2 if self.free else 0
-        freq, L = continued(self.freq, self.G[None, None], respond, slope)
-        return nyquist_count(freq, L, at_zero=slope + 1, unstable=0).unstable == 0
-
-
-def _rigid_peak(axis: Axis, late: float) -> float:
-    """Return max |S| of the rigid body alone, with its lateness."""
-    top = 0.49 * axis.rate if axis.rate else 1e2 * axis.bandwidth
-    freq = np.geomspace(1e-2 * axis.bandwidth, top, 300)
-    s = 2j * np.pi * freq
-    return float(np.max(1.0 / np.abs(1.0 + axis.response(freq) * np.exp(-s * late) / s**2)))
+    def together(self, found: list[tuple[AxisLaw, FoundLaw]]) -> _Reached | None:
+        """Return the laws if they hold the peak in all axes together, or do so a little slower."""
+        for step in range(_STEPS):
+            each = [law.slower(one.numbers, _SLOWER**step) for law, one in found]
+            laws = dict(zip(self.axes.names, each, strict=True))
+            inner = axes_controller(self.axes, laws)
+            report = report_loops((self.axes.plant, inner), at="y", rigid=self.rigid)
+            margins = [one.modulus_margin for one in report.loops]
+            if report.is_stable and min(margins) >= 1.0 / self.peak:
+                return _Reached(
+                    laws, [note for law, one in found for note in law.notes(one.numbers)]
+                )
+            if not report.is_stable or min(margins) < _FAR / self.peak:
+                return None
+        return None
 
 
 def _free_modes(plant: StateSpace) -> int:
@@ -265,4 +212,5 @@ def _free_modes(plant: StateSpace) -> int:
 def _response(plant: StateSpace) -> Frf:
     """Return the response over a grid through the resonances of a model."""
     grid = resonance_grid(plant.poles(), plant.dt, points=1000)
-    return frequency_response(plant, grid[grid < 0.4999 / plant.dt] if plant.dt else grid)
+    frf = frequency_response(plant, grid[grid < 0.4999 / plant.dt] if plant.dt else grid)
+    return frf.replace(variance=np.zeros(frf.data.shape))

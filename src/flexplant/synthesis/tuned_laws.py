@@ -22,8 +22,10 @@ from .structures import DIFFERENCES, ControllerFamily
 #: what an element may have free; the depth of a notch is not, unless it is named
 _NUMBERS = ("p", "i", "d", "pole", "freq", "ratio", "width", "damping", "depth")
 _FREE = _NUMBERS[:-1]
-#: logarithm of the farthest that a number moves; highest frequency beside half the rate
-_FARTHEST, _HIGHEST = 8.0, 0.98
+#: logarithm of the farthest that a number moves
+_FARTHEST = 8.0
+#: highest corner beside half the rate; of a continuous plant beside its fastest pole
+_HIGHEST, _FASTER = 0.98, 10.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -31,7 +33,9 @@ class TunedLaws(Value):
     """A decoupled controller ``u = -before diag(laws) after y`` whose numbers are free.
 
     Each number that is not zero moves by a factor and keeps its sign: gains, corners, centres of
-    notches. The laws given are where the search begins.
+    notches. No corner moves above half the rate, or ten times the fastest pole of a continuous
+    plant; one that was given higher stays at most where it is. The laws given are where the search
+    begins.
 
     Parameters
     ----------
@@ -86,7 +90,9 @@ class TunedLaws(Value):
         before[[plant.u.index(name) for name in axes.before.outputs]] = axes.before.D
         after = np.zeros((len(axes.names), len(plant.y)))
         after[:, [plant.y.index(name) for name in axes.after.inputs]] = axes.after.D
-        return _Laws(self, laws, before, after, axes.rate)
+        fastest = np.abs(plant.system.poles()).max(initial=0.0) / (2.0 * np.pi)
+        highest = 0.5 * _HIGHEST * axes.rate if axes.rate else _FASTER * float(fastest)
+        return _Laws(self, laws, before, after, axes.rate, highest)
 
 
 class _Number(NamedTuple):
@@ -109,10 +115,13 @@ class _Laws(ControllerFamily):
         before: FloatArray,
         after: FloatArray,
         rate: float,
+        highest: float,
     ) -> None:
         self._given, self._laws, self.before, self.after = given, dict(laws), before, after
         self.rate = rate
         self._each = list(laws.values())
+        factors = [factor for law in self._each for factor in law.factors]
+        self._highest = max([highest, *(corner for one in factors for corner in _corners(one))])
         self.numbers = [n for i, law in enumerate(self._each) for n in _free(i, law, given.free)]
         if not self.numbers:
             raise ModelError(f"no number of the laws is free: name some of {_NUMBERS} in free=.")
@@ -181,15 +190,22 @@ class _Laws(ControllerFamily):
         return self._gain(axis, theta), [one.at(self._rate(axis)) for one in sections]
 
     def _matrices(self, axis: int, theta: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the matrices of a law in the s of Tustin's rule; NaN above half the rate."""
+        """Return the matrices of a law in the s of Tustin's rule; NaN for corners too high."""
         gain, sections = self._sections(axis, theta)
-        rate = self._rate(axis)
-        far = rate and any(one.centre >= _HIGHEST * np.pi * rate for one in sections)
+        count = len(self._each[axis].factors)
+        corners = [f for i in range(count) for f in _corners(self._element(axis, i, theta))]
+        far = any(corner > self._highest for corner in corners)
         return in_series(np.nan if far else gain, sections)
 
 
 def _factor(theta: float) -> float:
     return float(np.exp(np.clip(theta, -_FARTHEST, _FARTHEST)))
+
+
+def _corners(element: SingleElement) -> list[float]:
+    """Return the corners [Hz] of an element."""
+    given = (getattr(element, name, None) for name in ("pole", "freq"))
+    return [float(one) for one in given if one is not None]
 
 
 def _with(element: SingleElement, numbers: Mapping[str, float]) -> SingleElement:

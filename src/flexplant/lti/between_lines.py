@@ -1,0 +1,88 @@
+"""A measured response between its lines, by the resonance that three lines make."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..values import ComplexArray, FloatArray, IntArray
+
+#: change of a response between two lines, beside its size, below which it is a straight line
+_STRAIGHT = 1e-9
+#: where an interval is filled: by its length, and about a resonance by its half-width
+_SHARES = (0.25, 0.5, 0.75)
+_AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
+
+
+def between_lines(
+    lines: FloatArray, data: ComplexArray, freq: FloatArray
+) -> tuple[ComplexArray, FloatArray]:
+    """Return responses between lines, and what two estimates of them differ by.
+
+    ``(a + b f) / (1 + c f)`` through three neighbours is exact for one mode on a constant, where
+    a straight line cuts its circle. Each frequency lies in two such triples: the result is their
+    mean.
+
+    Parameters
+    ----------
+    lines : (n,) array [Hz]
+        Increasing; at least 4.
+    data : (..., n) complex array
+        The response there.
+    freq : (k,) array [Hz]
+        Within the lines.
+
+    Returns
+    -------
+    response : (..., k) complex array
+    error : (..., k) array
+    """
+    last = lines.size - 3
+    i = np.searchsorted(lines, freq, side="right") - 1
+    below = _through(lines, data, np.clip(i - 1, 0, last), freq)
+    above = _through(lines, data, np.clip(i, 0, last), freq)
+    return 0.5 * (below + above), np.asarray(np.abs(below - above))
+
+
+def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> FloatArray:
+    """Return frequencies [Hz] in some intervals, dense where the circles through lines turn.
+
+    Parameters
+    ----------
+    lines : (n,) array [Hz]
+        As for `between_lines`.
+    data : (n,) complex array
+        One response.
+    places : (k,) array
+        Intervals, by the line that each begins with.
+    """
+    low, wide = lines[places], lines[places + 1] - lines[places]
+    found = [low + share * wide for share in _SHARES]
+    for first in (places - 1, places):
+        first = np.clip(first, 0, lines.size - 3)
+        c = _circle(lines, data, first)[1]
+        pole = lines[first] - 1.0 / np.where(c == 0.0, 1e-300, c)
+        near = pole.real + np.abs(pole.imag) * _AROUND[:, None]
+        found += list(np.clip(near, low + 0.01 * wide, low + 0.99 * wide))
+    return np.unique(np.concatenate(found))
+
+
+def _circle(
+    lines: FloatArray, data: ComplexArray, first: IntArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """Return a and c of ``g1 + a h / (1 + c h)``, h = f - f1, through three lines."""
+    g1, g2, g3 = (data[..., first + k] for k in range(3))
+    slope, second = ((g - g1) / (lines[first + k] - lines[first]) for k, g in ((1, g2), (2, g3)))
+    apart = g3 - g2
+    bent = np.abs(apart) > _STRAIGHT * (np.abs(g1) + np.abs(g2) + np.abs(g3))
+    c = np.where(bent, (slope - second) / np.where(bent, apart, 1.0), 0.0)
+    return slope + c * (g2 - g1), c
+
+
+def _through(
+    lines: FloatArray, data: ComplexArray, first: IntArray, freq: FloatArray
+) -> ComplexArray:
+    a, c = _circle(lines, data, first)
+    h = freq - lines[first]
+    below = 1.0 + c * h
+    below = np.where(np.abs(below) > _STRAIGHT, below, _STRAIGHT)
+    return np.asarray(data[..., first] + a * h / below)
