@@ -1,6 +1,9 @@
 """The README keeps its word: its commands are there, its code runs."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -44,6 +47,19 @@ def test_names_that_it_gives_exist():
         value = flexplant
         for part in name[1:].split("."):
             value = getattr(value, part)
+
+
+@pytest.mark.slow
+def test_its_scripts_pass_strict_type_checks(tmp_path):
+    """Lists where arrays are held, one name or several; dask's own functions have no types."""
+    pytest.importorskip("mypy")
+    script = tmp_path / "readme.py"
+    script.write_text("\n".join(BLOCKS), encoding="utf-8")
+    options = ["--strict", "--allow-untyped-calls", f"--config-file={ROOT / 'pyproject.toml'}"]
+    command = [sys.executable, "-m", "mypy", *options, f"--cache-dir={ROOT / '.mypy_cache'}"]
+    env = os.environ | {"MYPYPATH": str(ROOT / "src")}
+    answer = subprocess.run([*command, str(script)], capture_output=True, text=True, env=env)
+    assert answer.returncode == 0, answer.stdout + answer.stderr
 
 
 def write_stage(folder):

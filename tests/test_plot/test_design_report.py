@@ -85,7 +85,7 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
     for part in (fx.__version__, np.__version__, "seed of run7", "u4:effort", "no choice is below"):
         assert part in said
     drawn = [one for one in tree.iter("figure") if one.get("class") == "picture"]
-    assert len(drawn) >= 7 and all(one.find(".//path") is not None for one in drawn)
+    assert len(drawn) >= 8 and all(one.find(".//path") is not None for one in drawn)
 
 
 @pytest.mark.slow

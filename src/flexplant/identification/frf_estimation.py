@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, TypeAlias
+
+import numpy.typing as npt
 
 from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
-from ..values import FloatArray, positive
+from ..values import positive
 from .dropouts import dropouts_warned
 from .periodic import Periodic, periodic_frf
 from .records import records
 from .spectra import H1Estimator, SpectralMethod, spectral_frf
 
-Signals = FloatArray | Mapping[str, Any]
+Signals: TypeAlias = npt.ArrayLike | Mapping[str, Any]
 
 
 def estimate_frf(

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError
@@ -54,6 +55,18 @@ class MeasuredModes(Value):
     covariance: FloatArray | None = field(default=None, kw_only=True)
     shapes: ComplexArray | None = field(default=None, kw_only=True)
     dofs: tuple[str, ...] | None = field(default=None, kw_only=True)
+
+    if TYPE_CHECKING:  # what comes in is anything array-like
+
+        def __init__(
+            self,
+            poles: npt.ArrayLike,
+            *,
+            modes: Iterable[int] | None = None,
+            covariance: npt.ArrayLike | None = None,
+            shapes: npt.ArrayLike | None = None,
+            dofs: Iterable[str] | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         poles = _checked_poles(self.poles)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
@@ -15,6 +16,7 @@ from ..values import (
     FloatArray,
     Value,
     known_units,
+    name_list,
     positive,
     real_array,
     rebuild,
@@ -98,6 +100,25 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
     freedom: float | None = None
     units: Mapping[str, str] = field(default_factory=dict)
 
+    if TYPE_CHECKING:  # what comes in is anything array-like
+
+        def __init__(
+            self,
+            freq: npt.ArrayLike,
+            data: npt.ArrayLike,
+            inputs: Sequence[str] = (),
+            outputs: Sequence[str] = (),
+            quantity: str | None = None,
+            coherence: npt.ArrayLike | None = None,
+            variance: npt.ArrayLike | None = None,
+            correlation: npt.ArrayLike | None = None,
+            resolution: float | None = None,
+            window: str | tuple[Any, ...] | None = None,
+            overlap: float = 0.0,
+            freedom: float | None = None,
+            units: Mapping[str, str] = ...,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         freq = checked_freq(self.freq)
         if np.any(np.diff(freq) <= 0):
@@ -167,7 +188,7 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         return len(self.outputs) * len(self.inputs)
 
     def select(
-        self, outputs: Sequence[str] | None = None, inputs: Sequence[str] | None = None
+        self, outputs: Sequence[str] | str | None = None, inputs: Sequence[str] | str | None = None
     ) -> Frf:
         """Return the responses between some channels, in the order given.
 
@@ -176,8 +197,8 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         LabelError
             When a name is unknown.
         """
-        chosen_out = list(self.outputs if outputs is None else outputs)
-        chosen_in = list(self.inputs if inputs is None else inputs)
+        chosen_out = name_list(self.outputs if outputs is None else outputs, "outputs")
+        chosen_in = name_list(self.inputs if inputs is None else inputs, "inputs")
         rows = [_index(self.outputs, name, "output") for name in chosen_out]
         columns = [_index(self.inputs, name, "input") for name in chosen_in]
         picked = np.ix_(rows, columns)
@@ -324,7 +345,7 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         return _index(self.outputs, rows[0], "output"), _index(self.inputs, columns[0], "input")
 
 
-def frequency_response(sys: System, freq: FloatArray | None = None) -> Frf:
+def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     """Return the frequency response ``C (s I - A)^-1 B + D``.
 
     s = 2 pi i f, or exp(2 pi i f dt) when sampled. Where A has 1 x 1 and 2 x 2 diagonal blocks

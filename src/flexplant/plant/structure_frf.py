@@ -8,6 +8,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple, overload
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError
@@ -79,18 +80,18 @@ class StructureFrf(Frf):
 
 
 @overload
-def frequency_response(model: System, ports: FloatArray | None = None) -> Frf: ...
+def frequency_response(model: System, ports: npt.ArrayLike | None = None) -> Frf: ...
 
 
 @overload
-def frequency_response(model: System, *, freq: FloatArray | None = None) -> Frf: ...
+def frequency_response(model: System, *, freq: npt.ArrayLike | None = None) -> Frf: ...
 
 
 @overload
 def frequency_response(
     model: Structure,
     ports: Ports,
-    freq: FloatArray,
+    freq: npt.ArrayLike,
     *,
     damping: Damping | None = None,
     checks: int = 4,
