@@ -117,6 +117,8 @@ def test_every_example_has_its_task():
     table = README.split("## Which example for which task")[1].split("\n## ")[0]
     for path in (ROOT / "examples").glob("*.py"):
         assert f"`examples/{path.name}`" in table, path.name
+    rows = [line for line in table.splitlines() if line.startswith("|")]
+    assert {row.replace("\\|", "").count("|") for row in rows} == {3}, "two columns"
 
 
 @pytest.mark.slow
