@@ -118,11 +118,8 @@ def picture(result: dict[str, Any], folder: Path = stage.OUT) -> Path:
 
     figure, axs = plt.subplots(1, 2, figsize=(13, 4.5), layout="constrained")
     for ax, (name, runs) in zip(axs, result["runs"].items(), strict=True):
-        for label, color in (("acceleration", "0.6"), ("jerk", "tab:orange"), ("snap", "tab:blue"),
-                             ("inverse", "black")):  # fmt: skip
-            fx.plot.response(
-                runs[label], ["die:error"], span=(0.04, 0.2), label=label, color=color, ax=ax
-            )
+        for label in (*TERMS, "inverse"):
+            fx.plot.response(runs[label], ["die:error"], span=(0.04, 0.2), label=label, ax=ax)
         peak = figures(runs["none"])[0]
         ax.set_title(f"{name}: error at the die ({1e-3 * peak:.1f} µm without feedforward)")
     folder.mkdir(exist_ok=True)

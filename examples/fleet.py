@@ -203,12 +203,10 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
         ),
         strict=True,
     ):
-        for (name, one), color, style in zip(
-            result["tables"].items(), ("0.45", "tab:blue"), ("--", "-"), strict=True
-        ):
+        for (name, one), role in zip(result["tables"].items(), ("nominal", "model"), strict=True):
             values = np.sort(scale * one[column][one["stable"]])
             share = np.arange(1, values.size + 1) / values.size
-            ax.step(values, 100.0 * share, where="post", color=color, ls=style, label=name)
+            ax.step(values, 100.0 * share, where="post", label=name, **fx.plot.STYLES[role])
         ax.set(xlabel=label, ylabel="machines below [%]", ylim=(0.0, 102.0))
         ax.grid(alpha=0.3)
     axs[1].set_xscale("log")

@@ -189,7 +189,8 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
             for what, style in (("loop", "-"), ("observer", "--")):
                 rms = [1e9 * case[what].rms(f"die:{axis}") for case in found["path"]]
                 label = axis if what == "loop" else f"{axis}, estimate"
-                ax.plot(way, rms, style, color=f"C{i}", marker="o", markersize=3, label=label)
+                color = fx.plot.CYCLE[i]["color"]
+                ax.plot(way, rms, style, color=color, marker="o^s"[i], markersize=4, label=label)
         ax.set(xlabel="way of the POI from the middle to a corner [mm]", ylim=(0.0, None))
         ax.set(ylabel=f"rms error [{_unit(kind[0])}]", title=f"{', '.join(kind)} along the path")
         ax.legend(frameon=False, ncols=3)

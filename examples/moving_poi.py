@@ -110,8 +110,8 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     at, truth = result["exposed"], result["run"]["die:z"]
     way = 1e3 * (L / 2 + SCAN.at(result["run"].time).position[at])
     shown = (
-        {"as the middle": "0.4"},
-        {"as a rigid body": "tab:orange", "along the path": "tab:blue"},
+        {"as the middle": fx.plot.STYLES["nominal"]["color"]},
+        {"as a rigid body": fx.plot.CYCLE[1]["color"], "along the path": fx.plot.CYCLE[0]["color"]},
     )
     for ax, colors in zip(axs, shown, strict=True):
         for name, color in colors.items():

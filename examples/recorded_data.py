@@ -141,15 +141,17 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     middle = 1e9 * (one["die:hat"] - (0.0 if run is None else run["die:z"]))[near]
     center = middle if run is None else np.zeros_like(middle)
     ax.axvspan(*DARK, color="0.92", label="y2 sees nothing")
+    blue = fx.plot.STYLES["model"]["color"]
     ax.fill_between(
         one.time[near],
         center - 2 * deviation,
         center + 2 * deviation,
+        color=blue,
         alpha=0.3,
         lw=0,
         label="two stated deviations",
     )
-    ax.plot(one.time[near], middle, lw=0.8)
+    ax.plot(one.time[near], middle, color=blue, lw=0.8)
     what = "motion of the die" if run is None else "error of the estimate at the die"
     ax.set(xlabel="time [s]", ylabel=f"{what} [nm]")
     ax.legend(frameon=False, loc="upper left")

@@ -1,4 +1,4 @@
-"""Ten ways to reduce one machine to the same order, side by side.
+"""Twelve ways to reduce one machine to the same order, side by side.
 
 Run it: ``python examples/reduction_methods.py``. The plate of the paper with 0.5 % damping, four
 actuators and four corner sensors, is reduced to 24 coordinates by every method of
@@ -13,6 +13,7 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # matrices are small: more threads only wait
 
 import time
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,8 @@ import flexplant as fx
 
 L = 0.6
 ORDER = 24
+OUT = Path(__file__).parent / "out"
+DRAWN = ("Guyan", "CraigBampton", "DesiredDofs")
 BAND = (100.0, 1500.0)  # Hz, where responses are compared
 DAMPING = fx.ModalDamping(0.005)
 
@@ -88,12 +91,13 @@ def ranking() -> Any:
 
 # %% The run
 def main() -> dict[str, Any]:
-    """Return {name: (order, quality, CPU seconds)} and the ranking of the modes."""
-    judged = {}
+    """Return {name: (order, quality, CPU seconds)}, the models, and the ranking of the modes."""
+    judged, models = {}, {}
     for name, (_, model, seconds) in methods().items():
+        models[name] = model
         quality = model.quality(plate, band=BAND, inputs=ACTUATORS, outputs=SENSORS)
         judged[name] = (model.n_dof, quality, seconds)
-    return {"judged": judged, "ranking": ranking()}
+    return {"judged": judged, "models": models, "ranking": ranking()}
 
 
 # %% The table
@@ -116,5 +120,50 @@ def table(result: dict[str, Any]) -> str:
     )
 
 
+# %% The picture
+def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
+    """Draw a response by three of the methods, and the errors of all."""
+    import matplotlib.pyplot as plt
+
+    figure, axs = plt.subplots(1, 2, figsize=(16.0, 5.5), layout="constrained")
+    ports = fx.Ports(u=[fx.Actuator("u1", at=ACTUATORS[0])], y=[fx.Sensor("y1", at=SENSORS[0])])
+    freq = np.geomspace(*BAND, 2000)
+    full = fx.solve_modes(plate, damping=DAMPING)
+    models = {"full model": full} | {name: result["models"][name] for name in DRAWN}
+    responses = {
+        name: fx.frequency_response(fx.assemble_plant(model, ports).Gyu, freq)
+        for name, model in models.items()
+    }
+    fx.plot.frf(responses, "y1", "u1", reference="full model", ax=axs[0])
+    axs[0].set_title(f"from actuator to corner, order {ORDER}")
+    rows = list(result["judged"])[::-1]
+    for k, (label, marker) in enumerate(
+        (("frequencies", "o"), ("responses", "s"), ("static", "D"))
+    ):
+        found = [_errors(result["judged"][name][1])[k] for name in rows]
+        look = fx.plot.CYCLE[k]["color"]
+        axs[1].semilogx(found, range(len(rows)), marker, color=look, label=label, markersize=7)
+    axs[1].set_yticks(range(len(rows)), rows)
+    axs[1].set(xlabel="largest error [%]", title=f"{BAND[0]:g} to {BAND[1]:g} Hz and at rest")
+    axs[1].grid(alpha=0.25)
+    axs[1].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), frameon=False)
+    folder.mkdir(exist_ok=True)
+    figure.savefig(folder / "reduction_methods.png", dpi=90)
+    plt.close(figure)
+    return folder / "reduction_methods.png"
+
+
+def _errors(quality: Any) -> tuple[float, float, float]:
+    """Return the largest errors [%] of frequencies, responses and static compliance."""
+    worst = np.nanmax(np.abs(quality.freq_error))
+    errors = (worst, quality.frf_error.max(), quality.static_error.max())
+    frf, response, static = (max(100.0 * float(error), 1e-12) for error in errors)
+    return frf, response, static
+
+
 if __name__ == "__main__":
-    print(table(main()))
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    outcome = main()
+    print(table(outcome), f"picture: {picture(outcome)}", sep="\n\n")

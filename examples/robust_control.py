@@ -162,28 +162,28 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
     robust, worst = found["robust"], found["worst"]
     figure, axs = plt.subplots(1, 3, figsize=(16, 4.6), layout="constrained")
     for name, one, color in (
-        (f"servo, {BANDWIDTH:g} Hz", robust, "tab:blue"),
-        (f"H-infinity, {MORE:g} Hz", found["sharp"], "tab:red"),
+        (f"servo, {BANDWIDTH:g} Hz", robust, fx.plot.CYCLE[0]["color"]),
+        (f"H-infinity, {MORE:g} Hz", found["sharp"], fx.plot.CYCLE[1]["color"]),
     ):
         axs[0].loglog(one.frequencies, one.bounds, ".", ms=3, color=color)
         axs[0].axhline(one.upper, color=color, label=f"{name}: proven at all frequencies")
-    axs[0].axhline(1.0, color="0.5", ls="--", label="uncertainty of the fit")
+    axs[0].axhline(1.0, label="uncertainty of the fit", **fx.plot.STYLES["bound"])
     axs[0].set(title="robust stability", xlabel="frequency [Hz]", ylabel="mu from above",
                xlim=(80.0, 5e3), ylim=(1e-3, 30.0))  # fmt: skip
     freq = np.geomspace(5.0, 4e3, 1500)
     for name, loop, color in (
-        ("nominal", found["loop"], "tab:blue"),
-        ("worst machine", found["bad"], "tab:orange"),
+        ("nominal", found["loop"], fx.plot.CYCLE[0]["color"]),
+        ("worst machine", found["bad"], fx.plot.CYCLE[1]["color"]),
     ):
         gain = np.abs(loop.frequency_response(freq)["die:error", "die:ref"])
         wide = {"lw": 4.0, "alpha": 0.4} if loop is found["loop"] else {"lw": 1.2}
         axs[1].loglog(freq, gain, color=color, label=name, **wide)
-    axs[1].axhline(worst.upper, color="black", lw=0.8, label="bound on every machine")
+    axs[1].axhline(worst.upper, label="bound on every machine", **fx.plot.STYLES["bound"])
     axs[1].set(title="from set-point to error", xlabel="frequency [Hz]", ylim=(1e-3, 4.0))
     nominal, bad = found["runs"]["nominal"], found["runs"]["worst"]
     within = nominal.time <= 0.2
     difference = 1e9 * (bad["die:error"] - nominal["die:error"])[within]
-    axs[2].plot(nominal.time[within], difference, color="tab:orange")
+    axs[2].plot(nominal.time[within], difference, **fx.plot.STYLES["difference"])
     largest = 1e6 * np.max(np.abs(nominal["die:error"]))
     axs[2].set(title=f"worst machine less nominal, whose error is {largest:.0f} µm",
                xlabel="time [s]", ylabel="difference of error [nm]")  # fmt: skip

@@ -25,6 +25,7 @@ import flexplant as fx
 
 SIZE, ELEMENTS = (0.4, 0.3, 0.1), (4, 3, 1)  # m
 DENSITY, YOUNG, POISSON = 2700.0, 70e9, 0.33
+OUT = Path(__file__).parent / "out"
 RATE, DELAY = 10e3, 1  # Hz, samples
 SENSOR = 1e-9 / np.sqrt(RATE / 2)  # 1 nm rms a sample
 FORCE = 1e-3  # N/sqrt(Hz) at each actuator
@@ -179,5 +180,30 @@ def printed(found: dict[str, Any]) -> None:
     print(f"error in the last 0.1 s: {1e9 * np.std(found['run']['die:error'][-1000:]):.2f} nm rms")
 
 
+# %% The picture
+def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
+    """Draw the stage with its ports, its first elastic mode, the move and the loop."""
+    import matplotlib.pyplot as plt
+
+    figure = plt.figure(figsize=(14.0, 10.0), layout="constrained")
+    solid = [figure.add_subplot(2, 2, k, projection="3d") for k in (1, 2)]
+    flat = [figure.add_subplot(2, 2, k) for k in (3, 4)]
+    fx.plot.layout(found["model"].dofs, ports=ports(), ax=solid[0])
+    fx.plot.mode_shape(found["modes"], 7, ax=solid[1])
+    fx.plot.exposures(found["run"], "die:error", start=0.3, ax=flat[0])
+    fx.plot.sensitivity({"die:ref to die:error": found["loop"]}, ax=flat[1])
+    flat[0].set_title("error after a move of 1 mm, moving windows of 5 ms")
+    flat[1].set(title="sensitivity at the point of interest", xlim=(1.0, 5e3), ylim=(-80.0, 15.0))
+    folder.mkdir(exist_ok=True)
+    figure.savefig(folder / "solid_stage.png", dpi=90)
+    plt.close(figure)
+    return folder / "solid_stage.png"
+
+
 if __name__ == "__main__":
-    printed(main())
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    outcome = main()
+    printed(outcome)
+    print(f"picture: {picture(outcome)}")

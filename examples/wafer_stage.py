@@ -29,8 +29,8 @@ FORCES = (1e-4, 1e-3, 1e-2)  # N/sqrt(Hz): amplifier noise, two decades
 DAMPINGS, BANDWIDTH = (0.01, 0.001), 80.0  # Hz, asked of H-infinity
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
-COLORS = ("0.55", "tab:orange", "tab:blue")  # of the loops; then of the estimates
-SHADES = ("tab:orange", "0.55", "tab:cyan", "tab:blue")
+GREY, ORANGE, SKY, BLUE = "0.55", "#E69F00", "#56B4E9", "#0072B2"  # as in all pictures
+COLORS, SHADES = (GREY, ORANGE, BLUE), (ORANGE, GREY, SKY, BLUE)  # of loops, of estimates
 
 
 def ports(force: float = 1e-3) -> fx.Ports:

@@ -98,3 +98,7 @@ def test_table(example, result):
     assert max(map(len, text.splitlines())) <= 100
     assert text.splitlines()[0].startswith("method")
     assert "   4     245.75" in text
+
+
+def test_picture(example, result, tmp_path):
+    assert example.picture(result, tmp_path).stat().st_size > 40_000

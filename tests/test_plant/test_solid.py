@@ -95,3 +95,8 @@ def test_the_poi_between_nodes_moves_rigidly():
     motion = np.linalg.solve(see, at_sensors)
     wanted = [body_row(example().POI, d, centre) @ motion for d in "xyz"] + [*motion[3:]]
     np.testing.assert_allclose(rigid, wanted, atol=1e-8)
+
+
+@pytest.mark.slow
+def test_picture(tmp_path):
+    assert example().picture(found(), tmp_path).stat().st_size > 60_000

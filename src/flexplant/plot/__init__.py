@@ -1,11 +1,21 @@
-"""All pictures: functions that take values and `ax=`, and return the axes they drew on."""
+"""All pictures: functions that take values and `ax=`, and return the axes they drew on.
 
+Labels that name a thing give it the look of `STYLES`: "measured", "truth" (or "machine", "full
+model"), "model" ("updated"), "nominal" ("drawing", "before"), "reduced", "bound"; other lines
+follow `CYCLE`. Axes carry SI units with the prefix that brings the largest value to 1 .. 1000;
+what is drawn into them later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is.
+"""
+
+from ._style import CYCLE as CYCLE
+from ._style import STYLES as STYLES
 from .bode import bode as bode
 from .budget import budget as budget
+from .consistency import consistency as consistency
 from .error_map import error_map as error_map
 from .estimation import estimate as estimate
 from .estimation import lag_report as lag_report
 from .estimation import predictions as predictions
+from .exposures import exposures as exposures
 from .frequency import frf as frf
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
@@ -22,6 +32,8 @@ from .response import response as response
 from .sensitivity import sensitivities as sensitivities
 from .sensitivity import sensitivity as sensitivity
 from .singular_values import singular_values as singular_values
+from .spectra import spectra as spectra
+from .step import step as step
 from .structure import layout as layout
 from .update_summary import update as update
 from .updating import eigenvalues as eigenvalues

@@ -141,7 +141,7 @@ def legend(ax: Axes, *, given: bool) -> None:
     if corners[emptiest]:
         emptiest = min(("upper right", "upper left"), key=lambda corner: corners[corner])
         side = points[across[emptiest.split()[1]], 1]
-        _raise_top(ax, float(side[side <= 1.0].max(initial=0.0)) + height)
+        _raise_top(ax, float(side[side <= 1.0].max(initial=0.0)) / (1.0 - min(height, 0.7)))
     ax.legend(frameon=False, loc=emptiest)
 
 

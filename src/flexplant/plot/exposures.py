@@ -1,0 +1,104 @@
+"""Errors over exposures: moving average and moving standard deviation."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+from matplotlib.axes import Axes
+
+from ..errors import LabelError
+from ..simulation import Response, exposure_errors
+from ..simulation.exposure import error_channels
+from ..values import instance, with_unit
+from ._axes import axes, finish, legend, named, shown_in
+from ._style import BLACK, BLUE, GREY, ORANGE
+from .response import shade, time_axis
+
+
+def exposures(
+    run: Response,
+    channel: str | None = None,
+    *,
+    window: float = 5e-3,
+    start: float = 0.0,
+    exposures: npt.ArrayLike | None = None,
+    ax: Axes | None = None,
+) -> Axes:
+    """Draw an error with its moving average (MA) and moving standard deviation (MSD).
+
+    The windows in which the figures of `exposure_errors` are taken are shaded; those figures are
+    in the legend. Of several runs the first is drawn, and the figures are of all.
+
+    Parameters
+    ----------
+    run : Response
+        From `simulate`.
+    channel : str, optional
+        The first error of a POI when not given.
+    window : float [s]
+        The time for which one point is exposed.
+    start : float [s]
+        Without `exposures`: all after this time is exposed.
+    exposures : (k, 2) array [s], optional
+        Beginning and end of each, such as `SetPoint.exposures`.
+    ax : Axes, optional
+        Where to draw.
+
+    Returns
+    -------
+    Axes
+
+    Raises
+    ------
+    ModelError
+        When `run` is no Response, or an exposure is not within it or shorter than the window.
+    LabelError
+        When the channel is unknown, or the run has no error.
+    ShapeError
+        When `exposures` are no pairs.
+    """
+    instance(run, Response, "run", "Pass what simulate returned.")
+    known = error_channels(run)
+    if channel is None and not known:
+        raise LabelError("the run has no error of a POI: name the channel, channel='y1'.")
+    name = known[0] if channel is None else channel
+    found = exposure_errors(run, [name], window=window, start=start, exposures=exposures)
+    parts = [[max(start, run.time[0]), run.time[-1]]] if exposures is None else exposures
+    given, ax = ax is not None, axes(ax, figsize=(9.5, 4.0))
+    unit = run.units.get(name)
+    signal, average, deviation = (
+        np.atleast_2d(values)[0]
+        for values in (
+            run[name],
+            run.moving_average(name, window=window),
+            run.moving_std(name, window=window),
+        )
+    )
+    inside = np.zeros(run.time.size, dtype=bool)
+    for begin, end in np.asarray(parts, dtype=np.float64).tolist():
+        inside |= (run.time >= begin) & (run.time <= end)
+    factor, shown = shown_in(ax.yaxis, float(np.max(np.abs(signal[inside]))), unit)
+    second, time = time_axis(ax, run)
+    shade(ax, parts, run)
+    largest = found[name]
+    looks: tuple[dict[str, Any], ...] = (
+        {"label": name, "color": GREY, "linewidth": 0.6},
+        {"label": f"MA, at most {with_unit(largest.ma, unit)}", "color": BLUE, "linewidth": 1.8},
+        {
+            "label": f"MSD, at most {with_unit(largest.msd, unit)}",
+            "color": ORANGE,
+            "linewidth": 1.6,
+            "linestyle": "--",
+        },
+    )
+    for values, look in zip((signal, average, deviation), looks, strict=True):
+        ax.plot(run.time / second, values / factor, **look)
+    ax.axhline(0.0, color=BLACK, linewidth=0.6)
+    limit = 1.25 * float(np.max(np.abs(signal[inside]))) / factor
+    if limit:
+        ax.set_ylim(-limit, limit)
+    legend(ax, given=given)
+    text = f"moving windows of {with_unit(found.window, 's')}"
+    return finish(ax, x=named("time", time), y=named("error", shown), title=text)
