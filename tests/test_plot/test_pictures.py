@@ -228,6 +228,11 @@ def test_what_is_drawn_later_has_the_unit_of_the_axes():
     fx.plot.response(run_of(2e-9 * wave), label="small", ax=ax)
     np.testing.assert_allclose(ax.get_lines()[1].get_ydata(), 2e-3)
     assert ax.get_ylabel() == "error [\N{MICRO SIGN}m]"
+    bump = np.exp(-(np.linspace(-20.0, 20.0, 50) ** 2))
+    for size in (1e-6, 3e-6):  # with room for the legend, also where a larger one comes later
+        fx.plot.response(run_of([size * bump] * 2), label=f"run of {1e6 * size:g}", ax=ax)
+        assert covered(ax) == 0
+    assert ax.get_ylim()[1] > 3.0 * bump.max()
     rotation = run_of(wave).replace(units={"die:error": "rad"})
     with pytest.raises(ModelError, match="one axes holds one unit: it shows 'error"):
         fx.plot.response(rotation, ax=ax)

@@ -150,11 +150,12 @@ def _raise_top(ax: Axes, top: float) -> None:
     scale = ax.yaxis.get_transform()
     low, high = scale.transform(np.array(ax.get_ylim()))
     further = scale.inverted().transform(np.array([low + max(top, 1.0) * (high - low)]))
-    ax.set_ylim(top=float(further[0]))
+    ax.set_ylim(top=float(further[0]), auto=True)  # for what is drawn later
 
 
 def _drawn(ax: Axes) -> FloatArray:
     """Return points (k, 2) along all lines and at the edges of areas, in units of the axes."""
+    ax.get_xlim(), ax.get_ylim()  # limits follow new lines when they are read, not in transforms
     to_axes = ax.transData + ax.transAxes.inverted()
     parts = [_between(np.asarray(line.get_xydata(), dtype=float)) for line in ax.get_lines()]
     for area in ax.collections:

@@ -100,7 +100,7 @@ def readable(ax: Axes) -> None:
     if lowest < floor or sum(map(len, over)) < sum(map(len, whole)):
         bottom = max(lowest, floor)
         room = 0.05 * (top - bottom)
-        ax.set_ylim(bottom - room, top + room)
+        ax.set_ylim(bottom - room, top + room, auto=True)  # for what is drawn later
 
 
 def _depth(line: FloatArray) -> float:

@@ -246,6 +246,6 @@ def _limit(ax: Axes, weight: Any, what: str, lines: Sequence[_Line]) -> None:
 
 
 def _levels(ax: Axes) -> None:
-    readable(ax)
     for level, style in ((0.0, "-"), (6.0, ":")):
         ax.axhline(level, color=GREY, linestyle=style, linewidth=0.8, zorder=1.0)
+    readable(ax)
