@@ -235,6 +235,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     axs[0, 2].set(ylim=(-100.0, 100.0), title="error at the die after the move, machine")
     axs[1, 0].set(ylim=(-2.0, 2.0), title="force of actuator u1, machine")
     axs[1, 1].set(xlim=(5.0, 5e3), ylim=(-50.0, 12.0), title="sensitivity, die:ref to die:error")
+    axs[1, 1].legend(frameon=False, loc="lower right")
     folder.mkdir(exist_ok=True)
     claimed = {"Comment": json.dumps(result["claims"])}  # says when the README's copy is old
     figure.savefig(folder / "wafer_stage.png", dpi=90, metadata=claimed)

@@ -71,7 +71,7 @@ def sensitivity(
         if label in dashed:
             style |= {"linestyle": "--", "linewidth": 1.2, "zorder": 2.5}
         elif dashed:
-            style |= {"linewidth": 2.6, "alpha": 0.7}
+            style |= {"linestyle": "-", "linewidth": 2.6, "alpha": 0.7}
         ax.semilogx(line[0], decibel(line[1]), label=label or None, **style)
     _limit(ax, weight, "S", list(lines.values()))
     if not given:
