@@ -19,10 +19,10 @@ Style = dict[str, Any]
 #: what is drawn in every picture, and how. What lies below others is wide
 STYLES: Mapping[str, Style] = {
     "measured": {"color": BLACK, "linestyle": "-", "linewidth": 0.9, "zorder": 1.8},
-    "truth": {"color": GREEN, "linestyle": "-", "linewidth": 3.5, "alpha": 0.5, "zorder": 1.5},
+    "truth": {"color": GREEN, "linestyle": "-", "linewidth": 4.0, "alpha": 0.35, "zorder": 1.5},
     "model": {"color": BLUE, "linestyle": "-", "linewidth": 1.4},
     "nominal": {"color": GREY, "linestyle": (0, (5, 1.5)), "linewidth": 1.4},
-    "reduced": {"color": ORANGE, "linestyle": (0, (2.5, 1)), "linewidth": 1.4},
+    "reduced": {"color": ORANGE, "linestyle": (0, (2.5, 1)), "linewidth": 1.6},
     "bound": {"color": RED, "linestyle": (0, (1, 1)), "linewidth": 1.6},
     "difference": {"color": PURPLE, "linestyle": "-.", "linewidth": 1.3},
 }
