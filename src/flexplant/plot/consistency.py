@@ -60,8 +60,7 @@ def consistency(
 
     References
     ----------
-    Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and Navigation, 2001, ch.
-    5.4; Bartlett, Stochastic Processes, 1955.
+    [BarShalom2001]_, ch. 5.4; [Bartlett1955]_.
     """
     instance(estimate, Estimate, "estimate", "Pass what observer.estimate returned.")
     instance(found, Consistency | None, "found", "Pass what consistency returned.")
