@@ -66,7 +66,7 @@ def test_points_as_keys_are_drawn():
     pair = fx.Sensor("pair", at={CORNERS[0]: 0.5, CORNERS[3]: 0.5}, asd=NOISE)
     ax = fx.plot.layout(some_modes().dofs, ports=fx.Ports(y=[pair]))
     drawn = [line.get_xydata() for line in ax.lines if line.get_label() == "sensors y"]
-    np.testing.assert_allclose(drawn[0], [[0.3, 0.3]])
+    np.testing.assert_allclose(drawn[0], [[300.0, 300.0]])
 
 
 def test_a_fit_alone_opens_its_uncertainty():

@@ -79,7 +79,7 @@ def test_a_map_is_the_run_of_a_poi_at_each_point():
     assert found.msd[0] > 1.001 * found.msd[4]  # it bends: the corners follow last
     assert "9 points along z, windows of 5 ms" in repr(found)
     ax = fx.plot.error_map(found, what="msd")
-    assert "MSD along z" in ax.figure.axes[1].get_ylabel()
+    assert "MSD of the error along z" in ax.figure.axes[1].get_ylabel()
     with pytest.raises(ModelError, match="'ma' or 'msd'"):
         fx.plot.error_map(found, what="rms")
     plt.close("all")

@@ -60,9 +60,13 @@ def test_everything_is_in_it(case):
     np.testing.assert_allclose(axs["mac before"].images[0].get_array(), before.mac)
     np.testing.assert_allclose(axs["mac after"].images[0].get_array(), after.mac)
     np.testing.assert_allclose(axs["convergence"].lines[0].get_ydata(), fit.history.error)
-    labels = [label.get_text() for label in axs["parameters"].get_yticklabels()]
-    assert labels[0].startswith("mass at 2:z\n0.02")
-    assert len(axs["parameters"].patches) == 1  # the prior of one of the two
+    rows = axs["parameters"].child_axes
+    titles = [row.get_title(loc="left") for row in rows]
+    assert titles[0].startswith(f"mass at 2:z: {1e3 * fit.values[0]:.4g} \N{PLUS-MINUS SIGN} ")
+    assert titles[0].endswith(" g")
+    assert [len(row.patches) for row in rows] == [1, 0]  # the prior of one of the two
+    mass = next(line for line in rows[0].lines if line.get_marker() == "o")
+    np.testing.assert_allclose(mass.get_xdata(), 1e3 * fit.values[0])
     lines = {line.get_label(): line.get_ydata() for line in axs["response"].lines}
     assert set(lines) == {"measured", "before", "after"}
     np.testing.assert_allclose(lines["after"], lines["measured"], rtol=1e-3)
