@@ -66,7 +66,7 @@ def test_everything_is_in_it(case):
     assert titles[0].endswith(" g")
     assert [len(row.patches) for row in rows] == [1, 0]  # the prior of one of the two
     mass = next(line for line in rows[0].lines if line.get_marker() == "o")
-    np.testing.assert_allclose(mass.get_xdata(), 1e3 * fit.values[0])
+    assert float(mass.get_xdata()[0]) == pytest.approx(1e3 * fit.values[0], rel=1e-12)
     lines = {line.get_label(): line.get_ydata() for line in axs["response"].lines}
     assert set(lines) == {"measured", "before", "after"}
     np.testing.assert_allclose(lines["after"], lines["measured"], rtol=1e-3)
