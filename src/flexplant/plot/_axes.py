@@ -155,7 +155,7 @@ def _raise_top(ax: Axes, top: float) -> None:
 
 def _drawn(ax: Axes) -> FloatArray:
     """Return points (k, 2) along all lines and at the edges of areas, in units of the axes."""
-    _ = ax.get_xlim(), ax.get_ylim()  # limits follow new lines when they are read, not in transforms
+    _ = ax.get_xlim(), ax.get_ylim()  # which brings the limits up to date, as transforms do not
     to_axes = ax.transData + ax.transAxes.inverted()
     parts = [_between(np.asarray(line.get_xydata(), dtype=float)) for line in ax.get_lines()]
     for area in ax.collections:
