@@ -20,7 +20,7 @@ Exodus                read_exodus_modes     .exo, .e: modes (classic netCDF; HDF
 universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 15, 2411 with `flexplant[uff]`
 tables                read_dofs             .csv, text: node, direction, x, y, z
 responses             read_frf_csv, ...     .csv, .mat, .npz: frequency responses
-state space           read_mat, write_mat   .mat: A, B, C, D with names
+values for MATLAB     read_mat, write_mat   .mat: systems, plants, reduced models, responses
 ====================  ====================  =======================================================
 """
 
@@ -35,8 +35,9 @@ from .frf_csv import write_frf_csv as write_frf_csv
 from .harwell_boeing import read_harwell_boeing as read_harwell_boeing
 from .mat_matrices import read_matlab as read_matlab
 from .mat_matrices import read_npz as read_npz
-from .mat_systems import read_mat as read_mat
-from .mat_systems import write_mat as write_mat
+from .mat_values import read_mat as read_mat
+from .mat_values import read_mat_values as read_mat_values
+from .mat_values import write_mat as write_mat
 from .matrix_market import read_matrix_market as read_matrix_market
 from .models import read_matrices as read_matrices
 from .models import read_model as read_model

@@ -22,7 +22,7 @@ OTHERS: tuple[Elsewhere, ...] = (
     ),
     Elsewhere(
         (".mph",),
-        "a model of COMSOL. Matrices: LiveLink's mphmatrix(model, 'sol1', 'out', {'K', 'E', 'D'}), "
-        "of which E is M, saved as .mat: read_matlab",
+        "a model of COMSOL. Matrices: LiveLink's mphmatrix(model, 'sol1', 'out', {'Kc', 'Ec'}), "
+        "of which Ec is M, saved as .mat: read_matlab",
     ),
 )

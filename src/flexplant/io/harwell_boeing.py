@@ -155,7 +155,7 @@ def _damage(lines: list[bytes], form: tuple[int, int], size: int, before: int) -
     """Return which line holds something else than numbers, in words; empty when none does."""
     per_line, width = form
     for place, line in enumerate(lines):
-        due = min(per_line, size - place * per_line)
+        due = max(0, min(per_line, size - place * per_line))
         fields = line[: due * width].ljust(due * width)
         if fixed_numbers(fields, width) is None and spaced_numbers(line, due) is None:
             return f", line {before + place + 1} is {line[:72].decode('latin-1')!r}"
