@@ -87,6 +87,8 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
         n_rows, n_columns, n_entries = (int(lines[2][i : i + 14]) for i in (14, 28, 42))
         formats = lines[3].decode("ascii")
         forms = [_form(formats[a:b]) for a, b in ((0, 16), (16, 32), (32, 52))]
+        if min(*counts, n_rows, n_columns, n_entries) < 0:
+            raise ValueError("a count below 0")
     except (IndexError, ValueError, UnicodeDecodeError) as error:
         raise FlexplantError(
             f"{str(path)!r} is no Harwell-Boeing file: its header cannot be read ({error})."
