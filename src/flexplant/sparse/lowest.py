@@ -12,7 +12,7 @@ import scipy.sparse as sp
 import scipy.sparse.linalg as spla
 
 from ..errors import SolverError
-from ..values import FloatArray
+from ..values import FloatArray, IntArray
 from .factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
 from .multifrontal import MultifrontalCholesky, multifrontal_inertia
 from .ordering import Dissection, dissect
@@ -44,6 +44,8 @@ class Lowest:
     below : int or None
         Eigenvalues below the first that is not zero, counted by a factorisation (Sylvester); None
         when it was not possible. Less `n_zero` it is the number of negative ones, or missed ones.
+    worst : (float, (n,) array) or None
+        The lowest eigenvalue and its shape, where there are negative ones.
     """
 
     values: FloatArray
@@ -51,9 +53,18 @@ class Lowest:
     spread: FloatArray
     n_zero: int
     below: int | None
+    worst: tuple[float, FloatArray] | None = None
 
 
-def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest:
+def lowest_modes(
+    K: Any,
+    M: Any,
+    count: int,
+    *,
+    rounding: float = 0.0,
+    nodes: IntArray | None = None,
+    xyz: FloatArray | None = None,
+) -> Lowest:
     """Return the `count` lowest eigenvalues and more, until one of them is not zero.
 
     By inverse iteration at a shift below zero, hence exact to rounding also where K is singular
@@ -67,6 +78,8 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
         How many at least.
     rounding : float
         Relative error of the entries of K: of a text file, say.
+    nodes, xyz : (n,), (n, 3) arrays, optional
+        Of each row: they make the factorisations of a large model cheaper.
 
     Raises
     ------
@@ -81,7 +94,8 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
     floor = max(rounding, ROUNDING)
     limit = min(int(np.count_nonzero(heavy > 0)), _MOST)
     # one elimination order serves all shifts
-    order = dissect(sp.csc_array(K + shift * M)) if K.shape[0] > DENSE_LIMIT else None
+    large = K.shape[0] > DENSE_LIMIT
+    order = dissect(sp.csc_array(K + shift * M), nodes, xyz) if large else None
     for _ in range(6):
         number = min(number, limit)
         shapes = _inverse_iteration(K, M, shift, number, order)
@@ -101,7 +115,28 @@ def lowest_modes(K: Any, M: Any, count: int, *, rounding: float = 0.0) -> Lowest
             continue
         break
     below = _count_below(K, M, values, n_zero, order)
-    return Lowest(values, shapes, spread, n_zero, below)
+    worst = None
+    if below is not None and below > n_zero:
+        worst = _most_negative(K, M, shift, order)
+    return Lowest(values, shapes, spread, n_zero, below, worst)
+
+
+def _most_negative(
+    K: Any, M: Any, shift: float, order: Dissection | None
+) -> tuple[float, FloatArray] | None:
+    """Return the lowest eigenvalue and its shape: by a shift at which K + s M is definite."""
+    for _ in range(30):
+        try:
+            if order is not None:
+                MultifrontalCholesky(K + shift * M, order, keep=False)
+            else:
+                la.cholesky(dense(K + shift * M), check_finite=False)
+        except (SolverError, la.LinAlgError):
+            shift *= 10.0
+            continue
+        shape = _inverse_iteration(K, M, shift, 1, order)[:, 0]
+        return float(shape @ (K @ shape)), shape
+    return None
 
 
 def _inverse_iteration(

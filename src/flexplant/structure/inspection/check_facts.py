@@ -23,6 +23,8 @@ from ..zero_energy import ZeroEnergy, own_motions, zero_energy
 
 #: requested from the solver: six rigid-body motions and some elastic modes
 _MODES = 10
+#: DOFs without stiffness that are counted as motions without energy, at most
+_LOOSE = 64
 #: a rigid-body motion whose relative force is below this is free; its residual measures rounding
 _FREE = 1e-10
 
@@ -64,9 +66,9 @@ class Facts:
         if self.lowest is None:
             return 0
         first = self.lowest.n_zero
-        seen = int(np.count_nonzero(self.lowest.values[first:] < 0))
-        counted = 0 if self.lowest.below is None else self.lowest.below - first
-        return max(seen, counted)
+        if self.lowest.below is not None:
+            return max(self.lowest.below - first, 0)
+        return int(np.count_nonzero(self.lowest.values[first:] < 0))
 
     @property
     def first_freq(self) -> float:
@@ -101,7 +103,8 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
     there = np.flatnonzero(~absent)
     mass_definite, negative, weak = _mass_state(given, M, no_mass)
     rounding = _rounding(K, M, given)
-    lowest, scaled, failure = _lowest(K, M, there, bool(mass_definite), rounding)
+    loose = np.flatnonzero(no_stiffness & ~absent)
+    lowest, scaled, failure = _lowest(given, K, M, there, loose, bool(mass_definite), rounding)
     motions, mechanisms = None, np.zeros((n, 0))
     if lowest is not None:
         zero = lowest.shapes[:, : lowest.n_zero]
@@ -203,11 +206,22 @@ def _held(lowest: Lowest, suspended: int) -> Lowest:
 
 
 def _lowest(
-    K: Any, M: Any, there: IntArray, mass_definite: bool, rounding: float
+    given: FEMatrices,
+    K: Any,
+    M: Any,
+    there: IntArray,
+    loose: IntArray,
+    mass_definite: bool,
+    rounding: float,
 ) -> tuple[Lowest | None, bool, str]:
-    """Return the lowest modes, whether M made them, and why there are none."""
+    """Return the lowest modes, whether M made them, and why there are none.
+
+    DOFs without stiffness (`loose`) are motions without energy as they are; the others are judged
+    without them, since shapes that M couples to them have no energy but rounding.
+    """
     if not there.size or not K.nnz:
         return None, False, "K is zero"
+    there = np.setdiff1d(there, loose)
     stiff = np.abs(diagonal(K))
     # without a mass to weigh by, displacements and rotations compare by their own stiffness
     weight = sp.diags_array(np.where(stiff > 0, stiff, float(stiff.max()) or 1.0))
@@ -215,16 +229,35 @@ def _lowest(
     inner: Any = M if scaled else weight
     kept_K, kept_M = K[there][:, there], sp.csc_array(inner)[there][:, there]
     try:
-        found = lowest_modes(kept_K, kept_M, min(_MODES, there.size), rounding=rounding)
+        found = lowest_modes(
+            kept_K,
+            kept_M,
+            min(_MODES, there.size),
+            rounding=rounding,
+            nodes=None if given.dofs is None else given.dofs.nodes[there],
+            xyz=given.dofs.xyz[there] if given.dofs is not None and given.located else None,
+        )
     except (SolverError, ModelError) as error:
         return None, scaled, str(error)
-    shapes = np.zeros((K.shape[0], found.shapes.shape[1]))
-    shapes[there] = found.shapes
-    return (
-        Lowest(found.values, shapes, found.spread, found.n_zero, found.below),
-        scaled,
-        "",
+    few = loose[:_LOOSE]
+    shapes = np.zeros((K.shape[0], few.size + found.shapes.shape[1]))
+    shapes[few, np.arange(few.size)] = 1.0
+    shapes[there, few.size :] = found.shapes
+    worst = None
+    if found.worst is not None:
+        shape = np.zeros(K.shape[0])
+        shape[there] = found.worst[1]
+        worst = found.worst[0], shape
+    none = np.zeros(few.size)
+    whole = Lowest(
+        np.concatenate([none, found.values]),
+        shapes,
+        np.concatenate([none, found.spread]),
+        found.n_zero + few.size,
+        None if found.below is None else found.below + few.size,
+        worst,
     )
+    return whole, scaled, ""
 
 
 def _damping(D: Any, motions: ZeroEnergy | None) -> dict[str, Any]:

@@ -86,13 +86,17 @@ def _stiffness_line(found: Facts) -> Line:
             "mend what the other lines name first",
         )
     if found.n_negative:
-        worst = found.lowest.values[found.lowest.values < 0]
-        lowest = f", the lowest found {worst.min():.3g} 1/s^2" if worst.size else ""
-        lowest = lowest if found.scaled_by_mass else ""
+        worst = found.lowest.worst
+        text = f"K has {found.n_negative} negative eigenvalue{'s' * (found.n_negative != 1)}"
+        if worst is not None:
+            lowest = f", the lowest {worst[0]:.3g} 1/s^2" if found.scaled_by_mass else ""
+            # displacements and rotations compare by the forces that they take
+            size = np.sqrt(np.abs(diagonal(found.given.K)))
+            text += f"{lowest}, moving {listed(spread(found, size * worst[1]), most=3)}"
         return (
             "fail",
             "definiteness of K",
-            f"K has {found.n_negative} negative eigenvalues{lowest}: unstable",
+            f"{text}: unstable",
             (
                 "buckled or prestressed state, a sign, or lost digits? Export the unloaded "
                 "stiffness. FEModel takes it where only rigid-body motions are unstable (magnets)"
