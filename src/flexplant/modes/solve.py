@@ -296,6 +296,13 @@ def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[float, F
     limit = _RESIDUAL[0] * inertia + _RESIDUAL[1] * np.linalg.norm(weight * whole, axis=0)
     if not np.all(size <= limit):
         i = int(np.argmax(size / limit))
+        if omega[i] == 0:
+            raise SolverError(
+                f"rigid-body motion {i + 1} leaves a force (of {size[i]:.2g}, limit "
+                f"{limit[i]:.2g}): the entries of K carry too few digits. check(model) says how "
+                "many; export in double precision, or take "
+                "FEMatrices(K, M, dofs=dofs).model(free=True)."
+            )
         raise SolverError(
             f"mode {i + 1} at {omega[i] / (2 * np.pi):.5g} Hz leaves a residual of {size[i]:.2g} "
             f"(limit {limit[i]:.2g}) in the eigenvalue problem: not a mode of this model."

@@ -23,7 +23,7 @@ from .definite import SEMIDEFINITE
 from .local_axes import cosines
 from .massless import inertial
 from .model import FEModel
-from .precision import digits_of, endangered, held_by_rounding
+from .precision import digits_of, endangered, held_by_rounding, shown_digits
 from .units import units
 from .zero_energy import freed
 
@@ -342,8 +342,10 @@ class FEMatrices(Value):
                 "read_model."
             )
         ready = self
-        if flag(free, "free") and (self.digits is not None or not self.located):
-            ready = ready.freed()
+        if flag(free, "free"):
+            digits = self.digits or (shown_digits(self.K, self.dofs) if self.located else None)
+            if digits is not None or not self.located:
+                ready = ready.replace(digits=digits).freed()
         K, M, D, rows, done = inertial(
             ready.K, ready.M, ready.D, ready.names, digits=self.digits, massless=massless
         )

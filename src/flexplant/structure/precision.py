@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy.sparse as sp
 
 from ..errors import SolverError
 from ..labels import DofSet
@@ -15,6 +16,10 @@ from .zero_energy import nearly_free
 
 #: relative error of the first elastic eigenvalue from which on it is worth a warning
 _WORTH = 1e-4
+#: relative errors of entries of K that are noticed, and that are rounding still
+_FINE, _COARSE = 3e-12, 1e-4
+#: rows that a motion loads, for a median of their forces
+_ROWS = 12
 #: a text of this many digits loses nothing of a double
 _ALL_DIGITS = 16
 
@@ -40,6 +45,38 @@ def digits_of(given: Any) -> int | None:
         return None
     digits = int(-np.log10(np.finfo(kind).eps / 2))
     return digits if digits < np.finfo(np.float64).precision else None
+
+
+def shown_digits(K: Any, dofs: DofSet) -> int | None:
+    """Return to how many digits the entries of K are right, None where they are to more than 11.
+
+    Rigid translations t cost no energy, so that ``K t`` is rounding: in every row, of either sign.
+    Springs to ground act in few rows, or with the motion. Errors uniform up to a relative d leave
+    ``|K t|_i = 0.39 d (sum_j K_ij^2 t_j^2)^(1/2)`` in the median.
+
+    Parameters
+    ----------
+    K : (n, n) sparse matrix
+        Stiffness.
+    dofs : DofSet
+        What its rows are; coordinates are not needed.
+    """
+    stiffness: Any = sp.csr_array(K)
+    size = stiffness.multiply(stiffness)
+    worst = 0.0
+    for direction in range(3):
+        motion = (dofs.kinds == direction).astype(np.float64)
+        force = stiffness @ motion
+        scale = np.sqrt(size @ motion)
+        rows = np.flatnonzero(scale > 0)
+        if rows.size < _ROWS:
+            continue
+        error = float(np.median(np.abs(force[rows]) / scale[rows])) / 0.39
+        work = np.abs(motion * force)
+        aligned = abs(float(motion @ force)) > 0.5 * float(work.sum())
+        if error < _COARSE and not aligned:
+            worst = max(worst, error)
+    return round(-float(np.log10(worst))) if worst > _FINE else None
 
 
 def loss(found: Lowest, digits: int) -> float | None:

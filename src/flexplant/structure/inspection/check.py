@@ -197,10 +197,22 @@ def _pieces(found: Facts) -> list[Line]:
 
 
 def _digits(found: Facts) -> list[Line]:
-    digits = found.given.digits
+    digits = found.digits
     if digits is None:
         return []
     said: Any = verdict(found.loss, digits)
+    if found.given.digits is None:
+        return [
+            (
+                "note",
+                "digits",
+                f"K carries about {digits} digits: rigid translations leave forces in every row",
+                (
+                    "export in double precision; or free what rounding holds: "
+                    "FEMatrices(K, M, dofs=dofs).model(free=True)"
+                ),
+            )
+        ]
     if said is None:
         return [("ok", "digits", f"{digits} digits are enough", "")]
     text, _, following = said.partition(" Export")

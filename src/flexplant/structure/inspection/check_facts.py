@@ -15,7 +15,7 @@ from ...values import FloatArray, IntArray
 from ..components import pieces
 from ..masses import RigidMass, rigid_mass
 from ..matrices import FEMatrices
-from ..precision import loss
+from ..precision import loss, shown_digits
 from ..rigid import rigid_motions
 from ..singular_mass import left_out, null_motions
 from ..soft_springs import PRECISION, unheld
@@ -49,6 +49,7 @@ class Facts:
     body: RigidMass
     piece: IntArray
     loss: float | None
+    digits: int | None
     damping: dict[str, Any]
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
@@ -102,7 +103,10 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
     absent = no_stiffness & (no_mass if M is not None else True)
     there = np.flatnonzero(~absent)
     mass_definite, negative, weak = _mass_state(given, M, no_mass)
-    rounding = _rounding(K, M, given)
+    digits = given.digits
+    if digits is None and given.dofs is not None:
+        digits = shown_digits(K, given.dofs)
+    rounding = _rounding(K, M, given, digits)
     loose = np.flatnonzero(no_stiffness & ~absent)
     lowest, scaled, failure = _lowest(given, K, M, there, loose, bool(mass_definite), rounding)
     motions, mechanisms = None, np.zeros((n, 0))
@@ -140,7 +144,8 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
         mechanisms=mechanisms,
         body=body,
         piece=pieces(K, M, given.dofs),
-        loss=None if lowest is None or given.digits is None else loss(lowest, given.digits),
+        loss=None if lowest is None or digits is None else loss(lowest, digits),
+        digits=digits,
         damping={} if D is None else _damping(D, motions),
     )
 
@@ -180,9 +185,9 @@ def _mass_state(given: FEMatrices, M: Any, no_mass: Any) -> tuple[bool | None, I
     return True, negative, kept[left_out(motions, part)] if motions.size else none
 
 
-def _rounding(K: Any, M: Any, given: FEMatrices) -> float:
+def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
     """Return the relative error of K's entries, from its digits or its free rigid motions."""
-    written = 0.0 if given.digits is None else 10.0**-given.digits
+    written = 0.0 if digits is None else 10.0**-digits
     if given.dofs is None:
         return written
     motions = own_motions(M, rigid_motions(given.dofs)[:, : 6 if given.located else 3])

@@ -12,6 +12,8 @@ from ...sparse.factor import diagonal
 from ...values import FloatArray
 from ..zero_energy import ZeroEnergy, most_moved
 from .check_facts import Facts
+from .free_axes import free_axes
+from .plausible import swapped, unusual
 
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
@@ -20,9 +22,6 @@ Line: TypeAlias = tuple[str, str, str, str]
 _SYMMETRY = 1e-9
 #: a diagonal that exceeds all it couples to by this much is a penalty
 _PENALTY = 1e6
-#: a body larger than this [m] and lighter, per cube of its size, than that [kg/m^3] is odd
-_LARGE, _LIGHT = 20.0, 1e-5
-_HEAVY = 1e5
 
 
 def listed(names: Sequence[str], most: int = 6) -> str:
@@ -55,6 +54,15 @@ def matrices(found: Facts) -> list[Line]:
         )
     if not wrong:
         lines.append(("ok", "symmetry", f"{', '.join(found.skew)} symmetric", ""))
+    if swapped(found):
+        lines.append(
+            (
+                "fail",
+                "order of K and M",
+                "M resists no rigid translation as a stiffness does, K every one as a mass does",
+                "they are swapped: FEMatrices(K, M), but FEModel(M, K)",
+            )
+        )
     lines += [_mass_line(found), _stiffness_line(found)]
     if found.damping:
         lines.append(_damping_line(found))
@@ -188,7 +196,7 @@ def rigid(found: Facts) -> list[Line]:
         ]
     motions = found.motions
     lines: list[Line] = []
-    text = _freedom(motions)
+    text = _freedom(found, motions)
     extra = motions.mechanisms.shape[1]
     expected = f"{motions.n_rigid} by the geometry, {found.n_zero} found in K"
     odd = motions.length_factor
@@ -211,7 +219,17 @@ def rigid(found: Facts) -> list[Line]:
             )
         )
         return lines
-    lines.append(("ok", "rigid body", f"{text} ({expected})", ""))
+    partly = motions.n_rigid > 0 and bool(motions.grounded) and odd is None
+    lines.append(
+        (
+            "note" if partly else "ok",
+            "rigid body",
+            f"{text} ({expected})",
+            "the supports leave that free: a mode at 0 Hz. Hold it where the machine does"
+            if partly
+            else "",
+        )
+    )
     if not extra:
         lines.append(("ok", "mechanisms", "none", ""))
     elif odd is None:
@@ -230,7 +248,7 @@ def rigid(found: Facts) -> list[Line]:
     return lines
 
 
-def _freedom(motions: ZeroEnergy) -> str:
+def _freedom(found: Facts, motions: ZeroEnergy) -> str:
     """Return what moves freely and what is held, in words."""
     free, held = ", ".join(motions.free), ", ".join(motions.grounded)
     combined = motions.n_rigid - len(motions.free)
@@ -242,10 +260,12 @@ def _freedom(motions: ZeroEnergy) -> str:
         one = "motion" if combined == 1 else "motions"
         return f"free in {free}, and {combined} {one} of components in their joints{absent}"
     if combined > 0:
-        alone = f"free in {free}, and " if free else ""
-        among = f"{combined} combination{'s' * (combined != 1)} of {held}"
-        what = "is" if combined == 1 else "are"
-        return f"{alone}{among} {what} free (each by itself is held){absent}"
+        alone = [f"free in {free}"] if free else []
+        if found.given.located and found.given.dofs is not None:
+            alone += [f"free {way}" for way in free_axes(motions, found.given.dofs)]
+            return f"{', and '.join(alone)}; else grounded in {held}{absent}"
+        alone.append(f"free in {combined} combination{'s' * (combined != 1)} of {held}")
+        return f"{', and '.join(alone)} (each by itself is held){absent}"
     grounded = f"; grounded in {held}" if held else ""
     return f"{f'free in {free}' if free else 'held'}{grounded}{absent}"
 
@@ -311,28 +331,7 @@ def scales(found: Facts) -> list[Line]:
                 "their rounding exceeds soft modes; hold them: FEMatrices.without([...])",
             )
         )
-    dofs = found.given.dofs
-    known = np.isfinite(found.body.mass)
-    if dofs is None or not found.given.located or not known.any():
-        return lines
-    size = float(np.linalg.norm(np.ptp(dofs.xyz, axis=0)))
-    mass = float(found.body.mass[known].max())
-    if size > _LARGE and mass < _LIGHT * size**3:
-        lines.append(
-            (
-                "note",
-                "units",
-                f"{size:.4g} m in size, but {mass:.4g} kg: the coordinates look like mm",
-                "converted(length='mm', mass='t') turns mm, t, s (N, MPa) into SI",
-            )
-        )
-    elif size > 0 and mass > _HEAVY * size**3:
-        lines.append(
-            (
-                "note",
-                "units",
-                f"{mass:.4g} kg within {size:.4g} m is denser than any metal",
-                "matrices and coordinates in different units? converted(...) before",
-            )
-        )
+    odd = unusual(found)
+    if odd is not None:
+        lines.append(("note", "units", *odd))
     return lines
