@@ -25,6 +25,8 @@ from ..zero_energy import ZeroEnergy, own_motions, zero_energy
 _MODES = 10
 #: DOFs without stiffness that are counted as motions without energy, at most
 _LOOSE = 64
+#: part of its largest possible energy that a rigid translation has at most in K, least in M
+_NONE, _SOME = 1e-6, 0.1
 #: a rigid-body motion whose relative force is below this is free; its residual measures rounding
 _FREE = 1e-10
 
@@ -50,6 +52,7 @@ class Facts:
     piece: IntArray
     loss: float | None
     digits: int | None
+    swapped: bool
     damping: dict[str, Any]
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
@@ -106,9 +109,12 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
     digits = given.digits
     if digits is None and given.dofs is not None:
         digits = shown_digits(K, given.dofs)
-    rounding = _rounding(K, M, given, digits)
+    swapped = _are_swapped(given)
     loose = np.flatnonzero(no_stiffness & ~absent)
-    lowest, scaled, failure = _lowest(given, K, M, there, loose, bool(mass_definite), rounding)
+    lowest, scaled, failure, rounding = None, False, "K and M are swapped", 0.0
+    if not swapped:
+        rounding = _rounding(K, M, given, digits)
+        lowest, scaled, failure = _lowest(given, K, M, there, loose, bool(mass_definite), rounding)
     motions, mechanisms = None, np.zeros((n, 0))
     if lowest is not None:
         zero = lowest.shapes[:, : lowest.n_zero]
@@ -146,8 +152,30 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
         piece=pieces(K, M, given.dofs),
         loss=None if lowest is None or digits is None else loss(lowest, digits),
         digits=digits,
+        swapped=swapped,
         damping={} if D is None else _damping(D, motions),
     )
+
+
+def _are_swapped(given: FEMatrices) -> bool:
+    """Return whether M moves freely as a stiffness does, and K resists as a mass does."""
+    dofs, M = given.dofs, given.M
+    if dofs is None or M is None:
+        return False
+    for direction in range(3):
+        motion = (dofs.kinds == direction).astype(np.float64)
+        if not motion.any():
+            continue
+        energy, most = (_energy(matrix, motion) for matrix in (M, given.K))
+        if energy > _NONE or most < _SOME:
+            return False
+    return bool(np.any(dofs.kinds < 3))
+
+
+def _energy(matrix: Any, motion: FloatArray) -> float:
+    """Return ``t^T A t``, of what it would be if nothing cancelled."""
+    size = float(motion @ (abs(matrix) @ motion))
+    return abs(float(motion @ (matrix @ motion))) / size if size else 0.0
 
 
 def _skew(matrix: Any) -> tuple[float, int, int]:

@@ -13,7 +13,7 @@ from ...values import FloatArray
 from ..zero_energy import ZeroEnergy, most_moved
 from .check_facts import Facts
 from .free_axes import free_axes
-from .plausible import swapped, unusual
+from .plausible import unusual
 
 #: verdict, subject, finding, next step
 Line: TypeAlias = tuple[str, str, str, str]
@@ -54,7 +54,7 @@ def matrices(found: Facts) -> list[Line]:
         )
     if not wrong:
         lines.append(("ok", "symmetry", f"{', '.join(found.skew)} symmetric", ""))
-    if swapped(found):
+    if found.swapped:
         lines.append(
             (
                 "fail",

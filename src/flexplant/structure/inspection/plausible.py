@@ -1,4 +1,4 @@
-"""What a machine is like: whether units, and the order of K and M, make the model one."""
+"""What machines are like: units in which a model has the density and wave speed of one."""
 
 from __future__ import annotations
 
@@ -31,8 +31,6 @@ _UNITS = (
     (-3, 1.5, "M is in t, the rest in SI", "multiply M by 1000"),
     (3, -1.5, "M is in g, the rest in SI", "divide M by 1000"),
 )
-#: part of its largest possible energy that a rigid translation has at most in K, least in M
-_NONE, _SOME = 1e-6, 0.1
 
 
 def unusual(found: Facts) -> tuple[str, str] | None:
@@ -94,24 +92,3 @@ def unusual(found: Facts) -> tuple[str, str] | None:
         f"{text}: as if {' or '.join(cause for cause, _ in explained[:3])}",
         "; or ".join(step for _, step in explained[:3]),
     )
-
-
-def swapped(found: Facts) -> bool:
-    """Return whether M moves freely as a stiffness does, and K resists as a mass does."""
-    dofs, M = found.given.dofs, found.given.M
-    if dofs is None or M is None:
-        return False
-    for direction in range(3):
-        motion = (dofs.kinds == direction).astype(np.float64)
-        if not motion.any():
-            continue
-        energy, most = (_energy(matrix, motion) for matrix in (M, found.given.K))
-        if energy > _NONE or most < _SOME:
-            return False
-    return bool(np.any(dofs.kinds < 3))
-
-
-def _energy(matrix: Any, motion: Any) -> float:
-    """Return ``t^T A t``, of what it would be if nothing cancelled."""
-    size = float(motion @ (abs(matrix) @ motion))
-    return abs(float(motion @ (matrix @ motion))) / size if size else 0.0
