@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from ...sparse.factor import diagonal
 from .check_facts import Facts
@@ -40,6 +39,8 @@ def unusual(found: Facts) -> tuple[str, str] | None:
     of nodes. A plate of areal mass m'' that has transverse motion only shows ``c / density =
     sqrt(K_ii / M_ii) h^2 / (2 m'')``. Both come from local entries: supports do not matter.
     """
+    from scipy.spatial import cKDTree
+
     dofs, M = found.given.dofs, found.given.M
     known = np.isfinite(found.body.mass)
     if dofs is None or M is None or not found.given.located or not known.any():
