@@ -124,6 +124,14 @@ def test_what_is_no_report(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+def test_what_has_no_picture_says_so(tmp_path):
+    """Two points span no map: the rest of the report is there."""
+    points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
+    found = fx.placement.SensorMap(points, np.array([2.0, 1.0]), 4.0, "PoiVariance()", ())
+    said = words(tree_of(fx.plot.report(tmp_path / "map", found).read_text()))
+    assert "Not shown: 2 points on one line span no map" in said and "Versions" in said
+
+
 def test_neighbours_are_the_lines_of_a_mesh():
     """Of a box of 3 x 2 x 2 cells with sides 1, 4 and 0.5: all edges, no diagonals."""
     x, y, z = np.meshgrid(np.arange(4.0), 4.0 * np.arange(3), 0.5 * np.arange(3), indexing="ij")

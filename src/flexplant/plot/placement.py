@@ -42,9 +42,14 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     Raises
     ------
     ModelError
-        When `found` is no SensorMap.
+        When `found` is no SensorMap, or its points lie on one line.
     """
     instance(found, SensorMap, "found", "Pass what sensor_map returned.")
+    if np.linalg.matrix_rank(found.points[:, :2] - found.points[:1, :2]) < 2:
+        raise ModelError(
+            f"{len(found.points)} points on one line span no map: give sensor_map points over an "
+            "area, or read found.values."
+        )
     ax = axes(ax, figsize=(6.4, 5.4))
     ratio = np.sqrt(found.ratio)
     factor = plan(ax, found.points)
