@@ -4,20 +4,17 @@ import doctest
 import importlib
 import pkgutil
 
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import flexplant
 from test_public_api import DESCRIBED
 
-MODULES = [
-    module.name
-    for module in pkgutil.walk_packages(flexplant.__path__, "flexplant.")
-    if ".plot" not in module.name
-]
+MODULES = [module.name for module in pkgutil.walk_packages(flexplant.__path__, "flexplant.")]
 #: rooms whose examples design something: they take longer
 DESIGNS = tuple(
-    f"flexplant.{room}" for room in ("estimation", "placement", "synthesis", "updating")
+    f"flexplant.{room}" for room in ("estimation", "placement", "synthesis", "updating", "plot")
 )
 
 
@@ -26,6 +23,7 @@ def runs(name):
     # pyYeti, an oracle, sets the printing of NumPy 1.13 for the whole process when it is imported
     with np.printoptions(legacy=False):
         failed, tried = doctest.testmod(importlib.import_module(name))
+    plt.close("all")
     return tried, failed
 
 

@@ -40,6 +40,16 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     ------
     ModelError
         When it is no ErrorBudget.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> ax = fx.plot.budget(fx.close_loop(plant, observer, servo).budget("die:x"))
+    >>> ax.get_xlabel()
+    'frequency [Hz]'
     """
     instance(found, ErrorBudget, "found", "Pass loop.budget(channel).")
     given, ax = ax is not None, axes(ax, figsize=(9.0, 4.0))

@@ -107,6 +107,13 @@ def lag_report(report: LagReport, channel: str | None = None, *, ax: Axes | None
         When it is no LagReport.
     LabelError
         When it has no such channel.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> ax = fx.plot.lag_report(fx.design_kalman(fx.testbeds.three_masses()).report())
+    >>> ax.get_xlabel()
+    'lag [ms]'
     """
     instance(report, LagReport, "report", "Pass observer.report().")
     row = row_of(report.channels, report.channels[0] if channel is None else channel)
@@ -168,6 +175,16 @@ def estimate(
         When the truth has another length.
     LabelError
         When there is no such channel.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> observer = fx.design_kalman(fx.testbeds.three_masses())
+    >>> found = observer.estimate({name: np.zeros(50) for name in ("y1", "y2", "u1")})
+    >>> ax = fx.plot.estimate(found)
+    >>> ax.get_xlabel()
+    'time [ms]'
     """
     instance(result, Estimate, "result", "Pass what observer.estimate returned.")
     name = result.names[0] if channel is None else channel

@@ -64,6 +64,15 @@ def frf(
     ModelError
         When there is no such mapping, the responses are of different units, or nothing of one is
         in the band.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> frf = fx.frequency_response(fx.testbeds.three_masses().Gyu, np.geomspace(1.0, 900.0, 200))
+    >>> ax = fx.plot.frf({"model": frf}, "y1", "u1")
+    >>> ax.get_xlabel()
+    'frequency [Hz]'
     """
     if not isinstance(responses, Mapping) or isinstance(responses, Frf):
         raise ModelError(

@@ -38,6 +38,16 @@ def stabilisation(
     Returns
     -------
     Axes
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> freq = np.arange(10.0, 40.0, 0.1)
+    >>> frf = fx.Frf(freq, (1 / (20.0**2 - freq**2 + 0.4j * freq))[None, None])
+    >>> ax = fx.plot.stabilisation(fx.identification.stabilisation_diagram(frf), frf=frf)
+    >>> ax.get_xlabel()
+    'frequency [Hz]'
     """
     instance(diagram, StabilisationDiagram, "diagram", "Pass what stabilisation_diagram returned.")
     given, ax = ax is not None, axes(ax, figsize=(10.0, 5.0))
@@ -91,6 +101,16 @@ def identified(
     Axes
         Displacement per input; a dotted line at every pole, the standard deviation of the
         measurement in grey where known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> freq = np.arange(10.0, 40.0, 0.1)
+    >>> frf = fx.Frf(freq, (1 / (20.0**2 - freq**2 + 0.4j * freq))[None, None])
+    >>> ax = fx.plot.identified(frf, fx.identify_modes(frf), frf.outputs[0], frf.inputs[0])
+    >>> ax.get_xlabel()
+    'frequency [Hz]'
     """
     instance(modes, IdentifiedModes, "modes", "Pass what identify_modes returned.")
     given, ax = ax is not None, axes(ax, figsize=(10.0, 5.0))

@@ -60,6 +60,16 @@ def mode_shape(
     ModelError
         When there is no such mode, no displacement along x, y or z, or so many nodes that no
         picture could show them.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> size, mesh = {"size": (1.0, 1.0), "thickness": 0.01}, {"elements": (2, 2)}
+    >>> steel = {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
+    >>> modes = fx.solve_modes(fx.kirchhoff_plate(**size, **mesh, **steel), count=4)
+    >>> ax = fx.plot.mode_shape(modes, 4)
+    >>> ax.name
+    '3d'
     """
     return _Moving(modes, number, scale, color, ax).at(phase)
 

@@ -90,6 +90,15 @@ def pareto_curve(found: ParetoCurve, *, ax: Axes | None = None) -> Axes:
     ------
     ModelError
         When `found` is no ParetoCurve.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 3)]
+    >>> ax = fx.plot.pareto_curve(fx.placement.pareto_curve(plant, candidates, [1, 2]))
+    >>> len(ax.get_lines()) > 0
+    True
     """
     instance(found, ParetoCurve, "found", "Pass what pareto_curve returned.")
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.2))

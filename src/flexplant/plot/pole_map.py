@@ -45,6 +45,13 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     ------
     ModelError
         When one is no system.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> ax = fx.plot.pole_map({"plant": fx.testbeds.three_masses().system})
+    >>> len(ax.get_lines()) + len(ax.collections) > 0
+    True
     """
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     named = dict(systems) if isinstance(systems, Mapping) else {"": systems}

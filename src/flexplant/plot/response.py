@@ -60,6 +60,16 @@ def response(
     ModelError
         When `run` is no Response, nothing of it is within `span`, or channels of several units
         shall go into one axes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> time = np.arange(100) * 1e-3
+    >>> run = fx.Response(time, 1e-9 * np.sin(time)[None], ["die:error"])
+    >>> axs = fx.plot.response(run)
+    >>> np.ravel(axs)[-1].get_xlabel()
+    'time [ms]'
     """
     instance(run, Response, "run", "Pass what simulate returned.")
     run = run if span is None else _part(run, span)

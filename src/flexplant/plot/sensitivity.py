@@ -64,6 +64,16 @@ def sensitivity(
         When one of them is none of these, or the weight has several channels.
     ShapeError
         When frequencies and sizes are not of one length.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> ax = fx.plot.sensitivity({"S": fx.loop.sensitivity(fx.close_loop(plant, observer, servo))})
+    >>> ax.get_xlabel()
+    'frequency [Hz]'
     """
     lines = {label: _size(one, freq) for label, one in _named(curves).items()}
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))

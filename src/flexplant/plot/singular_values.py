@@ -37,6 +37,13 @@ def singular_values(
     ------
     ModelError
         When there is nothing to draw.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> ax = fx.plot.singular_values({"plant": fx.testbeds.three_masses().Gyu})
+    >>> ax.get_xlabel()
+    'frequency [Hz]'
     """
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     drawn = curves(systems, freq)

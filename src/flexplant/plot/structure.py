@@ -54,6 +54,15 @@ def layout(
     ModelError
         When a solid has so many nodes that no picture could show them, or is to be drawn on axes of
         two dimensions.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> size, mesh = {"size": (1.0, 1.0), "thickness": 0.01}, {"elements": (2, 2)}
+    >>> steel = {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
+    >>> ax = fx.plot.layout(fx.kirchhoff_plate(**size, **mesh, **steel).dofs)
+    >>> ax.get_aspect()
+    1.0
     """
     if np.ptp(dofs.xyz[:, 2]) > 0 and (skin := surface_of(dofs)).is_solid:
         return _solid(skin, dofs, ports, desired, marked or {}, ax)

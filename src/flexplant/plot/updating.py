@@ -63,6 +63,17 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     Axes
         The sum of squares of all differences between model and measurement, each divided by its
         standard deviation where that is known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> ax = fx.plot.residual(fit)
+    >>> len(ax.get_lines()) > 0
+    True
     """
     ax = axes(ax, figsize=(7.0, 4.0))
     steps = np.arange(len(fit.history) + 1)
@@ -89,6 +100,17 @@ def parameters(
     Returns
     -------
     list of Axes
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> axs = fx.plot.parameters(fit)
+    >>> len(axs)
+    1
     """
     drawn = []
     steps = np.arange(len(fit.history) + 1)
