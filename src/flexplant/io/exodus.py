@@ -172,24 +172,12 @@ def opened(path: str | Path) -> ExodusFile:
                 f"{str(path)!r} is a netCDF-4 file, which needs h5py. Install it: "
                 "pip install 'flexplant[hdf5]'."
             ) from None
-        kinds: tuple[type[Exception], ...] = (
-            OSError,
-            RuntimeError,
-            ValueError,
-            KeyError,
-            TypeError,
-        )
-        return ExodusFile(str(path), lambda: h5py.File(path, "r"), kinds)
-    kinds = (TypeError, ValueError, OSError, KeyError, IndexError, AssertionError, EOFError)
-    return ExodusFile(
-        str(path),
-        lambda: scipy.io.netcdf_file(path, "r", mmap=False),
-        (*kinds, OverflowError, MemoryError, UnicodeDecodeError, AttributeError),
-    )
+        return ExodusFile(str(path), lambda: h5py.File(path, "r"))
+    return ExodusFile(str(path), lambda: scipy.io.netcdf_file(path, "r", mmap=False))
 
 
 class ExodusFile:
-    """Arrays of an Exodus file by name; whatever fails becomes an error that names the file.
+    """Arrays of an Exodus file by name; what fails in a `with` block becomes an error of the file.
 
     Parameters
     ----------
@@ -197,16 +185,14 @@ class ExodusFile:
         For messages.
     opener : callable
         Opens the netCDF file.
-    kinds : tuple of exception classes
-        What the opened file raises when it is damaged.
     """
 
-    def __init__(self, path: str, opener: Any, kinds: tuple[type[Exception], ...]) -> None:
-        self.path, self.kinds = path, kinds
+    def __init__(self, path: str, opener: Any) -> None:
+        self.path = path
         try:
             with np.errstate(all="ignore"):  # sizes of a damaged file overflow
                 self.file = opener()
-        except kinds as error:
+        except Exception as error:  # its bytes lead anywhere
             raise self._wrong(error) from None
 
     def __enter__(self) -> Self:
@@ -219,6 +205,8 @@ class ExodusFile:
         trace: TracebackType | None,
     ) -> None:
         self.file.close()
+        if isinstance(error, Exception) and not isinstance(error, FlexplantError):
+            raise self._wrong(error) from None
 
     def _wrong(self, what: object) -> FlexplantError:
         return FlexplantError(
@@ -239,18 +227,12 @@ class ExodusFile:
         """
         if not self.holds(name):
             raise self._wrong(f"it has no {name!r}")
-        try:
-            array = np.array(self._names()[name][()] if self._hdf() else self._names()[name][:])
-        except self.kinds as error:
-            raise self._wrong(error) from None
+        array = np.array(self._names()[name][()] if self._hdf() else self._names()[name][:])
         return array.astype(array.dtype.newbyteorder("="))
 
     def holds(self, name: str) -> bool:
         """Return whether there is a variable of a name."""
-        try:
-            return name in self._names()
-        except self.kinds as error:
-            raise self._wrong(error) from None
+        return name in self._names()
 
     def _hdf(self) -> bool:
         return not hasattr(self.file, "variables")

@@ -65,9 +65,11 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
                 continue
             try:
                 part = file.read_sets(place)
+                part = part[0] if isinstance(part, list) else part
+                if "node_nums" in part:
+                    part["node_nums"] = np.atleast_1d(part["node_nums"]).astype(np.int64)
             except Exception as error:
                 raise _damaged(path, f"dataset {place + 1} (type {kind})", error) from None
-            part = part[0] if isinstance(part, list) else part
             if kind == 58:
                 _check_58(part, path, place)
             found.append(part)
