@@ -59,7 +59,7 @@ def test_products_multiply():
     wanted = (3.0 + 1.0 / S) * Notch(80.0).law.response(FREQ) / (S / w(400) + 1)
     np.testing.assert_allclose(law.response(FREQ), wanted, rtol=1e-12)
     assert (law.gain, len(law.factors), law.system.n_states) == (1.0, 3, 4)
-    assert repr(law) == "Pid p 3 i 1 * Notch 80 Hz depth 0.05 width 0.3 * LowPass 400 Hz order 1"
+    assert repr(law) == "Pid p 3 i 1 /s * Notch 80 Hz depth 0.05 width 0.3 * LowPass 400 Hz order 1"
 
 
 def test_sampled_by_tustin_what_has_a_frequency_stays_there():
@@ -91,3 +91,16 @@ def test_what_makes_no_law_is_refused():
         Law((1.0,))
     with pytest.raises(ModelError, match="run at 1000 and 2000 Hz"):
         _ = Pid(1.0).sampled(1e3) * Pid(1.0).sampled(2e3)
+
+
+def test_laws_are_scaled_and_not_added():
+    law = Pid(3.0, i=1.0) * Notch(80.0)
+    freq = np.array([10.0, 70.0])
+    np.testing.assert_allclose((-law / 4).response(freq), -0.25 * law.response(freq), rtol=1e-12)
+    np.testing.assert_allclose((-Pid(2.0)).law.response(freq), -2.0, rtol=1e-12)
+    with pytest.raises(ModelError, match="not zero, got 0"):
+        law / 0
+    with pytest.raises(ModelError, match="a law is a product"):
+        Pid(2.0) + Lead(30.0)
+    with pytest.raises(ModelError, match="a law is a product"):
+        1.0 - law

@@ -160,3 +160,17 @@ def test_what_does_not_go_together_is_refused():
     for name in ("bandwidth", "rolloff"):
         with pytest.raises(ModelError, match=f"{name} must be below half the rate, 10000 Hz"):
             shape_loop(G, **({"bandwidth": 50.0} | {name: 12e3}))
+
+
+def test_what_is_rarely_meant_is_said():
+    """A model above half the rate is refused; a low roll-off, a heavy weight are warned of."""
+    sampled = discretized(BODY, 200.0)
+    with pytest.raises(ModelError, match="model must be below half the rate, 100 Hz, got 150"):
+        shape_loop(sampled, bandwidth=1.0, model=150.0)
+    with pytest.warns(FlexplantWarning, match="not above twice the bandwidth"):
+        shape_loop(BODY, bandwidth=1.0, rolloff=1.9)
+    with pytest.warns(FlexplantWarning, match="1 to 3 is usual"):
+        shape_loop(BODY, bandwidth=1.0, model=1.0, weight=30.0)
+    frf = fx.frequency_response(BODY, np.array([1.0, 2.0]))
+    with pytest.raises(ModelError, match="tune laws on the Frf by tune_loops"):
+        fx.design_ncf(frf)

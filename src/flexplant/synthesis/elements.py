@@ -26,7 +26,7 @@ class Pid(SingleElement):
     --------
     >>> import flexplant as fx
     >>> fx.Pid(2.0, i=1.0, d=0.1, pole=100.0)
-    Pid p 2 i 1 d 0.1 pole 100 Hz
+    Pid p 2 i 1 /s d 0.1 s pole 100 Hz
     """
 
     p: float
@@ -80,7 +80,9 @@ class Pid(SingleElement):
         return cls(p, k * w_i, k / w_z - p / w_p, float(pole))
 
     def __repr__(self) -> str:
-        parts = [f"{name} {getattr(self, name):.4g}" for name in "pid" if getattr(self, name)]
+        units = {"p": "", "i": " /s", "d": " s"}
+        gains = {name: getattr(self, name) for name in units}
+        parts = [f"{name} {gain:.4g}{units[name]}" for name, gain in gains.items() if gain]
         pole = "" if self.pole is None else f" pole {self.pole:g} Hz"
         return f"Pid {' '.join(parts) or 'p 0'}{pole}"
 

@@ -18,6 +18,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from .controller import Controller
 from .method import SolvedController
+from .reach import require_reach
 from .singular import made_regular, missing_ranks
 from .spill_over import spill_over, unchecked
 
@@ -169,10 +170,14 @@ def _solved(p: Prepared) -> SolvedController:
     try:
         control = solve_control(p.A, p.B2, Q=p.C1.T @ p.C1, R=p.D12.T @ p.D12, S=p.C1.T @ p.D12)
     except (SolverError, ModelError) as error:
+        if not p.direct:  # it names channel and frequency where a mode is to blame
+            require_reach(p)
         raise AssumptionError(f"no optimal feedback from the states to u: {error}") from error
     try:
         estimate = solve_filter(p.A, p.C2, Q=p.B1 @ p.B1.T, R=p.D21 @ p.D21.T, S=p.B1 @ p.D21.T)
     except (SolverError, ModelError) as error:
+        if not p.direct:
+            require_reach(p)
         raise AssumptionError(f"no optimal estimate of the states from y: {error}") from error
     residual = {"residual of the Riccati equations": max(control.residual, estimate.residual)}
     X, F, Y, L = control.P, -control.gain, estimate.P, -estimate.gain

@@ -116,6 +116,41 @@ class Element(Value):
         """Return the law times a number."""
         return self.law * other
 
+    def __truediv__(self, other: float) -> Law:
+        """Return the law over a number.
+
+        Raises
+        ------
+        ModelError
+            When it is no number, or zero.
+        """
+        if not isinstance(other, int | float | np.number) or not other:
+            raise ModelError(
+                f"a law is divided by a number, not zero, got {short(other)}. The inverse of "
+                "an element is an element of its own: Notch(freq, depth=20), Lead(freq, 1 / ratio)."
+            )
+        return self.law * (1.0 / float(other))
+
+    def __neg__(self) -> Law:
+        """Return the law with its sign reversed."""
+        return self.law * -1.0
+
+    def __add__(self, other: object) -> Law:
+        """Refuse a sum: a law is a product.
+
+        Raises
+        ------
+        ModelError
+            Always.
+        """
+        raise ModelError(
+            f"a law is a product of elements, {short(self)} + {short(other)} is a sum. Pid has "
+            "proportional, integral and derivative action in one; other sums are a StateSpace, "
+            "add(first.system, second.system)."
+        )
+
+    __radd__ = __sub__ = __rsub__ = __add__
+
 
 class SingleElement(Element):
     """An element with one section."""
@@ -150,10 +185,10 @@ class Law(Element):
 
     Examples
     --------
-    >>> from flexplant.synthesis import LowPass, Notch, Pid
-    >>> law = Pid.corners(2e5, integrator=5.0, zero=15.0, pole=300.0) * Notch(830.0)
+    >>> from flexplant.synthesis import LowPass, Pid
+    >>> law = Pid.corners(2e5, integrator=5.0, zero=15.0, pole=300.0) * LowPass(830.0)
     >>> print(law.sampled(1e4))
-    Pid p 2.633e+05 i 6.283e+06 d 1982 pole 300 Hz * Notch 830 Hz depth 0.05 width 0.3, at 10000 Hz
+    Pid p 2.633e+05 i 6.283e+06 /s d 1982 s pole 300 Hz * LowPass 830 Hz order 2, at 10000 Hz
     """
 
     factors: Sequence[SingleElement] = ()

@@ -11,7 +11,7 @@ from ..certificates import stability_name
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..loop import modulus_margin
 from ..lti.discretisation import bilinear, tustin
-from ..lti.frequency import frequency_response
+from ..lti.frequency import Frf, frequency_response
 from ..lti.hankel import hankel_norm
 from ..lti.interconnection import lft, series
 from ..lti.minimal import minimal
@@ -96,6 +96,7 @@ def design_ncf(
     >>> round(fx.ncf_margin(plant, controller), 2)
     0.35
     """
+    require_model(plant)
     G = plant.Gyu if isinstance(plant, StandardPlant) else as_statespace(plant)
     back_off = positive(back_off, "back_off")
     first = as_statespace(np.eye(len(G.inputs)) if before is None else before)
@@ -309,6 +310,21 @@ def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, flo
     gain = gamma**2 * np.linalg.solve(L.T, Z @ g.C.T)
     K = StateSpace(g.A + g.B @ F + gain @ (g.C + g.D @ F), gain, g.B.T @ X, -g.D.T)
     return (tustin(K, 1.0 / shaped.dt) if shaped.dt else K), gamma, least
+
+
+def require_model(plant: object) -> None:
+    """Refuse a measured plant.
+
+    Raises
+    ------
+    ModelError
+        When it is a frequency response.
+    """
+    if isinstance(plant, Frf) or hasattr(plant, "frdata"):
+        raise ModelError(
+            "the plant is a frequency response: loop shaping needs a model. Identify one, or tune "
+            "laws on the Frf by tune_loops."
+        )
 
 
 def below_half_rate(freq: float, name: str, dt: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -9,10 +10,9 @@ from typing import Any
 import numpy as np
 
 from ..certificates import stability_name
-from ..errors import CertificateError, ModelError, SolverError
+from ..errors import CertificateError, FlexplantWarning, SolverError
 from ..loop import LoopReport, report_loops
 from ..lti.discretisation import tustin
-from ..lti.frequency import Frf
 from ..lti.interconnection import append, series
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace, System, as_statespace
@@ -22,12 +22,14 @@ from ..plant import StandardPlant
 from ..values import FloatArray, Value, positive
 from .controller import Controller
 from .loop_design import Axes, axes_of, connected
-from .ncf import below_half_rate, integral_action, loop_margin, verified_controller
+from .ncf import below_half_rate, integral_action, loop_margin, require_model, verified_controller
 from .ncf_following import following
 from .spill_over import spill_over, unchecked
 
 #: how near the crossover comes to the bandwidth, and the steps that it may take
 _NEAR, _STEPS = 0.02, 8
+#: weight of following a model above which a warning is given
+_HEAVY = 10.0
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -134,6 +136,7 @@ def shape_loop(
     -----
     FlexplantWarning
         When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+        When the roll-off is below twice the bandwidth, or the weight above 10.
 
     References
     ----------
@@ -148,16 +151,15 @@ def shape_loop(
     """
     target, back_off = positive(bandwidth, "bandwidth"), positive(back_off, "back_off")
     rho = positive(weight, "weight")
-    if isinstance(plant, Frf) or hasattr(plant, "frdata"):
-        raise ModelError(
-            "the plant is a frequency response: loop shaping needs a model. Identify one, or tune "
-            "laws on the Frf by tune_loops."
-        )
+    require_model(plant)
     axes = axes_of(plant, before, after, None, 0.0, True)
     dt = axes.plant.dt
     below_half_rate(target, "bandwidth", dt)
     if rolloff is not None:
         below_half_rate(rolloff, "rolloff", dt)
+    if isinstance(model, int | float | np.number):
+        below_half_rate(float(model), "model", dt)
+    _unusual(target, rolloff, None if model is None else rho)
     T_ref = None if model is None else _model(model, axes)
     freq = target
     for _ in range(_STEPS):
@@ -200,6 +202,24 @@ def shape_loop(
         notes=unchecked(axes.given) if lacking and axes.given else (),
     )
     return ShapedLoop(shaped, controller, report)
+
+
+def _unusual(bandwidth: float, rolloff: float | None, rho: float | None) -> None:
+    """Warn of numbers that are allowed and rarely meant."""
+    if rolloff is not None and positive(rolloff, "rolloff") < 2.0 * bandwidth:
+        warnings.warn(
+            f"rolloff {rolloff:g} Hz is not above twice the bandwidth, {bandwidth:g} Hz: its phase "
+            "lag takes the margin. Three to ten times the bandwidth is usual.",
+            FlexplantWarning,
+            stacklevel=4,
+        )
+    if rho is not None and rho > _HEAVY:
+        warnings.warn(
+            f"weight {rho:g} counts following the model so much more than robustness that little "
+            "margin is left: 1 to 3 is usual.",
+            FlexplantWarning,
+            stacklevel=4,
+        )
 
 
 @dataclass(frozen=True)

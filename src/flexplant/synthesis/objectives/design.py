@@ -21,10 +21,13 @@ from ..lmi_plant import Plant
 from ..lmi_programs import modelling, solve_program
 from ..spill_over import spill_over, unchecked
 from . import lmis
+from .sampled_poles import Disc, Edge, damped, within
 from .specifications import H2, Hinf, PeakGain, PoleRegion
 
 #: what a verified norm may exceed its bound by
 _EXCESS = 1e-3
+#: largest part by which a reachable set shrinks in one sample
+_MOST = 0.9
 #: rates of decay that are tried for peak gains, beside the plant's own speed
 _RATES = (0.1, 0.3, 1.0, 3.0)
 #: multiples of the back-off that are tried in turn, and multiples of the optimum after them
@@ -57,8 +60,8 @@ def design_lmi(
     Parameters
     ----------
     plant : StandardPlant
-        Usually weighted; at most max_states states. A sampled one takes H2, Hinf and the decay of
-        a PoleRegion.
+        Usually weighted; at most max_states states. Of a sampled one damping and bandwidth of a
+        PoleRegion are not convex: the poles are held in a polygon and a disc inside the region.
     minimize : H2, Hinf or PeakGain
         Without `below`.
     subject_to : sequence of H2, Hinf, PeakGain (with `below`) and PoleRegion
@@ -167,10 +170,10 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
         raise ModelError(f"subject_to must be a list of specifications, got {short(subject_to)}.")
     for one in (minimize, *subject_to):
         if isinstance(one, PoleRegion):
-            if plant.dt and (one.damping is not None or one.bandwidth is not None):
+            if plant.dt and one.bandwidth is not None and one.bandwidth >= 0.5 / plant.dt:
                 raise ModelError(
-                    "damping and bandwidth of poles are no convex regions of a sampled plant: "
-                    "require decay, or design on plant.continuous and discretise_controller."
+                    f"bandwidth {one.bandwidth:g} Hz of poles is not below half the rate, "
+                    f"{0.5 / plant.dt:g} Hz: no sampled pole is faster. Lower it, or leave it out."
                 )
             continue
         if not isinstance(one, _KINDS) or (one is not minimize and one.below is None):
@@ -186,8 +189,6 @@ def _checked(plant: StandardPlant, minimize: Any, subject_to: Any, most: int) ->
                 f"white noise on {w[k]} reaches {z[i]} at once: the H2 norm is infinite. Weight "
                 "that w or z by a low-pass, leave one of them out, or sample the plant."
             )
-        if isinstance(one, PeakGain) and plant.dt:
-            raise ModelError("PeakGain is of continuous plants: design on plant.continuous.")
     n = plant.system.n_states
     if not 0 < n <= most:
         raise ModelError(
@@ -264,19 +265,35 @@ class _Programs:
         self, v: lmis.Variables, spec: Any, level: Any, bound: float, rate: float
     ) -> Any:
         """Return the LMIs of a specification, in units of its bound."""
-        sampled = bool(self.given.dt)
         if isinstance(spec, PoleRegion):
-            speed = self.plant.speed
-            radius = float(np.exp(-spec.decay * self.given.dt)) if sampled else 0.0
-            top = None if spec.bandwidth is None else 2 * np.pi * spec.bandwidth / speed
-            return lmis.poles(v, spec.decay / speed, spec.damping, top, radius)
+            return lmis.poles(v, self._region(spec))
         own = self.channel(spec, bound)
         if isinstance(spec, H2):
             return lmis.h2(v, own, level)
         if isinstance(spec, PeakGain):
-            decay = rate if spec.decay is None else spec.decay / self.plant.speed
-            return lmis.peak(v, own, level, decay)
+            return lmis.peak(v, own, level, self._shrinking(spec, rate))
         return lmis.hinf(v, own, level)
+
+    def _shrinking(self, spec: PeakGain, rate: float) -> float:
+        """Return the rate at which the reachable set shrinks, in the plant's unit of time."""
+        speed, dt = self.plant.speed, self.given.dt
+        if spec.decay is None:
+            return min(rate, _MOST / speed) if dt else rate
+        return float(1.0 - np.exp(-spec.decay * dt)) / speed if dt else spec.decay / speed
+
+    def _region(self, spec: PoleRegion) -> lmis.Region:
+        """Return the region of z, or of s in the plant's unit of time."""
+        speed, dt = self.plant.speed, self.given.dt
+        if not dt:
+            edges = []
+            if spec.damping is not None:
+                edges = [Edge(float(np.sqrt(1.0 - spec.damping**2)), spec.damping, 0.0)]
+            top = None if spec.bandwidth is None else 2 * np.pi * spec.bandwidth / speed
+            return lmis.Region(spec.decay / speed, edges, (), top)
+        discs = [Disc(0.0, float(np.exp(-spec.decay * dt)))]
+        if spec.bandwidth is not None:
+            discs.append(within(2.0 * np.pi * spec.bandwidth * dt))
+        return lmis.Region(0.0, [] if spec.damping is None else damped(spec.damping), discs)
 
     def program(self, v: lmis.Variables, level: Any, unit: float, rate: float) -> list[Any]:
         found = [v.positive(), *self.constraints(v, self.minimize, level, unit, rate)]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ import scipy.linalg as la
 from ...values import FloatArray
 from ..lmi_plant import Plant
 from ..lmi_programs import modelling, symmetric_blocks
+from .sampled_poles import Disc, Edge
 
 #: strictness of the inequalities, relative to unit scale
 _STRICT = 1e-7
@@ -132,14 +134,22 @@ def h2(v: Variables, channel: Channel, square: Any) -> list[Any]:
 
 
 def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
-    """Return the LMIs of the star norm: peak to peak below gamma units, for one rate."""
+    """Return the LMIs of the star norm: peak to peak below gamma units, for one rate.
+
+    ``x' P x`` shrinks by the rate beside what |w| < 1 adds, so that x stays in an ellipsoid, and z
+    is bounded there (Abedor, Nagpal, Poolla, 1996). Of a sampled plant a step shrinks it by
+    ``1 - decay t``.
+    """
     cp = modelling()
 
     B, C, D = v.of(channel)
     z, w = D.shape
     n = v.P.shape[0]
     part = cp.Variable()
-    first = -symmetric_blocks([[v.A + v.A.T + decay * v.P, B], [-part * np.eye(w)]])
+    rows = [[-(v.A + v.A.T) - decay * v.P, -B], [part * np.eye(w)]]
+    if v.root:
+        rows = [[*rows[0], v.root * v.A.T], [*rows[1], v.root * B.T], [v.P]]
+    first = symmetric_blocks(rows)
     second = symmetric_blocks([
         [decay * v.P, np.zeros((n, w)), C.T],
         [(gamma - part) * np.eye(w), D.T],
@@ -148,29 +158,41 @@ def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
     return [one >> _STRICT * np.eye(one.shape[0]) for one in (first, second)]
 
 
-def poles(
-    v: Variables, decay: float, damping: float | None, bandwidth: float | None, radius: float
-) -> list[Any]:
-    """Return the LMIs of a region of poles, in the plant's unit of time.
-
-    Of a sampled plant the disc of a radius.
-    """
+def poles(v: Variables, region: Region) -> list[Any]:
+    """Return the LMIs of a region of poles, in the plant's unit of time."""
     found = []
-    if v.root:
-        less = 1.0 - radius
-        found.append(symmetric_blocks([
-            [-(v.A + v.A.T) - 2.0 * less / v.root**2 * v.P, v.root * v.A + less / v.root * v.P],
-            [radius * v.P],
-        ]))  # fmt: skip
-    else:
-        found.append(-symmetric_blocks([[v.A + v.A.T + 2.0 * decay * v.P]]))
-    if damping is not None:
-        angle = np.arccos(damping)
-        even, odd = np.sin(angle) * (v.A + v.A.T), np.cos(angle) * (v.A - v.A.T)
-        found.append(-symmetric_blocks([[even, odd], [even]]))
-    if bandwidth is not None:
-        found.append(-symmetric_blocks([[-bandwidth * v.P, v.A], [-bandwidth * v.P]]))
+    if not v.root:
+        found.append(-symmetric_blocks([[v.A + v.A.T + 2.0 * region.decay * v.P]]))
+    found += [_disc(v, disc) for disc in region.discs]
+    # edges of z are those of (z - 1) / t, with z = 1 as origin
+    for x, y, most in region.edges:
+        beyond = 2.0 * (most - x) / v.root**2 * v.P if v.root else 0.0
+        even, odd = x * (v.A + v.A.T) - beyond, y * (v.A - v.A.T)
+        found.append(-symmetric_blocks([[even, odd], [even]] if y else [[even]]))
+    if region.bandwidth is not None:
+        found.append(-symmetric_blocks([[-region.bandwidth * v.P, v.A], [-region.bandwidth * v.P]]))
     return [one >> _STRICT * np.eye(one.shape[0]) for one in found]
+
+
+class Region(NamedTuple):
+    """Where poles lie: half planes and discs of z, or what bounds continuous ones.
+
+    Of a continuous plant an edge is one of s through 0.
+    """
+
+    decay: float = 0.0
+    edges: Sequence[Edge] = ()
+    discs: Sequence[Disc] = ()
+    bandwidth: float | None = None
+
+
+def _disc(v: Variables, disc: Disc) -> Any:
+    """Return ``[-(X + X'), X'; X, radius P] > 0`` with X = A_z - (centre + radius), over t."""
+    past = disc.centre + disc.radius - 1.0
+    return symmetric_blocks([
+        [-(v.A + v.A.T) + 2.0 * past / v.root**2 * v.P, v.root * v.A.T - past / v.root * v.P],
+        [disc.radius * v.P],
+    ])  # fmt: skip
 
 
 def size(v: Variables) -> Any:
