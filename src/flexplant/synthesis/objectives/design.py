@@ -21,7 +21,7 @@ from ..lmi_plant import Plant
 from ..lmi_programs import modelling, solve_program
 from ..spill_over import spill_over, unchecked
 from . import lmis
-from .sampled_poles import Disc, Edge, damped, within
+from .sampled_poles import PoleDisc, PoleEdge, damped, within
 from .specifications import H2, Hinf, PeakGain, PoleRegion
 
 #: what a verified norm may exceed its bound by
@@ -281,19 +281,19 @@ class _Programs:
             return min(rate, _MOST / speed) if dt else rate
         return float(1.0 - np.exp(-spec.decay * dt)) / speed if dt else spec.decay / speed
 
-    def _region(self, spec: PoleRegion) -> lmis.Region:
+    def _region(self, spec: PoleRegion) -> lmis.PolesHeld:
         """Return the region of z, or of s in the plant's unit of time."""
         speed, dt = self.plant.speed, self.given.dt
         if not dt:
             edges = []
             if spec.damping is not None:
-                edges = [Edge(float(np.sqrt(1.0 - spec.damping**2)), spec.damping, 0.0)]
+                edges = [PoleEdge(float(np.sqrt(1.0 - spec.damping**2)), spec.damping, 0.0)]
             top = None if spec.bandwidth is None else 2 * np.pi * spec.bandwidth / speed
-            return lmis.Region(spec.decay / speed, edges, (), top)
-        discs = [Disc(0.0, float(np.exp(-spec.decay * dt)))]
+            return lmis.PolesHeld(spec.decay / speed, edges, (), top)
+        discs = [PoleDisc(0.0, float(np.exp(-spec.decay * dt)))]
         if spec.bandwidth is not None:
             discs.append(within(2.0 * np.pi * spec.bandwidth * dt))
-        return lmis.Region(0.0, [] if spec.damping is None else damped(spec.damping), discs)
+        return lmis.PolesHeld(0.0, [] if spec.damping is None else damped(spec.damping), discs)
 
     def program(self, v: lmis.Variables, level: Any, unit: float, rate: float) -> list[Any]:
         found = [v.positive(), *self.constraints(v, self.minimize, level, unit, rate)]

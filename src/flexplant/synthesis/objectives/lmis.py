@@ -11,7 +11,7 @@ import scipy.linalg as la
 from ...values import FloatArray
 from ..lmi_plant import Plant
 from ..lmi_programs import modelling, symmetric_blocks
-from .sampled_poles import Disc, Edge
+from .sampled_poles import PoleDisc, PoleEdge
 
 #: strictness of the inequalities, relative to unit scale
 _STRICT = 1e-7
@@ -158,7 +158,7 @@ def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
     return [one >> _STRICT * np.eye(one.shape[0]) for one in (first, second)]
 
 
-def poles(v: Variables, region: Region) -> list[Any]:
+def poles(v: Variables, region: PolesHeld) -> list[Any]:
     """Return the LMIs of a region of poles, in the plant's unit of time."""
     found = []
     if not v.root:
@@ -174,19 +174,19 @@ def poles(v: Variables, region: Region) -> list[Any]:
     return [one >> _STRICT * np.eye(one.shape[0]) for one in found]
 
 
-class Region(NamedTuple):
+class PolesHeld(NamedTuple):
     """Where poles lie: half planes and discs of z, or what bounds continuous ones.
 
     Of a continuous plant an edge is one of s through 0.
     """
 
     decay: float = 0.0
-    edges: Sequence[Edge] = ()
-    discs: Sequence[Disc] = ()
+    edges: Sequence[PoleEdge] = ()
+    discs: Sequence[PoleDisc] = ()
     bandwidth: float | None = None
 
 
-def _disc(v: Variables, disc: Disc) -> Any:
+def _disc(v: Variables, disc: PoleDisc) -> Any:
     """Return ``[-(X + X'), X'; X, radius P] > 0`` with X = A_z - (centre + radius), over t."""
     past = disc.centre + disc.radius - 1.0
     return symmetric_blocks([

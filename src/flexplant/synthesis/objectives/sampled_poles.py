@@ -13,7 +13,7 @@ _ANGLES = (0.0, 0.05, 0.2, 0.6, 1.3)
 _CENTRES, _POINTS = 200, 2000
 
 
-class Edge(NamedTuple):
+class PoleEdge(NamedTuple):
     """The half planes ``x Re z + y |Im z| <= most``."""
 
     x: float
@@ -21,14 +21,14 @@ class Edge(NamedTuple):
     most: float
 
 
-class Disc(NamedTuple):
+class PoleDisc(NamedTuple):
     """``|z - centre| <= radius``."""
 
     centre: float
     radius: float
 
 
-def damped(ratio: float) -> list[Edge]:
+def damped(ratio: float) -> list[PoleEdge]:
     """Return the edges of a polygon in which poles z have at least a damping ratio.
 
     ``z = e^(s dt)`` of that ratio is the spiral ``|z| = e^(-a phi)``, phi = |arg z|,
@@ -43,15 +43,15 @@ def damped(ratio: float) -> list[Edge]:
     last = float(brentq(lambda phi: np.exp(-a * phi) * np.cos(phi) - end, 0.5 * np.pi, leftmost))
     phi = np.array([*_ANGLES, 0.5 * (_ANGLES[-1] + last), last])
     z = np.exp((1j - a) * phi)
-    edges = [Edge(-1.0, 0.0, float(-end))]
+    edges = [PoleEdge(-1.0, 0.0, float(-end))]
     for p, q in pairwise(z):
         normal = -1j * (q - p) / abs(q - p)  # to the right of the way, away from the origin
         most = float((np.conj(normal) * p).real)
-        edges.append(Edge(float(normal.real), float(normal.imag), most))
+        edges.append(PoleEdge(float(normal.real), float(normal.imag), most))
     return edges
 
 
-def within(speed: float) -> Disc:
+def within(speed: float) -> PoleDisc:
     """Return the largest disc in which stable poles z have ``|log z|`` below a speed.
 
     Parameters
@@ -64,4 +64,4 @@ def within(speed: float) -> Disc:
     centres = np.linspace(np.exp(-speed), 1.0, _CENTRES)
     radii = np.min(np.abs(curve - centres[:, None]), axis=1)
     best = int(np.argmax(radii))
-    return Disc(float(centres[best]), float(radii[best]))
+    return PoleDisc(float(centres[best]), float(radii[best]))
