@@ -55,6 +55,19 @@ def test_from_bandwidth_to_margins(rate, rolloff):
         assert abs(fast[1] / fast[0]) < 0.1 * abs(plain[1] / plain[0])
 
 
+@pytest.mark.parametrize("rate", [0.0, 1e4], ids=["continuous", "sampled"])
+def test_a_free_mass_has_one_margin_at_any_bandwidth_and_mass(rate):
+    """Time and gain scale out of 1 / s^2: no state is lost to the units."""
+    margins = []
+    for bandwidth, gain in [(0.1, 1.0), (1.0, 1e-3), (10.0, 1e-3), (1000.0, 1.0)]:
+        if rate and bandwidth > 1.0:  # where the hold lags, the loop is another one
+            continue
+        mass = fx.lti.tf([gain], [1.0, 0.0, 0.0])
+        found = shape_loop(discretized(mass, rate) if rate else mass, bandwidth=bandwidth)
+        margins.append(found.controller.certificate["margin"])
+    np.testing.assert_allclose(margins, margins[0], rtol=1e-3 if rate else 1e-6)
+
+
 @cache
 def two(weight):
     return shape_loop(mechanism(), bandwidth=50.0, model=40.0, weight=weight)

@@ -111,16 +111,29 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
 
 
 def _stabilised(g: StateSpace) -> StateSpace:
-    """Return the system with its poles moved together until it is stable: the same subspaces."""
+    """Return the system with its poles moved together until it is stable: the same subspaces.
+
+    They move by the speed of the system in even units of the states. Much farther out all of them
+    look alike: what zeros near them distinguish in a chain of integrators falls below `tol`.
+    """
     poles = g.poles()
+    eye = np.eye(g.n_states)
     if g.dt:
         radius = float(np.max(np.abs(poles)))
-        return g if radius < 1 and g.is_stable else g.replace(A=g.A / (1.1 * radius + 0.1))
+        if radius < 1 and g.is_stable:
+            return g
+        speed = min(_speed(g, g.A - radius * eye), 0.2)
+        return g.replace(A=g.A / (radius + (speed or 0.2)))
     growth = float(poles.real.max())
     if growth < 0:
         return g
-    speed = float(np.linalg.norm(g.A) / np.sqrt(g.n_states)) or 1.0
-    return g.replace(A=g.A - (growth + speed) * np.eye(g.n_states))
+    return g.replace(A=g.A - (growth + (_speed(g, g.A) or 1.0)) * eye)
+
+
+def _speed(g: StateSpace, A: FloatArray) -> float:
+    """Return the size of A of a system in even units of its states, a root mean square."""
+    d = state_scale(A, g.B, g.C)
+    return float(np.linalg.norm(A * d / d[:, None]) / np.sqrt(g.n_states))
 
 
 def _inverse(size: FloatArray) -> FloatArray:
