@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+import flexplant as fx
 import oracles_updating as oracle
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
@@ -379,6 +380,19 @@ def test_identifiability_names_what_is_missing(chain, plate):
     assert more
     told = MeasuredModes([-1 + 100j] * len(more), modes=more)
     assert identifiability(rom, two, [pair.select([6]), Eigenvalues(told)]).rank > first.rank
+
+
+def test_a_single_parameter_that_no_residual_sees():
+    """The middle of three masses is at rest in mode 2: nothing to compare its column with."""
+    free = fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5])
+    drawing = fx.reduce(fx.solve_modes(free, count=3), fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    poles = [Eigenvalues(MeasuredModes([630j], modes=[2]))]
+    found = identifiability(drawing, [AddedMass("2:x")], poles)
+    assert (found.rank, found.unseen) == (0, ("mass at 2:x",))
+    assert np.isinf(found.std[0])
+    assert found.missing == {"mass at 2:x": (3,)}
+    assert "0 of 1 combinations" in repr(found)
+    assert identifiability(drawing, [AddedMass("1:x")], poles).rank == 1
 
 
 @pytest.mark.slow

@@ -20,6 +20,9 @@ CORRELATED = 0.99
 LOST = 1e-6
 #: modes that are named as missing
 NAMED = 3
+#: a relative change of the data below this part of the relative change of an eigenvalue that the
+#: parameter can cause at most is rounding
+ROUNDING = 1e-12
 #: an eigenvalue that changes by less than this part of what the parts of a combination change it
 #: by does not determine the combination
 CANCELS = 1e-3
@@ -163,9 +166,13 @@ def identifiability(
     own = np.abs(J).max(initial=0.0) * 1e-12
     omega = float(np.median(np.abs(point.eigen.poles))) if point.eigen.poles.size else 1.0
     reach = objective.family.strength(omega)
-    # a column far below what the parameter can do to this model is rounding
+    # a column far below what the parameter can do to this model is rounding: beside the strongest
+    # one, and, as a single one is its own strongest, as a relative change of what is measured
     strongest = float(np.max(length / reach, initial=0.0))
+    whole = objective.size(point)
+    change = np.linalg.norm(J / np.where(whole > 0, whole, 1.0)[:, None], axis=0)
     seen = (length > own) & (length > 1e-9 * strongest * reach)
+    seen &= change > ROUNDING * reach / omega
     scaled = np.where(seen, J / np.where(seen, length, 1.0), 0.0)
     _, s, Vt = np.linalg.svd(scaled, full_matrices=True)
     s = np.concatenate([s, np.zeros(len(names) - s.size)])
