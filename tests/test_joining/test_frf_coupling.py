@@ -93,6 +93,14 @@ def test_what_responses_cannot_say_is_refused():
         fx.joined(frfs, fx.Joint("base/2:z", "frame/1:z"))
     with pytest.raises(ModelError, match="needs places or lever arms"):
         fx.joined(frfs, fx.Joint(("stage", (0, 0, 0)), "frame/1:z"))
+    with pytest.raises(ModelError, match="are one channel"):
+        fx.joined(frfs, fx.Joint("stage/1:z", "stage/1:z"))
+    with pytest.raises(LabelError, match="has no axis 'x': it is along z"):
+        fx.joined(frfs, fx.Joint("stage/1:z", "frame/1:z", axes=["x"]))
+    with pytest.raises(ModelError, match="no place and no name"):
+        fx.joined(frfs, JOINTS, name="machine")
+    with pytest.raises(ModelError, match="mapping of responses by component"):
+        fx.uncoupled(machine(), frfs["frame"], JOINTS)
     with pytest.raises(ModelError, match="frequencies of 'frame' are not those"):
         fx.joined(frfs | {"frame": frfs["frame"].replace(freq=FREQ + 1)}, JOINTS)
     with pytest.raises(ModelError, match="Convert them"):

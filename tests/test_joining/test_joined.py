@@ -314,6 +314,9 @@ def test_slides_and_hinges_are_rigid_body_motions_at_zero():
     m, frame = models["stage"].mass, models["frame"].mass
     pure = np.sqrt(300.0 * (1 / m + 1 / frame)) / (2 * np.pi)
     assert pure < soft.freq[6] < 1.5 * pure
+    # springs of no stiffness hold nothing together
+    loose = fx.joined(models, at_feet("x", stiffness=0.0), placed=placed)
+    assert dict(loose.joining.pieces) == {"stage": 6, "frame": 6}
     # magnets along it: unstable, as a rigid body
     joints = [*at_feet(("y", "z")), *at_feet(("x",), stiffness=-100.0)]
     magnets = fx.joined(models, joints, placed=placed)
@@ -393,6 +396,16 @@ def test_what_is_refused(monkeypatch):
     monkeypatch.setattr(join_module, "_LARGEST", 20)
     with pytest.raises(ModelError, match=r"are too many .* Reduce the large components first"):
         join(models=models | {"stage": rom})
+    with pytest.raises(ModelError, match=r"times as stiff as its components .* joint is rigid"):
+        join(*at_feet(("x", "y", "z"), stiffness=1e21))
+    with pytest.raises(LabelError, match="the end of a joint must be a DOF"):
+        fx.Joint("stage/", "frame/1")
+    with pytest.raises(ModelError, match="it is in radians"):
+        fx.Pose(rotation=(0, 0, 90))
+    with pytest.raises(LabelError, match="node numbers must be whole"):
+        fx.Patch("stage", ["a", "b"])
+    with pytest.raises(LabelError, match="must be different ones"):
+        fx.Patch("stage", [1, 2, 1], weights=[1.0, 2.0, 3.0])
     damped = {"stage": models["stage"].with_damping(fx.Rayleigh(0.0, 1e-6))}
     with pytest.warns(FlexplantWarning, match=re.escape("components ['frame'] have no D")):
         join(models=models | damped)

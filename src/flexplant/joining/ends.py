@@ -9,7 +9,6 @@ import numpy as np
 
 from ..errors import LabelError, unknown_label
 from ..labels import DIRECTIONS
-from ..structure.rigid import rigid_motions
 from ..values import FloatArray
 from .component import Component
 from .patch import Patch, mean_motions
@@ -31,6 +30,8 @@ class JointEnd:
         As in `Joint`.
     size : float [m]
         Of the machine: lever arms below 1e-9 of it are none.
+    motions : sequence of (n, 6) arrays
+        The rigid-body motions of the machine at the DOFs of each component.
 
     Attributes
     ----------
@@ -49,7 +50,9 @@ class JointEnd:
         When there is no such place.
     """
 
-    def __init__(self, parts: Sequence[Component], end: Any, size: float) -> None:
+    def __init__(
+        self, parts: Sequence[Component], end: Any, size: float, motions: Sequence[FloatArray]
+    ) -> None:
         self.text = repr(end) if isinstance(end, Patch) else str(end)
         name = end.component if isinstance(end, Patch) else end[0]
         rest = ""
@@ -59,7 +62,7 @@ class JointEnd:
         if name not in names:
             raise unknown_label("component", name, names)
         self.index, self._size = names.index(name), size
-        self._dofs = parts[self.index].dofs
+        self._dofs, self._motions = parts[self.index].dofs, motions[self.index]
         self.label = ":" in rest
         self.axes: tuple[str, ...]
         if self.label:
@@ -172,7 +175,7 @@ class JointEnd:
     def carried(self, row: FloatArray) -> FloatArray:
         """Return what a row (n,) gives for the six rigid-body motions of the machine (6,)."""
         some = np.flatnonzero(row)
-        return np.asarray(row[some] @ rigid_motions(self._dofs._taken(some)))
+        return np.asarray(row[some] @ self._motions[some])
 
 
 def _split(text: str, names: Sequence[str]) -> tuple[str, str]:

@@ -103,7 +103,8 @@ def uncoupled(machine: Frf, known: Mapping[str, Frf], joints: Iterable[Joint] | 
     True
     """
     instance(machine, Frf, "machine", "Pass the responses of the whole.")
-    instance(known, Mapping, "known", "Pass {'frame': frf}.")
+    if isinstance(known, Frf) or not isinstance(known, Mapping) or not known:
+        raise ModelError("known must be a mapping of responses by component: {'frame': frf}.")
     _same_lines({"the machine": machine, **known})
     ends = _interface(_collocated(machine), known, _listed(joints))
     outputs = [*machine.outputs, *(f"known {name}" for name, _, _ in ends)]

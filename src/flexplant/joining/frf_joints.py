@@ -57,6 +57,8 @@ def frf_links(joints: Sequence[Any], channels: Mapping[str, tuple[str, ...]]) ->
         axes, named = _axes(joint, [str(end) for end in ends], channels)
         for axis, k, c in zip(axes, *joint.values(axes), strict=True):
             sides = [_channel(end, axis, channels) for end in named]
+            if len(set(sides)) < len(sides):
+                raise ModelError(f"both ends of {joint!r} are one channel: it would do nothing.")
             second = sides[1] if len(sides) > 1 else None
             stiffness = None if joint.is_rigid else float(k)
             found.append(FrfLink(sides[0], second, stiffness, float(c)))
@@ -88,6 +90,11 @@ def _channel(end: str, axis: str, channels: Mapping[str, tuple[str, ...]]) -> st
     name, _, rest = end.partition("/")
     if name not in channels:
         raise unknown_label("component", name, channels)
+    if ":" in rest and rest.rpartition(":")[2] != axis:
+        raise LabelError(
+            f"the joint at {end!r} has no axis {axis!r}: it is along {rest.rpartition(':')[2]}. "
+            "Join channels of one direction; of a node, 'stage/41', name axes=[...]."
+        )
     channel = rest if ":" in rest else f"{rest}:{axis}"
     if channel not in channels[name]:
         raise LabelError(

@@ -31,12 +31,12 @@ from .shapes import JoinedShape
 
 #: more coordinates of a machine with reduced components would not fit the memory comfortably
 _LARGEST = 5000
+#: a spring above this many times the stiffness of its components leaves these less than six digits
+_STIFFEST = 1e10
 
 
 @overload
-def joined(
-    components: Mapping[str, Frf], joints: Iterable[Joint] | Joint = (), *, name: str | None = None
-) -> Frf: ...
+def joined(components: Mapping[str, Frf], joints: Iterable[Joint] | Joint = ()) -> Frf: ...
 
 
 @overload
@@ -74,7 +74,7 @@ def joined(
         Where components stand; None: where they were made. Labels and coordinates are those of the
         machine after that.
     name : str, optional
-        For display.
+        Of an FEModel, for display.
 
     Returns
     -------
@@ -90,8 +90,8 @@ def joined(
     LabelError
         When a component, a place or an axis is not there.
     ModelError
-        When a rigid joint would hold the machine against the ground, a component is none, or full
-        matrices would be too large.
+        When a rigid joint would hold the machine against the ground, a component is none, a spring
+        is so stiff that the digits of its components are lost, or full matrices would be too large.
     CertificateError
         When the machine fails its checks.
 
@@ -117,8 +117,10 @@ def joined(
     [1.0, 0.0, 0.0]
     """
     if isinstance(components, Mapping) and _measured(components):
-        if placed is not None:
-            raise ModelError("measured responses have no place: leave placed= out.")
+        if placed is not None or name is not None:
+            raise ModelError(
+                "measured responses have no place and no name: leave placed= and name= out."
+            )
         return joined_frfs(components, joints)
     parts = components_of(components, placed)
     links = links_of(joints, parts)
@@ -126,6 +128,7 @@ def joined(
     rigid = [link for link in links if link.joint.is_rigid]
     soft = [link for link in links if not link.joint.is_rigid]
     B, S = rows_of(rigid, parts), rows_of(soft, parts)
+    _check_stiffness(soft, S, parts)
     done = eliminated(B, _sizes(parts), _owners(parts))
     matrices = _matrices(parts, soft, S, done)
     groups, kept = groups_of(links, len(parts)), done.kept
@@ -146,6 +149,21 @@ def joined(
 
 def _measured(components: Mapping[str, Any]) -> bool:
     return any(isinstance(component, Frf) for component in components.values())
+
+
+def _check_stiffness(soft: Sequence[Link], S: Any, parts: Sequence[Component]) -> None:
+    """Refuse springs beside which the digits of K are lost."""
+    own = np.concatenate([np.abs(part.model.K.diagonal()) for part in parts])
+    for i, link in enumerate(soft):
+        row = S[[i]]
+        there = float(own[row.indices].max(initial=0.0))
+        made = abs(link.stiffness) * float(np.max(row.data**2, initial=0.0))
+        if made > _STIFFEST * there > 0:
+            raise ModelError(
+                f"the spring {link.joint!r} is {made / there:.2g} times as stiff as its components "
+                f"there (limit {_STIFFEST:g}): the digits of their K would be lost beside it. "
+                "Leave stiffness= out: the joint is rigid."
+            )
 
 
 def _sizes(parts: Sequence[Component]) -> FloatArray:

@@ -129,7 +129,9 @@ class Joint(Value):
 
 
 def _checked(end: Any) -> Any:
-    if isinstance(end, Patch) or (isinstance(end, str) and "/" in end):
+    if isinstance(end, Patch):
+        return end
+    if isinstance(end, str) and all(end.partition("/")):
         return end
     if isinstance(end, tuple | list) and len(end) == 2 and isinstance(end[0], str):
         return end[0], tuple(real_array(end[1], "the point of a joint", (3,)).tolist())

@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, LabelError, ModelError
 from ..labels import DIRECTIONS
+from ..structure.rigid import rigid_motions
 from ..values import FloatArray, IntArray, instance
 from .component import Component
 from .ends import JointEnd
@@ -55,6 +56,11 @@ class Link(NamedTuple):
     carried: FloatArray
 
     @property
+    def holds(self) -> bool:
+        """Whether forces go through it: a spring of zero stiffness, to be updated say, has none."""
+        return self.joint.is_rigid or self.stiffness != 0 or self.rate != 0
+
+    @property
     def owners(self) -> tuple[int, ...]:
         """The components it joins."""
         return tuple(end.component for end in self.ends)
@@ -72,7 +78,8 @@ def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
     """
     listed = [joints] if isinstance(joints, Joint) else list(_iterated(joints))
     size = machine_size(parts)
-    return [link for joint in listed for link in _links(joint, parts, size)]
+    motions = [rigid_motions(part.dofs) for part in parts]
+    return [link for joint in listed for link in _links(joint, parts, size, motions)]
 
 
 def machine_size(parts: Sequence[Component]) -> float:
@@ -86,10 +93,12 @@ def _iterated(joints: Any) -> Iterable[Any]:
     return found
 
 
-def _links(joint: Any, parts: Sequence[Component], size: float) -> list[Link]:
+def _links(
+    joint: Any, parts: Sequence[Component], size: float, motions: Sequence[FloatArray]
+) -> list[Link]:
     instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
-    first = JointEnd(parts, joint.first, size)
-    second = None if joint.second is None else JointEnd(parts, joint.second, size)
+    first = JointEnd(parts, joint.first, size, motions)
+    second = None if joint.second is None else JointEnd(parts, joint.second, size, motions)
     axes = _axes(joint, first, second)
     point = first.point if joint.point is None else np.asarray(joint.point, dtype=np.float64)
     if joint.point is None and second is not None and second.is_near(point):

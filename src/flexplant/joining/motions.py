@@ -22,7 +22,7 @@ _NONE = 1e-9
 
 def groups_of(links: Sequence[Link], count: int) -> list[IntArray]:
     """Return the components (from 0) of each part of the machine that joints hold together."""
-    pairs = [link.owners for link in links if len(link.owners) == 2]
+    pairs = [link.owners for link in links if link.holds and len(link.owners) == 2]
     graph = sp.coo_array(
         (np.ones(len(pairs)), ([p[0] for p in pairs], [p[1] for p in pairs])), shape=(count, count)
     )

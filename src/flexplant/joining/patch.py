@@ -7,10 +7,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..dof_columns import node_numbers
 from ..errors import LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
-from ..values import FloatArray, IntArray, Value, instance, real_array
+from ..values import FloatArray, IntArray, Value, instance, real_array, short
 
 #: a singular value of the motions of a patch below this part of the largest is none
 _RANK = 1e-8
@@ -58,7 +59,12 @@ class Patch(Value):
             raise LabelError(
                 "a patch needs nodes=[...] or box=[(x, y, z), (x, y, z)], not both: give one."
             )
-        nodes = None if self.nodes is None else tuple(self.nodes)
+        nodes = None if self.nodes is None else tuple(node_numbers(self.nodes).tolist())
+        if nodes and len(set(nodes)) < len(nodes):
+            raise LabelError(
+                f"nodes of a patch must be different ones, got {short(nodes)}: name each once, "
+                "with the sum of its weights."
+            )
         weights = self.weights
         if weights is not None:
             weights = real_array(weights, "weights of a patch", (len(nodes or ()),))

@@ -34,7 +34,7 @@ class Pose(Value):
     Raises
     ------
     ShapeError, ModelError
-        When R is no rotation: not orthogonal, or a mirror image.
+        When R is no rotation: not orthogonal, or a mirror image; or a turn is beyond 2 pi.
 
     Examples
     --------
@@ -50,6 +50,11 @@ class Pose(Value):
         turn = real_array(self.rotation, "rotation")
         if turn.ndim == 1:
             x, y, z = real_array(turn, "rotation", (3,))
+            if la.norm(turn) > 2 * np.pi:
+                raise ModelError(
+                    f"rotation {turn.tolist()} is more than a whole turn: it is in radians. For "
+                    "degrees, pass numpy.radians([0, 0, 90])."
+                )
             turn = la.expm(np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]))
             turn[np.abs(turn) < _ZERO] = 0.0
         turn = real_array(turn, "rotation", (3, 3))
