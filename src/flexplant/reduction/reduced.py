@@ -15,10 +15,9 @@ from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
 from ..structure import FEModel
 from ..structure.negative_stiffness import refuse_unstable, unstable_stiffness
-from ..structure.placed import SPANNED, missed
-from ..structure.rigid import orthonormalised, rigid_motions
+from ..structure.placed import SPANNED
+from ..structure.rigid import orthonormalised
 from ..values import (
-    ComplexArray,
     FloatArray,
     IntArray,
     Value,
@@ -30,6 +29,7 @@ from .bounds import ErrorBound
 from .judging import quality_of
 from .massless import static_followers
 from .quality import ReductionQuality
+from .spanned import Spanned
 
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
 _DEFINITE = 1e-14
@@ -38,7 +38,7 @@ STATIC = "static "
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class ReducedModel(Value):
+class ReducedModel(Spanned, Value):
     """A reduced structure ``M* q_k'' + D* q_k' + K* q_k = T^T f``, ``q_n = T q_k``.
 
     Parameters
@@ -159,16 +159,6 @@ class ReducedModel(Value):
             f"motions{grows}, cond({self.condition_of}) {self.condition:.3g}{left}>"
         )
 
-    @property
-    def n_dof(self) -> int:
-        """Number of coordinates k."""
-        return int(self.M.shape[0])
-
-    @property
-    def is_physical(self) -> bool:
-        """Whether all coordinates are DOFs of the structure."""
-        return len(self.dofs) == self.n_dof
-
     @cached_property
     def n_unstable(self) -> int:
         """How many rigid-body motions springs of negative stiffness make unstable."""
@@ -179,6 +169,14 @@ class ReducedModel(Value):
         if self.rigid_body.shape[1] == motions.shape[1]:
             return 0
         return int(unstable_stiffness(self.K, motions).size)
+
+    @property
+    def body_motions(self) -> FloatArray:
+        """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
+        if self.joint_motions is not None:
+            return orthonormalised(self.M, self.joint_motions, dependent="drop")
+        made = self.missed_motions() < SPANNED
+        return orthonormalised(self.M, self.rigid_motions()[:, made], dependent="drop")
 
     @property
     def massless(self) -> IntArray:
@@ -284,85 +282,6 @@ class ReducedModel(Value):
         if not self.is_physical:
             phi, dofs = model.expand(phi), model.full_dofs
         return Modes(form.omega, form.zeta, phi, dofs, n_rigid=form.n_rigid)
-
-    def expand(self, q: FloatArray | ComplexArray) -> FloatArray | ComplexArray:
-        """Return the motion ``T q`` of all n DOFs, of motions (k,) or (k, m) of the coordinates.
-
-        Shapes may be complex.
-
-        Raises
-        ------
-        ShapeError
-            When there are not k rows.
-        """
-        if np.iscomplexobj(q):
-            parts = np.asarray(q)
-            return np.asarray(self.expand(parts.real) + 1j * self.expand(parts.imag))
-        shape = (self.n_dof,) if np.ndim(q) == 1 else (self.n_dof, None)
-        return np.asarray(self.T @ real_array(q, "q", shape))
-
-    def row(self, at: Place, direction: str = "z") -> FloatArray:
-        """Return the row (k,) that gives the motion at a place of the full structure.
-
-        Its transpose is the reduced load f* of a unit force there.
-
-        Parameters
-        ----------
-        at : str, (3,) array [m] or mapping
-            A DOF label, a point, or {label: weight}: any of the full structure, not only of the
-            desired DOFs.
-        direction : str
-            The motion at a point.
-
-        Raises
-        ------
-        LabelError
-            When the place is unknown.
-        """
-        return np.asarray(self.full_dofs.row(at, direction) @ self.T)
-
-    def rows(self, points: FloatArray, direction: str = "z") -> FloatArray:
-        """Return the rows (p, k) of the motion at many points (p, 3) [m]; see `row`."""
-        return np.asarray(self.full_dofs.rows(points, direction) @ self.T)
-
-    def inertia(self, motions: FloatArray) -> FloatArray:
-        """Return the loads (k, r) ``M* motions`` of motions (k, r)."""
-        return np.asarray(self.M @ motions)
-
-    def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
-        full = self.full_dofs
-        wanted = rigid_motions(full.replace(xyz=full.xyz - list(about), interpolation=None))
-        return missed(self.T @ self.rigid_motions(about), wanted)
-
-    @property
-    def body_motions(self) -> FloatArray:
-        """The M-orthonormal rigid-body motions (k, r) that T can make, held or not."""
-        if self.joint_motions is not None:
-            return orthonormalised(self.M, self.joint_motions, dependent="drop")
-        made = self.missed_motions() < SPANNED
-        return orthonormalised(self.M, self.rigid_motions()[:, made], dependent="drop")
-
-    def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
-        """Return the coordinates (k, 6) nearest to the six rigid-body motions of the geometry.
-
-        Parameters
-        ----------
-        about : (3,) array [m]
-            The point that rotations turn about.
-
-        Raises
-        ------
-        ShapeError
-            When `about` is no point.
-        """
-        centre = real_array(list(about), "about", (3,))
-        if self.is_physical:
-            dofs = self.dofs
-            return rigid_motions(dofs.replace(xyz=dofs.xyz - centre, interpolation=None))
-        dofs = self.full_dofs
-        wanted = rigid_motions(dofs.replace(xyz=dofs.xyz - centre, interpolation=None))
-        return np.asarray(la.lstsq(self.T, wanted)[0])
 
     def quality(
         self,
