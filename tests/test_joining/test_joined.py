@@ -264,6 +264,36 @@ def test_reduced_components_to_their_truncation():
     assert machine.row(f"right/{label}") == pytest.approx(machine.row(f"left/{node}"))
 
 
+def test_complex_modes_of_plates_on_dampers():
+    """Sparse: light damping is ``phi^T D phi / (2 omega)``, phi by another eigensolver."""
+    half = fx.kirchhoff_plate(size=(0.3, 0.6), thickness=0.02, elements=(16, 32), **PLATE)
+    places = fx.joining.coincident_joints({"left": half, "right": half}, placed=RIGHT)
+    soft = {"stiffness": [1e7, 1e5, 1e5], "rate": [3.0, 0.03, 0.03]}
+    joints = [fx.Joint(joint.first, joint.second, axes=joint.axes, **soft) for joint in places]
+    machine = fx.joined({"left": half, "right": half}, joints, placed=RIGHT)
+    assert sp.issparse(machine.D)
+    modes = fx.solve_modes(machine, count=10)
+    squares, phi = sp.linalg.eigsh(machine.K, 10, machine.M, sigma=-1e4)
+    omega = np.sqrt(squares[3:])
+    np.testing.assert_allclose(modes.omega[3:], omega, rtol=1e-6)
+    share = np.einsum("ij,ij->j", phi[:, 3:], machine.D @ phi[:, 3:])
+    np.testing.assert_allclose(modes.zeta[3:], share / (2 * omega), rtol=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore:component 'stage' .* holds no static shape")
+def test_modes_on_a_spring():
+    """Motions that the spring does not feel leave rounding alone, which is no force."""
+    model = fx.solid_block(size=(0.3, 0.2, 0.05), elements=(3, 2, 1), **SOLID)
+    rom = fx.reduce(fx.solve_modes(model, count=20), fx.ModalTruncation(14))
+    machine = fx.joined({"stage": rom}, fx.Joint("stage/1:z", stiffness=1e5))
+    row = rom.row("1:z")
+    K = np.diag(np.diag(rom.K)) + 1e5 * np.outer(row, row)
+    assert machine.joining.n_rigid == 5
+    assert machine.joining.rigid_force < 1e-12
+    truth = oracles.frequencies(rom.M, K)[5:]
+    np.testing.assert_allclose(machine.modes().freq[5:], truth, rtol=1e-9)
+
+
 def test_a_reduced_machine_is_a_model_like_any():
     """Labels, plants, an update of a joint's stiffness, a machine in a machine."""
     half = plate(2, 0.3)

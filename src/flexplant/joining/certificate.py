@@ -18,6 +18,8 @@ from .links import Link, machine_size, rows_of
 _LIMIT = 1e-7
 #: a rigid-body motion that a reduced component misses by less is one of its own
 _MADE = 1e-8
+#: the part of the largest entry of a motion that counts for the rounding of each
+_ENTRY = 1e-3
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -77,6 +79,7 @@ class JoiningCertificate(Value):
             pieces = f"{len(listed)} pieces ({'; '.join(listed)})"
         independent = f"{self.rank} of {self.constraints} rigid constraints independent"
         errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
+        errors += f", rigid force {self.rigid_force:.1g}"
         head = f"{self.n_rigid} rigid-body motions (alone: {before}), {pieces}"
         text = [f"<JoiningCertificate: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
         text += [f" {name}: compliance to {error:.2g}" for name, error in self.patches.items()]
@@ -162,8 +165,11 @@ def _by_piece(
 
 
 def _force(K: Any, motions: FloatArray) -> float:
+    """Return the largest elastic force of motions (k, r), relative to what cancels in it."""
     force = np.linalg.norm(np.asarray(K @ motions), axis=0)
-    most = np.linalg.norm(np.asarray(abs(K) @ np.abs(motions)), axis=0)
+    # a motion that no spring feels has nothing but rounding of its largest entries there
+    moved = np.abs(motions) + _ENTRY * np.abs(motions).max(axis=0, initial=0.0)
+    most = np.linalg.norm(np.asarray(abs(K) @ moved), axis=0)
     return float(np.max(force / np.where(most > 0, most, 1.0), initial=0.0))
 
 

@@ -25,7 +25,7 @@ _ENTRY = 1e-3
 #: steps after which no more is expected
 _STEPS = 30
 #: part of a correction, beyond the basis, below which it is rounding
-_NEW = 1e-5
+_NEW = 1e-7
 #: more undamped modes than wanted, as a part and at least; and how far beyond a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 
