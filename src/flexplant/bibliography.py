@@ -180,5 +180,7 @@
 .. [Whittle1953] Whittle, The analysis of multiple stationary time series, and Estimation and
    information in stationary time series, Arkiv foer Matematik 2, 1953.
 .. [Young1990] Young, Doyle, Computation of mu with real and complex uncertainties, IEEE CDC, 1990.
+.. [YoungBudynas2002] Young, Budynas, Roark's Formulas for Stress and Strain, 7th ed., McGraw-Hill,
+   2002.
 .. [ZhouDoyleGlover1996] Zhou, Doyle, Glover, Robust and Optimal Control, Prentice Hall, 1996.
 """

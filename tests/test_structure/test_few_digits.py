@@ -12,6 +12,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, ModelError
 from flexplant.structure import FEMatrices, FEModel, Spring
+from flexplant.structure.precision import digits_of
 from meshes import dofs_of, solid
 
 NASTRAN = Path("/work/shared/data/fe/nastran")
@@ -220,3 +221,17 @@ def test_single_precision_in_files(tmp_path, kind):
         with path.open("r+b") as file:
             file.write(b"MATLAB 7.3 MAT-file".ljust(124) + b"\0\2IM")
     assert fx.read_matrices(path).digits == 7
+
+
+def test_entries_show_the_digits_of_a_text():
+    """K read from a text by the user: its entries show the digits, unless they are exact."""
+    exact = plate((16, 12))
+    with pytest.warns(FlexplantWarning, match="rounding of K.s entries to 9 digits"):
+        FEModel(exact.M, text_of(exact.K, 9), dofs=exact.dofs)
+    with pytest.raises(ModelError, match="rounding of K's entries to 6 digits"):
+        FEModel(exact.M, text_of(exact.K, 6), dofs=exact.dofs)
+    # no text: springs of round numbers, and arithmetic in double precision
+    springs = 1e3 * np.arange(1.0, 60.0)
+    assert digits_of(np.diag(springs)) is None
+    assert digits_of(exact.K) is None
+    assert digits_of(np.array([0.0, 1e-300, np.inf])) is None

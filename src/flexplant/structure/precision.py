@@ -22,13 +22,20 @@ _FINE, _COARSE = 3e-12, 1e-4
 _ROWS = 12
 #: a text of this many digits loses nothing of a double
 _ALL_DIGITS = 16
+#: numbers of fewer digits may be exact; of more, rounding is not to be told from arithmetic
+_WRITTEN = range(5, 15)
+#: so many different entries, at least and at most, say with how many digits they were written
+_SAMPLE = (20, 400)
+#: the part of them that needs every digit: of ten last digits one is zero
+_FULL = 0.6
 
 
 def digits_of(given: Any) -> int | None:
-    """Return the decimal digits that entries of this type hold, None for double precision.
+    """Return the decimal digits that entries hold, None for double precision.
 
     Rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
-    digits, in single precision.
+    digits, in single precision. Entries in double precision that came from a text of few digits
+    show it: written with as few digits as tell them from others, none has more.
 
     Parameters
     ----------
@@ -39,12 +46,28 @@ def digits_of(given: Any) -> int | None:
     --------
     >>> digits_of(np.eye(2, dtype=np.float32)), digits_of(np.eye(2))
     (7, None)
+    >>> digits_of([[float(f"{np.sin(i + 9 * j):.5e}") for i in range(9)] for j in range(9)])
+    6
     """
     kind = np.dtype(given.dtype if hasattr(given, "dtype") else np.asarray(given).dtype)
     if kind.kind not in "fc":
         return None
     digits = int(-np.log10(np.finfo(kind).eps / 2))
-    return digits if digits < np.finfo(np.float64).precision else None
+    return digits if digits < np.finfo(np.float64).precision else _written_digits(given)
+
+
+def _written_digits(given: Any) -> int | None:
+    """Return with how many digits some numbers were written, None when that does not show."""
+    entries = np.abs(np.ravel(given.data if hasattr(given, "indptr") else np.asarray(given)).real)
+    step = max(1, entries.size // (20 * _SAMPLE[1]))
+    some = np.unique(entries[::step])
+    some = some[(some > 0) & np.isfinite(some)]
+    if some.size < _SAMPLE[0]:
+        return None
+    chosen = some[:: max(1, some.size // _SAMPLE[1])]
+    count = [len(f"{x!r}".partition("e")[0].replace(".", "").strip("0")) for x in chosen.tolist()]
+    most = max(count)
+    return most if most in _WRITTEN and count.count(most) >= _FULL * len(count) else None
 
 
 def shown_digits(K: Any, dofs: DofSet) -> int | None:

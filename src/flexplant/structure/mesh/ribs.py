@@ -32,11 +32,18 @@ class Rib(Value):
     """A straight beam on a plate, along edges of its elements: bending and St Venant torsion.
 
     A rectangular rib (`width`, `height`) stands on the plate. Its stiffness and inertia are taken
-    about the plate's middle plane, ``I + A e^2`` with its centre at e = (height + thickness) / 2:
-    the plate of this model has no motion in its plane, with which the neutral plane would move up
-    towards the rib. The stiffness is thus an upper bound, good where the plate's section is large
-    against the rib's; a pair of ribs above and below (``eccentricity=0`` and the section of both)
-    is exact.
+    about the plate's middle plane, ``I + A e^2`` with its centre at e = (height + thickness) / 2.
+    The two are one piece: in torsion the rib reaches through the plate, a rectangle of the height
+    ``height + thickness``, which agrees with the tables for T sections.
+
+    The model errs to both sides. The plate has no motion in its plane, with which the neutral plane
+    would move up towards the rib: bending along it is too stiff. The plate under the rib is not
+    stiffened across it: bending across is too soft, the more the wider the rib. Beside solid
+    elements, frequencies of a plate of 300 x 200 x 6 mm with one rib of 10 mm, 6 to 40 mm high,
+    differ by -0.5 to 0.6 % in torsion, by up to 7 % in bending along it and -5 % in bending across;
+    with a width of 20 mm by up to 13 % and -10 %. Use ribs narrower than twice the thickness, or a
+    solid mesh. In a pair of ribs above and below (``eccentricity=0`` and the section of both)
+    bending along it is exact.
 
     Parameters
     ----------
@@ -64,7 +71,8 @@ class Rib(Value):
     References
     ----------
     Torsion of a rectangle: [TimoshenkoGoodier1970]_, sec. 109 (a fit within 0.5 %): ``J = w^3 h
-    (1/3 - 0.21 w/h (1 - (w/h)^4 / 12))`` for w <= h.
+    (1/3 - 0.21 w/h (1 - (w/h)^4 / 12))`` for w <= h. Of a T section: [YoungBudynas2002]_, table
+    10.1, case 26.
 
     Examples
     --------
@@ -123,18 +131,21 @@ class Rib(Value):
             section = f"area {self.area:g} m^2, inertia {self.inertia:g} m^4"
         return f"<Rib {self.start} to {self.end} m, {section}>"
 
-    def section(self, thickness: FloatArray) -> tuple[float, FloatArray, float, FloatArray]:
+    def section(self, thickness: FloatArray) -> tuple[float, FloatArray, FloatArray, FloatArray]:
         """Return area, inertia, torsion and polar inertia about the plate's middle plane."""
         if self.width is not None and self.height is not None:
             w, h = self.width, self.height
-            thin, long = min(w, h), max(w, h)
+            # one that does not stand on the plate is not one piece with it
+            deep = np.full_like(thickness, h)
+            deep += thickness if self.eccentricity is None else 0.0
+            thin, long = np.minimum(w, deep), np.maximum(w, deep)
             q = thin / long
             torsion = thin**3 * long * (1 / 3 - 0.21 * q * (1 - q**4 / 12))
             area, inertia = w * h, w * h**3 / 12
             polar, offset = inertia + h * w**3 / 12, 0.5 * (h + thickness)
         else:
             area, inertia = float(self.area or 0.0), float(self.inertia or 0.0)
-            torsion = float(self.torsion or 0.0)
+            torsion = np.full_like(thickness, float(self.torsion or 0.0))
             polar = inertia if self.polar is None else self.polar
             offset = np.zeros_like(thickness)
         if self.eccentricity is not None:
