@@ -7,7 +7,17 @@ import scipy.sparse.linalg as spla
 
 import oracles_grids as oracle
 from flexplant.errors import LabelError, ModelError, ShapeError
-from flexplant.structure import Disc, FEModel, PlateShape, Rectangle, Rib, Spring
+from flexplant.modes import solve_modes
+from flexplant.structure import (
+    Disc,
+    FEModel,
+    PlateShape,
+    Rectangle,
+    Rib,
+    Spring,
+    kirchhoff_plate,
+    solid_block,
+)
 from plates import make_plate
 
 SIDE, T, E, NU, RHO = 0.6, 0.01, 70e9, 0.3, 2700.0
@@ -107,7 +117,7 @@ def test_functions_of_the_centre_and_arrays_are_the_same():
     two = make_plate(
         elements=(4, 3),
         size=(0.8, 0.5),
-        holes=[Rectangle((0, 0), (0.2, 1 / 6)), Disc((0.5, 0.25), 0.05)],
+        holes={Rectangle((0, 0), (0.2, 1 / 6)), Rectangle((0.4, 1 / 6), (0.6, 1 / 3))},
         thickness=lambda x, y: 0.01 + 0.01 * x * y,
     )
     np.testing.assert_allclose(two.K.toarray(), one.K.toarray(), rtol=1e-12, atol=1e-6)
@@ -116,6 +126,36 @@ def test_functions_of_the_centre_and_arrays_are_the_same():
     )
     assert three.dofs.labels == one.dofs.labels
     assert repr(three.dofs.interpolation) == "<PlateShape 0.8 x 0.5 m, 4 x 3 elements, 2 missing>"
+
+
+@pytest.mark.slow
+def test_a_disc_cuts_elements_by_their_area():
+    """Against a mesh so fine that its staircase does not count."""
+    size, disc = {"size": (0.6, 0.4), "thickness": 0.02}, Disc((0.3, 0.2), 0.1)
+    plate = make_plate(**size, elements=(24, 16), holes=disc)
+    solid = make_plate(**size, elements=(24, 16)).mass
+    assert plate.mass == pytest.approx(solid * (1 - np.pi * 0.1**2 / 0.24), rel=3e-3)
+    fine = make_plate(
+        **size, elements=(120, 80), holes=lambda x, y: np.hypot(x - 0.3, y - 0.2) < 0.1
+    )
+    freq, exact = (solve_modes(model, count=12).freq[3:] for model in (plate, fine))
+    np.testing.assert_allclose(freq, exact, rtol=5e-3)
+
+
+@pytest.mark.slow
+def test_a_rib_twists_as_one_piece_with_its_plate():
+    """The lowest mode of a plate with one rib is torsion: beside the same body of bricks."""
+    material = {"density": 2700, "youngs_modulus": 70e9, "poisson_ratio": 0.33}
+    plate = kirchhoff_plate(
+        size=(0.15, 0.1), thickness=0.006, elements=(30, 20), **material,
+        ribs=Rib((0, 0.05), (0.15, 0.05), width=0.01, height=0.01),
+    )  # fmt: skip
+    body = solid_block(
+        size=(0.15, 0.1, 0.016), elements=(30, 20, 8), **material,
+        holes=lambda x, y, z: z > 0.006 and abs(y - 0.05) > 0.005,
+    )  # fmt: skip
+    found, exact = solve_modes(plate, count=4).freq[3], solve_modes(body, count=7).freq[6]
+    assert found == pytest.approx(exact, rel=0.02)
 
 
 @pytest.mark.parametrize("direction", ["z", "rx", "ry"])

@@ -21,7 +21,7 @@ Field: TypeAlias = "float | Sequence[Any] | FloatArray | Callable[..., float]"
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rectangle(Value):
-    """A rectangular hole: elements whose centre is inside are missing.
+    """A rectangular hole: the part of each element that is inside is missing.
 
     Parameters
     ----------
@@ -62,7 +62,7 @@ class Rectangle(Value):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Disc(Value):
-    """A round hole: elements whose centre is inside are missing.
+    """A round hole: the part of each element that is inside is missing.
 
     Parameters
     ----------
@@ -101,6 +101,11 @@ class Disc(Value):
 
 
 Hole = Rectangle | Disc
+
+#: elements with less than this part of their area outside all holes are missing
+_LEAST = 0.02
+#: points along each side of an element: to see whether a hole's edge cuts it, and its area
+_FEW, _MANY = 3, 20
 
 
 def lengths_of(size: Any, count: int) -> tuple[float, ...]:
@@ -257,7 +262,34 @@ def _missing(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any
             f"holes must be Rectangle and Disc values, a mask of the elements or a function of an "
             f"element's centre, got {short(holes)}. Rectangle((0.1, 0.1), (0.2, 0.2)), say."
         )
-    return np.any([hole.holds(centres) for hole in listed], axis=0)
+    return _shares(listed, lengths, counts) < _LEAST
+
+
+def share_of(holes: Any, lengths: Sequence[float], counts: Sequence[int]) -> Any:
+    """Return the part of the area of each element (ny, nx) outside all holes, 1 when uncut."""
+    listed = [holes] if isinstance(holes, Hole) else holes
+    if not isinstance(listed, Sequence) or not all(isinstance(hole, Hole) for hole in listed):
+        return 1.0
+    return _shares(listed, lengths, counts).reshape(tuple(counts[::-1])) if listed else 1.0
+
+
+def _shares(holes: Sequence[Hole], lengths: Sequence[float], counts: Sequence[int]) -> FloatArray:
+    """Return the part of the area of each element (elements,) outside all holes."""
+    steps = np.array(lengths) / counts
+    corners = centres_of(lengths, counts) - 0.5 * steps
+
+    def outside(some: FloatArray, number: int) -> FloatArray:
+        line = (np.arange(number) + 0.5) / number
+        points = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2) * steps
+        every = (some[:, None] + points).reshape(-1, 2)
+        held = np.any([hole.holds(every) for hole in holes], axis=0)
+        return np.asarray(1.0 - held.reshape(some.shape[0], -1).mean(axis=1))
+
+    found = outside(corners, _FEW)
+    cut = np.flatnonzero((found > 0) & (found < 1))
+    if cut.size:
+        found[cut] = outside(corners[cut], _MANY)
+    return found
 
 
 def dofs_of(
