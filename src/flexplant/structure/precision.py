@@ -22,7 +22,7 @@ _FINE, _COARSE = 3e-12, 1e-4
 _ROWS = 12
 #: a text of this many digits loses nothing of a double
 _ALL_DIGITS = 16
-#: numbers of fewer digits may be exact; of more, rounding is not to be told from arithmetic
+#: numbers of fewer digits may be exact; those of more cannot be distinguished from computed ones
 _WRITTEN = range(5, 15)
 #: so many different entries, at least and at most, say with how many digits they were written
 _SAMPLE = (20, 400)
@@ -35,7 +35,7 @@ def digits_of(given: Any) -> int | None:
 
     Rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
     digits, in single precision. Entries in double precision that came from a text of few digits
-    show it: written with as few digits as tell them from others, none has more.
+    show it: written with as few digits as distinguish them, none has more.
 
     Parameters
     ----------
