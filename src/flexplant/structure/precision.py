@@ -58,7 +58,9 @@ def digits_of(given: Any) -> int | None:
 
 def _written_digits(given: Any) -> int | None:
     """Return with how many digits some numbers were written, None when that does not show."""
-    entries = np.abs(np.ravel(given.data if hasattr(given, "indptr") else np.asarray(given)).real)
+    columns: Any = sp.csc_array
+    held: Any = columns(given).data if sp.issparse(given) else np.ravel(given)
+    entries = np.abs(held.real)
     step = max(1, entries.size // (20 * _SAMPLE[1]))
     some = np.unique(entries[::step])
     some = some[(some > 0) & np.isfinite(some)]
