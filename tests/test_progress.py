@@ -182,6 +182,7 @@ def test_the_outermost_work_has_the_bar(monkeypatch, capsys):
 
 def test_what_compiled_code_does_not_look_for():
     """A program of semidefinite matrices is left at once; results and errors come through."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # test workers ignore it
     started, over = threading.Event(), threading.Event()
 
     def program():
@@ -193,9 +194,12 @@ def test_what_compiled_code_does_not_look_for():
         os.kill(os.getpid(), signal.SIGINT)
 
     threading.Thread(target=interrupt, daemon=True).start()
-    with pytest.raises(KeyboardInterrupt):
-        interruptible(program)
-    over.set()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            interruptible(program)
+    finally:
+        signal.signal(signal.SIGINT, before)
+        over.set()
     assert interruptible(lambda: 3) == 3
     with pytest.raises(ZeroDivisionError):
         interruptible(lambda: 1 // 0)

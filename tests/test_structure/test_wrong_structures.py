@@ -118,8 +118,9 @@ CALLS = [
     *(
         (name, getattr(io, name), ("text",))
         for name in sorted(vars(io))
-        if name.startswith("read_")
+        if name.startswith("read_") and name != "read_modes"
     ),
+    ("read_modes", lambda x: io.read_modes(x, zeta=0.01), ("text",)),
     ("read_model units", lambda x: fx.read_model("a.mtx", units=x), ()),
 ]  # fmt: skip
 
