@@ -191,6 +191,7 @@ def table(result: dict[str, Any]) -> str:
 def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     """Draw the distributions of bandwidth and error, both ways."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import PercentFormatter
 
     figure, axs = plt.subplots(1, 3, figsize=(13, 4), layout="constrained")
     figure.suptitle("Machines that differ: one controller for all, and one for each")
@@ -204,10 +205,10 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
         strict=True,
     ):
         for (name, one), role in zip(result["tables"].items(), ("nominal", "model"), strict=True):
-            values = np.sort(scale * one[column][one["stable"]])
-            share = np.arange(1, values.size + 1) / values.size
-            ax.step(values, 100.0 * share, where="post", label=name, **fx.plot.STYLES[role])
-        ax.set(xlabel=label, ylabel="machines below [%]", ylim=(0.0, 102.0))
+            values = scale * one[column][one["stable"]]
+            ax.ecdf(values, label=name, **fx.plot.STYLES[role])
+        ax.set(xlabel=label, ylabel="machines below", ylim=(0.0, 1.02))
+        ax.yaxis.set_major_formatter(PercentFormatter(1.0))
         ax.grid(alpha=0.3)
     axs[1].set_xscale("log")
     axs[1].set_xticks([5, 10, 20, 50], ["5", "10", "20", "50"])

@@ -168,7 +168,7 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
         axs[0].loglog(one.frequencies, one.bounds, ".", ms=3, color=color)
         axs[0].axhline(one.upper, color=color, label=f"{name}: proven at all frequencies")
     axs[0].axhline(1.0, label="uncertainty of the fit", **fx.plot.STYLES["bound"])
-    axs[0].set(title="robust stability", xlabel="frequency [Hz]", ylabel="mu from above",
+    axs[0].set(title="robust stability", xlabel="frequency [Hz]", ylabel="upper bound of mu [1]",
                xlim=(80.0, 5e3), ylim=(1e-3, 30.0))  # fmt: skip
     freq = np.geomspace(5.0, 4e3, 1500)
     for name, loop, color in (
@@ -179,14 +179,15 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
         wide = {"lw": 4.0, "alpha": 0.4} if loop is found["loop"] else {"lw": 1.2}
         axs[1].loglog(freq, gain, color=color, label=name, **wide)
     axs[1].axhline(worst.upper, label="bound on every machine", **fx.plot.STYLES["bound"])
-    axs[1].set(title="from set-point to error", xlabel="frequency [Hz]", ylim=(1e-3, 4.0))
+    axs[1].set(title="from set-point to error", xlabel="frequency [Hz]",
+               ylabel="|error / set-point| [1]", ylim=(1e-2, 4.0))  # fmt: skip
     nominal, bad = found["runs"]["nominal"], found["runs"]["worst"]
     within = nominal.time <= 0.2
     difference = 1e9 * (bad["die:error"] - nominal["die:error"])[within]
-    axs[2].plot(nominal.time[within], difference, **fx.plot.STYLES["difference"])
+    axs[2].plot(1e3 * nominal.time[within], difference, **fx.plot.STYLES["difference"])
     largest = 1e6 * np.max(np.abs(nominal["die:error"]))
     axs[2].set(title=f"worst machine less nominal, whose error is {largest:.0f} µm",
-               xlabel="time [s]", ylabel="difference of error [nm]")  # fmt: skip
+               xlabel="time [ms]", ylabel="difference of error [nm]")  # fmt: skip
     for ax in axs:
         ax.grid(alpha=0.3)
     for ax in axs[:2]:

@@ -98,7 +98,7 @@ class KalmanEstimator(Value):
             )
         return (
             f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
-            f"spectral radius {self.certificate.spectral_radius:.6f};\n"
+            f"spectral radius {self.certificate.spectral_radius:.6f}\n"
             f"  rms error {rms} ({counted})>"
         )
 

@@ -94,7 +94,7 @@ class InputEstimator(Value):
         late = "in their own sample" if not self.delay else f"{self.delay} sample late"
         return (
             f"<InputEstimator: {self.system.n_states} states, inputs {late}, spectral radius "
-            f"{self.certificate.spectral_radius:.6f};\n  rms error {rms}>"
+            f"{self.certificate.spectral_radius:.6f}\n  rms error {rms}>"
         )
 
     def rms(self, channel: str) -> float:

@@ -80,4 +80,4 @@ def _origin(seeds: Mapping[str, Any] | None) -> Chapter:
     """Return the section of versions and seeds."""
     rows = [[f"seed of {name}", short(seed)] for name, seed in (seeds or {}).items()]
     rows += [list(pair) for pair in versions().items()]
-    return Chapter("Versions", table(["", ""], rows))
+    return Chapter("Versions", table(["", ""], rows, words=True))

@@ -62,13 +62,15 @@ def _resource(name: str) -> str:
     return (files(__package__) / name).read_text(encoding="utf-8")
 
 
-def table(head: Iterable[str], rows: Iterable[Sequence[str]], caption: str = "") -> str:
-    """Return a table; a cell that begins with a digit or sign stands to the right."""
+def table(
+    head: Iterable[str], rows: Iterable[Sequence[str]], caption: str = "", *, words: bool = False
+) -> str:
+    """Return a table; but in one of words a cell that begins with a digit or sign stands right."""
     top = "".join(f'<th scope="col">{escape(cell)}</th>' for cell in head)
     lines = "".join(
         "<tr>"
         f'<th scope="row">{escape(first)}</th>'
-        + "".join(f"<td{_aligned(cell)}>{escape(cell)}</td>" for cell in rest)
+        + "".join(f"<td{'' if words else _aligned(cell)}>{escape(cell)}</td>" for cell in rest)
         + "</tr>\n"
         for first, *rest in rows
     )

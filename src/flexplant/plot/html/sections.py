@@ -53,6 +53,13 @@ _CHANNELS = 9
 #: parameters of an update that are drawn, each by itself
 _PARAMETERS = 6
 
+#: what numbers of a Kalman filter's certificate are, where their names alone do not say it
+_WORDS = {
+    "difference": "difference between two ways to the variances",
+    "left_out": "modes left out, counted as noise",
+    "unresolved": "share of a variance from modes the mesh hardly resolves",
+}
+
 Picture = tuple[str, Callable[[], Any]]
 
 
@@ -194,7 +201,8 @@ def certificates(design: Design) -> Chapter | None:
     rows = []
     for name, value in design.named.items():
         for what, number in _verified(value):
-            rows.append([name, what.replace("_", " "), figure(what, number)])
+            plain = _WORDS.get(what, what.replace("_", " "))
+            rows.append([name, plain, figure(what, number)])
     if not rows:
         return None
     return Chapter("Certificates", table(["value", "verified by another computation", ""], rows))
@@ -214,7 +222,7 @@ def _verified(value: Any) -> Iterator[tuple[str, Any]]:
         yield "modulus margin", value.modulus_margin
         if value.left_out is not None:
             yield from value.left_out.certificate.items()
-    if isinstance(value, UpdateResult) and value.covariance is not None:
+    if isinstance(value, UpdateResult) and value.chi2 is not None:
         yield "chi-square of the fit", value.chi2
         yield "its degrees of freedom", value.dof
     if isinstance(value, Placement):
