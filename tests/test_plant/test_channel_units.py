@@ -71,6 +71,9 @@ def test_units_travel_with_the_channels(tmp_path):
     assert fx.loop.control_sensitivity((measured, loop)).unit("u1", "y1") == "N/m"
     assert "0 dB = 1 N/m" in fx.plot.frf({"KS": KS}, "u1", "y1").get_ylabel()
     assert "0 dB = 1]" in fx.plot.frf({"S": S}, "y1", "y1").get_ylabel()
+    # the controller takes m and rad: of its gains together only "SI units" is true
+    assert "0 dB = 1 in SI units]" in fx.plot.singular_values(servo.system).get_ylabel()
+    assert "0 dB = 1 N/m]" in fx.plot.singular_values(KS).get_ylabel()
     run = fx.simulate(loop, duration=0.01, rng=1)
     assert [run.units[n] for n in ("die:z", "die:rx", "u1", "die:rx:hat", "y1")] == [
         "m", "rad", "N", "rad", "m"

@@ -121,6 +121,12 @@ def shared_unit(response: Frf) -> str | None:
     return units.pop() if len(units) == 1 else None
 
 
+def shared_reference(response: Frf) -> str:
+    """Return what 0 dB is for all gains together: of unlike units, 1 in SI units."""
+    alike = len({response.unit(*channel) for channel in response}) == 1
+    return reference_of(shared_unit(response)) if alike else "1 in SI units"
+
+
 def reference_of(unit: str | None) -> str:
     """Return what 0 dB is: one of the unit of a gain."""
     return "1" if unit in (None, "1") else f"1 {unit}"

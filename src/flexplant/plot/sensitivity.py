@@ -18,7 +18,7 @@ from ..lti.statespace import as_statespace
 from ..values import FloatArray, real_array, short
 from ._axes import axes, finish, legend
 from ._style import GREY, STYLES, Style, styles
-from .gains import decibel, readable, reference_of, shared_unit
+from .gains import decibel, readable, shared_reference
 
 #: what weights limit
 _LIMITED = ("S", "T", "KS")
@@ -158,7 +158,7 @@ def sensitivities(
             readable(panel)
         else:
             _levels(panel)
-        unit = f", 0 dB = {reference_of(shared_unit(found[0]))}" if what == "KS" else ""
+        unit = f", 0 dB = {shared_reference(found[0])}" if what == "KS" else ""
         finish(panel, x="frequency [Hz]" if what == "KS" else "", y=f"|{what}| [dB{unit}]")
         legend(panel, given=ax is not None)
     first: Axes = panels[0]

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 
 from ..values import FloatArray
 from ._axes import axes, finish, legend
-from .gains import curves, decibel, readable, reference_of, shared_unit
+from .gains import curves, decibel, readable, shared_reference
 
 
 def singular_values(
@@ -56,8 +56,8 @@ def singular_values(
             ax.fill_between(
                 curve.response.freq, smallest, largest, color=curve.line["color"], alpha=0.12
             )
-    unit = shared_unit(drawn[0].response)
+    reference = shared_reference(drawn[0].response)
     readable(ax)
     if any(curve.label for curve in drawn):
         legend(ax, given=given)
-    return finish(ax, x="frequency [Hz]", y=f"singular values [dB, 0 dB = {reference_of(unit)}]")
+    return finish(ax, x="frequency [Hz]", y=f"singular values [dB, 0 dB = {reference}]")
