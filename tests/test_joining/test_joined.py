@@ -264,6 +264,7 @@ def test_reduced_components_to_their_truncation():
     assert machine.row(f"right/{label}") == pytest.approx(machine.row(f"left/{node}"))
 
 
+@pytest.mark.slow
 def test_complex_modes_of_plates_on_dampers():
     """Sparse: light damping is ``phi^T D phi / (2 omega)``, phi by another eigensolver."""
     half = fx.kirchhoff_plate(size=(0.3, 0.6), thickness=0.02, elements=(16, 32), **PLATE)
@@ -326,6 +327,21 @@ def test_a_reduced_machine_is_a_model_like_any():
     assert "machine/left/1:z" in outer.full_dofs
     assert outer.full_dofs.components == ("machine/left", "machine/right", "wafer")
     assert outer.modes().n_rigid == 5
+
+
+def test_a_node_of_a_machine_in_a_machine():
+    """By the name of its component, also where it follows another node; a number is not enough."""
+    part = fx.chain(masses=[1.0, 2.0], stiffnesses=[1e6])
+    inner = fx.joined({"a": part, "b": part}, fx.Joint("a/2", "b/1"))
+    for node in ("a/1", "b/1"):
+        first, second = (
+            fx.joined({"m": inner, "c": part}, fx.Joint(f"m/{node}{axis}", f"c/1{axis}"))
+            for axis in ("", ":x")
+        )
+        assert first.dofs.labels == second.dofs.labels
+        np.testing.assert_array_equal(first.K.toarray(), second.K.toarray())
+    with pytest.raises(LabelError, match="no node '2' for the joint at 'm/2'"):
+        fx.joined({"m": inner, "c": part}, fx.Joint("m/2", "c/1"))
 
 
 def test_slides_and_hinges_are_rigid_body_motions_at_zero():

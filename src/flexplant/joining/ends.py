@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -80,18 +81,21 @@ class JointEnd:
         self.axes = tuple(axis for axis in DIRECTIONS if axis in self._rows)
 
     def _at_node(self, node: str) -> None:
-        rows = np.zeros(0, dtype=np.int64)
-        if node.lstrip("-").isdigit():
-            rows = np.flatnonzero(self._dofs.nodes == int(node))
-        if not rows.size:
+        dofs, self._rows = self._dofs, {}
+        if dofs.component_of is None and node.lstrip("-").isdigit():
+            for row in np.flatnonzero(dofs.nodes == int(node)):
+                self._rows[dofs.directions[row]] = _unit(len(dofs), row)
+                self.point = np.asarray(dofs.xyz[row])
+        else:  # of a machine: "frame/41", of which DOFs may follow others
+            for axis in DIRECTIONS:
+                with suppress(LabelError):
+                    self._rows[axis] = dofs.row(f"{node}:{axis}")
+                    self.point = np.asarray(dofs.location(f"{node}:{axis}"))
+        if not self._rows:
             raise LabelError(
-                f"no node {node!r} for the joint at {self.text!r}: {self._dofs!r}. "
+                f"no node {node!r} for the joint at {self.text!r}: {dofs!r}. "
                 "dofs.nearest((x, y, z)) finds one by its place."
             )
-        self.point = np.asarray(self._dofs.xyz[rows[0]])
-        self._rows = {}
-        for row in rows:
-            self._rows[self._dofs.directions[row]] = _unit(len(self._dofs), row)
 
     def _at_patch(self, patch: Patch) -> None:
         self.point = patch.point(self._dofs)
