@@ -124,6 +124,8 @@ def _form(shape: tuple[int | None, ...]) -> str:
     """Return in words what a shape requires."""
     if not shape:
         return "be one number"
+    if shape == (None, None):
+        return "be a matrix, of shape (rows, columns)"
     sizes = ", ".join("any" if n is None else str(n) for n in shape)
     return f"have shape ({sizes}{',' if len(shape) == 1 else ''})"
 

@@ -96,6 +96,16 @@ def test_singular_values():
     np.testing.assert_allclose(low.get_ydata(), 20 * np.log10(sizes[:, 1]), rtol=1e-9)
 
 
+def test_systems_may_stand_in_a_list():
+    g = system()
+    for draw in (fx.plot.bode, fx.plot.singular_values, fx.plot.step, fx.plot.pole_map):
+        legends = [ax.get_legend() for ax in draw([g, 2.0 * g]).figure.axes]
+        words = [text.get_text() for one in legends if one for text in one.get_texts()]
+        assert [w.startswith("system 1") for w in words].count(True) == 1, draw.__name__
+        with pytest.raises(ModelError, match="nothing to draw"):
+            draw([])
+
+
 @pytest.mark.parametrize("rate", [0.0, 1e4])
 def test_poles_by_frequency_and_damping(rate):
     g = machine(n_rigid=1, n_elastic=4, m=1, p=1)

@@ -34,7 +34,7 @@ def bode(
 
     Parameters
     ----------
-    systems : StateSpace, Frf, or mapping {label: one of these}
+    systems : StateSpace, Frf, or mapping {label: one of these} or list of them
         What to draw; several share their axes. Systems of python-control and SciPy too.
     outputs, inputs : str or sequence of str, optional
         Channels of the first one; all when not given. Others are drawn by the same names.

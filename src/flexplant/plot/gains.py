@@ -28,10 +28,28 @@ class Curve(NamedTuple):
     line: Style
 
 
+def labelled(found: Any) -> dict[str, Any]:
+    """Return what to draw by label: of a mapping, a list of systems (numbered from 1), or one.
+
+    Raises
+    ------
+    ModelError
+        When there is nothing in it.
+    """
+    numbers = (int, float, list, tuple)  # of a static gain
+    if isinstance(found, list | tuple) and not any(isinstance(one, numbers) for one in found):
+        found = {f"system {k}": one for k, one in enumerate(found, 1)}
+    several = isinstance(found, Mapping) and not isinstance(found, Frf)
+    named = {str(label): one for label, one in found.items()} if several else {"": found}
+    if not named:
+        raise ModelError("there is nothing to draw: the mapping or list is empty.")
+    return named
+
+
 def curves(
     found: Any, freq: FloatArray | None = None, colors: Mapping[str, str] | None = None
 ) -> list[Curve]:
-    """Return what to draw of a system, an Frf, or a mapping {label: one of these}.
+    """Return what to draw of a system, an Frf, or a mapping {label: one of these} or list.
 
     Systems are evaluated at `freq`; when it is not given, on their own grids.
 
@@ -40,10 +58,7 @@ def curves(
     ModelError
         When it is none of these, or a mapping without entries.
     """
-    several = isinstance(found, Mapping) and not isinstance(found, Frf)
-    named = {str(label): one for label, one in found.items()} if several else {"": found}
-    if not named:
-        raise ModelError("there is nothing to draw: the mapping is empty.")
+    named = labelled(found)
     measured = [label for label, one in named.items() if _is_measured(label, one)]
     modelled = iter(styles([label for label in named if label not in measured], colors))
     drawn = []

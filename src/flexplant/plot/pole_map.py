@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -13,6 +12,7 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..values import ComplexArray, FloatArray
 from ._axes import axes, finish, legend
 from ._style import GREY, RED, styles
+from .gains import labelled
 
 #: markers of poles and zeros, one of each for a system
 _MARKERS = (("x", "o"), ("+", "s"), ("1", "D"), ("2", "^"))
@@ -29,7 +29,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
 
     Parameters
     ----------
-    systems : StateSpace, or mapping {label: StateSpace}
+    systems : StateSpace, or mapping {label: StateSpace} or list of them
         Whose poles are drawn as crosses.
     zeros : bool
         Whether invariant zeros are drawn too, as circles.
@@ -54,8 +54,8 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
     True
     """
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
-    named = dict(systems) if isinstance(systems, Mapping) else {"": systems}
-    looks = styles(str(label) for label in named)
+    named = labelled(systems)
+    looks = styles(named)
     for i, (label, one) in enumerate(named.items()):
         g, color = as_statespace(one), str(looks[i]["color"])
         pole, zero = _MARKERS[i % len(_MARKERS)]

@@ -22,7 +22,7 @@ def singular_values(
 
     Parameters
     ----------
-    systems : StateSpace, Frf, or mapping {label: one of these}
+    systems : StateSpace, Frf, or mapping {label: one of these} or list of them
         What to draw.
     freq : (n_freq,) array [Hz], optional
         Where systems are evaluated; a grid of each, refined at resonances, when not given.

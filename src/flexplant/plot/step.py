@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -17,6 +17,7 @@ from ..lti.statespace import StateSpace, as_statespace
 from ..values import FloatArray, name_list, positive
 from ._axes import finish, legend, named, shown_in
 from ._style import styles
+from .gains import labelled
 
 #: channels for which a grid of panels can still be read
 _MOST = 36
@@ -40,7 +41,7 @@ def step(
 
     Parameters
     ----------
-    systems : StateSpace, ClosedLoop, or mapping {label: one of these}
+    systems : StateSpace, ClosedLoop, or mapping {label: one of these} or list of them
         What to draw; several share their axes. Systems of python-control and SciPy too.
     outputs, inputs : str or sequence of str, optional
         Channels of the first one; all when not given. Others are drawn by the same names.
@@ -67,11 +68,7 @@ def step(
     >>> fx.plot.step(fx.lowpass(10.0)).get_xlabel()
     'time [ms]'
     """
-    several = isinstance(systems, Mapping)
-    found = {str(k): as_statespace(g) for k, g in systems.items()} if several else {"": systems}
-    found = {label: as_statespace(g) for label, g in found.items()}
-    if not found:
-        raise ModelError("there is nothing to draw: the mapping is empty.")
+    found = {label: as_statespace(g) for label, g in labelled(systems).items()}
     first = next(iter(found.values()))
     rows = list(first.outputs if outputs is None else name_list(outputs, "outputs"))
     columns = list(first.inputs if inputs is None else name_list(inputs, "inputs"))
@@ -90,7 +87,7 @@ def step(
                 _draw(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
     for panel in panels[:-1].ravel():
         panel.set_xlabel("")
-    if several:
+    if any(found):
         legend(panels[0, -1], given=ax is not None)
     shown: Axes = panels[0, 0]
     return shown
