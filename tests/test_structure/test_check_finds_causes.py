@@ -128,6 +128,18 @@ def test_rounding_of_entries_is_measured_and_freed(model, size):
     assert not [found for found in fx.check(matrices(model, K=bed)).lines if found[1] == "digits"]
 
 
+def test_what_rounding_holds_is_said_as_the_model_says_it():
+    plate = MODELS["plate"]
+    exact = matrices(plate).replace(digits=10)
+    assert line(fx.check(exact), "digits")[2] == "10 digits are enough"
+    rounded = exact.replace(K=with_noise(plate.K, 1e-10))
+    found = line(fx.check(rounded), "digits")
+    assert (found[0], found[2][:27]) == ("note", "3 of its rigid-body motions")
+    with pytest.warns(fx.FlexplantWarning) as said:
+        rounded.model()
+    assert found[2] in str(said[0].message)
+
+
 def test_modes_of_a_rounded_stiffness_say_so():
     plate = MODELS["plate"]
     with pytest.raises(SolverError, match="carry too few digits"):

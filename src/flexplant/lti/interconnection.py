@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..values import FloatArray
+from ..values import FloatArray, name_list
 from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
@@ -285,9 +285,9 @@ def connect(
     parts = [as_statespace(sys) for sys in systems]
     produced = [name for part in parts for name in part.outputs]
     needed = [name for part in parts for name in part.inputs]
-    outer = list(inputs)
+    outer, outputs = name_list(inputs, "inputs"), name_list(outputs, "outputs")
     known = [*produced, *outer]
-    may_add = set(adding)
+    may_add = set(name_list(adding, "adding"))
     for name in sorted({n for n in known if known.count(n) > 1} - may_add):
         raise LabelError(
             f"{name!r} is driven {known.count(name)} times: two blocks (or a block and an outer "

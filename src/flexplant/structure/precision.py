@@ -157,10 +157,15 @@ def held_by_rounding(
     nearly = nearly_free(K, M, dofs, digits).shape[1]
     if found is not None and force_free(M, K, found):
         nearly -= found.shape[1]
-    if nearly <= 0:
+    return held_motions(nearly, digits)
+
+
+def held_motions(count: int, digits: int) -> str | None:
+    """Return what to say of some rigid-body motions that rounding holds, None when it is none."""
+    if count <= 0:
         return None
     return (
-        f"{nearly} of its rigid-body motions are held by nothing but the rounding of K's entries "
+        f"{count} of its rigid-body motions are held by nothing but the rounding of K's entries "
         f"to {digits} digits, and modes at or below 0 would follow. Export in double precision, or "
         "free them: FEMatrices(K, M, dofs=dofs).model(free=True), read_model(..., free=True)."
     )

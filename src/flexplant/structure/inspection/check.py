@@ -11,7 +11,8 @@ from ...errors import ModelError
 from ...values import FloatArray, Value
 from ..matrices import FEMatrices
 from ..model import FEModel
-from ..precision import verdict
+from ..precision import held_motions, verdict
+from ..zero_energy import nearly_free
 from .check_facts import Facts, facts
 from .check_lines import Line, listed, masses, matrices, rigid, scales, spread, zero_rows
 
@@ -213,7 +214,20 @@ def _digits(found: Facts) -> list[Line]:
                 ),
             )
         ]
-    if said is None:
-        return [("ok", "digits", f"{digits} digits are enough", "")]
-    text, _, following = said.partition(" Export")
-    return [("note", "digits", text, f"export{following}")]
+    notes: list[Line] = []
+    for one in (said, _held(found, digits)):
+        if one:
+            text, _, following = one.partition(" Export")
+            notes.append(("note", "digits", text, f"export{following}"))
+    return notes or [("ok", "digits", f"{digits} digits are enough", "")]
+
+
+def _held(found: Facts, digits: int) -> str | None:
+    """Return what `FEMatrices.model` warns of, where rounding alone holds rigid-body motions."""
+    given = found.given
+    if given.dofs is None or not given.located or found.motions is None:
+        return None
+    nearly, exactly = (
+        nearly_free(given.K, given.M, given.dofs, of).shape[1] for of in (digits, None)
+    )
+    return held_motions(nearly - exactly, digits)
