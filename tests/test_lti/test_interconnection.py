@@ -144,11 +144,11 @@ def test_connect(seed):
 
 
 def test_connect_adds_where_allowed():
-    one = as_statespace([[2.0]]).replace(inputs=["a"], outputs=["u"])
-    two = as_statespace([[3.0]]).replace(inputs=["b"], outputs=["u"])
-    with pytest.raises(LabelError, match="'u' is driven 2 times"):
-        connect([one, two], ["a", "b"], ["u"])
-    both = connect([one, two], ["a", "b"], ["u"], adding=["u"])
+    one = as_statespace([[2.0]]).replace(inputs=["a"], outputs=["sum"])
+    two = as_statespace([[3.0]]).replace(inputs=["b"], outputs=["sum"])
+    with pytest.raises(LabelError, match="'sum' is driven 2 times"):
+        connect([one, two], ["a", "b"], ["sum"])
+    both = connect([one, two], ["a", "b"], "sum", adding="sum")  # one name is no list of letters
     np.testing.assert_array_equal(both.D, [[2.0, 3.0]])
 
 

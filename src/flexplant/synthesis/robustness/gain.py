@@ -132,8 +132,11 @@ def worst_case_gain(
     listed = [*loop.blocks, FullBlock(m, p, name="performance")]
     inside = np.zeros(len(listed), dtype=bool)
     inside[-1] = True
+    nominal, _ = peak_gain(_performance(loop, loop.uncertain.plant, m, p))
+    size = nominal or 1.0
+    M = _in_units(loop.system, size, p)
     with Progress(None, INTERVALS, progress=progress):
-        found = covered(loop.system, listed, inside.tolist(), loop.heights)
+        found = covered(M, listed, inside.tolist(), loop.heights)
     if not np.isfinite(found.level):
         raise AssumptionError(
             "machines of the uncertainty may be unstable (at "
@@ -141,9 +144,8 @@ def worst_case_gain(
             "largest gain is infinite. See robust_stability(uncertain, ...): lower the bandwidth, "
             "notch the mode there, or measure it better."
         )
-    upper = float(np.sqrt(found.level))
-    candidates = _candidates(loop, listed, found, chance)
-    nominal, _ = peak_gain(_performance(loop, loop.uncertain.plant, m, p))
+    upper = size * float(np.sqrt(found.level))
+    candidates = _candidates(loop, M, listed, found, chance)
     reached = [_reached(loop, one, m, p) for one in candidates]
     lower, freq, values, made = max(reached, key=lambda one: one[0])
     if not lower <= upper * (1.0 + 1e-2):
@@ -159,8 +161,18 @@ def worst_case_gain(
         values,
         made,
         np.array([loop.freq(one) for one in found.frequencies]),
-        np.sqrt(np.maximum(found.bounds, 0.0)),
+        size * np.sqrt(np.maximum(found.bounds, 0.0)),
     )
+
+
+def _in_units(M: StateSpace, size: float, p: int) -> StateSpace:
+    """Return the system with its last p outputs in units of a size: the level sought is near 1.
+
+    A level of 1e-18, of 1e-9 m/N, is below what is resolved beside Deltas of size one.
+    """
+    unit = np.ones((len(M.outputs), 1))
+    unit[len(unit) - p :] = 1.0 / size
+    return M.replace(C=unit * M.C, D=unit * M.D)
 
 
 def _reached(
@@ -189,11 +201,14 @@ def _performance(loop: UncertainLoop, plant: StandardPlant, m: int, p: int) -> S
 
 
 def _candidates(
-    loop: UncertainLoop, listed: list[Any], found: Covered, rng: np.random.Generator
+    loop: UncertainLoop,
+    M: StateSpace,
+    listed: list[Any],
+    found: Covered,
+    rng: np.random.Generator,
 ) -> list[Perturbation]:
     """Return perturbations of size one that are bad at some frequency, the worst first."""
     where = places(listed)
-    M = loop.system
     chosen = [float(found.omega)]
     for omega in found.frequencies[np.argsort(-found.bounds)]:
         if len(chosen) < _SOUGHT and all(abs(omega - one) > 1e-2 * one for one in chosen):
