@@ -119,7 +119,8 @@ def _pictures(name: str, value: Any, design: Design) -> list[Picture]:
         system: Any = value.system if isinstance(value, Controller) else value
         if len(system.inputs) * len(system.outputs) <= _CHANNELS:
             return [(f"Bode diagram of {name}", lambda: bode(system))]
-        return [(f"Singular values of {name}", lambda: singular_values(system))]
+        caption = f"Singular values of {name}, the area down to the smallest"
+        return [(caption, lambda: singular_values(system))]
     if isinstance(value, UpdateResult):
         few = len(value.parameters) <= _PARAMETERS
         through: list[Picture] = [("Parameters through the update", lambda: parameters(value))]
