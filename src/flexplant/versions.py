@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 
     found = {"flexplant": sys.modules["flexplant"].__version__, "python": platform.python_version()}
     found |= {name: _version(name) for name in _PACKAGES}
-    for pool in threadpool_info():
+    for pool in sorted(threadpool_info(), key=lambda pool: str(pool["filepath"])):
         kind = {"blas": "BLAS", "openmp": "OpenMP"}.get(pool["user_api"], pool["user_api"])
         parts = (pool.get("internal_api"), pool.get("version"), pool.get("architecture"))
         own = " ".join(str(part) for part in parts if part)
