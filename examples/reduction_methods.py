@@ -22,7 +22,7 @@ import flexplant as fx
 
 L = 0.6
 ORDER = 24
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 DRAWN = ("Guyan", "CraigBampton", "DesiredDofs")
 BAND = (100.0, 1500.0)  # Hz, where responses are compared
 DAMPING = fx.ModalDamping(0.005)

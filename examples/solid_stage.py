@@ -25,7 +25,7 @@ import flexplant as fx
 
 SIZE, ELEMENTS = (0.4, 0.3, 0.1), (4, 3, 1)  # m
 DENSITY, YOUNG, POISSON = 2700.0, 70e9, 0.33
-OUT = Path(__file__).parent / "out"
+OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
 RATE, DELAY = 10e3, 1  # Hz, samples
 SENSOR = 1e-9 / np.sqrt(RATE / 2)  # 1 nm rms a sample
 FORCE = 1e-3  # N/sqrt(Hz) at each actuator

@@ -128,7 +128,7 @@ GOOD = {"A": -np.eye(2), "B": np.ones((2, 1)), "C": np.ones((1, 2)), "D": np.zer
         ({"A": np.ones((2, 3))}, ShapeError, "A must have shape"),
         ({"B": np.ones((3, 1))}, ShapeError, "B must have shape"),
         ({"C": np.ones((1, 3))}, ShapeError, "C must have shape"),
-        ({"D": np.zeros(1)}, ShapeError, "D must have shape"),
+        ({"D": np.zeros(1)}, ShapeError, "D must be a matrix"),
         ({"A": np.array([[0, np.nan], [0, 0]])}, ModelError, r"NaN.*\(0, 1\)"),
         ({"A": 1j * np.eye(2)}, ModelError, "real"),
         ({"A": [["a", "b"], ["c", "d"]]}, ModelError, "numbers"),
