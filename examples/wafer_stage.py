@@ -22,15 +22,14 @@ import numpy as np
 import flexplant as fx
 
 OUT = Path(globals().get("__file__", ".")).parent / "out"  # "." in a notebook
-L = 0.6  # m
-RATE, DELAY = 10e3, 1  # Hz, samples
+L, RATE, DELAY = 0.6, 10e3, 1  # m, Hz, samples
 NOISE = 0.1e-9 / np.sqrt(RATE / 2)  # m/sqrt(Hz): sensors of 0.1 nm rms per sample
 FORCES = (1e-4, 1e-3, 1e-2)  # N/sqrt(Hz): amplifier noise, two decades
 DAMPINGS, BANDWIDTH = (0.01, 0.001), 80.0  # Hz, asked of H-infinity
 CORNERS = [(x, y, 0.0) for y in (0.0, L) for x in (0.0, L)]
 INSET = [(x, y, 0.0) for y in (L / 4, 3 * L / 4) for x in (L / 4, 3 * L / 4)]
-GREY, ORANGE, SKY, BLUE = "0.55", "#E69F00", "#56B4E9", "#0072B2"  # as in all pictures
-COLORS, SHADES = (GREY, ORANGE, BLUE), (ORANGE, GREY, SKY, BLUE)  # of loops, of estimates
+COLORS = ("0.55", "#E69F00", "#0072B2")  # of the loops; then of the estimates
+SHADES = ("#E69F00", "0.55", "#56B4E9", "#0072B2")
 
 
 def ports(force: float = 1e-3) -> fx.Ports:
