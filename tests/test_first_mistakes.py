@@ -34,7 +34,7 @@ def test_a_gain_of_zero_written_as_a_number():
     assert g.D.tolist() == [[0.0, 0.0]] * 3
     with pytest.raises(ShapeError, match=r"from 2 inputs to 3 outputs, .* \(3, 2\); got"):
         g.replace(D=1.0)
-    with pytest.raises(ShapeError, match="B must have shape"):
+    with pytest.raises(ShapeError, match="B must be a matrix"):
         fx.StateSpace([[-1.0]], [1.0], [[1.0]], 0)
 
 
