@@ -27,7 +27,7 @@ def test_responses_calculate_as_their_systems():
         (-G, -g),
         (2.0 * G, 2.0 * g),
         (np.float64(2.0) * G * 3, 6.0 * g),
-        (G / 4, 0.25 * g),
+        (G / 4, g / 4),
         (k * G, k * g),
         (G * k, g * k),
         (k + G, k + g),
@@ -41,6 +41,24 @@ def test_responses_calculate_as_their_systems():
     np.testing.assert_allclose((G * k.to_control()).data, (G * k).data)
     np.testing.assert_allclose(G.mag * np.exp(1j * G.phase), G.data)
     np.testing.assert_array_equal((1j * G)[0, 1], 1j * G["y1", "u2"])
+
+
+def test_quotients_of_one_channel():
+    """Of two responses, and of a number: as python-control divides, with the variance drawn."""
+    rng = np.random.default_rng(2)
+    one, two = (rng.normal(size=(1, 1, 3)) + 1j * rng.normal(size=(1, 1, 3)) for _ in range(2))
+    G, H = fx.Frf(FREQ, one), fx.Frf(FREQ, two, variance=np.full((1, 1, 3), 1e-6))
+    np.testing.assert_allclose((G / H).data, one / two)
+    np.testing.assert_allclose((2.0 / H).data, 2.0 / two)
+    noise = rng.normal(size=(2, 20_000, 1, 1, 3))
+    drawn = one / (two + np.sqrt(0.5e-6) * (noise[0] + 1j * noise[1]))
+    np.testing.assert_allclose((G / H).variance, np.var(drawn, axis=0), rtol=0.05)
+    with pytest.raises(ModelError, match="other than 0"):
+        system([-1.0], 1, 1, 0) / 0
+    with pytest.raises(ModelError, match=r"the response is 0 at 0\.1 Hz"):
+        G / fx.Frf(FREQ, [[[0.0, 1.0, 1.0]]])
+    with pytest.raises(ShapeError, match="one input and one output"):
+        G / fx.frequency_response(system([-1.0], 2, 1, 0), FREQ)
 
 
 def test_errors_propagate_as_drawn_ones():
@@ -77,8 +95,8 @@ def test_what_does_not_combine_is_refused():
         G + fx.Frf(FREQ, np.ones((1, 2, 3)), inputs=["a", "u2"])
     with pytest.raises(ShapeError, match=r"got 1 .y1. and 2 .u1, u2."):
         G * G
-    for wrong in (0, G, "2"):
-        with pytest.raises(ModelError, match="line by line"):
+    for wrong in (0, "2"):
+        with pytest.raises(ModelError, match="a number other than 0"):
             G / wrong
     with pytest.raises(ModelError, match="finite number"):
         np.inf * G

@@ -86,14 +86,37 @@ class Arithmetic:
             return _multiple(self, complex(other))
         return _product(self, _operand(other, self), _operand(self, self))
 
-    def __truediv__(self, other: Any) -> Any:
-        """Return the responses divided by a number."""
+    def __truediv__(self: Any, other: Any) -> Any:
+        """Return the responses divided by a number, or by a response of one channel."""
+        if isinstance(other, Arithmetic):
+            return self * _reciprocal(other)
         if not isinstance(other, _NUMBERS) or other == 0:
             raise ModelError(
-                f"responses are divided by a number other than 0, got {short(other)}. For the "
-                "quotient of two, solve line by line: numpy.linalg.solve over data."
+                f"responses are divided by a number other than 0 or by a response of one input "
+                f"and one output, got {short(other)}. Pass one of these."
             )
         return self * (1.0 / complex(other))
+
+    def __rtruediv__(self: Any, other: Any) -> Any:
+        """Return a number divided by a response of one channel."""
+        return _reciprocal(self) * other
+
+
+def _reciprocal(frf: Any) -> Any:
+    """Return 1/G, from the output to the input of G; its variance is ``var G / |G|^4``."""
+    if frf.data.shape[:2] != (1, 1):
+        raise ShapeError(
+            f"the quotient needs a response of one input and one output, got {_sides(frf)}. Select "
+            "one pair, or solve line by line: numpy.linalg.solve over data."
+        )
+    if not np.all(frf.data):
+        zero = float(frf.freq[~frf.data[0, 0].astype(bool)][0])
+        raise ModelError(
+            f"the response is 0 at {zero:g} Hz: its inverse is infinite there. Leave the line out."
+        )
+    inverse = 1.0 / frf.data
+    variance = None if frf.variance is None else frf.variance * np.abs(inverse) ** 4
+    return _computed(frf, inverse, variance, inputs=frf.outputs, outputs=frf.inputs, quantity=None)
 
 
 def _operand(given: Any, frf: Any) -> Operand:

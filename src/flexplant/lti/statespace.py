@@ -239,6 +239,13 @@ class StateSpace(Value):
         """Return the system with its outputs times a number."""
         return self * other if isinstance(other, int | float | np.number) else NotImplemented
 
+    def __truediv__(self, other: float) -> StateSpace:
+        """Return the system with its outputs divided by a number."""
+        divisor = float(real_array(other, "the divisor", ()))
+        if not divisor:
+            raise ModelError("a system is divided by a number other than 0: pass one.")
+        return self * (1.0 / divisor)
+
     def renamed(
         self, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None
     ) -> StateSpace:
