@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import AssumptionError, ModelError
+from ..errors import ModelError
 from ..lti.frequency import Frf, sampled_freq
 from ..lti.interconnection import lft
 from ..lti.responses import Responder, remembered, responder
@@ -20,7 +20,7 @@ from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, Value
 from .broken import BrokenLoop, moved
 from .budget import ErrorBudget, error_budget, source_variances
-from .noise import Source, check_direct, check_stationary, row_of, sources
+from .noise import Source, check_direct, sources, stationary_row
 from .spectrum import Spectrum, densities
 from .spill_over import SpillOver, growing_modes, high
 
@@ -118,7 +118,7 @@ class ClosedLoop(Value):
         D[rows.size : len(shown), len(self.plant.w) :] = np.eye(len(tapped))
         D[len(shown) :, : columns.size] = g.D[np.ix_(fed, columns)]
         C = np.vstack([g.C[rows], np.zeros((len(tapped), g.n_states)), g.C[fed]])
-        ear = [f"{name}|loop" for name in self.plant.y]
+        back = [f"{name}|loop" for name in self.plant.y]
         opened = StateSpace(
             g.A,
             np.hstack([g.B[:, columns], extra]),
@@ -126,12 +126,12 @@ class ClosedLoop(Value):
             D,
             g.dt,
             inputs=[*self.plant.w, *tapped],
-            outputs=[*shown, *ear],
+            outputs=[*shown, *back],
             states=g.states,
             name=g.name,
             units=self.units,
         )
-        return lft(opened, self.controller.replace(inputs=ear))
+        return lft(opened, self.controller.replace(inputs=back))
 
     @cached_property
     def system(self) -> StateSpace:
@@ -270,22 +270,20 @@ class ClosedLoop(Value):
     def left_out(self) -> SpillOver | None:
         """Stability and margin with the modes left out; None: not known."""
         whole = self.completed
-        if self.larger is None or whole is None:
+        if whole is None:
             return None
         stability = whole.spectral_radius if self.plant.dt else whole.spectral_abscissa
         margin, without, peak = whole.modulus_margin, self.modulus_margin, float("nan")
-        modes: tuple[int, ...] = ()
-        freq: tuple[float, ...] = ()
-        states = self.larger.system.states
+        found: tuple[tuple[int, ...], tuple[float, ...]] = (), ()
+        states = whole.plant.system.states
         if not whole.is_stable:
-            modes, freq = growing_modes(whole.monitored, states)
+            found = growing_modes(whole.monitored, states)
         else:
             peak = whole.broken.worst[1]
             if high(margin, without):
-                modes, freq = growing_modes(whole.monitored, states, near=peak)
-        return SpillOver(
-            stability, bool(self.plant.dt), margin, without, peak, len(states), modes, freq
-        )
+                found = growing_modes(whole.monitored, states, near=peak)
+        sampled = bool(self.plant.dt)
+        return SpillOver(stability, sampled, margin, without, peak, len(states), *found)
 
     @cached_property
     def modulus_margin(self) -> float:
@@ -396,15 +394,7 @@ class ClosedLoop(Value):
 
     def _noises(self, channel: str) -> tuple[int, list[Source]]:
         """Return the row of a signal and the white noises of a loop that has a stationary state."""
-        if self.plant.is_weighted:
-            raise AssumptionError(
-                "the plant is weighted, so its z and w are not physical signals: close the loop "
-                "around plant.unweighted with the same blocks."
-            )
-        row = row_of(self.monitored, channel)
-        check_stationary(self.obstacle, f"the rms of {channel!r}")
-        noises = self._white
+        row = stationary_row(self.plant, self.monitored, self.obstacle, channel)
         if not self.plant.dt:
-            for one in noises:
-                check_direct(one.D[row], one.name, channel)
-        return row, noises
+            check_direct(self._white, row, channel)
+        return row, self._white

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -147,17 +148,37 @@ def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
     return {" + ".join(white): total}
 
 
-def row_of(monitored: StateSpace, channel: str) -> int:
-    """Return the row of an output of a closed loop.
+def stationary_row(
+    plant: StandardPlant, monitored: StateSpace, problem: object, channel: str
+) -> int:
+    """Return the row of an output of a closed loop that has a stationary state.
+
+    Parameters
+    ----------
+    plant, monitored : StandardPlant, StateSpace
+        The plant, and the closed loop to all outputs.
+    problem : Obstacle or None
+        The pole in the way of a stationary state.
+    channel : str
+        The output.
 
     Raises
     ------
     LabelError
         When it has no such output.
+    AssumptionError
+        When the plant is weighted, or the loop is not stable.
     """
+    if plant.is_weighted:
+        raise AssumptionError(
+            "the plant is weighted, so its z and w are not physical signals: close the loop "
+            "around plant.unweighted with the same blocks."
+        )
     given: object = channel
     instance(given, str, "a channel", "Pass its name: 'die:error'.", LabelError)
-    return int(monitored.output_index([channel])[0])
+    row = int(monitored.output_index([channel])[0])
+    check_stationary(problem, f"the rms of {channel!r}")
+    return row
 
 
 def check_stationary(problem: object, what: str) -> None:
@@ -177,11 +198,12 @@ def check_stationary(problem: object, what: str) -> None:
         )
 
 
-def check_direct(D: FloatArray, source: str, channel: str) -> None:
+def check_direct(noises: Sequence[Source], row: int, channel: str) -> None:
     """Raise ModelError where continuous white noise passes to an output without rolling off."""
-    if np.any(D):
-        raise ModelError(
-            f"white noise {source!r} passes straight through to {channel!r}, so its variance in "
-            "continuous time is infinite. Close the loop around plant.discretized(rate), or let "
-            "the controller roll off."
-        )
+    for one in noises:
+        if np.any(one.D[row]):
+            raise ModelError(
+                f"white noise {one.name!r} passes straight through to {channel!r}, so its variance "
+                "in continuous time is infinite. Close the loop around plant.discretized(rate), or "
+                "let the controller roll off."
+            )

@@ -7,6 +7,7 @@ from .discretisation import tustin as tustin
 from .frequency import Frf as Frf
 from .frequency import default_freq as default_freq
 from .frequency import frequency_response as frequency_response
+from .h2_norms import h2_norm as h2_norm
 from .hankel import NormReport as NormReport
 from .hankel import hankel_norm as hankel_norm
 from .hankel import hankel_values as hankel_values
@@ -25,7 +26,6 @@ from .matching import matched as matched
 from .minimal import minimal as minimal
 from .modal import ModalForm as ModalForm
 from .modal import modal_form as modal_form
-from .norms import h2_norm as h2_norm
 from .norms import hinf_norm as hinf_norm
 from .norms import linf_norm as linf_norm
 from .norms import peak_gain as peak_gain

@@ -9,7 +9,8 @@ import numpy as np
 from ..errors import SolverError
 from ..values import FloatArray, Value
 from .factors import controllability_factor, observability_factor
-from .norms import axis_peak, h2_norm
+from .h2_norms import h2_norm
+from .norms import axis_peak
 from .stability import obstacle
 from .statespace import System, as_statespace
 

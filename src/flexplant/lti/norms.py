@@ -1,4 +1,4 @@
-"""H2, H-infinity and L-infinity norms: exact Gramians; peaks verified by a level set."""
+"""H-infinity and L-infinity norms: peaks of the gain, verified by a level set."""
 
 from __future__ import annotations
 
@@ -7,10 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import CertificateError, SolverError
+from ..errors import SolverError
 from ..parallel import Progress, one_thread
 from ..values import ComplexArray, FloatArray
-from .lyapunov import controllability_gramian, observability_gramian
 from .responses import Responder, continuous_poles, points, responder
 from .scaling import balanced_matrix, state_scale
 from .stability import obstacle
@@ -18,8 +17,6 @@ from .statespace import StateSpace, System, as_statespace
 
 #: the norm lies between the gain found and (1 + TOLERANCE) times it
 TOLERANCE = 1e-9
-#: the squares of the H2 norm by both Gramians agree to this, or to rounding of their terms
-AGREEMENT, ROUNDING = 2e-8, 1e-13
 LEVELS = 30
 #: how far above the largest gain of the feedthrough a level set is not lost in rounding
 CLEAR = 1e-7
@@ -29,67 +26,6 @@ QUICK, POOR, STEP = 100, 1e7, 64
 #: points across each resonance at first; parabolas from there on, each on an interval so much
 #: narrower: the last one is 1e-3 of a resonance wide, its error in the gain below 1e-10
 ACROSS, PARABOLAS, NARROWER = 9, 3, 8.0
-
-
-@one_thread()
-def h2_norm(sys: System) -> float:
-    """Return the H2 norm: the rms of all outputs together for white inputs of unit intensity.
-
-    ``trace(C P C')^(1/2)``, P the controllability Gramian (``trace(C P C' + D D')^(1/2)`` when
-    sampled). Exact in modal blocks. The observability Gramian Q gives it a second time,
-    ``trace(B' Q B) = trace(C P C')``: both agree to 1e-8, or to the rounding of their terms.
-
-    Parameters
-    ----------
-    sys : StateSpace or control.StateSpace
-        Continuous or sampled.
-
-    Returns
-    -------
-    float
-        Infinite when the system is not strictly stable (rigid-body modes are not), or continuous
-        with feedthrough; `norm_report` says which.
-
-    Raises
-    ------
-    ModelError
-        When `sys` is no system.
-    SolverError
-        When a Gramian is too badly conditioned for its residual.
-    CertificateError
-        When the two Gramians give different norms.
-
-    References
-    ----------
-    [ZhouDoyleGlover1996]_, section 4.6.
-
-    Examples
-    --------
-    >>> print(f"{h2_norm(StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])):.3f}")
-    0.500
-    """
-    g = as_statespace(sys)
-    if obstacle(g) is not None or (not g.dt and g.n_states and np.any(g.D)):
-        return float("inf")
-    if not g.n_states:
-        return float(np.linalg.norm(g.D)) if g.dt else (float("inf") if np.any(g.D) else 0.0)
-    square, terms = _trace(g.C, controllability_gramian(g))
-    other, their = _trace(g.B.T, observability_gramian(g))
-    direct = float(np.sum(g.D**2)) if g.dt else 0.0
-    allowed = AGREEMENT * (max(square, other) + direct) + ROUNDING * max(terms, their)
-    if not abs(square - other) <= allowed:
-        raise CertificateError(
-            f"the H2 norm of {g!r} is {np.sqrt(max(square, 0.0)):.9g} by the controllability "
-            f"Gramian and {np.sqrt(max(other, 0.0)):.9g} by the observability Gramian: a pole is "
-            "too close to the edge of stability for double precision. Check the least damped poles."
-        )
-    return float(np.sqrt(max(square + direct, 0.0)))
-
-
-def _trace(C: FloatArray, P: FloatArray) -> tuple[float, float]:
-    """Return ``trace(C P C')`` and the size of its terms before they cancel."""
-    deviation = np.abs(C) @ np.sqrt(np.maximum(P.diagonal(), 0.0))
-    return float(np.sum(C @ P * C)), float(np.sum(deviation**2))
 
 
 def hinf_norm(sys: System, *, progress: bool | None = None) -> float:

@@ -16,7 +16,6 @@ from ..values import (
     ComplexArray,
     FloatArray,
     IntArray,
-    Value,
     known_units,
     positive,
     real_array,
@@ -25,8 +24,9 @@ from ..values import (
 from .channels import Channels, chosen_pair, rows_of
 from .direct import direct_gain
 from .foreign import foreign_fields
-from .joining import block_eigenvalues, checked_blocks, in_parallel, in_series, short_list
+from .joining import block_eigenvalues, checked_blocks, short_list
 from .scaling import state_scale
+from .system_arithmetic import SystemArithmetic
 from .zeros import invariant_zeros
 
 if TYPE_CHECKING:
@@ -38,7 +38,7 @@ System: TypeAlias = "StateSpace | control.StateSpace | control.TransferFunction 
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class StateSpace(Value):
+class StateSpace(SystemArithmetic):
     """A linear time-invariant system with named channels.
 
     ``dx/dt = A x + B u, y = C x + D u`` (dt = 0), or ``x[k+1] = A x[k] + B u[k]`` with
@@ -209,42 +209,8 @@ class StateSpace(Value):
         """
         return self.select(*chosen_pair(self.outputs, self.inputs, key))
 
-    #: arrays leave `2.0 * g` with a numpy number to this class
-    __array_ufunc__ = None
-
-    def __neg__(self) -> StateSpace:
-        """Return the system with its outputs negated."""
-        return self.replace(C=-self.C, D=-self.D)
-
-    def __add__(self, other: System) -> StateSpace:
-        """Return `parallel(self, other)`: same channels, outputs added."""
-        if isinstance(other, Mapping):  # an Frf, which is computed line by line
-            return NotImplemented
-        return StateSpace(**in_parallel(self, as_statespace(other)))
-
-    def __sub__(self, other: System) -> StateSpace:
-        """Return self + (-other): same channels, outputs subtracted."""
-        return NotImplemented if isinstance(other, Mapping) else self + -as_statespace(other)
-
-    def __mul__(self, other: System | float) -> StateSpace:
-        """Return `series(other, self)`, as transfer functions multiply; a number scales outputs."""
-        if isinstance(other, int | float | np.number):
-            factor = float(real_array(other, "the factor", ()))
-            return self.replace(C=factor * self.C, D=factor * self.D)
-        if isinstance(other, Mapping):
-            return NotImplemented
-        return StateSpace(**in_series(as_statespace(other), self))
-
-    def __rmul__(self, other: float) -> StateSpace:
-        """Return the system with its outputs times a number."""
-        return self * other if isinstance(other, int | float | np.number) else NotImplemented
-
-    def __truediv__(self, other: float) -> StateSpace:
-        """Return the system with its outputs divided by a number."""
-        divisor = float(real_array(other, "the divisor", ()))
-        if not divisor:
-            raise ModelError("a system is divided by a number other than 0: pass one.")
-        return self * (1.0 / divisor)
+    def _like(self, other: Any) -> StateSpace:
+        return as_statespace(other)
 
     def renamed(
         self, inputs: dict[str, str] | None = None, outputs: dict[str, str] | None = None

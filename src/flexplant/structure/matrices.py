@@ -226,9 +226,9 @@ class FEMatrices(Value):
     def _kept(self, rows: IntArray) -> FEMatrices:
         dropped = np.setdiff1d(np.arange(self.n_dof), rows)
         parts = {name: matrix[rows][:, rows] for name, matrix in self._matrices.items()}
-        constrained = (*self.constrained, *self.names(dropped))
         dofs = None if self.dofs is None else self.dofs._taken(rows)
-        return self.replace(**parts, dofs=dofs, constrained=constrained)
+        held = (*self.constrained, *self.names(dropped))
+        return self.replace(**parts, dofs=dofs, constrained=held)
 
     def converted(
         self, length: str | float = "m", mass: str | float = "kg", time: str | float = "s"
@@ -387,8 +387,7 @@ class FEMatrices(Value):
         """
         if self.M is None or self.dofs is None or not self.located:
             raise ModelError(
-                "freeing rigid-body motions needs M, and DOFs with coordinates: with_dofs(dofs) or "
-                "located_at(nodes, xyz) first."
+                "freeing needs M and located DOFs: with_dofs(dofs) or located_at(nodes, xyz) first."
             )
         K = freed(self.K, self.M, self.dofs, self.digits)
         return self.replace(K=K, notes=(*self.notes, "K freed of rounding in rigid-body motions"))

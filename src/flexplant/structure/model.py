@@ -175,13 +175,8 @@ class FEModel(Placed, Value):
             return False
         more = min(self.n_dof, count + 1)
         try:
-            elastic_modes(
-                dense(self.M),
-                dense(self.K),
-                self.rigid_body,
-                more,
-                motions=lambda: self.body_motions,
-            )
+            M, K = dense(self.M), dense(self.K)
+            elastic_modes(M, K, self.rigid_body, more, motions=lambda: self.body_motions)
         except ModelError:
             return False
         return True

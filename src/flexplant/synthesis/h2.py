@@ -9,8 +9,8 @@ import numpy as np
 
 from ..certificates import stability_name
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..lti.h2_norms import h2_norm
 from ..lti.interconnection import lft
-from ..lti.norms import h2_norm
 from ..lti.preparation import Prepared, prepared
 from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ..lti.statespace import StateSpace, System

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError, unknown_label
-from ...lti.norms import h2_norm, peak_gain
+from ...lti.h2_norms import h2_norm
+from ...lti.norms import peak_gain
 from ...lti.responses import continuous_poles
 from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
