@@ -108,6 +108,7 @@ def study():
 def threads():
     return [pool["num_threads"] for pool in threadpool_info()]
 
+signal.signal(signal.SIGINT, signal.default_int_handler)  # jobs in the background ignore it
 before, found = threads(), {}
 for name, work in {**WORK, "machines": study}.items():
     if name == "parts of the record":
@@ -135,7 +136,10 @@ print(json.dumps({"found": found, "same": bool(same)}))
 def test_interrupted_work_leaves_nothing_behind():
     """By the signal of Ctrl-C: threads of BLAS, bars and processes are as before."""
     process = child(INTERRUPTED, subprocess.PIPE)
-    out, err = process.communicate(timeout=300)
+    try:
+        out, err = process.communicate(timeout=300)
+    finally:
+        process.kill()
     assert process.returncode == 0, err.decode()
     answer = json.loads(out)
     assert len(answer["found"]) == 5 and answer["same"]

@@ -49,7 +49,8 @@ def h2_norm(sys: System) -> float:
 
     Examples
     --------
-    >>> print(f"{h2_norm(StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])):.3f}")
+    >>> import flexplant as fx
+    >>> print(f"{fx.h2_norm(fx.StateSpace([[-2.0]], [[1.0]], [[1.0]], [[0.0]])):.3f}")
     0.500
     """
     g = as_statespace(sys)
