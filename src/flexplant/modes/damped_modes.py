@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 
 from ..errors import SolverError
 from ..sparse.factor import by_rows, diagonal
+from ..sparse.orthonormal import beyond
 from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import absolute
 from ..structure import FEModel
@@ -109,7 +109,7 @@ def damped_modes(
         if factor is None:
             factor = stiffness_factor(model, method)
         step = factor.solve(np.hstack([rest[:, wrong].real, rest[:, wrong].imag]))
-        more = _beyond(model, V, step)
+        more = beyond(by_rows(model.M), V, step, dependent=_NEW)
         if not more.shape[1]:
             break
         V = np.hstack([V, more])
@@ -157,17 +157,3 @@ def _rest(
     limit = limit + _RESIDUAL[1] * np.linalg.norm(weight * whole, axis=0)
     size[: form.n_rigid] = 0.0  # at zero by convention: checked as undamped modes
     return np.asarray(rest), np.asarray(size), np.asarray(limit)
-
-
-def _beyond(model: FEModel, V: FloatArray, step: FloatArray) -> FloatArray:
-    """Return an M-orthonormal basis of what corrections (n, m) have beyond V."""
-    M = by_rows(model.M)
-    length = np.sqrt(np.einsum("ij,ij->j", step, M @ step))
-    new = step[:, length > 0] / length[length > 0]
-    for _ in range(2):  # the second time takes out what rounding of the first leaves
-        for _ in range(2):
-            new = new - V @ (V.T @ (M @ new))
-        values, mix = la.eigh(new.T @ (M @ new))
-        kept = values > _NEW**2
-        new = new @ (mix[:, kept] / np.sqrt(values[kept]))
-    return np.asarray(new)

@@ -12,6 +12,7 @@ import scipy.sparse as sp
 from ..errors import ModelError, SolverError
 from ..sparse.complex_symmetric import ComplexSymmetricFactor
 from ..sparse.factor import DENSE_LIMIT, dense
+from ..sparse.orthonormal import beyond
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
 from ..structure.negative_stiffness import signed_root, unstable_stiffness
 from ..values import ComplexArray, FloatArray
@@ -19,8 +20,6 @@ from .attachment_vectors import static_response
 from .modes import Modes
 from .shifted import dissection_of, stiffness_factor
 
-#: of the diagonal of a scaled Gram matrix: vectors below it depend on the others
-_DEPENDENT = 1e-10
 #: loads above which the second static response of each is left out
 _MANY = 30
 #: relative: damping between coordinates below this is rounding
@@ -227,34 +226,6 @@ class DynamicBasis:
         size = np.sqrt(np.abs(np.outer(self._rates, self._rates))) + 1e-3 * np.abs(C).max(initial=0)
         coupled = k > 0 and bool(np.any(off > _COUPLED * size))
         self._coupling = C if coupled else None
-
-
-def beyond(M: Any, V: FloatArray, part: FloatArray) -> FloatArray:
-    """Return M-orthonormal vectors that span, with V, what V and `part` span.
-
-    Parameters
-    ----------
-    M : (n, n) matrix
-        The mass.
-    V : (n, k) array
-        M-orthonormal.
-    part : (n, m) array
-        Any vectors; those that depend on the others add none.
-    """
-    if not part.shape[1]:
-        return part
-    length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))
-    part = part / np.where(length > 0, length, 1.0)
-    for _ in range(2):
-        part = part - V @ (V.T @ np.asarray(M @ part))
-    gram = part.T @ np.asarray(M @ part)
-    size, mix = la.eigh((gram + gram.T) / 2)
-    keep = size > _DEPENDENT
-    new = part @ (mix[:, keep] / np.sqrt(size[keep]))
-    # once more: what was nearly dependent has lost digits
-    new = new - V @ (V.T @ np.asarray(M @ new))
-    factor = la.cholesky(new.T @ np.asarray(M @ new), lower=True)
-    return np.asarray(la.solve_triangular(factor, new.T, lower=True).T)
 
 
 def static_shapes(model: FEModel, loads: FloatArray) -> FloatArray:

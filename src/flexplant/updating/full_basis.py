@@ -11,9 +11,10 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..modes import solve_modes
-from ..modes.dynamic_basis import beyond, static_shapes
+from ..modes.dynamic_basis import static_shapes
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
+from ..sparse.orthonormal import beyond
 from ..structure.model import FEModel
 from ..values import FloatArray
 from .pairing import pair
