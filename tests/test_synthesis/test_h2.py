@@ -153,11 +153,9 @@ def test_cheap_control_and_clean_sensors_reach_their_limits(dt):
 
 @TIMES
 def test_what_cannot_be_controlled_is_refused(dt):
-    rank = r" .* 1 mode\(s\) of A at 1\+0j"
-    reach, seen = ("to u:" + rank, "from y:" + rank) if dt else (r"u \(u0\) .* reach", r"y \(y0\)")
-    with pytest.raises(AssumptionError, match=reach):
+    with pytest.raises(AssumptionError, match=r"u \(u0\) does not reach .* integrating"):
         design(scalar(dt, reach=0.0))
-    with pytest.raises(AssumptionError, match=seen):
+    with pytest.raises(AssumptionError, match=r"y \(y0\) does not see .* integrating"):
         design(scalar(dt, seen=0.0))
 
 

@@ -191,7 +191,7 @@ def test_the_scale_of_units_does_not_matter():
 
 def test_refusals():
     given = plant()
-    with pytest.raises(InfeasibleError):
+    with pytest.raises(InfeasibleError, match="beyond every controller"):
         design_lmi(given, minimize=H2(), subject_to=[Hinf(below=0.2)])
     with pytest.raises(ModelError, match="without below"):
         design_lmi(given, minimize=H2(below=1.0))

@@ -157,7 +157,7 @@ def test_the_stage_follows_its_reference():
     row, column = P.z.index("die:z"), P.w.index("die:ref")
     assert gain[row, column, 0] == pytest.approx(1.0, abs=5e-3)
     with pytest.warns(FlexplantWarning, match="with the modes that the plant left out"):
-        shape_loop(sampled(small(12), ports()), bandwidth=120.0, larger=many())
+        shape_loop(sampled(small(12), ports()), bandwidth=120.0, model=100.0, larger=many())
 
 
 def test_what_does_not_go_together_is_refused():

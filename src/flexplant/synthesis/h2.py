@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..certificates import stability_name
-from ..errors import AssumptionError, CertificateError, ModelError, SolverError
+from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.h2_norms import h2_norm
 from ..lti.interconnection import lft
 from ..lti.preparation import Prepared, prepared
@@ -118,14 +118,11 @@ def design_h2(
         plant.check().require(("stabilisable", "detectable"), "H2 synthesis")
     _require_finite(plant)
     problem = prepared(plant.system, plant.u, plant.y, direct=True)
-    lacking = missing_ranks(problem)
-    if lacking:
-        found = made_regular(problem, _solved, lacking, h2_norm)
-    else:
-        try:
-            found = _solved(problem)
-        except AssumptionError as error:  # a mode on the stability boundary is missed by w or z
-            found = made_regular(problem, _solved, (str(error).rstrip("."),), h2_norm)
+    try:
+        found = _least(problem)
+    except FlexplantError:  # a mode that u or y misses is named, with channel and frequency
+        require_reach(prepared(plant.system, plant.u, plant.y))
+        raise
     K = problem.restored(found.A, found.B, found.C, found.D).replace(name="h2", units=plant.units)
     # a norm of the scaled problem, in the user's unit of time
     certificate = _certified(plant.system, K, float(np.sqrt(problem.speed)) * found.gamma)
@@ -156,6 +153,17 @@ def _require_finite(plant: StandardPlant) -> None:
     )
 
 
+def _least(p: Prepared) -> SolvedController:
+    """Return the optimal controller; noise and effort are added where the problem is singular."""
+    lacking = missing_ranks(p)
+    if not lacking:
+        try:
+            return _solved(p)
+        except AssumptionError as error:  # a mode on the stability boundary is missed by w or z
+            lacking = (str(error).rstrip("."),)
+    return made_regular(p, _solved, lacking, h2_norm)
+
+
 def _solved(p: Prepared) -> SolvedController:
     """Return the optimal controller of a regular prepared problem.
 
@@ -170,14 +178,10 @@ def _solved(p: Prepared) -> SolvedController:
     try:
         control = solve_control(p.A, p.B2, Q=p.C1.T @ p.C1, R=p.D12.T @ p.D12, S=p.C1.T @ p.D12)
     except (SolverError, ModelError) as error:
-        if not p.direct:  # it names channel and frequency where a mode is to blame
-            require_reach(p)
         raise AssumptionError(f"no optimal feedback from the states to u: {error}") from error
     try:
         estimate = solve_filter(p.A, p.C2, Q=p.B1 @ p.B1.T, R=p.D21 @ p.D21.T, S=p.B1 @ p.D21.T)
     except (SolverError, ModelError) as error:
-        if not p.direct:
-            require_reach(p)
         raise AssumptionError(f"no optimal estimate of the states from y: {error}") from error
     residual = {"residual of the Riccati equations": max(control.residual, estimate.residual)}
     X, F, Y, L = control.P, -control.gain, estimate.P, -estimate.gain

@@ -266,7 +266,8 @@ def made(
     inner = axes_controller(axes, laws)
     report = report_loops((axes.plant, inner), at="y", rigid=rigid, unstable=unstable)
     system = connected(axes, inner, references or {}).replace(name="loops")
-    left_out = None if axes.given is None else spill_over(axes.given, [system], larger)
+    feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
+    left_out = None if axes.given is None else spill_over(axes.given, [feedback], larger)
     lacking = axes.given is not None and left_out is None
     return LoopDesign(
         system, laws, report, left_out, unchecked(axes.given) if lacking and axes.given else ()

@@ -6,6 +6,7 @@ import numpy as np
 
 from ..errors import AssumptionError
 from ..lti.preparation import Prepared
+from ..plant import StandardPlant
 
 #: relative: poles so small are zero, real parts above this are not stable
 _ZERO, _STABLE = 1e-6, -1e-10
@@ -13,6 +14,13 @@ _ZERO, _STABLE = 1e-6, -1e-10
 _MISSED = 1e-12
 #: |z| of poles that are delays; e-folds of a mode during them that leave nothing to be gained
 _NILPOTENT, _TOO_LONG = 0.5, 15.0
+
+
+def require_stabilisable(plant: StandardPlant, problem: Prepared, what: str) -> None:
+    """Raise AssumptionError, naming mode and channels, when no controller stabilises a plant."""
+    if plant.is_assembled:  # it can name the rigid-body motion that is missed
+        plant.check().require(("stabilisable", "detectable"), what)
+    require_reach(problem)
 
 
 def require_reach(problem: Prepared) -> None:

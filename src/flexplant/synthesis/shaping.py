@@ -190,7 +190,8 @@ def shape_loop(
             "the loop of the plant as given is not stable: a mode was hidden by the shaping. "
             "Move the zeros of `before` and `after`."
         )
-    left_out = None if axes.given is None else spill_over(axes.given, [system], larger)
+    feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
+    left_out = None if axes.given is None else spill_over(axes.given, [feedback], larger)
     lacking = axes.given is not None and left_out is None
     controller = Controller(
         system,

@@ -19,6 +19,7 @@ from ..values import FloatArray, Rng, generator, positive, short, whole
 from .certificate import certified_norm, reached_norms
 from .controller import Controller
 from .nonsmooth import Minimum, bfgs, sampled_minimum
+from .reach import require_stabilisable
 from .spill_over import spill_over, unchecked
 from .structured_loop import DECAY, Matrices, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
@@ -91,6 +92,8 @@ def design_structured(
 
     Raises
     ------
+    AssumptionError
+        When u does not reach, or y does not see, a mode that is not stable.
     InfeasibleError
         When no start is stabilised; with the frequency of the pole that stays unstable.
     CertificateError
@@ -124,6 +127,8 @@ def design_structured(
     starts, random = whole(starts, "starts"), generator(rng)
     limit, begun = positive(time_limit, "time_limit"), time.perf_counter()
     problems = [prepared(one.system, one.u, one.y) for one in plants]
+    for one, problem in zip(plants, problems, strict=True):
+        require_stabilisable(one, problem, "structured synthesis")
     family = structure.family(plants[0], problems[0])
     search = _StructureSearch(
         family, [ScaledLoop(p, family.order) for p in problems], problems, begun + _SHARE * limit

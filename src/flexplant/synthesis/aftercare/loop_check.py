@@ -17,13 +17,19 @@ from ...plant import StandardPlant
 
 
 class LoopFacts(NamedTuple):
-    """Stability, modulus margin at u, and gamma of a weighted plant (NaN of another)."""
+    """Stability, at which frequency [Hz], modulus margin at u, and gamma of a weighted plant."""
 
     sampled: bool
     stability: float
+    freq: float
     is_stable: bool
     margin: float
     gamma: float
+
+    @property
+    def why(self) -> str:
+        """The least stable pole, in words."""
+        return f"{stability_name(self.sampled)} {self.stability:.6g}, at {self.freq:.4g} Hz"
 
     @property
     def certificate(self) -> dict[str, float]:
@@ -38,21 +44,24 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
         warnings.simplefilter("ignore", FlexplantWarning)
         loop = close_loop(plant, controller, larger=None)
     poles = loop.monitored.poles()
-    size = np.abs(poles) if loop.plant.dt else poles.real
+    dt = loop.plant.dt
+    size = np.abs(poles) if dt else poles.real
+    least = poles[np.argmax(size)] if poles.size else np.nan
+    freq = np.abs(np.angle(least) / dt if dt else np.imag(least)) / (2.0 * np.pi)
     gamma = float("nan")
     if plant.is_weighted and loop.obstacle is None:
         gamma = peak_gain(lft(plant.system, controller))[0]
     stable = loop.obstacle is None
     margin = loop.modulus_margin if stable else 0.0
     return LoopFacts(
-        bool(loop.plant.dt), float(np.max(size, initial=-np.inf)), stable, margin, gamma
+        bool(dt), float(np.max(size, initial=-np.inf)), float(freq), stable, margin, gamma
     )
 
 
 def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:
     """Return what was lost in words; empty when nothing was."""
     if not after.is_stable:
-        return f"the loop becomes unstable ({after.stability:.6g})"
+        return f"the loop becomes unstable ({after.why})"
     if after.margin < (1.0 - loss) * before.margin:
         return (
             f"the modulus margin falls from {before.margin:.3g} to {after.margin:.3g}, by more "
@@ -84,7 +93,7 @@ def stable_before(plant: StandardPlant, controller: StateSpace) -> Any:
     facts = loop_facts(plant, controller)
     if not facts.is_stable:
         raise CertificateError(
-            f"the controller as given does not stabilise the plant ({facts.stability:.6g}): there "
-            "is no loop to preserve. Is it the plant that it was made for?"
+            f"the controller as given does not stabilise the plant ({facts.why}): "
+            "there is no loop to preserve. Is it the plant that it was made for?"
         )
     return facts

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...errors import AssumptionError, CertificateError, InfeasibleError, ModelError, SolverError
 from ...lti.interconnection import lft
+from ...lti.preparation import prepared
 from ...lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ...lti.scaling import mean_speed, state_scale
 from ...lti.statespace import StateSpace, System
@@ -17,7 +18,9 @@ from ...plant import StandardPlant, standard_plant
 from ...values import positive, short, whole
 from ..controller import Controller
 from ..lmi_plant import Plant
+from ..reach import require_stabilisable
 from ..spill_over import spill_over, unchecked
+from .least import require_reachable
 from .programs import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion
 
@@ -76,11 +79,13 @@ def design_lmi(
     Raises
     ------
     AssumptionError
-        When w reaches z of an H2 norm at once in a continuous plant.
+        When w reaches z of an H2 norm at once in a continuous plant, or u does not reach, or y does
+        not see, a mode that is not stable.
     CertificateError
         When the closed loop does not keep a bound.
     InfeasibleError
-        When the solver proves that no controller keeps the bounds with one Lyapunov matrix.
+        When a bound is below what any controller reaches for it alone, or the solver proves that
+        none keeps them all with one Lyapunov matrix.
     ModelError, LabelError
         When specifications do not fit the plant.
     SolverError
@@ -105,6 +110,8 @@ def design_lmi(
     """
     given = standard_plant(plant)
     _checked(given, minimize, subject_to, whole(max_states, "max_states"))
+    require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
+    require_reachable(given, subject_to)
     scaled = _prepared(given)
     problem = ObjectivePrograms(
         given, scaled, minimize, tuple(subject_to), positive(time_limit, "time_limit")
