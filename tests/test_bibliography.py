@@ -45,6 +45,14 @@ def test_references_are_given_by_keys():
         assert not re.search(r"\b(19|20)\d\d\b", re.sub(CITED, "", text)), f"{name}: {text}"
 
 
+def test_nobody_is_cited_by_a_year():
+    """In the text too, sources are keys: "[Welch1967]_", not "(Welch 1967)"."""
+    year = r"(?!2000)(19[4-9]\d|20[0-3]\d)"
+    pattern = rf"[A-Z][\w.']+[),]* \(?{year}\b|\({year}\)|, {year}[).,;\]](?!\d)"
+    found = {path.name: re.search(pattern, path.read_text("utf-8")) for path in MODULES}
+    assert not {name: match[0] for name, match in found.items() if match}
+
+
 def test_methods_of_the_literature_say_where_they_are_from():
     """What implements a method that others published cites them."""
     cited = {

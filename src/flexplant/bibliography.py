@@ -2,6 +2,8 @@
 
 .. [paper] "Finite Element Model Reduction and Model Updating of structures for Control": the method
    that this library is built on.
+.. [Abedor1996] Abedor, Nagpal, Poolla, A linear matrix inequality approach to peak-to-peak gain
+   minimization, Int. J. Robust Nonlinear Control 6, 1996.
 .. [AlexandrovLewis2001] Alexandrov, Lewis, An overview of first-order model management for
    engineering optimization, Optim. Eng. 2, 2001.
 .. [Allemang2003] Allemang, The modal assurance criterion: twenty years of use and abuse, Sound and
@@ -20,13 +22,19 @@
 .. [BarShalom2001] Bar-Shalom, Li, Kirubarajan, Estimation with Applications to Tracking and
    Navigation, Wiley, 2001.
 .. [Bartlett1955] Bartlett, An Introduction to Stochastic Processes, Cambridge, 1955.
+.. [BarzilaiBorwein1988] Barzilai, Borwein, Two-point step size gradient methods, IMA J. Numer.
+   Anal. 8, 1988.
 .. [BendatPiersol2010] Bendat, Piersol, Random Data, 4th ed., Wiley, 2010.
 .. [BittantiColaneri2009] Bittanti, Colaneri, Periodic Systems, Springer, 2009.
 .. [Boerlage2004] Boerlage, Tousain, Steinbuch, Jerk derivative feedforward control for motion
    systems, American Control Conference, 2004.
+.. [Boisvert1996] Boisvert, Pozo, Remington, The Matrix Market exchange formats: initial design,
+   NISTIR 5935, 1996.
 .. [BoydBalakrishnan1990] Boyd, Balakrishnan, A regularity result for the singular values of a
    transfer matrix and a quadratically convergent algorithm for computing its L-infinity norm, Syst.
    Control Lett. 15, 1990.
+.. [BoydElGhaoui1993] Boyd, El Ghaoui, Method of centers for minimizing generalized eigenvalues,
+   Linear Algebra Appl. 188, 1993.
 .. [Branch1999] Branch, Coleman, Li, A subspace, interior, and conjugate gradient method for
    large-scale bound-constrained minimization problems, SIAM J. Sci. Comput. 21, 1999.
 .. [BruinsmaSteinbuch1990] Bruinsma, Steinbuch, A fast algorithm to compute the H-infinity norm of a
@@ -37,6 +45,8 @@
    optimization, SIAM J. Optim. 15, 2005.
 .. [Burke2006] Burke, Henrion, Lewis, Overton, HIFOO: a Matlab package for fixed-order controller
    design and H-infinity optimization, IFAC Symposium on Robust Control Design, 2006.
+.. [Cauberghe2004] Cauberghe, Applied frequency-domain system identification in the field of
+   experimental and operational modal analysis, PhD thesis, Vrije Universiteit Brussel, 2004.
 .. [ChenChen2008] Chen, Chen, Extended Bayesian information criteria for model selection with large
    model spaces, Biometrika 95, 2008.
 .. [Chu2004] Chu, Fan, Lin, Wang, Structure-preserving algorithms for periodic discrete-time
@@ -51,7 +61,16 @@
 .. [deJong1991] de Jong, The diffuse Kalman filter, Ann. Statist. 19, 1991.
 .. [deKlerk2008] de Klerk, Rixen, Voormeeren, General framework for dynamic substructuring: history,
    review and classification of techniques, AIAA J. 46, 2008.
+.. [Demmel1989] Demmel, On floating point errors in Cholesky, LAPACK Working Note 14, 1989.
+.. [deSilvaTenenbaum2004] de Silva, Tenenbaum, Sparse multidimensional scaling using landmark
+   points, Stanford University, 2004.
+.. [Dobrowiecki2006] Dobrowiecki, Schoukens, Guillaume, Optimized excitation signals for MIMO
+   frequency response function measurements, IEEE Trans. Instrum. Meas. 55, 2006, 1778-1786.
 .. [Doyle1986] Doyle, Lenz, Packard, Design examples using mu-synthesis, IEEE CDC, 1986.
+.. [Duff1992] Duff, Grimes, Lewis, Users' guide for the Harwell-Boeing sparse matrix collection,
+   CERFACS, 1992.
+.. [DuffReid1983] Duff, Reid, The multifrontal solution of indefinite sparse symmetric linear
+   equations, ACM Trans. Math. Softw. 9, 1983.
 .. [EmamiNaeiniVanDooren1982] Emami-Naeini, Van Dooren, Computation of zeros of linear multivariable
    systems, Automatica 18, 1982.
 .. [Enns1984] Enns, Model reduction with balanced realizations, IEEE CDC, 1984.
@@ -60,6 +79,7 @@
    unmodeled dynamics, IEEE Trans. Autom. Control 36, 1991.
 .. [FanTits1992] Fan, Tits, A measure of worst-case H-infinity performance and of largest acceptable
    uncertainty, Syst. Control Lett. 18, 1992.
+.. [Fletcher1987] Fletcher, Practical Methods of Optimization, 2nd ed., Wiley, 1987.
 .. [Franklin1998] Franklin, Powell, Workman, Digital Control of Dynamic Systems, 3rd ed.,
    Addison-Wesley, 1998.
 .. [FriswellGarveyPenny1995] Friswell, Garvey, Penny, Model reduction using dynamic and iterated IRS
@@ -70,12 +90,16 @@
    control, Int. J. Robust Nonlinear Control 4, 1994.
 .. [Gawronski2004] Gawronski, Advanced Structural Dynamics and Active Control of Structures,
    Springer, 2004.
+.. [George1973] George, Nested dissection of a regular finite element mesh, SIAM J. Numer. Anal. 10,
+   1973.
 .. [Geromel1999] Geromel, Optimal linear filtering under parameter uncertainty, IEEE Trans. Signal
    Process. 47, 1999.
 .. [GillijnsDeMoor2007a] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
    linear discrete-time systems, Automatica 43, 2007, 111-116.
 .. [GillijnsDeMoor2007b] Gillijns, De Moor, Unbiased minimum-variance input and state estimation for
    linear discrete-time systems with direct feedthrough, Automatica 43, 2007, 934-937.
+.. [Giraud2005] Giraud, Langou, Rozloznik, van den Eshof, Rounding error analysis of the classical
+   Gram-Schmidt orthogonalization process, Numer. Math. 101, 2005.
 .. [Glover1984] Glover, All optimal Hankel-norm approximations of linear multivariable systems and
    their L-infinity error bounds, Int. J. Control 39, 1984.
 .. [GloverDoyle1988] Glover, Doyle, State-space formulae for all stabilizing controllers that
@@ -100,16 +124,23 @@
    programming, SIAM J. Optim. 6, 1996.
 .. [HeylenLammens1996] Heylen, Lammens, FRAC: a consistent way of comparing frequency response
    functions, Identification in Engineering Systems, 1996.
+.. [Hosking1980] Hosking, The multivariate portmanteau statistic, J. Amer. Stat. Assoc. 75, 1980.
 .. [Hoyle1991] Hoyle, Hyde, Limebeer, An H-infinity approach to two degree of freedom design, IEEE
    CDC, 1991.
 .. [Imamovic1998] Imamovic, Validation of large structural dynamics models using modal test data,
    PhD thesis, Imperial College, 1998.
 .. [IwasakiSkelton1994] Iwasaki, Skelton, All controllers for the general H-infinity control
    problem, Automatica 30, 1994.
+.. [JoshiBoyd2009] Joshi, Boyd, Sensor selection via convex optimization, IEEE Trans. Signal
+   Process. 57, 2009.
 .. [Kammer1991] Kammer, Sensor placement for on-orbit modal identification and correlation of large
    space structures, J. Guid. Control Dyn. 14, 1991.
+.. [Kaufman1975] Kaufman, A variable projection method for solving separable nonlinear least squares
+   problems, BIT 15, 1975.
 .. [Kitanidis1987] Kitanidis, Unbiased minimum-variance linear state estimation, Automatica 23,
    1987.
+.. [KuczynskiWozniakowski1992] Kuczynski, Wozniakowski, Estimating the largest eigenvalue by the
+   power and Lanczos algorithms with a random start, SIAM J. Matrix Anal. Appl. 13, 1992.
 .. [Kwakernaak1993] Kwakernaak, Robust control and H-infinity optimization, Automatica 29, 1993.
 .. [Lainiotis1975] Lainiotis, Partitioned linear estimation algorithms: discrete case, IEEE Trans.
    Autom. Control 20, 1975.
@@ -141,6 +172,8 @@
    (SEREP), IMAC 7, 1989.
 .. [Odelson2006] Odelson, Rajamani, Rawlings, A new autocovariance least-squares method for
    estimating noise covariances, Automatica 42, 2006.
+.. [OkabeIto2008] Okabe, Ito, Color universal design, jfly.uni-koeln.de/color, 2008.
+.. [Osborne1960] Osborne, On pre-conditioning of matrices, J. ACM 7, 1960.
 .. [PackardDoyle1993] Packard, Doyle, The complex structured singular value, Automatica 29, 1993.
 .. [Pascual1997] Pascual, Golinval, Razeto, A frequency domain correlation technique for model
    correlation and updating, IMAC 15, 1997.
@@ -148,6 +181,10 @@
    method: a new standard for modal parameter estimation?, Shock and Vibration 11, 2004, 395-409.
 .. [PeetersDeRoeck1999] Peeters, De Roeck, Reference-based stochastic subspace identification for
    output-only modal analysis, Mech. Syst. Signal Process. 13, 1999.
+.. [PerezArriaga1982] Perez-Arriaga, Verghese, Schweppe, Selective modal analysis with applications
+   to electric power systems, IEEE Trans. Power App. Syst. 101, 1982.
+.. [Piessens1983] Piessens, de Doncker-Kapenga, Ueberhuber, Kahaner, QUADPACK: A Subroutine Package
+   for Automatic Integration, Springer, 1983.
 .. [Pintelon2007] Pintelon, Guillaume, Schoukens, Uncertainty calculation in (operational) modal
    analysis, Mech. Syst. Signal Process. 21, 2007, 2359-2373.
 .. [PintelonSchoukens2012] Pintelon, Schoukens, System Identification: A Frequency Domain Approach,
@@ -160,6 +197,8 @@
    systems using Krylov subspace methods, Linear Algebra Appl. 415, 2006.
 .. [Scherer1997] Scherer, Gahinet, Chilali, Multiobjective output-feedback control via LMI
    optimization, IEEE Trans. Autom. Control 42, 1997.
+.. [Skelton1998] Skelton, Iwasaki, Grigoriadis, A Unified Algebraic Approach to Linear Control
+   Design, Taylor & Francis, 1998.
 .. [Skogestad2005] Skogestad, Postlethwaite, Multivariable Feedback Control, 2nd ed., Wiley, 2005.
 .. [Sleijpen1996] Sleijpen, Booten, Fokkema, van der Vorst, Jacobi-Davidson type methods for
    generalized eigenproblems and polynomial eigenproblems, BIT 36, 1996.
@@ -173,10 +212,14 @@
    non-minimal state-space system, Int. J. Control 46, 1987.
 .. [VandeWijdevenBosgra2010] Van de Wijdeven, Bosgra, Using basis functions in iterative learning
    control: analysis and design theory, Int. J. Control 83, 2010.
+.. [VanLoan1978] Van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Autom.
+   Control 23, 1978.
 .. [VanZundertOomen2018] Van Zundert, Oomen, On inversion-based approaches for feedforward and ILC,
    Mechatronics 50, 2018.
 .. [VoormeerenRixen2012] Voormeeren, Rixen, A family of substructure decoupling techniques based on
    a dual assembly approach, Mech. Syst. Signal Process. 27, 2012.
+.. [Welch1967] Welch, The use of fast Fourier transform for the estimation of power spectra, IEEE
+   Trans. Audio Electroacoust. 15, 1967.
 .. [Whittle1953] Whittle, The analysis of multiple stationary time series, and Estimation and
    information in stationary time series, Arkiv foer Matematik 2, 1953.
 .. [Young1990] Young, Doyle, Computation of mu with real and complex uncertainties, IEEE CDC, 1990.

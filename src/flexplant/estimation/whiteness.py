@@ -56,8 +56,8 @@ def ljung_box(white: FloatArray, lags: int) -> Statistic:
     """Return the portmanteau statistic of vectors (N, p) over some lags.
 
     ``N^2 sum_l tr(G_l' G_0^-1 G_l G_0^-1) / (N - l)``, chi-square with p^2 lags degrees of freedom;
-    Ljung and Box for one channel, Hosking (J. American Statistical Association 75, 1980) for
-    several. Missing rows (NaN) count as zero, N is the number of pairs.
+    [LjungBox1978]_ for one channel, [Hosking1980]_ for several. Missing rows (NaN) count as zero, N
+    is the number of pairs.
     """
     from scipy.stats import chi2
 

@@ -28,8 +28,8 @@ def pole_terms(
 
     .. math:: \frac{e^{\lambda T} - 1}{\lambda}\,\frac{1}{z - e^{\lambda T}}, \quad z = e^{sT},
 
-    which has the same pole on the axis of s and tends to 1/(s - lambda) with T (Pintelon and
-    Schoukens, System Identification, 2012, sec. 6.2).
+    which has the same pole on the axis of s and tends to 1/(s - lambda) with T
+    ([PintelonSchoukens2012]_, section 6.2).
     """
     gap = s[None, :] - poles[:, None]
     if hold is None:

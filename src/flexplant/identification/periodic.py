@@ -68,7 +68,7 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
 
     .. math:: \sigma^2_{oi} = [C_e]_{oo}\,\bigl[(U U^H)^{-1}\bigr]_{ii}
 
-    (Pintelon and Schoukens 2012, sec. 2.7). A drift leaks as much into these as into the mean;
+    ([PintelonSchoukens2012]_, section 2.7). A drift leaks as much into these as into the mean;
     into the spectrum of each period up to P times more, in power.
     """
     n_exp, n_in, n_time = data.u.shape
@@ -230,8 +230,7 @@ def multisine(
     r"""Return random-phase multisines for `count` inputs in as many orthogonal experiments.
 
     Input i in experiment e has the spectrum ``U(f) exp(2 pi i e k / count)`` with a common random
-    phase per line, so that U U^H is diagonal at every line (Dobrowiecki, Schoukens and Guillaume,
-    IEEE Trans. Instrumentation and Measurement 55 (2006) 1778-1786).
+    phase per line, so that U U^H is diagonal at every line [Dobrowiecki2006]_.
 
     Parameters
     ----------

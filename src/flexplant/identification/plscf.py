@@ -1,7 +1,6 @@
 """Poly-reference least-squares complex frequency (pLSCF): poles of matrix fractions.
 
-Peeters, Van der Auweraer, Guillaume and Leuridan, "The PolyMAX frequency-domain method", Shock and
-Vibration 11 (2004) 395-409; Cauberghe, PhD thesis, Vrije Universiteit Brussel, 2004 (constraint).
+[Peeters2004]_; [Cauberghe2004]_ (constraint).
 """
 
 from __future__ import annotations
@@ -86,7 +85,7 @@ class Moments:
         """Return A (order + 1, n_in, n_in) with A_0 = I and B (n_out, order + 1, n_in).
 
         This constraint makes the mathematical poles unstable and leaves the physical ones
-        stable, which is what makes the stabilisation diagram clear (Cauberghe 2004).
+        stable, which is what makes the stabilisation diagram clear [Cauberghe2004]_.
         """
         n, m = order + 1, self.n_in
         toeplitz = np.arange(n)[None, :] - np.arange(n)[:, None] + self.order

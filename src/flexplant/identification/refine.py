@@ -100,8 +100,8 @@ def refined(
         + \frac{\bar\psi_{ok} \bar l_{ik}}{s - \bar\lambda_k} + \sum_p E_{oip} g_p(s),
 
     the maximum likelihood one when the weights are those of circular Gaussian errors. Shapes psi
-    and residual terms E are linear and eliminated at each step (Golub and Pereyra, Inverse
-    Problems 19 (2003) R1; Kaufman's Jacobian); poles and participation l, one entry of each
+    and residual terms E are linear and eliminated at each step ([GolubPereyra2003]_;
+    the Jacobian of [Kaufman1975]_); poles and participation l, one entry of each
     column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
     to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
     up: as soon as twenty times what a full step would gain is not enough.

@@ -295,7 +295,7 @@ def _total(found: Averages, output: int) -> ComplexArray:
 
 
 def _effective(window: FloatArray, hop: int, count: int) -> float:
-    """Return the number of independent averages of overlapping segments (Welch 1967)."""
+    """Return the number of independent averages of overlapping segments [Welch1967]_."""
     power, doubled = float(np.sum(window**2)), 0.0
     for lag in range(1, count):
         shift = lag * hop

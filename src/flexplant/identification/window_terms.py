@@ -8,7 +8,7 @@ whose impulse response is multiplied by the autocorrelation of the window, a lag
     \left(\frac{2}{3} + \frac{1}{3} \cos\frac{2 \pi \tau}{T}\right)
     + \frac{1}{2 \pi} \sin\frac{2 \pi \tau}{T}
 
-(Bendat, Piersol, Random Data, 2010, sec. 11.5 and 11.6, for segments of T seconds; Hann window).
+([BendatPiersol2010]_, sections 11.5 and 11.6, for segments of T seconds; Hann window).
 """
 
 from __future__ import annotations

@@ -61,8 +61,7 @@ def read_harwell_boeing(
 
     Notes
     -----
-    Format: I. S. Duff, R. G. Grimes, J. G. Lewis, "Users' Guide for the Harwell-Boeing Sparse
-    Matrix Collection", 1992, section 2.
+    Format: [Duff1992]_, section 2.
 
     Examples
     --------

@@ -68,8 +68,7 @@ def read_matrix_market(
 
     Notes
     -----
-    Format: R. F. Boisvert, R. Pozo, K. A. Remington, "The Matrix Market Exchange Formats: Initial
-    Design", NISTIR 5935, 1996. Exponents of Fortran (7.5D+03, 7.5+03) are read as such.
+    Format: [Boisvert1996]_. Exponents of Fortran (7.5D+03, 7.5+03) are read as such.
 
     Examples
     --------

@@ -159,7 +159,7 @@ def _rule() -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return nodes on (-1, 1) and the weights of Gauss (7 points) and Kronrod (15 points).
 
     Kronrod's weights integrate polynomials exactly to degree 14 at least: they follow from the
-    nodes, which are those of Piessens et al., QUADPACK, 1983.
+    nodes, which are those of QUADPACK [Piessens1983]_.
     """
     half = [
         0.991455371120812639206854697526329,

@@ -158,8 +158,8 @@ def growing_modes(
     """Return the numbers of the modes that take part in what grows, and its frequencies [Hz].
 
     The part of state k in an eigenvalue is ``|left_k right_k|``, of its own left and right
-    eigenvectors (participation factors, Perez-Arriaga et al., IEEE Trans. Power Apparatus and
-    Systems 101, 1982); they do not depend on the units of the states.
+    eigenvectors (participation factors, [PerezArriaga1982]_); they do not depend on the
+    units of the states.
 
     Parameters
     ----------

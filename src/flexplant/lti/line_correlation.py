@@ -74,7 +74,7 @@ def line_correlation(
         C_s(x) = \sum_t w_t w_{t+s} e^{-2 \pi i x t / L}
 
     over the shifts s between segments: 4/9 and 1/36 for neighbours under a Hann window without
-    overlap (Bendat and Piersol, Random Data, 2010, sec. 11.5; Welch 1967).
+    overlap ([BendatPiersol2010]_, section 11.5; [Welch1967]_).
 
     Parameters
     ----------

@@ -24,7 +24,7 @@ def accumulated_noise(
     rounding give less than n columns, as for a large structure with few forces. Else over a piece
     so short that ten nodes are exact, then ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate)
     steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
-    any units; the block exponential of Van Loan was seen to lose that on large models.
+    any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models.
 
     Parameters
     ----------

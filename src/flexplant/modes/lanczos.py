@@ -37,7 +37,7 @@ class BlockLanczos:
     """The largest eigenvalues ``theta = 1 / (omega^2 - sigma)`` of ``(K - sigma M)^-1 M``.
 
     Every new block is made M-orthogonal to all before it, so that no value appears twice
-    [Grimes, Lewis and Simon, SIAM J. Matrix Anal. 15, 228 (1994)].
+    [Grimes1994]_.
 
     Parameters
     ----------
@@ -172,8 +172,8 @@ class BlockLanczos:
     ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         """Return the M-orthonormal part of W beyond the basis, M times it, and the coefficients.
 
-        Gram-Schmidt twice is enough [Giraud, Langou, Rozloznik and van den Eshof, Numer. Math. 101,
-        87 (2005)], and again where the block itself had next to nothing new in some direction.
+        Gram-Schmidt twice is enough [Giraud2005]_, and again where the block itself had next to
+        nothing new in some direction.
         """
         basis = self._V[: self._r + self._m]
         along = np.zeros((basis.shape[0], W.shape[1]))

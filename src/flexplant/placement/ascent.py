@@ -20,7 +20,7 @@ def ascended(
 ) -> tuple[float, FloatArray]:
     """Return a number above the function at every choice of a branch, and weights near the largest.
 
-    Projected gradient steps of Barzilai and Borwein (IMA J. Numer. Anal. 8, 1988). Whatever w is,
+    Projected gradient steps of Barzilai and Borwein [BarzilaiBorwein1988]_. Whatever w is,
     ``h(w) + h'(w) (x - w)`` is above h at every choice x: that is the bound.
 
     Parameters

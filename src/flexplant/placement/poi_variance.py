@@ -211,7 +211,7 @@ def _lagged(estimator: KalmanEstimator, rows: FloatArray, lag: Any) -> FloatArra
     """Return the variances of ``rows x`` before the measurement, or some samples after it.
 
     ``P_k|k+L = P - sum_{i=0..L} W_i' S^-1 W_i`` with ``W_i = C M^i P`` and M of the predictor
-    (Anderson, Moore, Optimal Filtering, 1979, ch. 7).
+    ([AndersonMoore1979]_, chapter 7).
     """
     model, P = estimator.model, estimator.predicted_covariance
     found = np.einsum("ij,jk,ik->i", rows, P, rows)

@@ -58,7 +58,7 @@ class SummedMatrices(Convex):
     """Minus a measure of ``sum_i W_i`` over the chosen: W_i (N, n, n), positive semidefinite.
 
     Minus the logarithm of the determinant is convex in weights of the candidates, so that it has a
-    relaxation (Joshi, Boyd, IEEE Trans. Signal Processing 57, 2009). The other measures grow with
+    relaxation [JoshiBoyd2009]_. The other measures grow with
     each candidate: the bound is that of all of them.
 
     Parameters

@@ -1,6 +1,6 @@
 """One look for one thing: the palette, and how measurements, models, truths and bounds are drawn.
 
-The colours are those of Okabe and Ito (jfly.uni-koeln.de/color, 2008), which remain different for
+The colours are those of Okabe and Ito [OkabeIto2008]_, which remain different for
 every kind of colour vision; dashes and widths differ too, for print without colour.
 """
 

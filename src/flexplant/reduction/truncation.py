@@ -202,7 +202,7 @@ class ModalBalanced(ReductionMethod):
     -----
     The bound is the sum of the neglected modes' own peaks, exact for one neglected mode; over a
     band `ErrorBound.below(freq)` is tighter. Twice the
-    sum of neglected Hankel values (K. Glover, 1984) bounds the truncation of the exactly balanced
+    sum of neglected Hankel values [Glover1984]_ bounds the truncation of the exactly balanced
     model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
 
     References

@@ -162,8 +162,8 @@ def lowest_eigenvalue_bound(matrix: Any) -> float:
 
     Lanczos from a random vector sees the lowest eigenvalue from above, as theta; with c above all
     eigenvalues, ``(theta - lowest) / (c - lowest) > eps`` has a probability below ``1.648 sqrt(n)
-    exp(-sqrt(eps) (2 k - 1))`` after k steps [Kuczynski and Wozniakowski, SIAM J. Matrix Anal.
-    13, 1094 (1992), Theorem 4.2], whatever the matrix is.
+    exp(-sqrt(eps) (2 k - 1))`` after k steps ([KuczynskiWozniakowski1992]_, theorem 4.2),
+    whatever the matrix is.
     """
     n = matrix.shape[0]
     fast = by_rows(matrix)

@@ -24,7 +24,7 @@ _ENERGY = 1e-4
 
 
 class MultifrontalCholesky:
-    """``A = L L^T`` of a sparse symmetric positive definite matrix [Duff and Reid 1983].
+    """``A = L L^T`` of a sparse symmetric positive definite matrix [DuffReid1983]_.
 
     Parameters
     ----------

@@ -59,7 +59,7 @@ def dissect(
     """Return the nested dissection of a symmetric matrix.
 
     Parts are cut in two across their longest side, through the median; the nodes on one side that
-    touch the other come after both [George, SIAM J. Numer. Anal. 10, 345 (1973)].
+    touch the other come after both [George1973]_.
 
     Parameters
     ----------
@@ -107,8 +107,8 @@ def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_ar
 def graph_coordinates(graph: sp.csr_array) -> FloatArray:
     """Return coordinates (n, 3) of a graph's nodes from distances to a few far-apart ones.
 
-    Classical scaling of the distances to landmarks [de Silva and Tenenbaum, 2004]; components
-    that do not touch lie beside each other.
+    Classical scaling of the distances to landmarks [deSilvaTenenbaum2004]_;
+    components that do not touch lie beside each other.
     """
     n = graph.shape[0]
     count, component = csgraph.connected_components(graph, directed=False)

@@ -44,8 +44,7 @@ def elastic_modes(
 
     The transformation that makes M the identity leaves an error of a rounding of the largest
     eigenvalue in all of them. Soft modes are therefore improved by inverse iteration with the
-    scaled Cholesky factor of K + s M, whose error is a rounding of each entry [Demmel, "On
-    floating point errors in Cholesky", LAPACK Working Note 14 (1989)].
+    scaled Cholesky factor of K + s M, whose error is a rounding of each entry [Demmel1989]_.
 
     Raises
     ------

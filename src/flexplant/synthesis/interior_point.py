@@ -2,8 +2,7 @@
 
 ``min cost' y`` with blocks ``Z = const + linear(y) >= 0``; multipliers X >= 0 with
 ``adjoint(X) = cost``. The direction of Helmberg, Kojima and Monteiro with Mehrotra's predictor and
-corrector, from a start that need not be feasible (Helmberg, Rendl, Vanderbei, Wolkowicz, An
-interior-point method for semidefinite programming, SIAM J. Optim. 6, 1996).
+corrector, from a start that need not be feasible [Helmberg1996]_.
 """
 
 from __future__ import annotations

@@ -85,7 +85,7 @@ class LawSearch:
         """Return what steps from some numbers lead to; None when that does not hold the peak.
 
         Each step is the best of the linearised problem within a radius, with an exact penalty on
-        what is violated (Fletcher, Practical Methods of Optimization, 1987, ch. 14).
+        what is violated ([Fletcher1987]_, chapter 14).
         """
         x, radius, best = numbers, _RADIUS, None
         if not self.of.axis.is_stable(self.of.law(x)):

@@ -66,7 +66,7 @@ def symmetric_blocks(rows: list[list[Any]]) -> Any:
 
 
 def smallest_gamma(p: Plant, scale: float, settings: dict[str, float]) -> Optimum:
-    """Return the smallest gamma of the projected LMIs (Gahinet and Apkarian, theorem 4.3)."""
+    """Return the smallest gamma of the projected LMIs ([GahinetApkarian1994]_, theorem 4.3)."""
     cp = modelling()
     n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
     X, Y = (cp.Variable((n, n), symmetric=True) for _ in range(2))

@@ -1,7 +1,7 @@
 """The projected LMIs of H-infinity synthesis as one semidefinite program that keeps its structure.
 
-Over symmetric R, S (n, n) and gamma, with N_R = null [B2' D12'], N_S = null [C2 D21] (Gahinet and
-Apkarian 1994, theorem 4.3)::
+Over symmetric R, S (n, n) and gamma, with N_R = null [B2' D12'], N_S = null [C2 D21]
+([GahinetApkarian1994]_, theorem 4.3)::
 
     min gamma,   -N_R' [A R + R A'  R C1'      B1      ] N_R >= 0,   [R I] >= 0,
                        [C1 R        -gamma I   D11     ]             [I S]

@@ -295,7 +295,7 @@ def _bordered(
 
 
 def _eliminated(Q: FloatArray, P: FloatArray, C: FloatArray) -> FloatArray:
-    """Return K with ``Q + P K C + (P K C)' < 0`` (Iwasaki and Skelton, theorem 2.3.12 there).
+    """Return K with ``Q + P K C + (P K C)' < 0`` ([Skelton1998]_, theorem 2.3.12).
 
     ``K = -r P' F C' (C F C')^-1`` with ``F = (r P P' - Q)^-1`` positive definite.
 

@@ -1,4 +1,4 @@
-"""The LMIs of several objectives: one Lyapunov matrix for all (Scherer, Gahinet, Chilali 1997)."""
+"""The LMIs of several objectives: one Lyapunov matrix for all [Scherer1997]_."""
 
 from __future__ import annotations
 
@@ -137,7 +137,7 @@ def peak(v: Variables, channel: Channel, gamma: Any, decay: float) -> list[Any]:
     """Return the LMIs of the star norm: peak to peak below gamma units, for one rate.
 
     ``x' P x`` shrinks by the rate beside what |w| < 1 adds, so that x stays in an ellipsoid, and z
-    is bounded there (Abedor, Nagpal, Poolla, 1996). Of a sampled plant a step shrinks it by
+    is bounded there [Abedor1996]_. Of a sampled plant a step shrinks it by
     ``1 - decay t``.
     """
     cp = modelling()

@@ -133,7 +133,7 @@ class Scalings:
 
     D of a repeated scalar is Hermitian of its size, of a full block a number; G, of real scalars
     alone, is Hermitian. With F > 0 no w = Delta z of ``|Delta|^2 <= 1 / level`` closes the loop
-    z = M w: level = mu^2 from above (Fan, Tits, Doyle 1991). Blocks that are not `leveled` keep
+    z = M w: level = mu^2 from above [Fan1991]_. Blocks that are not `leveled` keep
     level 1: their Delta is bounded by one (skewed mu).
 
     Parameters
@@ -225,7 +225,7 @@ def _hermitian(size: int) -> ComplexArray:
 def osborne(M: ComplexArray, where: Sequence[Place]) -> FloatArray:
     """Return the squares d of a number for each block that even out ``d_i^(1/2) M_ij d_j^(-1/2)``.
 
-    Frobenius norms of the blocks stand for their largest singular values (Osborne 1960).
+    Frobenius norms of the blocks stand for their largest singular values [Osborne1960]_.
     """
     k = len(where)
     size = np.array([[la.norm(M[a.z, b.w]) for b in where] for a in where])

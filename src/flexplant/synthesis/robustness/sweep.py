@@ -2,7 +2,7 @@
 
 Scalings of one frequency hold on the interval around it in which ``F(j omega) > 0``. F is singular
 where a Hamiltonian matrix has an eigenvalue j omega, so the interval ends there, not at a grid
-point: no peak between frequencies is missed (Lawrence, Tits, Van Dooren, Automatica 36, 2000).
+point: no peak between frequencies is missed [Lawrence2000]_.
 """
 
 from __future__ import annotations

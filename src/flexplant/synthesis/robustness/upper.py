@@ -39,7 +39,7 @@ def upper_level(
 ) -> Certified:
     """Return the smallest level that scalings D, G reach: mu^2 (of a skewed problem, gain^2).
 
-    Generalised eigenvalue minimisation by the method of centres (Boyd, El Ghaoui 1993): at a
+    Generalised eigenvalue minimisation by the method of centres [BoydElGhaoui1993]_: at a
     level, Newton steps to the maximum of ``log det F + sum log det D`` with the trace of D fixed;
     the next level lies between it and what those scalings reach.
 
