@@ -54,4 +54,4 @@ def test_versions_of_all_that_results_depend_on(capsys):
     assert lines["flexplant"] == fx.__version__
     assert {"scipy", "control", "cvxpy", "clarabel", "matplotlib", "python"} <= set(lines)
     found = versions()
-    assert any(name.startswith("BLAS of") and "threads" in text for name, text in found.items())
+    assert any(name.startswith("BLAS of") and "thread" in text for name, text in found.items())

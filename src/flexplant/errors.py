@@ -75,6 +75,11 @@ class FlexplantWarning(UserWarning):
     """
 
 
+def counted(number: int, noun: str) -> str:
+    """Return a number with its noun: `1 mode`, `2 modes`."""
+    return f"{number} {noun}{'s' * (number != 1)}"
+
+
 def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = "") -> LabelError:
     """Return the LabelError for an unknown `name`, with the closest known ones.
 

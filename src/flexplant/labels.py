@@ -18,7 +18,7 @@ from .dof_columns import (
     node_numbers,
 )
 from .dof_index import DofIndex, unknown_dof
-from .errors import LabelError, ShapeError, unknown_label
+from .errors import LabelError, ShapeError, counted, unknown_label
 from .places import DIRECTIONS as DIRECTIONS
 from .places import Interpolation as Interpolation
 from .places import Place as Place
@@ -151,7 +151,7 @@ class DofSet(Value):
         kinds = ", ".join(f"{n} {d}" for n, d in zip(counts, DIRECTIONS, strict=True) if n)
         nodes = int(self.node_index.max(initial=-1)) + 1
         of = f" of {', '.join(self.components)}" if self.components else ""
-        return f"<DofSet {len(self)} DOFs at {nodes} nodes{of}: {kinds}>"
+        return f"<DofSet {counted(len(self), 'DOF')} at {counted(nodes, 'node')}{of}: {kinds}>"
 
     def index(self, label: str) -> int:
         """Return the row of a DOF in the matrices (from 0).

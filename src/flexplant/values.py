@@ -305,6 +305,25 @@ def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
     )
 
 
+def seed_of(sequence: np.random.SeedSequence) -> int | tuple[int, ...]:
+    """Return the number, or numbers, that give the same draws as a SeedSequence when passed as rng.
+
+    A spawned one mixes the key of its place in after four words of entropy, so that a list does.
+
+    Examples
+    --------
+    >>> seed_of(np.random.SeedSequence(7)), seed_of(np.random.SeedSequence(7, spawn_key=(2,)))
+    (7, (7, 0, 0, 0, 2))
+    """
+    entropy: Any = sequence.entropy
+    given = entropy if isinstance(entropy, Sequence | np.ndarray) else (entropy,)
+    numbers = tuple(int(number) for number in given)
+    if not sequence.spawn_key:
+        return numbers[0] if given is not entropy else numbers
+    words = [n >> k & 0xFFFFFFFF for n in numbers for k in range(0, max(n.bit_length(), 1), 32)]
+    return (*words, *(0,) * (sequence.pool_size - len(words)), *sequence.spawn_key)
+
+
 def generator(rng: Any, name: str = "rng") -> np.random.Generator:
     """Return the Generator that a seed, SeedSequence, Generator or None stands for.
 

@@ -8,6 +8,8 @@ import sys
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+from .errors import counted
+
 #: what is imported when it is needed, in the order in which it is listed
 _PACKAGES = (
     *("numpy", "scipy", "control", "slycot", "cvxpy", "clarabel", "filterpy", "matplotlib"),
@@ -34,7 +36,7 @@ def versions() -> dict[str, str]:
         path = Path(pool["filepath"])
         owner = next((n for n in ("numpy", "scipy") if f"{n}.libs" in path.parts), path.parent.name)
         name = f"{kind} of {owner}"
-        found[name] = f"{own}, {pool['num_threads']} threads"
+        found[name] = f"{own}, {counted(pool['num_threads'], 'thread')}"
     found["platform"] = platform.platform()
     found["processors"] = str(os.cpu_count())
     limits = [f"{n}={os.environ[n]}" for n in sorted(os.environ) if n.endswith("_NUM_THREADS")]

@@ -43,7 +43,7 @@ def test_every_kind_of_words(tmp_path, order, size):
     np.testing.assert_allclose(modes.dofs.xyz[[0, 6]], list(XYZ.values()), rtol=1e-6)
     assert modes.zeta.tolist() == [0, 0.02, 0.03]
     said = repr(modes)
-    for words in ("no residual attachment", "1 nodes moved in local", "generalised masses of 0.25"):
+    for words in ("no residual attachment", "1 node moved in local", "generalised masses of 0.25"):
         assert words in said
     # basic directions by the name of the table; other units
     content = op2(XYZ, {9: 5}, VALUES, EIGENVALUES, MASSES, order=order, size=size, name="BOUGV1")

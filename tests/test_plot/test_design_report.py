@@ -49,7 +49,7 @@ def design():
 @pytest.fixture(scope="module")
 def text(design, tmp_path_factory):
     path = tmp_path_factory.mktemp("report") / "design.html"
-    fx.plot.report(path, *design, title=f"Stage {HOSTILE}", seeds={"run": 7})
+    fx.plot.report(path, *design, title=f"Stage {HOSTILE}", seeds={"test": 8})
     return path.read_text(encoding="utf-8")
 
 
@@ -72,7 +72,10 @@ def test_the_page_is_well_formed_and_loads_nothing(text):
 def test_it_begins_with_the_result_and_ends_with_versions(text, design):
     tree, loop = tree_of(text), design[0]
     headings = [one.text for one in tree.iter("h2")]
-    assert headings[:2] == ["Result", "Loop"] and headings[-2:] == ["Certificates", "Versions"]
+    assert headings[:2] == ["Result", "Loop"] and headings[-2:] == [
+        "Certificates",
+        "Seeds and versions",
+    ]
     assert {"Runs", "Controller", "Observer", "Placement", "Plant", "Machine"} < set(headings)
     tiles = [words(one) for one in tree.iter("div") if "tile " in one.get("class", "")]
     error = with_unit(loop.rms("die:error"), "m")
@@ -82,7 +85,8 @@ def test_it_begins_with_the_result_and_ends_with_versions(text, design):
     assert "stablespectral radius" in tiles[2] and "(490 states)" in tiles[2]
     assert f"modulus margin {loop.modulus_margin:.3g}" in tiles[3]
     said = words(tree)
-    for part in (fx.__version__, np.__version__, "seed of run7", "u4:effort", "no choice is below"):
+    seeds = "seed of run7", "seed of test8"
+    for part in (fx.__version__, np.__version__, *seeds, "u4:effort", "no choice is below"):
         assert part in said
     drawn = [one for one in tree.iter("figure") if one.get("class") == "picture"]
     assert len(drawn) >= 8 and all(one.find(".//path") is not None for one in drawn)
@@ -129,7 +133,7 @@ def test_what_has_no_picture_says_so(tmp_path):
     points = np.array([[0.0, 0.0, 0.0], [1.0, 1.0, 0.0]])
     found = fx.placement.SensorMap(points, np.array([2.0, 1.0]), 4.0, "PoiVariance()", ())
     said = words(tree_of(fx.plot.report(tmp_path / "map", found).read_text()))
-    assert "Not shown: 2 points on one line span no map" in said and "Versions" in said
+    assert "Not shown: 2 points on one line span no map" in said and "versions" in said
 
 
 def test_neighbours_are_the_lines_of_a_mesh():

@@ -232,7 +232,7 @@ def test_a_chain_in_all_its_dofs_is_itself():
 def test_travels(plate, tmp_path):
     _, model = reduced(plate, vector=True)
     assert repr(model) == (
-        "<ReducedModel: 25 of 243 DOFs by 24 modes and 1 attachment vectors, "
+        "<ReducedModel: 25 of 243 DOFs by 24 modes and 1 attachment vector, "
         "3 rigid-body motions, cond(phi_kk) 11.6>"
     )
     model.save(tmp_path / "rom.npz")

@@ -111,7 +111,7 @@ def test_hankel_values_against_lyapunov(modes):
     assert len(text.splitlines()) == 4
     assert f"{ranking.order[0]:4d}" in text
     assert "1:z -> " in text
-    assert repr(ranking).startswith("<ModeRanking: 6 elastic modes, 1 inputs to 2 outputs")
+    assert repr(ranking).startswith("<ModeRanking: 6 elastic modes, 1 input to 2 outputs")
 
 
 def test_a_mode_that_a_channel_does_not_see_comes_last(modes):

@@ -128,7 +128,7 @@ def test_is_a_mapping_and_a_value(tmp_path):
             again["e"][0] = 5.0
     run.save(tmp_path / "run.npz")
     assert load(tmp_path / "run.npz")["e"].tolist() == [1.0, 2.0, 3.0]
-    assert repr(run) == "<Response 3 samples over 0.003 s, 1 channels: e>"
+    assert repr(run) == "<Response 3 samples over 0.003 s, 1 channel: e>"
 
 
 def test_bad_input():

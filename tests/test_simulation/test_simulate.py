@@ -22,6 +22,7 @@ from flexplant.lti import StateSpace
 from flexplant.plant import Foreign, StandardPlant, Weighted
 from flexplant.simulation import setpoint, simulate
 from flexplant.simulation import simulate as simulate_function
+from flexplant.store import load
 from machines import RATE, block, matrices, observer, servo, stage
 
 
@@ -142,6 +143,20 @@ def test_seeds(loop):
     first, second = (simulate(loop, rng=g, **options).data for g in generators)
     np.testing.assert_array_equal(first, second)
     assert np.any(first != simulate(loop, rng=generators[0], **options).data)
+
+
+def test_a_run_keeps_the_seed_that_gives_it_again(loop, tmp_path):
+    """Whatever was passed: a number, several, a generator, a spawned sequence, nothing."""
+    spawned = np.random.SeedSequence(2**70 + 3, spawn_key=(2, 2**33)).spawn(2)[1]
+    assert simulate(loop, duration=0.01, rng=7).seed == 7
+    assert simulate(loop, duration=0.01, rng=7, noise=False).seed is None
+    for rng in ([3, 2**40], np.random.default_rng(7), spawned, np.random.SeedSequence(0), None):
+        run = simulate(loop, duration=0.01, rng=rng, runs=[4])
+        run.save(tmp_path / "run.npz")
+        seed = load(tmp_path / "run.npz").seed
+        np.testing.assert_array_equal(
+            simulate(loop, duration=0.01, rng=seed, runs=[4]).data, run.data
+        )
 
 
 @given(st.floats(1e-3, 1e3), st.integers(0, 5))

@@ -358,7 +358,7 @@ def test_designs_receive_only_answers():
 
 
 def test_repr_hides_what_it_is():
-    assert repr(stage(0.01)) == "<WaferStage: rate 10000 Hz, delay 1 samples>"
+    assert repr(stage(0.01)) == "<WaferStage: rate 10000 Hz, delay 1 sample>"
     assert isinstance(stage(0.01), WaferStage)
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, unknown_label
+from ..errors import LabelError, counted, unknown_label
 from ..lti.lyapunov import scale_of
 from ..parallel import one_thread
 from ..values import FloatArray, Value, instance, known_units, real_array, sizes_of
@@ -100,7 +100,7 @@ class Estimate(Value, Mapping[str, FloatArray]):
         gaps = f", {missing} of {self.innovations.size} innovations missing" if missing else ""
         last = sizes_of(dict(zip(self.names, self._typical(), strict=True)), self.units)
         return (
-            f"<Estimate by {self.lag!r}: {self.time.size} samples{gaps};\n"
+            f"<Estimate by {self.lag!r}: {counted(self.time.size, 'sample')}{gaps};\n"
             f"  median deviation {last}>"
         )
 

@@ -97,7 +97,8 @@ class KalmanEstimator(Value):
                 "of the mesh a wavelength: a finer one for larger= would change it"
             )
         return (
-            f"<KalmanEstimator: {self.system.n_states} states, {len(sensors(self.plant))} sensors, "
+            f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "
+            f"{counted(len(sensors(self.plant)), 'sensor')}, "
             f"spectral radius {self.certificate.spectral_radius:.6f}\n"
             f"  rms error {rms} ({counted})>"
         )

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import AssumptionError, ShapeError, SolverError
+from ..errors import AssumptionError, ShapeError, SolverError, counted
 from ..plant import StandardPlant
 from ..values import FloatArray, Value
 from .channels import poi_channels, sensors
@@ -74,7 +74,10 @@ class FilterModel(Value):
 
     def __repr__(self) -> str:
         n, ny = self.C2.T.shape
-        return f"<FilterModel: {n} states, {ny} sensors, {self.C1.shape[0]} POI channels>"
+        return (
+            f"<FilterModel: {counted(n, 'state')}, {counted(ny, 'sensor')}, "
+            f"{counted(self.C1.shape[0], 'POI channel')}>"
+        )
 
     def scaled(self, d: FloatArray, s: FloatArray) -> FilterModel:
         """Return the model with states x / d and measurements y / s."""

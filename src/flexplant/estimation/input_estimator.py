@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..certificates import Certificate
+from ..errors import counted
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, sizes_of
@@ -93,7 +94,8 @@ class InputEstimator(Value):
         rms = sizes_of({name: self.rms(name) for name in names[:6]}, self.plant.units)
         late = "in their own sample" if not self.delay else f"{self.delay} sample late"
         return (
-            f"<InputEstimator: {self.system.n_states} states, inputs {late}, spectral radius "
+            f"<InputEstimator: {counted(self.system.n_states, 'state')}, inputs {late}, spectral "
+            "radius "
             f"{self.certificate.spectral_radius:.6f}\n  rms error {rms}>"
         )
 

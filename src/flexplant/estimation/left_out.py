@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..plant.building import with_flexibility
@@ -67,7 +67,7 @@ class LeftOut(Value):
         self._set(modes=self.modes, sensors=self.sensors, pois=self.pois, cross=self.cross)
 
     def __repr__(self) -> str:
-        return f"<LeftOut: {self.modes.size} modes as noise and static compliance>"
+        return f"<LeftOut: {counted(self.modes.size, 'mode')} as noise and static compliance>"
 
 
 def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:

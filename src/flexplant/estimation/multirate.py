@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..certificates import Certificate
-from ..errors import CertificateError, LabelError, ModelError, ShapeError, unknown_label
+from ..errors import CertificateError, LabelError, ModelError, ShapeError, counted, unknown_label
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
@@ -97,7 +97,8 @@ class PeriodicEstimator(Value):
         names = poi_channels(self.plant)[:4]
         rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
         return (
-            f"<PeriodicEstimator: {self.gains.shape[1]} states, {len(self.sensors)} sensors, "
+            f"<PeriodicEstimator: {counted(self.gains.shape[1], 'state')}, "
+            f"{counted(len(self.sensors), 'sensor')}, "
             f"period {self.period} samples;\n  rms error {rms}>"
         )
 

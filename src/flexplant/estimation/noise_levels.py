@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import counted
 from ..plant import StandardPlant
 from ..values import FloatArray, Value
 
@@ -68,7 +69,7 @@ class NoiseLevels(Value):
             for name, ratio in zip(self.channels[:5], self.ratios, strict=False)
         ]
         more = [f"  ... and {len(self.channels) - 5} more"] if len(self.channels) > 5 else []
-        first = f"<NoiseLevels from {self.samples} samples, NIS {self.nis:.4g}"
+        first = f"<NoiseLevels from {counted(self.samples, 'sample')}, NIS {self.nis:.4g}"
         return "\n".join([first, *shown, *more]) + ">"
 
     @property

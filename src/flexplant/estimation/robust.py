@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..certificates import Certificate
+from ..errors import counted
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, sizes_of
@@ -130,7 +131,8 @@ class RobustFilter(Value):
         names = poi_channels(self.plant)[:4]
         rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
         return (
-            f"<RobustFilter: {self.system.n_states} states, {len(sensors(self.plant))} sensors;\n"
+            f"<RobustFilter: {counted(self.system.n_states, 'state')}, "
+            f"{counted(len(sensors(self.plant)), 'sensor')};\n"
             f"  rms error on its own plant {rms};\n  {self.certificate!r}>"
         )
 

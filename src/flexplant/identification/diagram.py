@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError, SolverError
+from ..errors import ModelError, ShapeError, SolverError, counted
 from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
 from .plscf import OrderPoles
 
@@ -61,7 +61,10 @@ class PoleSelection(Value):
 
     def __repr__(self) -> str:
         listed = ", ".join(f"{pole.imag / 2 / np.pi:.4g}" for pole in self.poles[:6].tolist())
-        return f"<PoleSelection: {len(self)} poles at {listed}{', ...' * (len(self) > 6)} Hz>"
+        return (
+            f"<PoleSelection: {counted(len(self), 'pole')} at {listed}{', ...' * (len(self) > 6)} "
+            "Hz>"
+        )
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,7 +115,7 @@ class StabilisationDiagram(Value):
         known = np.unique(self.orders)
         span = f"{known[0]} .. {known[-1]}" if known.size else "none"
         return (
-            f"<StabilisationDiagram: orders {span}, {len(self)} poles, "
+            f"<StabilisationDiagram: orders {span}, {counted(len(self), 'pole')}, "
             f"{int(np.sum(self.flags == STABLE))} stable>"
         )
 

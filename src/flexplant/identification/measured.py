@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, ShapeError
+from ..errors import LabelError, ModelError, ShapeError, counted
 from ..values import ComplexArray, FloatArray, Value, check_names, real_array, short, whole
 
 
@@ -87,9 +87,8 @@ class MeasuredModes(Value):
     def __repr__(self) -> str:
         known = "" if self.modes is None else ", modes " + _listed(self.modes, "d")
         spread = "" if self.covariance is None else ", with covariance"
-        plural = "" if len(self) == 1 else "s"
         return (
-            f"<MeasuredModes: {len(self)} pole{plural}{known} at "
+            f"<MeasuredModes: {counted(len(self), 'pole')}{known} at "
             f"{_listed(self.freq, '.1f')} Hz{spread}>"
         )
 

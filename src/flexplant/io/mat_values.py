@@ -69,7 +69,7 @@ def write_mat(
     ...     path = os.path.join(folder, "filters.mat")
     ...     fx.io.write_mat(path, {"slow": fx.lowpass(10.0), "fast": fx.lowpass(100.0)})
     ...     fx.io.read_mat(path, "fast")
-    <StateSpace: 1 states, continuous, in -> out>
+    <StateSpace: 1 state, continuous, in -> out>
     """
     if isinstance(value, Mapping) and not isinstance(value, Frf):
         for name in value:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..dof_columns import at_nodes
-from ..errors import LabelError
+from ..errors import LabelError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray
 from .nastran import Nodes, read_nodes
@@ -53,7 +53,8 @@ def shapes_at(
     grid = kinds == 1
     notes: tuple[str, ...] = ()
     if not grid.all():
-        notes = (f"{int(np.count_nonzero(~grid))} scalar points, which have no place, left out",)
+        scalar = counted(int(np.count_nonzero(~grid)), "scalar point")
+        notes = (f"without a place, left out: {scalar}",)
     ids, values = ids[grid], np.array(values[grid])
     xyz, axes = _places(ids, nodes, path)
     local_rows = [] if turned else [i for i, node in enumerate(ids.tolist()) if node in axes]
@@ -62,8 +63,8 @@ def shapes_at(
         for first in (0, 3):
             values[row, first : first + 3] = local @ values[row, first : first + 3]
     if local_rows:
-        count = len(local_rows)
-        notes = (*notes, f"{count} nodes moved in local directions: turned into the basic ones")
+        moved = counted(len(local_rows), "node")
+        notes = (*notes, f"{moved} moved in local directions: turned into the basic ones")
     dofs = DofSet(np.repeat(ids, 6), DIRECTIONS * ids.size, np.repeat(xyz, 6, axis=0))
     phi = values.reshape(6 * ids.size, omega.size)
     return FileShapes(omega, phi, dofs, masses=masses, notes=notes)

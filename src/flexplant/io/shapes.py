@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, ModelError, ShapeError
+from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure.units import Units
@@ -108,7 +108,10 @@ def modes_of(
     notes = shapes.notes
     if not moved.all():
         held = int(np.count_nonzero(~moved))
-        notes = (*notes, f"{held} DOFs that no mode moves are left out (held, or not there)")
+        notes = (
+            *notes,
+            f"left out, as no mode moves them: {counted(held, 'DOF')} (held, or not there)",
+        )
     rows = np.flatnonzero(moved)
     directions = tuple(shapes.dofs.directions[i] for i in rows.tolist())
     dofs = DofSet(shapes.dofs.nodes[rows], directions, shapes.dofs.xyz[rows])

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, ModelError, ShapeError
+from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
@@ -125,7 +125,7 @@ def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
         at = wrong_line((b" ".join(row) for row in words), width)
         if at is not None:
             raise FlexplantError(
-                f"{str(path)!r}, line {first + at}: {width} number{'s' * (width > 1)} are due, "
+                f"{str(path)!r}, line {first + at}: {counted(width, 'number')} are due, "
                 f"got {lines[at][:72].decode('latin-1')!r}. Write it again with 'mfile'."
             )
         raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
@@ -210,7 +210,7 @@ def _per_node(path: str | Path, size: int, entry: IntArray, nodes: int | None) -
             if fits
             else ", not 8 or 9 a node. Is it of the same run?"
             if nodes is None
-            else f", not 8 or 9 for each of {nodes} nodes. Are they of the same mesh?"
+            else f", not 8 or 9 for each of {counted(nodes, 'node')}. Are they of the same mesh?"
         )
     )
 

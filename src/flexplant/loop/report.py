@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..errors import unknown_label
+from ..errors import counted, unknown_label
 from ..values import ComplexArray, FloatArray, Value, whole
 from .broken import BrokenLoop, inverted
 from .nyquist import NyquistCount, continued, nyquist_count
@@ -121,7 +121,7 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     @property
     def poles(self) -> str:
         """The number of unstable poles, in words."""
-        return "1 pole" if self.unstable == 1 else f"{self.unstable} poles"
+        return counted(self.unstable, "pole")
 
     def __getitem__(self, name: str) -> LoopMargins:
         for loop in self.loops:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError, SolverError
+from ..errors import ModelError, SolverError, counted
 from ..parallel import one_thread
 from ..values import FloatArray, Value, positive
 from .factors import compressed, controllability_factor, observability_factor
@@ -62,7 +62,8 @@ class BalancedReduction(Value):
         full = self.hankel.size + self.n_kept
         promised = f"bound {self.bound:.3g}" if np.isfinite(self.bound) else "no bound (weighted)"
         return (
-            f"<BalancedReduction: {full} -> {self.system.n_states} states ({self.n_kept} kept "
+            f"<BalancedReduction: {full} -> {counted(self.system.n_states, 'state')} "
+            f"({self.n_kept} kept "
             f"exactly), error {self.error:.3g} at {self.error_freq:.4g} Hz, {promised}>"
         )
 

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, ShapeError
+from ..errors import LabelError, ModelError, ShapeError, counted
 from ..values import ComplexArray, FloatArray, short
 from .joining import short_list
 from .responses import responses
@@ -180,4 +180,4 @@ def _sides(one: Operand) -> str:
 
 def _lines(frf: Any) -> str:
     span = f" from {frf.freq[0]:.4g} to {frf.freq[-1]:.4g} Hz" if frf.freq.size else ""
-    return f"{frf.freq.size} lines{span}"
+    return f"{counted(frf.freq.size, 'line')}{span}"

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..values import FloatArray, Value
 from .discretisation import bilinear, tustin
 from .modal import modal_form
@@ -77,7 +77,10 @@ class Prepared(Value):
     direct: bool = False
 
     def __repr__(self) -> str:
-        return f"<Prepared: {self.A.shape[0]} states, unit of frequency {self.speed:.3g} rad/s>"
+        return (
+            f"<Prepared: {counted(self.A.shape[0], 'state')}, unit of frequency {self.speed:.3g} "
+            "rad/s>"
+        )
 
     @property
     def system(self) -> StateSpace:

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..values import ComplexArray, FloatArray, Value, real_array
 from .doubling import Continuous, Discrete, RiccatiProblem, solved
 from .lyapunov import symmetric
@@ -58,8 +58,8 @@ class RiccatiSolution(Value):
 
     def __repr__(self) -> str:
         return (
-            f"<RiccatiSolution: {self.P.shape[0]} states, residual {self.residual:.1e}, "
-            f"{self.iterations} iterations>"
+            f"<RiccatiSolution: {counted(self.P.shape[0], 'state')}, residual {self.residual:.1e}, "
+            f"{counted(self.iterations, 'iteration')}>"
         )
 
     @property

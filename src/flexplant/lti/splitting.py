@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import SolverError
+from ..errors import SolverError, counted
 from ..values import FloatArray, Value
 from .joining import block_eigenvalues, is_block_diagonal
 from .scaling import state_scale
@@ -48,7 +48,8 @@ class Split(Value):
 
     def __repr__(self) -> str:
         return (
-            f"<Split: {self.stable.n_states} stable states, {self.rest.n_states} others, "
+            f"<Split: {counted(self.stable.n_states, 'stable state')}, "
+            f"{counted(self.rest.n_states, 'other')}, "
             f"separation {self.separation:.1e}>"
         )
 

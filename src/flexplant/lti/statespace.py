@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..values import (
     ComplexArray,
     FloatArray,
@@ -131,7 +131,7 @@ class StateSpace(SystemArithmetic):
         kind = "continuous" if not self.dt else f"dt {self.dt:g} s"
         named = f" {self.name!r}" if self.name else ""
         sides = f"{short_list(self.inputs)} -> {short_list(self.outputs)}"
-        return f"<StateSpace{named}: {self.n_states} states, {kind}, {sides}>"
+        return f"<StateSpace{named}: {counted(self.n_states, 'state')}, {kind}, {sides}>"
 
     @property
     def n_states(self) -> int:

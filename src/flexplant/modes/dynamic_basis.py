@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError
+from ..errors import ModelError, SolverError, counted
 from ..sparse.complex_symmetric import ComplexSymmetricFactor
 from ..sparse.factor import DENSE_LIMIT, dense
 from ..sparse.orthonormal import beyond
@@ -82,7 +82,9 @@ class DynamicBasis:
         self._damped()
 
     def __repr__(self) -> str:
-        return f"<DynamicBasis: {self.n_modes} modes and {self.n_shapes} shapes>"
+        return (
+            f"<DynamicBasis: {counted(self.n_modes, 'mode')} and {counted(self.n_shapes, 'shape')}>"
+        )
 
     @property
     def n_shapes(self) -> int:

@@ -8,7 +8,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet, Place
 from ..structure.negative_stiffness import signed_square
 from ..structure.placed import Placed, missed
@@ -177,7 +177,10 @@ class Modes(Placed, Value):
                 "frequency"
             )
         checked += "".join(f",\n  {note}" for note in self.notes)
-        return f"<Modes: {self.n_modes}{kind} of {len(self.dofs)} DOFs{held}{extra}{checked}>"
+        return (
+            f"<Modes: {self.n_modes}{kind} of "
+            f"{counted(len(self.dofs), 'DOF')}{held}{extra}{checked}>"
+        )
 
     @property
     def n_modes(self) -> int:

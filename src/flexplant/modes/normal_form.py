@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError, SolverError
+from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
 from ..structure.negative_stiffness import signed_square
@@ -66,7 +66,10 @@ class NormalForm(Value):
 
     def __repr__(self) -> str:
         kind = "real" if self.is_real else "complex"
-        return f"<NormalForm: {self.poles.size} modes, {self.n_rigid} rigid-body, {kind} shapes>"
+        return (
+            f"<NormalForm: {counted(self.poles.size, 'mode')}, {self.n_rigid} rigid-body, {kind} "
+            "shapes>"
+        )
 
     @property
     def is_real(self) -> bool:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError
+from ..errors import ModelError, SolverError, counted
 from ..sparse.multifrontal import MultifrontalCholesky, multifrontal_inertia
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
@@ -64,13 +64,13 @@ class StiffnessFactor:
             if not negative:
                 raise
             raise ModelError(
-                f"K has {negative} negative eigenvalue{'s' * (negative != 1)}: the structure is "
+                f"K has {counted(negative, 'negative eigenvalue')}: the structure is "
                 "unstable, and not as a rigid body. Look for a sign in K."
             ) from error
 
     def __repr__(self) -> str:
         size = self._cholesky.n_entries * 8e-9
-        return f"<StiffnessFactor: {self.K.shape[0]} DOFs, {size:.2g} GB>"
+        return f"<StiffnessFactor: {counted(self.K.shape[0], 'DOF')}, {size:.2g} GB>"
 
     def solve(self, force: FloatArray) -> FloatArray:
         """Return ``(K - sigma M)^-1 force`` for (n,) or (n, m) forces."""

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..plant import Sensor, StandardPlant
 from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
@@ -64,7 +64,7 @@ class SensorMap(Value):
     def __repr__(self) -> str:
         x, y, z = self.best
         return (
-            f"<SensorMap of {self.values.size} points by {self.criterion}: "
+            f"<SensorMap of {counted(self.values.size, 'point')} by {self.criterion}: "
             f"{in_words(self.without, self.unit)} without, "
             f"{in_words(float(self.values.min()), self.unit)} with a sensor at "
             f"({x:.4g}, {y:.4g}, {z:.4g}) m>"

@@ -105,7 +105,7 @@ class FirstOrder(_Spectrum):
     >>> import flexplant as fx
     >>> hum = fx.plant.FirstOrder(rms=0.01, corner=20.0)
     >>> hum.asd, hum.shape
-    (0.001784124116152771, <StateSpace: 1 states, continuous, u1 -> y1>)
+    (0.001784124116152771, <StateSpace: 1 state, continuous, u1 -> y1>)
     """
 
     rms: float
@@ -208,7 +208,7 @@ class RandomWalk(_Spectrum):
     >>> import flexplant as fx
     >>> drift = fx.plant.RandomWalk(drift=1e-3)
     >>> drift.shape
-    <StateSpace: 1 states, continuous, u1 -> y1>
+    <StateSpace: 1 state, continuous, u1 -> y1>
     """
 
     drift: float

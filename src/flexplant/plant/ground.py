@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..lti.statespace import StateSpace
 from ..structure.placed import SPANNED
 from ..values import FloatArray
@@ -146,7 +146,7 @@ def _unbounded(output: str, order: int, name: str, left: int, found: int) -> str
     has = f"the shape of {name!r} has {found or 'none'}"
     return (
         f"{output!r} is an absolute {QUANTITIES[order]}, which grows without bound with the "
-        f"acceleration of {name!r}: its integrals need {left} zero{'s' * (left > 1)} at 0 Hz more "
+        f"acceleration of {name!r}: its integrals need {counted(left, 'zero')} at 0 Hz more "
         f"than the sensor has, and {has}. Give it one that has, shape=highpass(0.1, "
         f"order={left}) say, or dynamics to the sensor (a geophone's), or measure relative to the "
         "ground: absolute=False."

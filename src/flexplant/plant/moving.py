@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, counted, unknown_label
 from ..values import FloatArray, Value, real_array
 from .building import rebuilt
 from .forces import Actuator, Disturbance
@@ -56,7 +56,7 @@ class Along(Value):
         self._set(points=self.points, C=self.C, D=self.D, B=self.B)
 
     def __repr__(self) -> str:
-        return f"<Along {self.points.shape[0]} points: {', '.join(self.channels)}>"
+        return f"<Along {counted(self.points.shape[0], 'point')}: {', '.join(self.channels)}>"
 
 
 def moved(ports: Ports, places: Any) -> Ports:

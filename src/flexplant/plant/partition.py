@@ -8,7 +8,7 @@ from typing import Any, Self, TypeGuard
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, counted, unknown_label
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import FloatArray, IntArray, Value, name_list, positive, short
 from .channel_sides import TYPE_THIS, sides
@@ -54,7 +54,7 @@ class Partition(Value):
         kind = f"dt {self.dt:g} s, delay {self.delay:g}" if self.dt else "continuous"
         named = f" {self.system.name!r}" if self.system.name else ""
         how = f", {self.alteration}" if self.is_weighted else ""
-        lines = [f"<StandardPlant{named}: {self.system.n_states} states, {kind}{how}>"]
+        lines = [f"<StandardPlant{named}: {counted(self.system.n_states, 'state')}, {kind}{how}>"]
         for side in "wuzy":
             names = getattr(self, side)
             shown = "  ".join(names[:8]) + ("  ..." if len(names) > 8 else "")

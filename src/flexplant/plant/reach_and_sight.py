@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..errors import counted
 from ..labels import DIRECTIONS
 from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray
@@ -76,7 +77,7 @@ def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
     """Return, in words, how many modes of each kind do not decay."""
     rigid, pairs = plant.n_rigid, len(plant.unstable_modes)
     words = [f"all {rigid} rigid-body modes"] if rigid else []
-    words += [f"{pairs} unstable rigid-body pair{'s' * (pairs != 1)}"] if pairs else []
+    words += [counted(pairs, "unstable rigid-body pair")] if pairs else []
     count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
     known = np.zeros(0)
     if plant.is_assembled:
@@ -92,7 +93,7 @@ def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
     for kind, freq in kinds.items():
         if freq:
             span = f"{min(freq):.4g}" + (f" to {max(freq):.4g}" if len(freq) > 1 else "")
-            words.append(f"{len(freq)} {kind}{'s' * (len(freq) > 1)} at {span} Hz")
+            words.append(f"{counted(len(freq), kind)} at {span} Hz")
             count -= len(freq)
     words += [f"{count} other poles that are not stable"] if count > 0 else []
     return words

@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import FlexplantWarning, ModelError, counted
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
 from ..lti.grid import sampled_freq
@@ -217,7 +217,7 @@ def frequency_response(
     return through.frf(
         grid,
         data,
-        route=f"{basis.n_modes} modes and {basis.n_shapes} static shapes",
+        route=f"{counted(basis.n_modes, 'mode')} and {counted(basis.n_shapes, 'static shape')}",
         check_freq=check.freq,
         error=check.of_peak,
         error_there=check.there,

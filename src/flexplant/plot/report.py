@@ -6,6 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from ..simulation import Response
 from ..store import written
 from ..values import short
 from ..versions import versions
@@ -42,7 +43,7 @@ def report(
     channel : str, optional
         The z whose error comes first; the first error at a POI when not given.
     seeds : mapping {str: seed}, optional
-        What chance was drawn from, for the record.
+        What chance was drawn from, for the record, beside the seeds that runs keep.
 
     Returns
     -------
@@ -68,7 +69,7 @@ def report(
         loops_section(design, gallery),
         *sections(design, gallery),
         certificates(design),
-        _origin(seeds),
+        _origin({**_drawn_from(design), **(seeds or {})}),
     ]
     text = page(str(title), str(subtitle), [one for one in found if one is not None])
     with written(path) as file:
@@ -76,8 +77,13 @@ def report(
     return Path(path)
 
 
-def _origin(seeds: Mapping[str, Any] | None) -> Chapter:
+def _drawn_from(design: Design) -> dict[str, Any]:
+    """Return the seeds of the runs that have noise."""
+    return {name: run.seed for name, run in design.of(Response).items() if run.seed is not None}
+
+
+def _origin(seeds: Mapping[str, Any]) -> Chapter:
     """Return the section of versions and seeds."""
-    rows = [[f"seed of {name}", short(seed)] for name, seed in (seeds or {}).items()]
+    rows = [[f"seed of {name}", short(seed)] for name, seed in seeds.items()]
     rows += [list(pair) for pair in versions().items()]
-    return Chapter("Versions", table(["", ""], rows, words=True))
+    return Chapter("Seeds and versions", table(["", ""], rows, words=True))

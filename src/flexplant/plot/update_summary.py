@@ -10,6 +10,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import MaxNLocator
 
+from ..errors import counted
 from ..lti.frequency import Frf
 from ..updating import Correlation, FrfResidual, Residual, UpdateResult, correlate
 from ..updating.search import Objective
@@ -88,7 +89,7 @@ def update(
     if shown:
         _response(axs["response"], shown[-1], before, fit.model)
     said = "converged" if fit.converged else "NOT CONVERGED"
-    figure.suptitle(f"update: {said} in {len(fit.history)} steps ({fit.reason})")
+    figure.suptitle(f"update: {said} in {counted(len(fit.history), 'step')} ({fit.reason})")
     return axs
 
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..errors import counted
 from ..values import FloatArray, Value, name_list, positive, real_array
 from .ranking import peak_gains
 
@@ -57,7 +58,8 @@ class ErrorBound(Value):
 
     def __repr__(self) -> str:
         return (
-            f"<ErrorBound {self.value:.4g} m/N, {len(self.inputs)} inputs to {len(self.outputs)} "
+            f"<ErrorBound {self.value:.4g} m/N, {counted(len(self.inputs), 'input')} to "
+            f"{len(self.outputs)} "
             f"outputs: {self.rule}>"
         )
 

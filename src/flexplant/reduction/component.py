@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import dense, unit_diagonal
@@ -84,7 +84,9 @@ class CraigBampton(ReductionMethod):
     def __repr__(self) -> str:
         labels = tuple(self.boundary)
         more = f"{self.modes}" if self.below is None else f"all below {self.below:g} Hz"
-        return f"<CraigBampton: {len(labels)} DOFs ({shown(labels)}), fixed modes: {more}>"
+        return (
+            f"<CraigBampton: {counted(len(labels), 'DOF')} ({shown(labels)}), fixed modes: {more}>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""
@@ -256,7 +258,10 @@ class Rubin(_FreeInterface):
 
     def __repr__(self) -> str:
         labels = tuple(self.boundary)
-        return f"<Rubin: {len(labels)} DOFs ({shown(labels)}), {self.modes} free modes>"
+        return (
+            f"<Rubin: {counted(len(labels), 'DOF')} ({shown(labels)}), "
+            f"{counted(self.modes, 'free mode')}>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""
@@ -314,7 +319,10 @@ class MacNeal(_FreeInterface):
 
     def __repr__(self) -> str:
         labels = tuple(self.boundary)
-        return f"<MacNeal: {len(labels)} DOFs ({shown(labels)}), {self.modes} free modes>"
+        return (
+            f"<MacNeal: {counted(len(labels), 'DOF')} ({shown(labels)}), "
+            f"{counted(self.modes, 'free mode')}>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""

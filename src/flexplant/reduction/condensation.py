@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError, ShapeError, SolverError
+from ..errors import ModelError, ShapeError, SolverError, counted
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
 from ..sparse.factor import unit_diagonal
@@ -53,7 +53,7 @@ def _loose(model: FEModel, kept: IntArray) -> str:
         order = la.qr(left.T, mode="r", pivoting=True)
     add = ", ".join(repr(names[i]) for i in order[1][:count])
     return (
-        f"the kept DOFs leave {count} rigid-body motion{'s' * (count != 1)} free: with them held, "
+        f"the kept DOFs leave {counted(count, 'rigid-body motion')} free: with them held, "
         f"the structure has no static shape. Keep {add} as well, say; or take Rubin or "
         "ModalTruncation, which need nothing held."
     )
@@ -129,7 +129,7 @@ class Guyan(ReductionMethod):
 
     def __repr__(self) -> str:
         labels = tuple(self.dofs)
-        return f"<Guyan: {len(labels)} DOFs ({shown(labels)})>"
+        return f"<Guyan: {counted(len(labels), 'DOF')} ({shown(labels)})>"
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the condensed model; `reduce` is the public way."""
@@ -204,7 +204,10 @@ class Irs(ReductionMethod):
 
     def __repr__(self) -> str:
         labels = tuple(self.dofs)
-        return f"<Irs: {len(labels)} DOFs ({shown(labels)}), at most {self.iterations} iterations>"
+        return (
+            f"<Irs: {counted(len(labels), 'DOF')} ({shown(labels)}), at most "
+            f"{counted(self.iterations, 'iteration')}>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the condensed model; `reduce` is the public way."""
@@ -228,7 +231,7 @@ class Irs(ReductionMethod):
             model,
             T,
             dofs=model.dofs.select(labels),
-            method=f"improved condensation (IRS, {done} iteration{'s' * (done != 1)})",
+            method=f"improved condensation (IRS, {counted(done, 'iteration')})",
             damping=self.damping,
             singular="The iteration lost modes: take fewer iterations, or other DOFs.",
             static_at=labels,
@@ -311,7 +314,9 @@ class Serep(ReductionMethod):
     def __repr__(self) -> str:
         labels = tuple(self.dofs)
         which = "lowest" if self.modes is None else "chosen"
-        return f"<Serep: the {which} {len(labels)} modes in as many DOFs ({shown(labels)})>"
+        return (
+            f"<Serep: the {which} {counted(len(labels), 'mode')} in as many DOFs ({shown(labels)})>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the model in these DOFs; `reduce` is the public way."""

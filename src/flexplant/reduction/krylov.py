@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError
+from ..errors import ModelError, SolverError, counted
 from ..labels import Place
 from ..modes.attachment_vectors import labels_of, places, static_response
 from ..modes.modes import Modes
@@ -95,7 +95,10 @@ class Krylov(ReductionMethod):
         listed: Any = self.inputs
         at = ", ".join(f"{f:g}" for f in np.atleast_1d(self.freq)[:4])
         more = ", ..." if np.size(self.freq) > 4 else ""
-        return f"<Krylov: {len(listed)} inputs, {self.moments} moments at {at}{more} Hz>"
+        return (
+            f"<Krylov: {counted(len(listed), 'input')}, {counted(self.moments, 'moment')} at "
+            f"{at}{more} Hz>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""

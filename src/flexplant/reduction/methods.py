@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantError, ModelError, ShapeError
+from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
@@ -130,7 +130,10 @@ class DesiredDofs(ReductionMethod):
             dofs=modes.dofs.select(labels),
             full_dofs=modes.dofs,
             rigid_body=partition[:, : modes.n_rigid],
-            method=f"{modes.n_modes} modes and {modes.n_vectors} attachment vectors",
+            method=(
+                f"{counted(modes.n_modes, 'mode')} and "
+                f"{counted(modes.n_vectors, 'attachment vector')}"
+            ),
             condition=condition,
             truncated=truncated,
             n_vectors=modes.n_vectors,

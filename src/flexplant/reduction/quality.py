@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import counted
 from ..values import FloatArray, IntArray, Value, name_list
 from .bounds import ErrorBound
 
@@ -128,7 +129,7 @@ class ReductionQuality(Value):
         lost = int(np.count_nonzero(np.isnan(self.freq)))
         errors = self.freq_error[~np.isnan(self.freq_error)]
         lines = [
-            f"<ReductionQuality: {self.modes.size} modes, worst frequency "
+            f"<ReductionQuality: {counted(self.modes.size, 'mode')}, worst frequency "
             f"{100 * np.abs(errors).max(initial=0.0):.3g} %, lowest MAC "
             f"{self.mac[~np.isnan(self.freq)].min(initial=1.0):.4f}"
             + (f", {lost} without a partner" if lost else "")

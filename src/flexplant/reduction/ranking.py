@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..labels import Place
 from ..lti.discretisation import block_diagonal
 from ..lti.hankel import hankel_values
@@ -91,7 +91,8 @@ class ModeRanking(Value):
         first = ", ".join(str(i) for i in self.order[:6])
         more = ", ..." if self.modes.size > 6 else ""
         return (
-            f"<ModeRanking: {self.modes.size} elastic modes, {len(self.inputs)} inputs to "
+            f"<ModeRanking: {counted(self.modes.size, 'elastic mode')}, "
+            f"{counted(len(self.inputs), 'input')} to "
             f"{len(self.outputs)} outputs; by Hankel value: {first}{more}>"
         )
 

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
@@ -144,9 +144,9 @@ class ReducedModel(Spanned, Value):
 
     def __repr__(self) -> str:
         held = len(self.dofs)
-        shown = f"{held} of {len(self.full_dofs)} DOFs"
+        shown = f"{held} of {counted(len(self.full_dofs), 'DOF')}"
         if held < self.n_dof:
-            extra = f"{self.n_dof - held} generalised coordinates"
+            extra = counted(self.n_dof - held, "generalised coordinate")
             shown = f"{shown} and {extra}" if held else f"{extra} for {len(self.full_dofs)} DOFs"
         left = ""
         if self.truncated is not None:
@@ -155,8 +155,9 @@ class ReducedModel(Spanned, Value):
             left = f", {count} {known} known"
         grows = f", {self.n_unstable} unstable" if self.n_unstable else ""
         return (
-            f"<ReducedModel: {shown} by {self.method}, {self.rigid_body.shape[1]} rigid-body "
-            f"motions{grows}, cond({self.condition_of}) {self.condition:.3g}{left}>"
+            f"<ReducedModel: {shown} by {self.method}, "
+            f"{counted(self.rigid_body.shape[1], 'rigid-body motion')}{grows}, "
+            f"cond({self.condition_of}) {self.condition:.3g}{left}>"
         )
 
     @cached_property

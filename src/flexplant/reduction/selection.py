@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, ShapeError
+from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
 from ..values import FloatArray, Value, instance, name_list, positive, real_array, whole
 from .criteria import PivotedQr, SelectionCriterion
@@ -48,7 +48,8 @@ class DofSelection(Value):
     def __repr__(self) -> str:
         more = f", ... {self.labels[-1]}" if len(self.labels) > 3 else ""
         return (
-            f"<DofSelection: {len(self.labels)} DOFs ({', '.join(self.labels[:3])}{more}), "
+            f"<DofSelection: {counted(len(self.labels), 'DOF')} "
+            f"({', '.join(self.labels[:3])}{more}), "
             f"condition {self.condition:.3g}>"
         )
 

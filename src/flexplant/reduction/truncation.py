@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..labels import Place
 from ..modes.attachment_vectors import attachment_vectors, labels_of, places, static_response
 from ..modes.modes import Modes
@@ -93,8 +93,8 @@ class ModalTruncation(ReductionMethod):
 
     def __repr__(self) -> str:
         listed: Any = self.static_at
-        extra = f", static at {len(listed)} places" if listed else ""
-        return f"<ModalTruncation: {len(self._numbers)} modes{extra}>"
+        extra = f", static at {counted(len(listed), 'place')}" if listed else ""
+        return f"<ModalTruncation: {counted(len(self._numbers), 'mode')}{extra}>"
 
     @property
     def _numbers(self) -> tuple[int, ...]:
@@ -240,7 +240,10 @@ class ModalBalanced(ReductionMethod):
     def __repr__(self) -> str:
         into: Any = self.inputs
         out: Any = self.outputs or self.inputs
-        return f"<ModalBalanced: {self.count} modes, {len(into)} inputs to {len(out)} outputs>"
+        return (
+            f"<ModalBalanced: {counted(self.count, 'mode')}, {counted(len(into), 'input')} to "
+            f"{counted(len(out), 'output')}>"
+        )
 
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the truncated model; `reduce` is the public way."""

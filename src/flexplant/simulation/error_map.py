@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError
+from ..errors import LabelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..plant import Poi
 from ..values import FloatArray, Value, instance, real_array
@@ -55,7 +55,7 @@ class ErrorMap(Value):
 
     def __repr__(self) -> str:
         window = f"windows of {1e3 * self.window:g} ms"
-        lines = [f"<ErrorMap {len(self.points)} points along {self.axis}, {window}>"]
+        lines = [f"<ErrorMap {counted(len(self.points), 'point')} along {self.axis}, {window}>"]
         for name, values in (("MA", self.ma), ("MSD", self.msd)):
             worst = int(np.argmax(values))
             place = ", ".join(f"{c:g}" for c in self.points[worst])

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError
+from ..errors import LabelError, ModelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..loop.known import DERIVATIVES, force_name
 from ..lti.statespace import StateSpace
@@ -48,7 +48,7 @@ class Feedforward(Value):
     >>> import flexplant as fx
     >>> forward = fx.design_feedforward(fx.testbeds.three_masses())
     >>> forward.up_to("acceleration")  # the mass alone
-    <Feedforward die:ref to 1 actuators>
+    <Feedforward die:ref to 1 actuator>
       x: acceleration 3
     """
 
@@ -65,8 +65,9 @@ class Feedforward(Value):
         )
 
     def __repr__(self) -> str:
-        places = f", {len(self.gains)} places" if len(self.gains) > 1 else ""
-        lines = [f"<Feedforward {self.reference} to {len(self.actuators)} actuators{places}>"]
+        places = f", {counted(len(self.gains), 'place')}" if len(self.gains) > 1 else ""
+        driven = counted(len(self.actuators), "actuator")
+        lines = [f"<Feedforward {self.reference} to {driven}{places}>"]
         for axis, row in zip(self.axes, self.gains[0], strict=True):
             shown = "  ".join(f"{t} {g:.4g}" for t, g in zip(TERMS, row, strict=True) if g)
             lines.append(f"  {axis}: {shown or 'nothing'}")
@@ -193,7 +194,7 @@ def design_feedforward(
     >>> forward.gains.shape
     (1, 1, 5)
     >>> forward
-    <Feedforward die:ref to 1 actuators>
+    <Feedforward die:ref to 1 actuator>
       x: acceleration 3  jerk 0.00225  snap 3.313e-06
     """
     loop = given if isinstance(given, ClosedLoop) else None

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError
+from ..errors import AssumptionError, ModelError, counted
 from ..estimation import design_kalman
 from ..identification import MeasuredModes, identify_modes, numbered
 from ..loop import ClosedLoop, SpillOver, bandwidth, close_loop
@@ -153,7 +153,7 @@ class MachinePipeline(Value):
     def __repr__(self) -> str:
         tried = ", ".join(f"{one:g}" for one in np.atleast_1d(self.bandwidth))
         control = "one controller for all" if self.blocks else f"H-infinity, {tried} Hz"
-        return f"<MachinePipeline: {len(self.parameters)} parameters updated, {control}>"
+        return f"<MachinePipeline: {counted(len(self.parameters), 'parameter')} updated, {control}>"
 
     @property
     def error(self) -> str:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..values import FloatArray, Value, instance, real_array
 from .profile import moved
 
@@ -97,11 +97,12 @@ class SetPoint(Value):
 
     def __repr__(self) -> str:
         peak = self.peaks
-        windows = f", {len(self.exposures)} exposures" if len(self.exposures) else ""
+        windows = f", {counted(len(self.exposures), 'exposure')}" if len(self.exposures) else ""
         grid = f", on a grid of {self.tick:g} s" if self.gridded else ""
         return (
-            f"<SetPoint {self.start:g} -> {self.stop:g} in {self.duration:.6g} s, order "
-            f"{self.order}, v {peak.velocity:.4g}, a {peak.acceleration:.4g}{windows}{grid}>"
+            f"<SetPoint {self.start:g} -> {self.stop:g} m or rad in {self.duration:.6g} s, order "
+            f"{self.order}, velocity to {peak.velocity:.4g} /s, acceleration to "
+            f"{peak.acceleration:.4g} /s^2{windows}{grid}>"
         )
 
     @property

@@ -9,7 +9,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..errors import LabelError, ModelError, ShapeError, counted, unknown_label
 from ..loop import Spectrum
 from ..values import FloatArray, Value, check_names, known_units, positive, real_array
 from .moments import moving_moments, unit_of
@@ -35,6 +35,8 @@ class Response(Value, Mapping[str, FloatArray]):
         The channels.
     units : mapping {channel: unit}, optional
         SI units of the channels that have a known one.
+    seed : int or tuple of int, optional
+        What its noise was drawn from: passed as `rng`, it gives the same run again.
 
     Raises
     ------
@@ -55,6 +57,7 @@ class Response(Value, Mapping[str, FloatArray]):
     data: FloatArray
     names: Sequence[str]
     units: Mapping[str, str] = field(default_factory=dict)
+    seed: int | tuple[int, ...] | None = None
 
     # values are compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
@@ -79,9 +82,10 @@ class Response(Value, Mapping[str, FloatArray]):
         runs = "" if self.data.ndim == 2 else f"{self.data.shape[0]} runs, "
         shown = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
         span = self.time.size * self.dt
+        drawn = "" if self.seed is None else f", seed {self.seed}"
         return (
-            f"<Response {runs}{self.time.size} samples over {span:.6g} s, "
-            f"{len(self.names)} channels: {shown}>"
+            f"<Response {runs}{counted(self.time.size, 'sample')} over {span:.6g} s, "
+            f"{counted(len(self.names), 'channel')}: {shown}{drawn}>"
         )
 
     def __getitem__(self, channel: str) -> FloatArray:

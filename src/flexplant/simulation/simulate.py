@@ -21,6 +21,7 @@ from ..values import (
     instance,
     positive,
     real_array,
+    seed_of,
     seed_sequence,
     short,
     whole,
@@ -143,7 +144,8 @@ def simulate(
     white = white_noise(silent)
     numbers = _run_numbers(runs)
     state = _start(loop, start)
-    generators = _generators(rng, numbers)
+    seed = seed_sequence(rng)
+    generators = _generators(seed, numbers)
     grows = _warn_unstable(closed, -(-steps // finer))
     shown = (*plant.z, *plant.y, *loop.driven, *loop.watched)
     data = np.zeros((len(numbers), len(shown), steps))
@@ -165,7 +167,8 @@ def simulate(
                             "at loop.is_stable first, or simulate a shorter time."
                         )
                     bar.advance()
-    return Response(time, data[0] if runs is None else data, shown, loop.units)
+    drawn = seed_of(seed) if white.factor.size or white.columns.size else None
+    return Response(time, data[0] if runs is None else data, shown, loop.units, drawn)
 
 
 def _check_sampled(loop: ClosedLoop) -> None:
@@ -319,9 +322,8 @@ def _run_numbers(runs: int | Sequence[int] | None) -> list[int]:
     return listed
 
 
-def _generators(rng: Any, numbers: Iterable[int]) -> list[np.random.Generator]:
+def _generators(seed: np.random.SeedSequence, numbers: Iterable[int]) -> list[np.random.Generator]:
     """Return the generator of each run, from the child of the seed with the run's number."""
-    seed = seed_sequence(rng)
     return [
         np.random.default_rng(
             np.random.SeedSequence(seed.entropy, spawn_key=(*seed.spawn_key, number))

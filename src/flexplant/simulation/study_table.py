@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, counted, unknown_label
 from ..values import Value, instance, short
 
 #: reasons that the repr lists
@@ -61,7 +61,7 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
 
     def __repr__(self) -> str:
         reasons = [(i, reason) for i, reason in enumerate(self.failed) if reason]
-        lines = [f"<StudyTable: {len(self.failed)} machines, {len(reasons)} failed>"]
+        lines = [f"<StudyTable: {counted(len(self.failed), 'machine')}, {len(reasons)} failed>"]
         width = max((len(name) for name in self.columns), default=0) + 2
         numeric = {n: c for n, c in self.columns.items() if c.dtype.kind == "f"}
         if numeric:

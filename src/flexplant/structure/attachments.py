@@ -9,7 +9,7 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, counted, unknown_label
 from ..labels import DIRECTIONS, DofSet, Interpolation, Place
 from ..values import FloatArray, IntArray, Matrix, Value, instance, positive, real_array
 
@@ -197,7 +197,7 @@ class HeldShape(Interpolation):
     rows_left: IntArray
 
     def __repr__(self) -> str:
-        return f"<HeldShape of {np.size(self.rows_left)} DOFs in {self.free!r}>"
+        return f"<HeldShape of {counted(np.size(self.rows_left), 'DOF')} in {self.free!r}>"
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of the DOFs that are left in a motion at a point.

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, ShapeError, counted
 from ..values import FloatArray, Value, flag, positive, real_array, short, whole
 
 
@@ -152,7 +152,9 @@ class ModalDamping(Damping):
             return f"<ModalDamping {self.ratio:g}>"
         low, high = np.min(self.ratio, initial=1.0), np.max(self.ratio, initial=0.0)
         more = "" if self.others is None else f", others {self.others:g}"
-        return f"<ModalDamping of {np.size(self.ratio)} modes, {low:g} to {high:g}{more}>"
+        return (
+            f"<ModalDamping of {counted(np.size(self.ratio), 'mode')}, {low:g} to {high:g}{more}>"
+        )
 
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios (k,) of modes at `omega` [rad/s]; 0 for rigid-body modes.

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..errors import LabelError, ModelError
+from ..errors import LabelError, ModelError, counted
 from ..labels import DIRECTIONS, DofSet, Interpolation
 from ..values import FloatArray, IntArray, instance, positive, real_array
 from .model import FEModel
@@ -114,7 +114,7 @@ class ScatteredShape(Interpolation):
 
     def __repr__(self) -> str:
         nodes = np.unique(self.xyz, axis=0).shape[0]
-        return f"<ScatteredShape between {nodes} nodes, margin {self.margin:g} m>"
+        return f"<ScatteredShape between {counted(nodes, 'node')}, margin {self.margin:g} m>"
 
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) of all DOFs in the motion `direction` at a point.

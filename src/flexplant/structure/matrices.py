@@ -12,7 +12,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..dof_columns import at_nodes, node_numbers
-from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError
+from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
@@ -112,7 +112,7 @@ class FEMatrices(Value):
     def __repr__(self) -> str:
         stored = [f"{name} ({matrix.nnz} entries)" for name, matrix in self._matrices.items()]
         where = f" of {self.source!r}" if self.source else ""
-        parts = [f"{self.n_dof} DOFs", *stored]
+        parts = [counted(self.n_dof, "DOF"), *stored]
         if self.constrained:
             parts.append(f"{len(self.constrained)} constrained DOFs dropped")
         if self.digits is not None:

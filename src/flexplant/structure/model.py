@@ -11,7 +11,7 @@ from typing import Any, Self
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import FlexplantWarning, ModelError, counted
 from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, is_positive_definite
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
@@ -124,9 +124,9 @@ class FEModel(Placed, Value):
         named = f" {self.name!r}" if self.name else ""
         kind = "sparse" if sp.issparse(self.K) else "dense"
         r = self.rigid_body.shape[1]
-        rigid = f"{r} rigid-body motion{'s' * (r != 1)}" if r else "no rigid-body motions"
+        rigid = counted(r, "rigid-body motion") if r else "no rigid-body motions"
         damping = "not given" if self.D is None else "given"
-        size = f"{self.n_dof} DOF{'s' * (self.n_dof != 1)}"
+        size = counted(self.n_dof, "DOF")
         if self.n_unstable:
             rigid += f", {self.n_unstable} unstable (negative stiffness)"
         return f"<FEModel{named}: {size}, {kind}, {rigid}, D {damping}>"

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..sparse.factor import by_rows
 from ..sparse.rayleigh_ritz import rounding_of
 from ..values import FloatArray
@@ -75,7 +75,7 @@ def refuse_unstable(model: Any, what: str) -> None:
     count = int(getattr(model, "n_unstable", 0))
     if count:
         raise ModelError(
-            f"springs of negative stiffness make {count} rigid-body motion{'s' * (count != 1)} of "
+            f"springs of negative stiffness make {counted(count, 'rigid-body motion')} of "
             f"this structure unstable: {what} is for structures that are free or held. Do it with "
             "the free structure, then suspend the result: suspend(model, springs)."
         )

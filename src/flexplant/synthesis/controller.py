@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ..certificates import in_words
+from ..errors import counted
 from ..loop import SpillOver
 from ..lti.statespace import StateSpace
 from ..values import Value
@@ -71,7 +72,7 @@ class Controller(Value):
         gamma = "" if self.gamma is None else f", gamma {self.gamma:.4g}"
         if self.gamma is not None and self.lower is not None:
             gamma += f" (lower bound {self.lower:.4g})"
-        lines = [f"<Controller {self.method}: {self.system.n_states} states{gamma}>"]
+        lines = [f"<Controller {self.method}: {counted(self.system.n_states, 'state')}{gamma}>"]
         if self.reached:
             shown = ", ".join(f"{key} {value:.3g}" for key, value in self.reached.items())
             lines.append(f"  reached, of 1 that the weights require: {shown}")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
+from ..errors import FlexplantWarning, LabelError, ModelError, counted, unknown_label
 from ..loop import LoopReport, SpillOver, in_axes, report_loops
 from ..loop.axes import static_map
 from ..loop.sensitivity import taken_apart
@@ -59,7 +59,7 @@ class LoopDesign(Value):
 
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
-        lines = [f"<LoopDesign of {axes}: {self.system.n_states} states>"]
+        lines = [f"<LoopDesign of {axes}: {counted(self.system.n_states, 'state')}>"]
         lines += [f"  {line}" for line in repr(self.report).splitlines()]
         lines += [f"  law of {axis}: {law!r}" for axis, law in list(self.laws.items())[:4]]
         if self.left_out is not None:

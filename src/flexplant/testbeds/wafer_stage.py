@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, counted, unknown_label
 from ..estimation import design_static
 from ..identification import MeasuredModes
 from ..identification.periodic import frf_of_periods, line_spectra, offsets
@@ -117,7 +117,7 @@ class WaferStage(Value):
     delay: int
 
     def __repr__(self) -> str:
-        return f"<WaferStage: rate {self.rate:g} Hz, delay {self.delay} samples>"
+        return f"<WaferStage: rate {self.rate:g} Hz, delay {counted(self.delay, 'sample')}>"
 
     @cached_property
     def _realisation(self) -> ModalRealisation:

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, ShapeError
+from ..errors import LabelError, ModelError, ShapeError, counted
 from ..values import ComplexArray, FloatArray, Value, instance, real_array, short
 from .family import Eigen, Family, repeated_groups
 from .parameters.added import Parameter
@@ -83,7 +83,9 @@ class Sensitivities(Value):
         self._set(modes=tuple(self.modes), poles=self.poles, S=self.S)
 
     def __repr__(self) -> str:
-        return f"<Sensitivities: {len(self.modes)} modes to {', '.join(self.parameters)}>"
+        return (
+            f"<Sensitivities: {counted(len(self.modes), 'mode')} to {', '.join(self.parameters)}>"
+        )
 
 
 def eigenvalue_sensitivities(

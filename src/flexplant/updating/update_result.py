@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, counted, unknown_label
 from ..modes import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Rng, Value, generator, positive, short, whole
 from .judgement.goodness import chance
@@ -62,7 +62,7 @@ class History(Value):
     def __repr__(self) -> str:
         halved = int(np.sum(self.fraction[1:] < 1))
         return (
-            f"<History: {len(self)} steps ({halved} shortened), "
+            f"<History: {counted(len(self), 'step')} ({halved} shortened), "
             f"error {self.error[0]:.3g} -> {self.error[-1]:.3g}>"
         )
 
@@ -233,7 +233,7 @@ class UpdateResult(Value):
         if self.negative_masses:
             lines.append(f"  negative: {', '.join(self.negative_masses[:5])}")
         said = "converged" if self.converged else "NOT CONVERGED"
-        head = f"<UpdateResult: {said} in {len(self.history)} steps ({self.reason})"
+        head = f"<UpdateResult: {said} in {counted(len(self.history), 'step')} ({self.reason})"
         if self.p_value is not None:
             head += f", chi2 {self.chi2:.4g} for {self.dof} dof"
         return "\n".join([head, *lines]) + ">"

@@ -8,7 +8,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...errors import CertificateError, ModelError
+from ...errors import CertificateError, ModelError, counted
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import append
 from ...lti.statespace import StateSpace, System
@@ -98,8 +98,10 @@ class NeglectedModes(Value):
 
     def __repr__(self) -> str:
         return (
-            f"<NeglectedModes: {len(self.inputs)} inputs -> {len(self.outputs)} outputs, "
-            f"{self.weights.n_states} states, bounded {self.tightest:.3g}, median looseness "
+            f"<NeglectedModes: {counted(len(self.inputs), 'input')} -> "
+            f"{counted(len(self.outputs), 'output')}, "
+            f"{counted(self.weights.n_states, 'state')}, bounded {self.tightest:.3g}, median "
+            "looseness "
             f"{self.looseness:.3g}>"
         )
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ModelError
+from ...errors import ModelError, counted
 from ...values import FloatArray, Value
 from ..matrices import FEMatrices
 from ..model import FEModel
@@ -95,7 +95,7 @@ class ModelCheck(Value):
         failed, noted = len(self.of("fail")), len(self.of("note"))
         named = f" {self.source!r}" if self.source else ""
         result = "ok" if self.ok else f"{failed} FAILED"
-        head = f"<ModelCheck{named}: {result}, {noted} warning{'s' * (noted != 1)}>"
+        head = f"<ModelCheck{named}: {result}, {counted(noted, 'warning')}>"
         text = [head]
         for found, subject, finding, following in self.lines:
             mark = {"ok": "ok  ", "note": "note", "fail": "FAIL"}[found]

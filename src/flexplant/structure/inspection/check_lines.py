@@ -7,6 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ...errors import counted
 from ...labels import DIRECTIONS
 from ...sparse.factor import diagonal
 from ...values import FloatArray
@@ -95,7 +96,7 @@ def _stiffness_line(found: Facts) -> Line:
         )
     if found.n_negative:
         worst = found.lowest.worst
-        text = f"K has {found.n_negative} negative eigenvalue{'s' * (found.n_negative != 1)}"
+        text = f"K has {counted(found.n_negative, 'negative eigenvalue')}"
         if worst is not None:
             lowest = f", the lowest {worst[0]:.3g} 1/s^2" if found.scaled_by_mass else ""
             # displacements and rotations compare by the forces that they take
@@ -239,7 +240,7 @@ def rigid(found: Facts) -> list[Line]:
                 "fail",
                 "mechanisms",
                 (
-                    f"{extra} zero-energy motion{'s' * (extra != 1)} beyond rigid body; the first "
+                    f"{counted(extra, 'zero-energy motion')} beyond rigid body; the first "
                     f"moves {moved}"
                 ),
                 "join or hold these; wrong coordinates or directions look alike (all DOFs move)",
@@ -257,14 +258,14 @@ def _freedom(found: Facts, motions: ZeroEnergy) -> str:
         together = f"free in {free}" if free else "held"
         return f"{motions.n_bodies} bodies, each with its own motions; together {together}{absent}"
     if combined > 0 and not held:
-        one = "motion" if combined == 1 else "motions"
-        return f"free in {free}, and {combined} {one} of components in their joints{absent}"
+        of_joints = f"{counted(combined, 'motion')} of components in their joints"
+        return f"free in {free}, and {of_joints}{absent}"
     if combined > 0:
         alone = [f"free in {free}"] if free else []
         if found.given.located and found.given.dofs is not None:
             alone += [f"free {way}" for way in free_axes(motions, found.given.dofs)]
             return f"{', and '.join(alone)}; else grounded in {held}{absent}"
-        alone.append(f"free in {combined} combination{'s' * (combined != 1)} of {held}")
+        alone.append(f"free in {counted(combined, 'combination')} of {held}")
         return f"{', and '.join(alone)} (each by itself is held){absent}"
     grounded = f"; grounded in {held}" if held else ""
     return f"{f'free in {free}' if free else 'held'}{grounded}{absent}"

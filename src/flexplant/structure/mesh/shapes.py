@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import LabelError
+from ...errors import LabelError, counted
 from ...labels import Interpolation
 from ...values import FloatArray, real_array
 from .assembly import Grid
@@ -202,7 +202,7 @@ class BeamShape(GridShape):
     elements: int
 
     def __repr__(self) -> str:
-        return f"<BeamShape {self.length:g} m, {self.elements} elements>"
+        return f"<BeamShape {self.length:g} m, {counted(self.elements, 'element')}>"
 
     def _layout(self) -> tuple[tuple[int, ...], Any, int]:
         return (self.elements,), None, 2

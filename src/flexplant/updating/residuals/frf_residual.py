@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import FlexplantWarning, ModelError, ShapeError
+from ...errors import FlexplantWarning, ModelError, ShapeError, counted
 from ...labels import Place
 from ...lti import Frf
 from ...values import ComplexArray, FloatArray, flag, instance, positive, real_array, short
@@ -124,7 +124,7 @@ class FrfResidual(Residual):
         late = f", delay {self.delay:g}" if self.delay else ""
         return (
             f"<FrfResidual: {len(frf.outputs)} x {len(frf.inputs)} channels, {self.lines.size} of "
-            f"{frf.freq.size} lines, {kind}, noise {known}{held}{late}>"
+            f"{counted(frf.freq.size, 'line')}, {kind}, noise {known}{held}{late}>"
         )
 
     @property
@@ -188,7 +188,7 @@ class _BoundFrf(Bound):
             frf.freq[lines],
             [f"{o} / {i}" for o in frf.outputs for i in frf.inputs],
         )
-        self.name = f"{lines.size} lines of FRFs"
+        self.name = f"{counted(lines.size, 'line')} of FRFs"
         self._last: tuple[Point, ComplexArray, Any] | None = None
 
     def row_name(self, row: int) -> str:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ...errors import LabelError, ModelError, ShapeError
+from ...errors import LabelError, ModelError, ShapeError, counted
 from ...identification import MeasuredModes
 from ...labels import Place
 from ...values import ComplexArray, FloatArray, flag, instance, real_array, short, whole
@@ -110,7 +110,9 @@ class ModeShapes(Residual):
         numbers = ", ".join(str(n) for n in self.measured.modes or ())
         known = "not known" if self.std is None and self.covariance is None else "known"
         places = len(self.at or ())
-        return f"<{type(self).__name__}: modes {numbers} at {places} places, noise {known}>"
+        return (
+            f"<{type(self).__name__}: modes {numbers} at {counted(places, 'place')}, noise {known}>"
+        )
 
     def select(self, modes: Sequence[int]) -> ModeShapes:
         """Return the residual of some of its modes, by number.
