@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, ShapeError, counted
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
@@ -83,7 +83,7 @@ class KalmanEstimator(Value):
         channels = poi_channels(self.plant)
         rms = sizes_of({name: self.rms(name) for name in channels[:4]}, self.plant.units)
         count = self.certificate.left_out
-        counted = (
+        beyond = (
             "modes left out are not known: truncation is not in these numbers"
             if count is None
             else f"with {count} modes left out"
@@ -92,7 +92,7 @@ class KalmanEstimator(Value):
         )
         share = self.certificate.unresolved
         if share is not None and share > NOTED:
-            counted += (
+            beyond += (
                 f"; up to {share:.0%} of a variance is from modes with fewer than {NODES:g} nodes "
                 "of the mesh a wavelength: a finer one for larger= would change it"
             )
@@ -100,7 +100,7 @@ class KalmanEstimator(Value):
             f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "
             f"{counted(len(sensors(self.plant)), 'sensor')}, "
             f"spectral radius {self.certificate.spectral_radius:.6f}\n"
-            f"  rms error {rms} ({counted})>"
+            f"  rms error {rms} ({beyond})>"
         )
 
     @cached_property

@@ -121,7 +121,7 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     @property
     def poles(self) -> str:
         """The number of unstable poles, in words."""
-        return counted(self.unstable, "pole")
+        return counted(self.unstable or 0, "pole")
 
     def __getitem__(self, name: str) -> LoopMargins:
         for loop in self.loops:

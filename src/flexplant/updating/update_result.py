@@ -219,9 +219,9 @@ class UpdateResult(Value):
 
     def __repr__(self) -> str:
         std = self.std
-        deviations = [""] * len(self.parameters) if std is None else [f" +- {s:.2g}" for s in std]
+        deviations = [None] * len(self.parameters) if std is None else std.tolist()
         lines = [
-            f"  {name} = {value:.7g}{deviation} {unit}".rstrip()
+            f"  {name} = {_estimate(value, deviation)} {unit}".rstrip()
             for name, value, deviation, unit in zip(
                 self.parameters[:5], self.values.tolist(), deviations, self.units, strict=False
             )
@@ -353,3 +353,13 @@ class UpdateResult(Value):
         if not self.model.is_physical:
             return reduced  # generalised coordinates: the shapes are expanded already
         return reduced.replace(phi=self.model.T @ reduced.phi, dofs=self.model.full_dofs)
+
+
+def _estimate(value: float, deviation: float | None) -> str:
+    """Return a number in words, without the figures that its standard deviation leaves open."""
+    if deviation is None:
+        return f"{value:.7g}"
+    known = 7
+    if value and deviation > 0 and np.isfinite(deviation):
+        known = min(max(int(np.floor(np.log10(abs(value) / deviation))) + 2, 1), 7)
+    return f"{value:.{known}g} +- {deviation:.2g}"
