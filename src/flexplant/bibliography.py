@@ -131,6 +131,8 @@
    PhD thesis, Imperial College, 1998.
 .. [IwasakiSkelton1994] Iwasaki, Skelton, All controllers for the general H-infinity control
    problem, Automatica 30, 1994.
+.. [JohnsonKienholz1982] Johnson, Kienholz, Finite element prediction of damping in structures with
+   constrained viscoelastic layers, AIAA Journal 20, 1982.
 .. [JoshiBoyd2009] Joshi, Boyd, Sensor selection via convex optimization, IEEE Trans. Signal
    Process. 57, 2009.
 .. [Kammer1991] Kammer, Sensor placement for on-orbit modal identification and correlation of large

@@ -210,6 +210,8 @@ def of_structures():
     yield bar.fixed(["1:z"]).dofs.interpolation
     yield from (fx.PointMass((0.1, 0, 0), 0.5, inertia=0.1), fx.Damper("1:z", 2.0))
     yield from (fx.Spring("1:z", 2.0, to="2:z"), fx.Hysteretic(0.02))
+    law = fx.Hysteretic(0.02, regions={"foot": (0.3, fx.Spring("1:z", 2.0)), "K": (0.1, np.eye(2))})
+    yield from (law, *law.regions.values())
     yield from (fx.Rectangle((0, 0), (1, 1)), fx.Disc((0, 0), 1.0))
     yield fx.Rib((0, 0), (1, 0), width=0.01, height=0.02)
     block = {"size": (1, 1, 1), "elements": (2, 1, 1), "poisson_ratio": 0.3}

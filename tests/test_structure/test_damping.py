@@ -1,9 +1,11 @@
 """Damping laws."""
 
 import pickle
+import warnings
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 import scipy.sparse as sp
 
 import flexplant as fx
@@ -12,7 +14,7 @@ import oracles_structure as oracle
 from flexplant.errors import FlexplantWarning, ModelError, ShapeError
 from flexplant.identification import MeasuredModes
 from flexplant.modes import solve_modes
-from flexplant.structure import Hysteretic, ModalDamping, Rayleigh, chain
+from flexplant.structure import Hysteretic, LossRegion, ModalDamping, Rayleigh, chain
 
 
 def test_modal_damping():
@@ -201,6 +203,63 @@ def test_bad_loss_factors():
         Hysteretic(0.1).error([-1.0], [1.0])
     with pytest.raises(ShapeError, match="gains"):
         Hysteretic(0.1).response_error([1.0], [1.0, 2.0], [1.0])
+
+
+def test_loss_factors_by_region():
+    """A plate of which a part and the feet have their own, by the dense complex eigenproblem."""
+
+    def build(E):
+        return fx.kirchhoff_plate(
+            size=(0.6, 0.4), thickness=0.02, elements=(3, 2), density=2702, youngs_modulus=E,
+            poisson_ratio=0.3,
+        )  # fmt: skip
+
+    E, mask = np.full((3, 2), 70e9), np.array([[True, True], [False, False], [False, False]])
+    feet = [fx.Spring(at, 2e5) for at in ((0, 0, 0), (0.6, 0, 0), (0, 0.4, 0), (0.6, 0.4, 0))]
+    model = build(E).with_parts(feet)
+    left = LossRegion.of_elements(0.02, build, mask, youngs_modulus=E)
+    law = Hysteretic(0.001, regions={"left": left, "feet": (0.3, feet)})
+    assert repr(law) == "<Hysteretic, loss factor 0.001, left 0.02, feet 0.3>"
+    K, M = model.K.toarray(), model.M.toarray()
+    soft = sum(2e5 * np.outer(*2 * [model.row(foot.at)]) for foot in feet)
+    part = (build(E * (1 + mask)).K - build(E).K).toarray()
+    H = 0.3 * soft + 0.02 * part + 0.001 * (K - soft - part)
+    squares = la.eigvals(K + 1j * H, M)
+    squares = squares[np.argsort(squares.real)][:9]
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        modes = solve_modes(model, count=9, damping=law)
+    np.testing.assert_allclose(2 * modes.zeta, squares.imag / squares.real, rtol=0.01)
+    assert modes.zeta[0] > 10 * modes.zeta[-1]
+    # the error that is known: strain energy beside the coupled modes, here all of them
+    whole = solve_modes(model, damping=ModalDamping(0.0))
+    errors = law.coupling_errors(whole.omega, whole.phi, model.dofs)[:9]
+    own = 2 * law.ratios(whole.omega, whole.phi, K, model.dofs)[:9]
+    true = squares.imag / squares.real
+    np.testing.assert_allclose(errors, np.abs(own / true - 1), rtol=1e-6, atol=1e-9)
+    assert 1e-4 < modes.certificate["loss_coupling"] < 0.01
+    # the same ratios in time, by D, and in reduced models
+    damped = solve_modes(model.with_damping(law), count=9)
+    np.testing.assert_allclose(damped.zeta, modes.zeta, rtol=1e-6)
+    for method in (fx.Rubin(["1:z"], 9, damping=law), fx.ModalTruncation(9, damping=law)):
+        np.testing.assert_allclose(fx.reduce(model, method).modes().zeta[:9], modes.zeta, rtol=1e-6)
+    boxed = fx.reduce(model, fx.CraigBampton(["1:z", "12:z"], 25, damping=law))
+    np.testing.assert_allclose(boxed.modes().zeta[:6], modes.zeta[:6], rtol=0.01)
+    # modes of near frequencies are coupled most
+    square = fx.chain(masses=[1.0, 1.0], stiffnesses=[1.0], ground=[1e5, 1e5])
+    one = Hysteretic(0.001, regions={"one": (0.1, fx.Spring("1:x", 1e5))})
+    with pytest.warns(FlexplantWarning, match=r"the loss factor of mode [12] at 50.3\d* Hz"):
+        solve_modes(square, damping=one)
+    with pytest.raises(ModelError, match=r"feet' and those before it hold 1.* they overlap"):
+        solve_modes(model, damping=Hysteretic(0.0, regions={"a": (0.1, K), "feet": (0.1, feet)}))
+    with pytest.raises(ModelError, match="by where it bends"):
+        law.zeta([1.0])
+    with pytest.raises(ShapeError, match="shape \\(2, 2\\), the structure has"):
+        solve_modes(model, damping=Hysteretic(0.0, regions={"a": (0.1, np.eye(2))}))
+    with pytest.raises(ModelError, match=r"must be \(loss factor, stiffness\)"):
+        Hysteretic(0.0, regions={"feet": 0.3})
+    with pytest.raises(ModelError, match="holds no spring"):
+        Hysteretic(0.0, regions={"feet": (0.3, [])})
 
 
 def test_laws_in_solve_modes():

@@ -34,7 +34,7 @@ _SETTLED, _UNSETTLED = 1e-9, 1e-6
 
 @dataclass(frozen=True)
 class DampingTerms:
-    """How a structure dissipates: ``K (1 + i eta) + i omega (a M + b K + D + M V R V^T M)``.
+    """How a structure dissipates: ``K (1 + i eta) + i H + i omega (a M + b K + D + M V R V^T M)``.
 
     R (diagonal, `own`) belongs to shapes V: those of the modes and vectors of a `DynamicBasis`.
     """
@@ -44,6 +44,7 @@ class DampingTerms:
     a: float = 0.0
     b: float = 0.0
     D: Any = None
+    H: Any = None
 
 
 class DynamicBasis:
@@ -99,7 +100,8 @@ class DynamicBasis:
     @property
     def damped_freq(self) -> FloatArray:
         """Frequencies [Hz] of the elastic modes whose response at resonance is finite."""
-        rates = self._rates + self.losses.eta * np.sqrt(np.abs(self.squares))
+        size = np.sqrt(np.abs(self.squares))
+        rates = self._rates + self._loss / np.where(size > 0, size, 1.0)
         own = rates[self.n_rigid : self.n_modes]
         return np.asarray(self.freq[own > _UNDAMPED * 2 * np.pi * self.freq])
 
@@ -128,7 +130,7 @@ class DynamicBasis:
         for begin in range(0, freq.size, _CHUNK):
             part = slice(begin, begin + _CHUNK)
             omega = 2 * np.pi * freq[part, None]
-            main = self.squares * (1 + 1j * self.losses.eta) - omega**2 + 1j * omega * self._rates
+            main = self.squares + 1j * self._loss - omega**2 + 1j * omega * self._rates
             if np.any(main == 0):
                 i = int(np.flatnonzero(np.any(main == 0, axis=1))[0])
                 raise ModelError(
@@ -136,10 +138,10 @@ class DynamicBasis:
                     "(or rigid-body) motion is there. Leave that frequency out, or pass "
                     "damping=ModalDamping(0.01)."
                 )
-            if self._coupling is None:
+            if not self._coupled:
                 found[part] = (left * (1 / main)[:, None]) @ right
                 continue
-            whole = 1j * omega[:, :, None] * self._coupling
+            whole = 1j * (omega[:, :, None] * self._C + self._L)
             at = np.arange(self.squares.size)
             whole[:, at, at] = main
             found[part] = left @ np.linalg.solve(whole, right[None].astype(np.complex128))
@@ -164,12 +166,14 @@ class DynamicBasis:
         matrix: Any = K * stiff - (omega**2 - 1j * omega * law.a) * M
         if law.D is not None:
             matrix = matrix + 1j * omega * _as_like(law.D, matrix)
+        if law.H is not None:
+            matrix = matrix + 1j * _as_like(law.H, matrix)
         chosen = np.flatnonzero(law.own)
         U = self._inertia[:, chosen]
         size: ComplexArray = np.asarray(1j * omega * law.own[chosen], dtype=np.complex128)
         if sp.issparse(matrix) and model.n_dof > DENSE_LIMIT:
             # a D may join DOFs that K and M do not
-            order = dissection_of(model) if law.D is None else None
+            order = dissection_of(model) if law.D is None and law.H is None else None
             solve = _with_rank(ComplexSymmetricFactor(matrix, order).solve, U, size)
         else:
             full = _dense(matrix) + (U * size) @ U.T
@@ -202,7 +206,8 @@ class DynamicBasis:
         if damping is None:
             return DampingTerms(none, D=self.model.D)
         if isinstance(damping, Hysteretic):
-            return DampingTerms(none, eta=damping.loss_factor)
+            more = damping.loss_stiffness(self.model.dofs)
+            return DampingTerms(none, eta=damping.loss_factor, H=more)
         if isinstance(damping, Rayleigh):
             own = none.copy()
             own[:r] = 0.0 if damping.rigid else -damping.alpha
@@ -216,18 +221,25 @@ class DynamicBasis:
 
     def _damped(self) -> None:
         """Set what the losses are in the coordinates: rates, and what couples them."""
-        law, k = self.losses, self.squares.size
-        C = np.diag(law.a + law.b * self.squares)
+        law = self.losses
+        C, L = np.diag(law.a + law.b * self.squares), np.diag(law.eta * self.squares)
         if law.D is not None:
             C = C + self.V.T @ np.asarray(law.D @ self.V)
         if np.any(law.own):
             turned = self.V.T @ self._inertia
             C = C + (turned * law.own) @ turned.T
-        self._rates = np.diag(C).copy()
-        off = np.abs(C - np.diag(self._rates))
-        size = np.sqrt(np.abs(np.outer(self._rates, self._rates))) + 1e-3 * np.abs(C).max(initial=0)
-        coupled = k > 0 and bool(np.any(off > _COUPLED * size))
-        self._coupling = C if coupled else None
+        if law.H is not None:
+            L = L + self.V.T @ np.asarray(law.H @ self.V)
+        self._C, self._L = C, L
+        self._rates, self._loss = np.diag(C).copy(), np.diag(L).copy()
+        self._coupled = _couples(C) or _couples(L)
+
+
+def _couples(C: FloatArray) -> bool:
+    """Return whether a matrix of losses couples coordinates."""
+    own = np.diag(C)
+    size = np.sqrt(np.abs(np.outer(own, own))) + 1e-3 * np.abs(C).max(initial=0)
+    return bool(np.any(np.abs(C - np.diag(own)) > _COUPLED * size))
 
 
 def static_shapes(model: FEModel, loads: FloatArray) -> FloatArray:

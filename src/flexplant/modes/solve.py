@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 import weakref
 from collections.abc import Iterable
 from typing import Any
@@ -9,13 +10,13 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError
+from ..errors import FlexplantWarning, ModelError, SolverError
 from ..labels import Place
 from ..progress import Progress
 from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
 from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import absolute, rounding_of
-from ..structure import Damping, FEModel, ModalDamping
+from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.eigen import elastic_modes, signed
 from ..structure.negative_stiffness import signed_root, signed_square
 from ..values import FloatArray, instance, positive, short
@@ -35,6 +36,8 @@ _RESIDUAL = (1e-8, 1e-12)
 _ENTRY = 1e-3
 #: elastic modes that responses are made of at least
 _FEW = 6
+#: relative error of a loss factor that is worth a warning
+_COUPLED = 0.1
 #: modes of models that are in use
 _solved: weakref.WeakKeyDictionary[FEModel, weakref.ref[Modes]] = weakref.WeakKeyDictionary()
 #: with a larger part of all modes wanted, a dense solution of a model of this size is faster
@@ -63,7 +66,7 @@ def solve_modes(
         arbitrary half of it.
     below : float [Hz], optional
         Keep modes up to this frequency. With neither, all modes (of a model that is not large).
-    damping : ModalDamping or Rayleigh, optional
+    damping : ModalDamping, Rayleigh or Hysteretic, optional
         In place of the model's D. None: its D, and no damping when it has none.
     compliance_at : place or sequence of places
         DOF labels, points (motion z) or mappings at which the static compliance of the truncated
@@ -93,6 +96,11 @@ def solve_modes(
         When the answer fails its check.
     LabelError
         When a place is unknown.
+
+    Warns
+    -----
+    FlexplantWarning
+        When loss factors of regions couple modes, which their damping ratios leave out.
 
     References
     ----------
@@ -152,7 +160,9 @@ def solve_modes(
     if damping is None:
         zeta = np.concatenate([np.zeros(r), projected_zeta(model.D, phi[:, r:], omega[r:])])
     else:
-        zeta = damping.zeta(omega)
+        zeta = damping.ratios(omega, phi, model.K, model.dofs)
+    if isinstance(damping, Hysteretic) and damping.regions:
+        certificate["loss_coupling"] = _loss_coupling(model, omega, phi, damping)
     found = Modes(
         omega,
         zeta,
@@ -227,7 +237,8 @@ def _vector_zeta(
     if not omega.size:
         return np.zeros(0)
     if given is not None:
-        return (given if isinstance(given, Damping) else ModalDamping(given)).zeta(omega)
+        law = given if isinstance(given, Damping) else ModalDamping(given)
+        return law.ratios(omega, vectors, model.K, model.dofs)
     if damping is None:
         return projected_zeta(model.D, vectors, omega)
     if isinstance(damping, ModalDamping) and not isinstance(damping.ratio, float):
@@ -235,7 +246,23 @@ def _vector_zeta(
             "damping is given mode by mode, so that the attachment vectors have none: "
             "pass compliance_damping=, a ratio."
         )
-    return damping.zeta(omega)
+    return damping.ratios(omega, vectors, model.K, model.dofs)
+
+
+def _loss_coupling(model: FEModel, omega: FloatArray, phi: FloatArray, law: Hysteretic) -> float:
+    """Return the relative error of loss factors by strain energy, warned of when large."""
+    errors = law.coupling_errors(omega, phi, model.dofs)
+    worst = int(np.argmax(errors))
+    if errors[worst] > _COUPLED:
+        warnings.warn(
+            f"{law!r} couples modes: the loss factor of mode {worst + 1} at "
+            f"{omega[worst] / (2 * np.pi):.5g} Hz, by its strain energy, is "
+            f"{100 * errors[worst]:.0f} % off that of the complex stiffness. Take the law itself "
+            "where this mode matters: frequency_response(model, ports, freq, damping=law).",
+            FlexplantWarning,
+            3,
+        )
+    return float(errors.max(initial=0.0))
 
 
 def _undamped(

@@ -176,7 +176,9 @@ def _built(
     M = (back.T * light) @ back
     K = (back.T * modes.basis_omega**2) @ back
     if damping is not None:
-        zeta = damping.zeta(modes.omega if massless else modes.basis_omega)
+        count = k if massless else light.size
+        shapes, omega = np.real(modes.basis)[:, :count], modes.basis_omega[:count]
+        zeta = damping.ratios(omega, shapes, model.K, model.dofs)
         rate = np.zeros(light.size)
         rate[: zeta.size] = 2 * zeta * modes.basis_omega[: zeta.size]
         D = (back.T * rate) @ back

@@ -120,11 +120,19 @@ def inner(matrix: Matrix, T: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (product + product.T), dtype=np.float64)
 
 
-def modal_damping(M: FloatArray, K: FloatArray, rigid: FloatArray, damping: Damping) -> FloatArray:
+def modal_damping(
+    M: FloatArray,
+    K: FloatArray,
+    rigid: FloatArray,
+    damping: Damping,
+    model: FEModel,
+    T: FloatArray,
+) -> FloatArray:
     """Return the D that gives the modes of a reduced model the ratios of a damping law."""
     omega, phi = elastic_modes(M, K, rigid)
     r = rigid.shape[1]
-    zeta = damping.zeta(np.concatenate([np.zeros(r), omega]))[r:]
+    omega_all = np.concatenate([np.zeros(r), omega])
+    zeta = damping.ratios(omega_all, T @ np.hstack([rigid, phi]), model.K, model.dofs)[r:]
     force = M @ phi
     D = (force * (2 * zeta * omega)) @ force.T
     return np.asarray(0.5 * (D + D.T), dtype=np.float64)
@@ -189,7 +197,7 @@ def projected(
                 + (singular or "Add coordinates that do.")
             )
     if damping is not None:
-        D = modal_damping(M, K, rigid, damping)
+        D = modal_damping(M, K, rigid, damping, model, T)
     else:
         D = np.zeros_like(M) if model.D is None else inner(model.D, T)
     return ReducedModel(

@@ -119,7 +119,9 @@ class ModalTruncation(ReductionMethod):
         solved = solve_modes(model, damping=ModalDamping(0.0), count=max(numbers))
         law = self.damping
         if law is not None:
-            solved = solved.replace(zeta=law.zeta(solved.omega))
+            phi = np.real(solved.phi)
+            zeta = law.ratios(solved.omega, phi, model.K, model.dofs)
+            solved = solved.replace(zeta=zeta)
         columns = kept_columns(numbers, solved)
         kept = Modes(
             solved.omega[columns],
@@ -132,7 +134,7 @@ class ModalTruncation(ReductionMethod):
             vectors, omega = attachment_vectors(model, np.real(kept.phi), static)
             zeta = np.zeros(omega.size)
             if law is not None:
-                zeta = law.zeta(omega)
+                zeta = law.ratios(omega, vectors, model.K, model.dofs)
             kept = kept.replace(
                 vectors=vectors,
                 vector_omega=omega,

@@ -12,6 +12,7 @@ from .inspection.check import ModelCheck as ModelCheck
 from .inspection.check import check as check
 from .interpolation import ScatteredShape as ScatteredShape
 from .interpolation import interpolated as interpolated
+from .loss_region import LossRegion as LossRegion
 from .matrices import FEMatrices as FEMatrices
 from .mesh.beam import beam as beam
 from .mesh.block import solid_block as solid_block

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, ShapeError, counted
-from ..values import FloatArray, Value, flag, positive, real_array, short, whole
+from ..labels import DofSet
+from ..values import FloatArray, Matrix, Value, flag, positive, real_array, short, whole
 
 
 class Damping(Value):
@@ -35,6 +36,26 @@ class Damping(Value):
         (k,) array [-]
         """
         raise NotImplementedError
+
+    def ratios(self, omega: FloatArray, shapes: FloatArray, K: Matrix, dofs: DofSet) -> FloatArray:
+        """Return the damping ratios of shapes: those of their frequencies, for most laws.
+
+        Parameters
+        ----------
+        omega : (k,) array [rad/s]
+            Undamped frequencies.
+        shapes : (n, k) array
+            The motions, real.
+        K : (n, n) matrix
+            The stiffness of the structure.
+        dofs : DofSet
+            Its DOFs.
+
+        Returns
+        -------
+        (k,) array [-]
+        """
+        return self.zeta(omega)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..errors import ModelError
+from ..labels import DofSet
 from ..sparse.factor import dense
 from ..values import FloatArray, Matrix
 from .damping import Damping, ModalDamping, Rayleigh
@@ -22,6 +23,7 @@ def damping_matrix(
     rigid: FloatArray,
     damping: Damping,
     motions: Callable[[], FloatArray],
+    dofs: DofSet,
 ) -> FloatArray:
     """Return the full D of a damping law, ``M Phi 2 Z Omega Phi^T M`` over all modes.
 
@@ -35,6 +37,8 @@ def damping_matrix(
         The law.
     motions : function
         Gives the rigid-body motions of every piece, whether held or not.
+    dofs : DofSet
+        The n rows.
 
     Raises
     ------
@@ -54,7 +58,8 @@ def damping_matrix(
         return np.asarray(0.5 * (D + D.T), dtype=np.float64)
     elastic, phi = elastic_modes(M, K, rigid, motions=motions)
     r = rigid.shape[1]
-    zeta = damping.zeta(np.concatenate([np.zeros(r), elastic]))[r:]
+    every = np.hstack([rigid, phi])
+    zeta = damping.ratios(np.concatenate([np.zeros(r), elastic]), every, K, dofs)[r:]
     forces = M @ phi
     D = (forces * (2 * zeta * np.abs(elastic))) @ forces.T
     if isinstance(damping, ModalDamping) and damping.rigid:

@@ -1,15 +1,23 @@
-"""Structural damping by a loss factor, and the error of its viscous equivalent."""
+"""Structural damping by loss factors, and the error of its viscous equivalent."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, cast
 
 import numpy as np
+import scipy.linalg as la
 
 from ..errors import ModelError
-from ..values import FloatArray, positive, real_array
+from ..labels import DofSet
+from ..values import FloatArray, Matrix, instance, real_array, short
+from .attachments import Spring
 from .damping import Damping
+from .loss_region import LossRegion, checked_loss_factor
+
+#: part of the strain energy of a mode that regions may have beyond all of it, by rounding
+_BEYOND = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -25,47 +33,153 @@ class Hysteretic(Damping):
     nothing at resonance, eta / (1 + r) away from it, eta at most (statically, where the hysteretic
     response alone has a loss). `error` gives it, `response_error` bounds a whole response.
 
+    With regions of their own loss factors eta_j the stiffness is ``K + i H``, ``H = eta K +
+    sum (eta_j - eta) K_j``, and the loss factor of a mode is the mean by strain energy, ``eta_i =
+    phi_i^T H phi_i / phi_i^T K phi_i``. That leaves out that H couples modes, most of all those
+    of near frequencies: `coupling_errors` compares with the eigenvalues of ``Phi^T (K + i H) Phi``,
+    and `solve_modes` warns where it matters. ``frequency_response(model, ports, freq,
+    damping=law)`` takes the law itself.
+
     Parameters
     ----------
     loss_factor : float [-]
-        eta, in [0, 2): the energy lost in a cycle over 2 pi times the largest energy stored.
+        eta, in [0, 2): the energy lost in a cycle over 2 pi times the largest energy stored. Of
+        all that is in no region.
+    regions : mapping {str: LossRegion or (eta_j, K_j)}, optional
+        Regions of other loss factors, each a part of K: a matrix, or Springs that K has; see
+        `LossRegion`. They must not overlap.
 
     Raises
     ------
     ModelError
-        When the loss factor is not in [0, 2).
+        When a loss factor is not in [0, 2), or a region is none.
 
     References
     ----------
-    [Ewins2000]_, sections 2.4 and 2.7.
+    [Ewins2000]_, sections 2.4 and 2.7; [JohnsonKienholz1982]_.
 
     Examples
     --------
     >>> law = Hysteretic(0.02)
     >>> law.zeta([0.0, 100.0]), law.error([0.0, 50.0, 100.0], [100.0])[:, 0].round(4)
     (array([0.  , 0.01]), array([0.02  , 0.0133, 0.    ]))
+
+    A stage on two rubber feet, which hold nearly all of the energy of its first mode:
+
+    >>> import flexplant as fx
+    >>> feet = [fx.Spring("1:x", 2e5), fx.Spring("2:x", 3e5)]
+    >>> model = fx.chain(masses=[1.0, 2.0], stiffnesses=[5e6]).with_parts(feet)
+    >>> law = Hysteretic(0.002, regions={"feet": (0.3, feet)})
+    >>> fx.solve_modes(model, damping=law).zeta.round(4)
+    array([0.1499, 0.0046])
     """
 
     loss_factor: float
+    regions: Mapping[
+        str, LossRegion | tuple[float, Matrix] | tuple[float, Spring | Iterable[Spring]]
+    ] = field(default_factory=dict, kw_only=True)
 
     def __post_init__(self) -> None:
-        eta = positive(self.loss_factor, "loss_factor", zero=True)
-        if eta >= 2:
-            raise ModelError(
-                f"loss_factor must be below 2, got {eta:g}: the equivalent damping ratio is half "
-                "of it, and from 1 on there is no oscillation left. Give 0.02 for 2 %."
-            )
-        self._set(loss_factor=eta)
+        given = instance(self.regions, Mapping, "regions", "Pass {'pads': (0.3, K_pads)}.")
+        self._set(
+            loss_factor=checked_loss_factor(self.loss_factor),
+            regions={str(name): _region(name, part) for name, part in given.items()},
+        )
 
     def __repr__(self) -> str:
-        return f"<Hysteretic, loss factor {self.loss_factor:g}>"
+        parts = "".join(f", {name} {part.loss_factor:g}" for name, part in self._regions.items())
+        return f"<Hysteretic, loss factor {self.loss_factor:g}{parts}>"
+
+    @property
+    def _regions(self) -> Mapping[str, LossRegion]:
+        return cast(Mapping[str, LossRegion], self.regions)
 
     def zeta(self, omega: FloatArray) -> FloatArray:
-        """Return the damping ratios (k,) of modes at `omega` [rad/s]: eta / 2, 0 for rigid ones."""
+        """Return the damping ratios (k,) of modes at `omega` [rad/s]: eta / 2, 0 for rigid ones.
+
+        Raises
+        ------
+        ModelError
+            When there are regions: where a mode bends decides, which its frequency does not say.
+        """
         omega = real_array(omega, "omega", (None,))
+        if self._regions:
+            raise ModelError(
+                f"{self!r} damps a mode by where it bends, which its frequency does not say. Solve "
+                "with it, solve_modes(model, damping=law), or call ratios(omega, shapes, K, dofs)."
+            )
         return np.where(omega > 0, 0.5 * self.loss_factor, 0.0)
 
-    def error(self, freq: FloatArray, natural: FloatArray) -> FloatArray:
+    def ratios(self, omega: FloatArray, shapes: FloatArray, K: Matrix, dofs: DofSet) -> FloatArray:
+        """Return the damping ratios (k,) of shapes: half their loss factors, 0 for rigid ones.
+
+        Raises
+        ------
+        ModelError
+            When regions have less than none or more than all of a shape's strain energy.
+        """
+        if not self._regions:
+            return self.zeta(omega)
+        stored = np.sum(shapes * np.asarray(K @ shapes), axis=0)
+        elastic = (real_array(omega, "omega", (None,)) > 0) & (stored > 0)
+        whole = np.where(elastic, stored, 1.0)
+        found, all_of = np.full(elastic.size, self.loss_factor), np.zeros(elastic.size)
+        for name, region in self._regions.items():
+            part = np.sum(shapes * np.asarray(region.matrix(dofs) @ shapes), axis=0)
+            share = np.where(elastic, part / whole, 0.0)
+            all_of += share
+            found += (region.loss_factor - self.loss_factor) * share
+            lowest, highest = float(share.min(initial=0.0)), float(all_of.max(initial=0.0))
+            if lowest < -_BEYOND or highest > 1 + _BEYOND:
+                raise ModelError(
+                    f"region {name!r} and those before it hold {100 * highest:.4g} % of the strain "
+                    f"energy of a mode (lowest part {100 * lowest:.4g} %): they overlap, or are no "
+                    "part of this K. Give each stiffness once, and springs that K has."
+                )
+        return np.where(elastic, 0.5 * found, 0.0)
+
+    def loss_stiffness(self, dofs: DofSet) -> Any:
+        """Return ``H - eta K = sum (eta_j - eta) K_j`` (n, n), None without regions."""
+        parts = [
+            (region.loss_factor - self.loss_factor) * region.matrix(dofs)
+            for region in self._regions.values()
+        ]
+        return sum(parts[1:], parts[0]) if parts else None
+
+    def coupling_errors(self, omega: FloatArray, shapes: FloatArray, dofs: DofSet) -> FloatArray:
+        """Return by how much, relatively, loss factors of modes change as H couples them (k,).
+
+        Parameters
+        ----------
+        omega : (k,) array [rad/s]
+            Undamped frequencies.
+        shapes : (n, k) array
+            Their mass-normalised shapes.
+        dofs : DofSet
+            The n rows.
+        """
+        from scipy.optimize import linear_sum_assignment
+
+        H = self.loss_stiffness(dofs)
+        omega = real_array(omega, "omega", (None,))
+        squares, found = omega**2, np.zeros(omega.size)
+        elastic = np.flatnonzero(omega > 0)
+        if H is None or not elastic.size:
+            return found
+        some, squares = shapes[:, elastic], squares[elastic]
+        loss = some.T @ np.asarray(H @ some) + self.loss_factor * np.diag(squares)
+        # each mode by itself, and all of them: matched, as near frequencies may change places
+        alone = squares + 1j * np.diag(loss)
+        coupled = np.asarray(la.eigvals(np.diag(squares) + 1j * loss), dtype=np.complex128)
+        gap: FloatArray = np.abs(alone[:, None] - coupled) / squares[:, None]
+        first, second = linear_sum_assignment(gap)
+        eta, true = alone[first].imag / squares[first], coupled[second].imag / coupled[second].real
+        found[elastic[first]] = np.abs(eta - true) / np.where(true > 0, true, 1.0)
+        return found
+
+    def error(
+        self, freq: FloatArray, natural: FloatArray, *, zeta: FloatArray | None = None
+    ) -> FloatArray:
         """Return by how much, relatively, the viscous responses of modes differ (n_freq, k).
 
         Parameters
@@ -74,22 +188,29 @@ class Hysteretic(Damping):
             Where.
         natural : (k,) array [Hz]
             Natural frequencies; rigid-body modes (0) differ by nothing.
+        zeta : (k,) array [-], optional
+            Their damping ratios, where regions differ: ``modes.zeta``.
 
         Raises
         ------
         ModelError
-            When a frequency is negative.
+            When a frequency is negative, or regions need the ratios.
         """
         at, own = _frequencies(freq, "freq")[:, None], _frequencies(natural, "natural")
         r = at / np.where(own > 0, own, 1.0)
-        eta = self.loss_factor
+        eta = 2.0 * (self.zeta(own) if zeta is None else real_array(zeta, "zeta", own.shape))
         size = np.sqrt((1 - r**2) ** 2 + (eta * r) ** 2)
         # without loss both are infinite at resonance, and the same
         found = eta * np.abs(1 - r) / np.where(size > 0, size, 1.0)
         return np.asarray(np.where(own > 0, found, 0.0), dtype=np.float64)
 
     def response_error(
-        self, freq: FloatArray, natural: FloatArray, gains: FloatArray
+        self,
+        freq: FloatArray,
+        natural: FloatArray,
+        gains: FloatArray,
+        *,
+        zeta: FloatArray | None = None,
     ) -> FloatArray:
         """Return a bound (n_freq,) of the difference between hysteretic and viscous responses.
 
@@ -103,6 +224,8 @@ class Hysteretic(Damping):
             Natural frequencies.
         gains : (k,) array [1/kg]
             ``phi_out phi_in`` of each mode, of mass-normalised shapes: receptance [m/N].
+        zeta : (k,) array [-], optional
+            As in `error`.
 
         Raises
         ------
@@ -111,9 +234,10 @@ class Hysteretic(Damping):
         """
         own = _frequencies(natural, "natural")
         weights = np.abs(real_array(gains, "gains", own.shape))
-        relative = self.error(freq, own)
+        relative = self.error(freq, own, zeta=zeta)
+        eta = 2.0 * (self.zeta(own) if zeta is None else real_array(zeta, "zeta", own.shape))
         at, omega = 2 * np.pi * real_array(freq, "freq")[:, None], 2 * np.pi * own
-        stiffness = np.abs(omega**2 * (1 + 1j * self.loss_factor) - at**2)
+        stiffness = np.abs(omega**2 * (1 + 1j * eta) - at**2)
         part = relative / np.where(stiffness > 0, stiffness, 1.0)
         return np.asarray(part @ weights, dtype=np.float64)
 
@@ -123,3 +247,14 @@ def _frequencies(value: Any, name: str) -> FloatArray:
     if np.any(found < 0):
         raise ModelError(f"{name} must not be negative, got {found.min():g} Hz. Take its size.")
     return found
+
+
+def _region(name: Any, part: Any) -> LossRegion:
+    if isinstance(part, LossRegion):
+        return part
+    if isinstance(part, tuple | list) and len(part) == 2:
+        return LossRegion(*part)
+    raise ModelError(
+        f"region {name!r} must be (loss factor, stiffness), got {short(part)}. Give "
+        "(0.3, K_pads), or (0.3, [Spring(...)])."
+    )

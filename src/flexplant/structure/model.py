@@ -258,7 +258,7 @@ class FEModel(Placed, Value):
         if isinstance(damping, Rayleigh) and not (free and damping.alpha and not damping.rigid):
             return self._with(D=frozen(damping.alpha * self.M + damping.beta * self.K))
         D = damping_matrix(
-            self.K, self.M, self.rigid_body, damping, motions=lambda: self.body_motions
+            self.K, self.M, self.rigid_body, damping, lambda: self.body_motions, self.dofs
         )
         return self._with(D=frozen(D))
 
