@@ -32,6 +32,7 @@ from flexplant.io.nastran import read_nodes
 
 sys.path.insert(0, str(Path(__file__).parent))
 from op2_files import op2, punch
+from uff_files import analysis
 
 RNG = np.random.default_rng(0)
 K = np.diag([4.0, 5.0, 6.0, 7.0, 8.0]) - np.eye(5, k=1) - np.eye(5, k=-1) + RNG.normal() * 0
@@ -233,6 +234,14 @@ def uff_shapes():
     return [saved(lambda path: pyuff.UFF(str(path)).write_sets([nodes, *shapes]))]
 
 
+def uff_analysis(kind):
+    rows = [f"{n:10d}{0:10d}{0:10d}{1:10d}{0.5:13.5E}{n:13.5E}{2.0:13.5E}\n" for n in (9, 4)]
+    nodes = "".join(["    -1\n    15\n", *rows, "    -1\n"]).encode()
+    values = RNG.normal(size=(2, 6)) * (1 + (1j if kind == 5 else 0))
+    sets = [analysis(kind, values, mode=k, load=1, freq=10.0 * k, real=(0.0, 1.0)) for k in (1, 2)]
+    return [nodes + "".join(sets).encode()]
+
+
 def dofs_table():
     return [b"node,direction,x,y,z\n1,z,0.0,1.0,2.0\n2,rx,0.5,1.5,2.5\n3,UY,1e-3,2,3\n"]
 
@@ -320,6 +329,8 @@ READERS = {
     "punch": ("m.pch", partial(result_file, punched=True), punched_modes),
     "uff_modes": ("m.unv", uff_shapes, modes_of),
     "ansys_rst": ("m.rst", partial(example, "file.rst"), modes_of),
+    "uff_2414": ("m.unv", partial(uff_analysis, 2), modes_of),
+    "uff_2414_frf": ("m.unv", partial(uff_analysis, 5), io.read_frf_uff),
     "uff_58": ("m.uff", uff, io.read_frf_uff),
     "uff_58b": ("m.uff", partial(uff, 1), io.read_frf_uff),
     "uff_55": ("m.uff", uff_shapes, io.read_modes_uff),

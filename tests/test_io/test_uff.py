@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.io.uff import read_frf_uff, read_modes_uff, read_nodes_uff
+from uff_files import analysis
 
 pyuff = pytest.importorskip("pyuff")
 SHARED = Path("/work/shared/data/fe/uff")
@@ -361,11 +363,65 @@ def test_coordinate_systems_that_are_not_the_global_one_are_refused(tmp_path):
             read_nodes_uff(written(tmp_path, [systems(**changes), nodes(2411)]))
 
 
-def test_shapes_of_a_finite_element_program_are_refused_with_a_reason(tmp_path):
-    path = tmp_path / "shapes.unv"
-    path.write_text("    -1\n  2414\n         1\nmode\n         1\n    -1\n")
-    with pytest.raises(FlexplantError, match=r"no mode shapes.*dataset 2414.*is not read"):
-        read_modes_uff(path)
+def results(tmp_path, *sets):
+    path = written(tmp_path, [units(1e3), nodes(2411, node_nums=[4, 9])], "m.unv")
+    path.write_text(path.read_text() + "".join(sets))
+    return path
+
+
+def test_modes_that_a_finite_element_program_computed(tmp_path):
+    """Dataset 2414 in mm and t: Modes with places, in SI; a complex mode is a measured one."""
+    shapes = np.array([[[0.0, 0, 3, 0.2, 0, 0], [0, 0, -2, 0.1, 0, 0]], np.ones((2, 6))])
+    sets = [
+        analysis(2, shape, mode=k + 1, freq=20.0 * k, real=(0.0, 4.0, 0.01 * k))
+        for k, shape in enumerate(shapes)
+    ]
+    stress = analysis(2, np.ones((2, 3)), mode=1, freq=20.0, result=2)
+    path = results(tmp_path, stress, *sets)
+    modes = fx.io.read_modes(path, zeta=None)
+    assert (modes.n_rigid, modes.freq[1]) == (1, pytest.approx(20.0))
+    np.testing.assert_allclose(modes.zeta, [0.0, 0.01])
+    assert modes.dofs.labels[:4] == ("9:x", "9:y", "9:z", "9:rx")
+    np.testing.assert_allclose(modes.dofs.xyz[0], [0.002, 0.004, 0.006])
+    # 1/sqrt(t) in 1/sqrt(kg), of generalised mass 4 t; rotations per mm
+    np.testing.assert_allclose(modes.at("9:z"), np.array([3, 1]) / np.sqrt(4e3))
+    np.testing.assert_allclose(modes.at("4:rx"), np.array([0.1, 1]) / np.sqrt(4e3) * 1e3)
+    mine = fx.io.read_modes(path, zeta=None, units=("m", "kg", "s"))
+    np.testing.assert_allclose(mine.at("9:z"), [1.5, 0.5])
+    with pytest.raises(FlexplantError, match=r"no normal modes: displacements .* 2414"):
+        fx.io.read_modes(results(tmp_path, stress), zeta=None)
+    swing = np.array([[1 + 2j, 0, 0.5j], [-1 - 1j, 0, 3]])
+    eigen = (0.0, 0.0, 0.0, 0.0, -3.0, 77.0)
+    one = read_modes_uff(results(tmp_path, analysis(7, swing, mode=5, real=eigen)))
+    np.testing.assert_allclose(one.poles, [-3 + 77j])
+    assert one.dofs == ("9:x", "9:z", "4:x", "4:z")
+    np.testing.assert_allclose(one.shapes[:, 0], swing[:, ::2].ravel())
+
+
+def test_responses_that_a_finite_element_program_computed(tmp_path):
+    rng = np.random.default_rng(3)
+    data = rng.normal(size=(2, 3, 2, 3)) + 1j * rng.normal(size=(2, 3, 2, 3))
+    data[..., 1] = 0.0
+    freq = [5.0, 20.0, 80.0]
+    sets = [
+        analysis(5, data[k, i], load=k + 1, freq=f) for i, f in enumerate(freq) for k in range(2)
+    ]
+    found = read_frf_uff(results(tmp_path, *sets[::-1]))
+    assert (found.inputs, found.outputs) == (("load 1", "load 2"), ("9:x", "9:z", "4:x", "4:z"))
+    np.testing.assert_allclose(found.freq, freq)
+    wanted = np.moveaxis(data[..., ::2].reshape(2, 3, 4), (0, 1, 2), (1, 2, 0)) * 1e-3
+    np.testing.assert_allclose(found.data, wanted, rtol=1e-5)
+    fast = read_frf_uff(results(tmp_path, *sets), quantity="velocity", scale=1.0)
+    np.testing.assert_allclose(fast.data, wanted * 1e3 * 2j * np.pi * found.freq, rtol=1e-5)
+    with pytest.raises(FlexplantError, match="load set 2 at 20 Hz twice"):
+        read_frf_uff(results(tmp_path, *sets, sets[3]))
+    with pytest.raises(FlexplantError, match="load set 2 is at other frequencies"):
+        read_frf_uff(results(tmp_path, *sets[:-1]))
+    both = [*sets, *(analysis(5, data[0, 0], load=1, freq=f, result=12) for f in freq)]
+    with pytest.raises(ModelError, match="in acceleration, displacement"):
+        read_frf_uff(results(tmp_path, *both))
+    with pytest.raises(FlexplantError, match="has no end"):
+        read_frf_uff(results(tmp_path, *sets, "    -1\n  2414\n"))
 
 
 @pytest.mark.parametrize("binary", [0, 1])

@@ -17,7 +17,7 @@ Abaqus                read_abaqus           .mtx: *MATRIX OUTPUT as text; *NODE 
 Sierra                read_sierra           .m: K, M as text; nodes of an Exodus file
 modes                 read_modes            .op2, .pch, .rst, .exo, .uff: of a solved model
 Exodus                read_exodus_modes     .exo, .e: modes (classic netCDF; HDF5 with an extra)
-universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 15, 2411 with `flexplant[uff]`
+universal file        read_modes_uff, ...   .uff, .unv: 55, 58, 2414, nodes; with `flexplant[uff]`
 tables                read_dofs             .csv, text: node, direction, x, y, z
 responses             read_frf_csv, ...     .csv, .mat, .npz: frequency responses
 values for MATLAB     read_mat, write_mat   .mat: systems, plants, reduced models, responses

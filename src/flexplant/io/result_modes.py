@@ -32,7 +32,7 @@ def read_modes(
     zeta: float | FloatArray | None,
     nodes: str | Path | None = None,
     rigid_below: float | None = None,
-    units: Sequence[str | float] = ("m", "kg", "s"),
+    units: Sequence[str | float] | None = None,
     matrices: FEMatrices | FEModel | None = None,
 ) -> Modes:
     r"""Return the modes that a finite-element program computed, whichever wrote the file.
@@ -58,8 +58,9 @@ def read_modes(
         file, or a table `node, x, y, z`.
     rigid_below : float [Hz], optional
         Modes below this are rigid-body modes, and set to exactly 0.
-    units : (length, mass, time)
-        Of the file: ("mm", "t", "s") for instance; the modes are in SI.
+    units : (length, mass, time), optional
+        Of the file: ("mm", "t", "s") for instance; the modes are in SI. None: as a universal file
+        says (dataset 164), or SI.
     matrices : FEMatrices or FEModel, optional
         In SI, with the same nodes: the shapes are checked to be mass-normalised with its M.
 
@@ -98,8 +99,8 @@ def read_modes(
     (('7:z',), array([200.]), array([[2.]]))
     """
     path = file_path(path)
-    sizes = tuple(units) if not isinstance(units, str) else ()
-    if len(sizes) != 3:
+    sizes = tuple(units or ()) if not isinstance(units, str) else ()
+    if units is not None and len(sizes) != 3:
         raise ModelError(
             f"units must be three, of length, mass and time, got {short(units)}: "
             "give ('mm', 't', 's') for instance."
@@ -114,7 +115,7 @@ def read_modes(
             "read by read_model."
         )
     shapes = form.read(path, None if nodes is None else file_path(nodes, "nodes"))
-    system = unit_system(*sizes)
+    system = shapes.units or unit_system() if units is None else unit_system(*sizes)
     modes = modes_of(shapes, zeta=zeta, rigid_below=rigid_below, system=system, path=str(path))
     if matrices is None:
         return modes

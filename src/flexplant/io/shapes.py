@@ -43,6 +43,8 @@ class FileShapes:
         Damping ratios, where the file has them.
     notes : tuple of str
         What was done in reading.
+    units : Units, optional
+        Of the numbers, where the file says so.
     """
 
     omega: FloatArray
@@ -51,6 +53,7 @@ class FileShapes:
     masses: FloatArray | None = None
     zeta: FloatArray | None = None
     notes: tuple[str, ...] = ()
+    units: Units | None = None
 
 
 @dataclass(frozen=True)

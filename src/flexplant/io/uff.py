@@ -1,4 +1,4 @@
-"""Universal files (UFF) of a measurement: responses (58), shapes (55), nodes (15, 2411)."""
+"""Universal files (UFF): responses (58, 2414), shapes (55, 2414), nodes (15, 2411)."""
 
 from __future__ import annotations
 
@@ -11,22 +11,25 @@ from ..errors import FlexplantError, LabelError, ModelError, unknown_label
 from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import Frf
-from ..values import positive
+from ..values import FloatArray, IntArray, positive
 from .formats import Elsewhere
-from .paths import damaged
+from .paths import damaged, file_path
+from .uff_analysis import AnalysisData, mode_records
 from .uff_records import (
     check_complete,
     check_systems,
     coherence_of,
     common_frequencies,
-    dataset_types,
     datasets,
     paired_records,
-    pole_of,
     record_sides,
     whole_entry,
 )
+from .uff_responses import responses_of_model
 from .uff_units import KINDS, ORDERS, record_scale
+
+#: of dataset 164: numbers divided by them are in SI
+_FACTORS = ("length", "force")
 
 
 def read_frf_uff(
@@ -36,9 +39,11 @@ def read_frf_uff(
     scale: float | None = None,
     coherence: bool = True,
 ) -> Frf:
-    """Return the frequency response functions of a universal file (dataset 58, text or binary).
+    """Return the frequency response functions of a universal file.
 
-    Every record gives one pair; a direction -3 is z with the sign turned.
+    Of dataset 58, text or binary: every record gives one pair; a direction -3 is z with the sign
+    turned. In a file without these, of dataset 2414: responses of all nodes of a model to its load
+    sets, "load 1", as large as these are.
 
     Parameters
     ----------
@@ -85,6 +90,9 @@ def read_frf_uff(
     records = [part for part in sets if part["type"] == 58]
     responses = [part for part in records if whole_entry(part, "func_type") == 4]
     if not responses:
+        computed = responses_of_model(file_path(path), factors, quantity, scale)
+        if computed is not None:
+            return computed
         kinds = sorted({whole_entry(part, "func_type") for part in records})
         raise FlexplantError(
             f"{str(path)!r} holds no frequency response function: {len(records)} records 58 of "
@@ -130,7 +138,9 @@ def read_frf_uff(
 
 
 def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> MeasuredModes:
-    """Return poles and mode shapes of a universal file (dataset 55: normal or complex modes).
+    """Return poles and mode shapes of a universal file (datasets 55 and 2414).
+
+    Normal or complex modes; of both, those of dataset 55, which test software writes.
 
     The numbers of the modes in the file count what was measured; which modes of a model they are
     is found by `numbered`.
@@ -159,50 +169,31 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     FileNotFoundError
         When there is no such file.
     """
-    parts = {}
-    for part in datasets(path, (55,)):
-        if part["type"] == 55 and whole_entry(part, "analysis_type") in (2, 3, 7):
-            number = whole_entry(part, "mode_n")
-            if number in parts:
-                raise FlexplantError(
-                    f"{str(path)!r} holds mode {number} twice. Export each once (one result set)."
-                )
-            parts[number] = part
+    parts: dict[int, AnalysisData] = {}
+    for part in mode_records(file_path(path), measured=True):
+        if part.mode in parts:
+            raise FlexplantError(
+                f"{str(path)!r} holds mode {part.mode} twice. Export each once (one result set)."
+            )
+        parts[part.mode] = part
     if not parts:
-        newer = (
-            " Its dataset 2414 (results of a finite-element program) is not read."
-            if 2414 in dataset_types(path)
-            else ""
-        )
         raise FlexplantError(
-            f"{str(path)!r} holds no mode shapes: dataset 55 of normal (2) or complex modes "
-            f"(3, 7).{newer} Export these."
+            f"{str(path)!r} holds no mode shapes: datasets 55, or 2414 of displacements at nodes, "
+            "of normal (2) or complex modes (3, 7). Export these."
         )
     chosen = list(parts) if modes is None else list(modes)
     for number in chosen:
         if number not in parts:
             raise LabelError(f"no mode {number!r} in {str(path)!r}: it holds {list(parts)[:12]}.")
-    poles = np.array([pole_of(parts[number]) for number in chosen])
+    poles = np.array([parts[number].pole for number in chosen])
     if np.any(poles.imag == 0):
         rigid = [number for number, pole in zip(chosen, poles, strict=True) if pole.imag == 0]
         raise ModelError(
             f"modes {rigid} of {str(path)!r} do not oscillate (rigid-body or overdamped): they "
             f"cannot be compared. Leave them out: modes={[n for n in chosen if n not in rigid]}."
         )
-    nodes = np.asarray(parts[chosen[0]]["node_nums"]).astype(np.int64)
-    shapes = []
-    for number in chosen:
-        part = parts[number]
-        own = np.asarray(part["node_nums"]).astype(np.int64)
-        rows = [np.asarray(part[f"r{i}"]) for i in range(1, 7) if part.get(f"r{i}") is not None]
-        if not np.array_equal(own, nodes) or any(row.size != nodes.size for row in rows):
-            raise FlexplantError(
-                f"{str(path)!r}: mode {number} is at other nodes than mode {chosen[0]}, or its "
-                "numbers are cut off. Export all at the same nodes."
-            )
-        rows += [np.zeros(nodes.size)] * (6 - len(rows))
-        shapes.append(np.stack(rows, axis=1).ravel())
-    phi = np.array(shapes, dtype=np.complex128).T
+    nodes = parts[chosen[0]].nodes
+    phi = np.array([parts[number].motions.ravel() for number in chosen], dtype=np.complex128).T
     labels = [f"{node}:{direction}" for node in nodes.tolist() for direction in DIRECTIONS]
     seen = np.array([np.any(phi[i::6]) for i in range(6)])
     keep = np.tile(seen, nodes.size)
@@ -236,8 +227,24 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
     FileNotFoundError
         When there is no such file.
     """
+    ids, xyz, (length, _) = raw_nodes(path)
+    count = len(directions)
+    xyz = np.repeat(xyz / length, count, axis=0)
+    return DofSet(np.repeat(ids, count), tuple(directions) * ids.size, xyz)
+
+
+def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, float]]:
+    """Return node numbers (n,), their places (n, 3) and the factors of length and force to SI.
+
+    Numbers divided by these factors are in SI; 1 where the file has no dataset 164.
+
+    Raises
+    ------
+    FlexplantError, ModelError
+        As `read_nodes_uff`.
+    """
     sets = datasets(path, (15, 2411, 164, 2420))
-    length = next((float(part["length"]) for part in sets if part["type"] == 164), 1.0)
+    factors = next((part for part in sets if part["type"] == 164), dict.fromkeys(_FACTORS, 1.0))
     check_systems([part for part in sets if part["type"] == 2420], str(path))
     parts = [part for part in sets if part["type"] in (15, 2411)]
     if not parts:
@@ -260,9 +267,8 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
         if any(axis.shape != numbers.shape for axis in axes):
             raise damaged(path, f"a dataset of {numbers.size} nodes lacks some of their numbers")
         places.append(np.stack(axes, axis=1))
-    count = len(directions)
-    ids, xyz = np.concatenate(nodes), np.concatenate(places) / length
-    return DofSet(np.repeat(ids, count), tuple(directions) * ids.size, np.repeat(xyz, count, 0))
+    length, force = (positive(factors[name], f"{name} of dataset 164") for name in _FACTORS)
+    return np.concatenate(nodes), np.concatenate(places), (length, force)
 
 
 UNIVERSAL = Elsewhere(

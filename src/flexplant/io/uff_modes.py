@@ -1,21 +1,19 @@
-"""Modes of a model in universal files: normal modes (dataset 55) and nodes (15, 2411)."""
+"""Modes of a model in universal files: normal modes (2414, 55) and nodes (15, 2411)."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ..dof_columns import at_nodes
 from ..errors import FlexplantError
 from ..labels import DIRECTIONS, DofSet
+from ..structure.units import Units
 from .shapes import FileShapes, ModesFormat
 from .tables import read_nodes_table
-from .uff import read_nodes_uff
-from .uff_records import datasets, whole_entry
-
-_NORMAL = 2
+from .uff import raw_nodes
+from .uff_analysis import NORMAL_MODE, mode_records
 
 
 def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
@@ -35,48 +33,34 @@ def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
     LabelError
         When a node has no place.
     """
-    parts = [p for p in datasets(path, (55,)) if whole_entry(p, "analysis_type") == _NORMAL]
+    parts = [p for p in mode_records(path, measured=False) if p.analysis == NORMAL_MODE]
     if not parts:
         raise FlexplantError(
-            f"{str(path)!r} holds no normal modes (dataset 55, analysis type 2). Measured or "
-            "complex ones are read by read_modes_uff, as MeasuredModes."
+            f"{str(path)!r} holds no normal modes: displacements at nodes in dataset 2414, or 55, "
+            "of analysis type 2. Measured or complex ones are read by read_modes_uff, as "
+            "MeasuredModes."
         )
-    ids = np.asarray(parts[0]["node_nums"]).astype(np.int64)
-    shapes = []
-    for part in parts:
-        rows = [part[f"r{i}"] for i in range(1, 7) if part.get(f"r{i}") is not None]
-        same = np.array_equal(np.asarray(part["node_nums"]).astype(np.int64), ids)
-        if not same or any(np.size(row) != ids.size for row in rows):
-            raise FlexplantError(
-                f"{str(path)!r}: modes are at different nodes, or numbers are cut off. Export all "
-                "at the same nodes."
-            )
-        rows += [np.zeros(ids.size)] * (6 - len(rows))
-        shapes.append(np.real(np.stack(rows, axis=1)).ravel())
+    ids = parts[0].nodes
     where = path if nodes is None else nodes
     if where.suffix.lower() in UNIVERSAL_MODES.suffixes:
-        points = read_nodes_uff(where, directions=("x",))
-        known, xyz = points.nodes, points.xyz
+        known, xyz, factors = raw_nodes(where)
     else:
-        known, xyz = read_nodes_table(where)
+        (known, xyz), factors = read_nodes_table(where), (1.0, 1.0)
     dofs = DofSet(
         np.repeat(ids, 6),
         DIRECTIONS * ids.size,
         np.repeat(at_nodes(ids, np.asarray(known), xyz, str(where)), 6, axis=0),
     )
-
-    def column(name: str) -> Any:
-        return np.array([float(part.get(name) or 0.0) for part in parts])
-
-    viscous, structural = column("modal_damp_vis"), column("modal_damp_his")
-    zeta = np.where(viscous != 0, viscous, structural / 2)
-    masses = column("modal_m")
+    zeta, masses = np.array([part.zeta for part in parts]), np.array([part.mass for part in parts])
+    length, force = factors
     return FileShapes(
-        2 * np.pi * column("freq"),
-        np.array(shapes).T,
+        2 * np.pi * np.array([part.freq for part in parts]),
+        np.array([np.real(part.motions).ravel() for part in parts]).T,
         dofs,
         masses=masses if np.any(masses) else None,
         zeta=zeta if np.any(zeta) else None,
+        # numbers over factors are in SI, and mass is force over acceleration
+        units=None if factors == (1.0, 1.0) else Units(1 / length, length / force, 1.0),
     )
 
 

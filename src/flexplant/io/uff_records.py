@@ -211,13 +211,3 @@ def coherence_of(
     rows = [[np.real(pairs[a, b][1]["data"]) for b in inputs] for a in outputs]
     # single precision goes beyond 1 by its rounding
     return np.minimum(np.array(rows, dtype=np.float64), 1.0)
-
-
-def pole_of(part: dict[str, Any]) -> complex:
-    """Return the pole [rad/s] of a mode shape."""
-    if whole_entry(part, "analysis_type") != 2:
-        return complex(part["eig"])
-    omega = 2 * np.pi * float(part["freq"])
-    viscous, hysteretic = float(part["modal_damp_vis"]), float(part["modal_damp_his"])
-    zeta = viscous or hysteretic / 2
-    return complex(omega * (-zeta + 1j * np.sqrt(max(0.0, 1 - zeta**2))))
