@@ -196,7 +196,7 @@ def test_a_pair_is_taken_apart_with_one_input():
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("known", "seeds"),
-    [(True, range(1000, 1050)), (False, range(2000, 2020))],
+    [(True, range(1000, 1025)), (False, range(2000, 2012))],
     ids=["variance", "no variance"],
 )
 def test_no_pole_is_lost_in_silence_and_the_doubt_is_honest(known, seeds):
@@ -386,13 +386,13 @@ TRIAL = pole([47.5, 48.2, 53.0], [0.004, 0.005, 0.003])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("common", [0.0, 0.9])
-def test_confidence_covers_the_truth(common):
-    """300 trials: chi-square of all poles together, 95 % regions within a binomial interval.
+@pytest.mark.parametrize(("common", "trials"), [(0.0, 100), (0.9, 300)])
+def test_confidence_covers_the_truth(common, trials):
+    """Many trials: chi-square of all poles together, 95 % regions within a binomial interval.
 
     With errors that outputs share, the same regions without the correlation cover too little.
     """
-    rng, trials = np.random.default_rng(7), 300
+    rng = np.random.default_rng(7)
     H = modal_frf(COARSE, TRIAL, PHI[:, :3], PHI[:2, :3], static=np.full((5, 2), 1e-7))
     deviation = 1e-3 * np.sqrt(np.mean(np.abs(H) ** 2))
     mix = np.full((5, 5), common) + (1 - common) * np.eye(5)
@@ -416,7 +416,7 @@ def test_confidence_covers_the_truth(common):
     share = np.mean(np.array(distance) < chi2.ppf(0.95, 6))
     margin = 3 * np.sqrt(0.95 * 0.05 / trials)
     assert abs(share - 0.95) < margin
-    assert np.std(z) == pytest.approx(1.0, abs=0.05)
+    assert np.std(z) == pytest.approx(1.0, abs=0.08)
     if common:
         assert np.mean(np.array(blind) < chi2.ppf(0.95, 6)) < 0.95 - 1.5 * margin
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flexplant.identification import average_frfs, identify_modes, numbered
+from flexplant.identification import identify_modes, numbered
 from flexplant.modes import solve_modes
 from flexplant.structure import ModalDamping
 from flexplant.testbeds import wafer_stage
@@ -14,22 +14,14 @@ VISIBLE = {4, 6, 7, 8, 9, 10, 11}
 pytestmark = pytest.mark.slow
 
 
-@pytest.mark.parametrize(
-    ("zeta", "period", "periods", "discard", "runs"),
-    [(0.01, 0.5, 1, 2, 6), (0.001, 1.5, 5, 4, 1)],
-    ids=["1 %", "0.1 %"],
-)
-def test_true_poles_lie_within_three_sigma(zeta, period, periods, discard, runs):
+def test_true_poles_lie_within_three_sigma():
     """Modes 5 and 12 are zero at the actuators; 825 Hz is a mode of 9175 Hz that folds.
 
-    The variance is that of six runs, or of the periods of one.
+    The variance is that of the periods of one run; several runs, at more damping: the example.
     """
+    zeta = 0.001
     machine, channels = wafer_stage(damping=zeta), ports()
-    measured = [
-        machine.measure_frf(channels, period=period, periods=periods, discard=discard, rng=k)
-        for k in range(runs)
-    ]
-    frf = average_frfs(measured) if runs > 1 else measured[0]
+    frf = machine.measure_frf(channels, period=1.5, periods=3, discard=4, rng=0)
     found = identify_modes(frf, band=(150.0, 1250.0), hold=1e4)
     modes = solve_modes(make_plate(), count=18, damping=ModalDamping(zeta))
     at = {sensor.name: sensor.at for sensor in channels.y}
@@ -41,6 +33,6 @@ def test_true_poles_lie_within_three_sigma(zeta, period, periods, discard, runs)
     assert np.abs(error.real / answer.std.real).max() < 3.5
     assert np.abs(error.imag / answer.std.imag).max() < 3.5
     # the doubt is small enough to tell the drawing from the machine, and the pair apart
-    assert np.max(np.abs(answer.std) / np.abs(answer.poles)) < 2e-3 * np.sqrt(zeta / 0.01)
+    assert np.max(np.abs(answer.std) / np.abs(answer.poles)) < 6e-4
     seven, eight = (answer.poles[list(answer.modes).index(k)] for k in (7, 8))
     assert abs(seven - eight) > 10 * np.abs(answer.std).max()
