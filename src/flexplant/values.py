@@ -382,6 +382,9 @@ def name_list(names: Any, what: str) -> tuple[str, ...]:
 
 def check_names(names: Sequence[str], side: str) -> None:
     """Raise LabelError unless the names are unique and of the allowed form."""
+    text = "\n".join(["", *names, ""])
+    if not ("." in text or "\n-" in text or "\n\n" in text) and len(set(names)) == len(names):
+        return
     for name in names:
         if not name or "." in name or name.startswith("-"):
             raise LabelError(

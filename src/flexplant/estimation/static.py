@@ -10,7 +10,7 @@ from ..errors import AssumptionError, ModelError
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
-from ..plant.rigid.rigid_motion import rigid_modes_of, seen
+from ..plant.rigid.rigid_motion import seen
 from ..values import FloatArray, Value
 from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .error import error_variances
@@ -85,7 +85,7 @@ class StaticEstimator(Value):
         plant = self.larger or self.plant
         if on is not None:
             plant = same_pois(self.plant, on)
-        held = rigid_modes_of(plant) if plant.is_assembled else None
+        held = plant.rigid_motions if plant.is_assembled else None
         found = error_variances(plant, self.system, None if held is None else held.modes)
         return float(np.sqrt(found.values[row]))
 
@@ -137,7 +137,7 @@ def design_static(
             "sensors only. Use plant.unweighted."
         )
     ports = plant.assembled.ports
-    motions = rigid_modes_of(plant)
+    motions = plant.rigid_motions
     orders = {s.name: s.order for s in ports.y}
     used = [name for name in sensors(plant) if orders.get(name) == 0]
     channels = poi_channels(plant)

@@ -27,45 +27,22 @@ def joined(
     actuator's name read these, not the commands.
     """
     read = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
-    none = np.zeros((0, 0))
     silent = [name for name in read if name not in driven]
     outer = {name: f"{name}|applied" for name in driven} if applied else {}
-    systems = [
-        sys.renamed(inputs={name: outer[name] for name in sys.inputs if name in outer})
-        for sys in systems
-    ]
-    zero = StateSpace(none, none, none, np.zeros((len(silent), 0)), plant.dt, outputs=silent)
-    # gains of 1e9 N/m beside lengths would look like an ill-posed algebraic loop: signals are
-    # joined in units in which direct gains are at most one, powers of two so that no digit changes
-    units = _units(systems)
-    scaled = [_in_units(sys, units) for sys in systems]
-    joined = connect(
-        [*scaled, zero] if silent else scaled,
+    if outer:
+        systems = [
+            sys.renamed(inputs={name: outer[name] for name in sys.inputs if name in outer})
+            for sys in systems
+        ]
+    if silent:
+        still = StateSpace([], [], [], np.zeros((len(silent), 0)), plant.dt, outputs=silent)
+        systems = [*systems, still]
+    return connect(
+        systems,
         inputs=[*plant.y, *outer.values()],
         outputs=[*driven, *watched],
         adding=driven,
     )
-    row = np.array([units[name] for name in (*driven, *watched)])[:, None]
-    return joined.replace(C=joined.C * row, D=joined.D * row, dt=plant.dt)
-
-
-def _units(systems: Sequence[StateSpace]) -> dict[str, float]:
-    """Return a size for each output of a block: its largest direct gain from outside."""
-    units = {name: 1.0 for sys in systems for name in sys.outputs}
-    for _ in systems:  # along chains of blocks, which are no longer than there are blocks
-        sizes = dict.fromkeys(units, 0.0)
-        for sys in systems:
-            gains = np.abs(sys.D) * [units.get(name, 1.0) for name in sys.inputs]
-            for name, gain in zip(sys.outputs, gains.max(axis=1, initial=0.0), strict=True):
-                sizes[name] = max(sizes[name], float(gain))
-        units = {n: float(2.0 ** np.ceil(np.log2(s))) if s else 1.0 for n, s in sizes.items()}
-    return units
-
-
-def _in_units(sys: StateSpace, units: dict[str, float]) -> StateSpace:
-    row = np.array([units.get(name, 1.0) for name in sys.outputs])[:, None]
-    column = np.array([units.get(name, 1.0) for name in sys.inputs])
-    return sys.replace(B=sys.B * column, C=sys.C / row, D=sys.D / row * column)
 
 
 def as_block(block: Any, place: int, dt: float) -> StateSpace:
@@ -90,7 +67,7 @@ def as_block(block: Any, place: int, dt: float) -> StateSpace:
             f"block {place} {sys!r} has dt {sys.dt:g} s, the plant {dt:g} s (0 is continuous). "
             "Design it on plant.discretized(rate), or discretise it at the plant's rate."
         )
-    return sys.replace(dt=dt)
+    return sys if sys.dt == dt else sys.replace(dt=dt)
 
 
 def drives(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -10,9 +10,9 @@ from typing import Literal
 import numpy as np
 
 from ..errors import LabelError
-from ..lti.grid import climbed, resonance_grid
+from ..lti.grid import highest, resonance_grid
 from ..lti.responses import Responder
-from ..plant import StandardPlant
+from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray, short
 
 Side = Literal["u", "y"]
@@ -91,9 +91,7 @@ class BrokenLoop:
     def worst(self) -> tuple[float, float]:
         """The largest sigma_max(S_u) and its frequency [Hz], over a grid refined at its peaks."""
         rounds = 6 if self.measured is None else 0
-        freq, size = climbed(lambda freq: sensitivity_size(self.gain(freq)), self.grid, rounds)
-        highest = int(np.argmax(size))
-        return float(size[highest]), float(freq[highest])
+        return highest(lambda freq: sensitivity_size(self.gain(freq)), self.grid, rounds)
 
     @property
     def modulus_margin(self) -> float:
@@ -131,8 +129,7 @@ def sensitivity_size(L: ComplexArray) -> FloatArray:
     return np.asarray(size)
 
 
-def moved(plant: StandardPlant, driven: Sequence[str]) -> tuple[str, ...]:
-    """Return the y that can move with some of u: their rows see a state or an actuator."""
-    g = plant.system.select(plant.y, driven)
+def moved(g: StateSpace) -> tuple[str, ...]:
+    """Return the outputs that can move: their rows see a state or an input."""
     moves = np.any(g.C != 0, axis=1) | np.any(g.D != 0, axis=1)
-    return tuple(name for name, one in zip(plant.y, moves, strict=True) if one)
+    return tuple(name for name, one in zip(g.outputs, moves, strict=True) if one)

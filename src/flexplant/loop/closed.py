@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..errors import ModelError
 from ..lti.frequency import Frf, sampled_freq
-from ..lti.interconnection import lft
+from ..lti.interconnection import lft, loop_poles
 from ..lti.responses import Responder, remembered, responder
 from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace
@@ -101,7 +101,25 @@ class ClosedLoop(Value):
     @cached_property
     def fed_back(self) -> tuple[str, ...]:
         """The channels of y that u can move; references are not among them."""
-        return moved(self.plant, self.driven)
+        return moved(self._path)
+
+    @cached_property
+    def _path(self) -> StateSpace:
+        """From the driven u to y."""
+        return self.plant.system.select(self.plant.y, self.driven)
+
+    @cached_property
+    def _command(self) -> StateSpace:
+        """From y to the driven u."""
+        return self.controller.select(outputs=self.driven)
+
+    @cached_property
+    def _poles(self) -> ComplexArray:
+        return loop_poles(self._path, self._command)
+
+    def poles(self) -> ComplexArray:
+        """Return the eigenvalues of the closed loop [rad/s or 1]."""
+        return self._poles.copy()
 
     @cached_property
     def monitored(self) -> StateSpace:
@@ -131,7 +149,9 @@ class ClosedLoop(Value):
             name=g.name,
             units=self.units,
         )
-        return lft(opened, self.controller.replace(inputs=back))
+        loop = lft(opened, self.controller.replace(inputs=back))
+        loop.__dict__["_poles"] = self._poles
+        return loop
 
     @cached_property
     def system(self) -> StateSpace:
@@ -199,7 +219,7 @@ class ClosedLoop(Value):
     @cached_property
     def _controller_response(self) -> Responder:
         """From y to the driven actuators; the first grid, that of all poles, is needed again."""
-        return remembered(responder(self.controller.select(outputs=self.driven)))
+        return remembered(responder(self._command))
 
     @cached_property
     def broken(self) -> BrokenLoop:
@@ -209,8 +229,8 @@ class ClosedLoop(Value):
             self.driven,
             self.fed_back,
             lambda freq: self._controller_response(freq)[:, read],
-            responder(self.plant.system.select(self.fed_back, self.driven)),
-            self.monitored.poles,
+            responder(self._path.select(self.fed_back)),
+            self.poles,
             self.plant.dt,
             units=self.units,
         )
@@ -229,7 +249,7 @@ class ClosedLoop(Value):
                 "the spectral radius belongs to sampled loops; this one is continuous: "
                 "use spectral_abscissa, or close the loop around plant.discretized(rate)."
             )
-        return float(np.max(np.abs(self.monitored.poles()), initial=0.0))
+        return float(np.max(np.abs(self._poles), initial=0.0))
 
     @property
     def spectral_abscissa(self) -> float:
@@ -240,7 +260,7 @@ class ClosedLoop(Value):
         if self.plant.dt:
             with np.errstate(divide="ignore"):
                 return float(np.log(self.spectral_radius) / self.plant.dt)
-        return float(np.max(self.monitored.poles().real, initial=-np.inf))
+        return float(np.max(self._poles.real, initial=-np.inf))
 
     @property
     def decay(self) -> str:
@@ -252,7 +272,7 @@ class ClosedLoop(Value):
     @property
     def is_stable(self) -> bool:
         """Whether all eigenvalues of the closed loop are strictly inside the stability region."""
-        return self.monitored.is_stable
+        return self.spectral_radius < 1.0 if self.plant.dt else self.spectral_abscissa < 0.0
 
     @cached_property
     def obstacle(self) -> Obstacle | None:

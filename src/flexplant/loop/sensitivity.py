@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf, frequency_response, sampled_freq
-from ..lti.interconnection import lft
+from ..lti.interconnection import loop_poles
 from ..lti.responses import remembered, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
@@ -221,7 +221,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
         if unread:
             raise unknown_label("y for the controller", unread[0], plant.y, "the plant")
         driven = [name for name in controller.outputs if name in plant.u]
-        fed = moved(plant, driven)
+        fed = moved(plant.system.select(plant.y, driven))
         read = [name for name in controller.inputs if name in fed]
         plant, controller = plant.system.select(read, driven), controller.select(driven, read)
     elif not isinstance(plant, StateSpace):
@@ -232,7 +232,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     controller = controller.select(driven)
     plant = plant.select(controller.inputs, driven)
     # the peaks of S are at the poles of the closed loop, not at those of its parts
-    return _modelled(plant, controller, lambda: lft(plant, controller).poles())
+    return _modelled(plant, controller, lambda: loop_poles(plant, controller))
 
 
 def _modelled(

@@ -22,6 +22,8 @@ UNDAMPED = 1e-12
 NARROWEST = 1e-8
 #: local maxima that are climbed at most, and the part of the highest that each has at least
 _PEAKS, _HIGH = 6, 0.5
+#: a bracket and its inner points; a maximum that gains less than this part is found
+_ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-11
 #: around a resonance, in units of its half-power half-width
 _AROUND = np.array([0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0])
 
@@ -209,6 +211,53 @@ def climbed(
         order = np.argsort(both)
         grid, values = both[order], np.concatenate([values, find(fresh)])[order]
     return grid, values
+
+
+def highest(
+    find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
+) -> tuple[float, float]:
+    """Return the largest value of a function of frequency, and its frequency [Hz].
+
+    The brackets around the highest local maxima of a grid are divided, until a parabola through
+    each says that it gains no more; those that can no longer be the highest are left.
+
+    Parameters
+    ----------
+    find : function
+        Of frequencies [Hz], gives a value for each.
+    grid : (n_freq,) array [Hz]
+        Where it begins.
+    rounds : int
+        How often brackets are divided at most.
+    """
+    values = find(grid)
+    ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
+    freq, size = grid[ends], values[ends]  # (k, 3): left, top and right of each
+    for n in range(1, rounds + 1):
+        left, top, right = freq[:, :1], freq[:, 1:2], freq[:, 2:]
+        fresh = np.hstack([left + (top - left) * _EIGHTHS, top + (right - top) * _EIGHTHS])
+        freq = np.hstack([freq, fresh])
+        size = np.hstack([size, find(fresh.ravel()).reshape(fresh.shape)])
+        order = np.argsort(freq, axis=1)
+        freq, size = (np.take_along_axis(both, order, axis=1) for both in (freq, size))
+        around = np.clip(np.argmax(size, axis=1)[:, None] + _ASIDE, 0, freq.shape[1] - 1)
+        freq, size = (np.take_along_axis(both, around, axis=1) for both in (freq, size))
+        # a top seen at half its height is seen at 1 - 0.5 / 8^n of it by now
+        left_in = size[:, 1] >= (1.0 - (1.0 - _HIGH) / 8.0**n) * size[:, 1].max()
+        freq, size = freq[left_in], size[left_in]
+        if not np.any(_rise(freq, size) > _GAIN * size[:, 1]):
+            break
+    best = int(np.argmax(size[:, 1]))
+    return float(size[best, 1]), float(freq[best, 1])
+
+
+def _rise(x: FloatArray, y: FloatArray) -> FloatArray:
+    """Return how far the vertex of a parabola lies above its middle point, x and y (k, 3)."""
+    with np.errstate(divide="ignore", invalid="ignore"):  # at an end of the grid there is no side
+        slopes = np.diff(y, axis=1) / np.diff(x, axis=1)
+        width = x[:, 2] - x[:, 0]
+        slope = (slopes[:, 0] * (x[:, 2] - x[:, 1]) + slopes[:, 1] * (x[:, 1] - x[:, 0])) / width
+        return np.asarray(slope**2 * width / (4.0 * (slopes[:, 0] - slopes[:, 1])))
 
 
 def checked_freq(freq: npt.ArrayLike) -> FloatArray:

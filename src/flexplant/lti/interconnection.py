@@ -5,10 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 
 import numpy as np
+import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..values import FloatArray, name_list
+from ..values import ComplexArray, FloatArray, name_list
 from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
@@ -161,16 +162,17 @@ def lft(P: System, K: System) -> StateSpace:
     )
 
 
-def loop_matrix(P: Matrices, K: Matrices) -> FloatArray:
-    """Return A of the loop of P and ``u = K y``, states of P first.
+def loop_poles(g: StateSpace, K: StateSpace) -> ComplexArray:
+    """Return the poles of the loop of g and ``u = K y``, channels of both in one order.
 
     Raises
     ------
     ModelError
         When the loop is ill-posed.
     """
-    D, DK = P[3], K[3]
-    return _looped(P, K, _well_posed(DK @ D), _well_posed(D @ DK))[0]
+    P, back = (g.A, g.B, g.C, g.D), (K.A, K.B, K.C, K.D)
+    A, *_ = _looped(P, back, _well_posed(K.D @ g.D), _well_posed(g.D @ K.D))
+    return np.asarray(la.eigvals(A), dtype=np.complex128)
 
 
 def _looped(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import TypeAlias
+from collections.abc import Callable, Sequence
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -11,21 +11,36 @@ import numpy.typing as npt
 from ..errors import ModelError
 from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray, IntArray
+from .scaling import scaled_schur
 from .statespace import StateSpace
 
 #: entries of the largest intermediate array of a back substitution (complex): it stays in cache
 CHUNK = 400_000
 #: rows of a back substitution that are solved together
 ROWS = 32
-#: frequencies at a time in block form: the scalar functions of all modes stay in cache
-MODAL_STEP = 512
+#: functions of frequency at a time in block form: in cache, and in memory that is used again
+MODAL_CHUNK = 19_200
 
-#: responses (p, m, n_s), and whether they are finite for certain: large arrays are not read again
-Modal: TypeAlias = Callable[[ComplexArray], tuple[ComplexArray, bool]]
 #: the responses (p, m, n_freq) at frequencies [Hz]
 Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
-#: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument
-Solver = Callable[[ComplexArray, ComplexArray], None]
+#: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument, and says whether it is finite for
+#: certain: large arrays are not read again
+Solver: TypeAlias = Callable[[ComplexArray, ComplexArray], bool]
+
+
+class Part(NamedTuple):
+    """A, B, C, sampling time and blocks of a part of a system."""
+
+    A: FloatArray
+    B: FloatArray
+    C: FloatArray
+    dt: float
+    blocks: Sequence[int] | None = None
+
+    @property
+    def schur_form(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+        """As of a StateSpace."""
+        return scaled_schur(self.A, self.B, self.C)
 
 
 def responses(g: StateSpace, freq: FloatArray) -> ComplexArray:
@@ -35,31 +50,21 @@ def responses(g: StateSpace, freq: FloatArray) -> ComplexArray:
 
 def responder(g: StateSpace) -> Responder:
     """Return the function of frequency [Hz] that gives the responses, prepared once."""
-    shape = len(g.outputs), len(g.inputs)
     if not g.n_states or not g.D.size:
         return lambda freq: np.repeat(g.D[:, :, None], freq.size, axis=2).astype(np.complex128)
-    modal = _modal(g) or _fed_by_lines(g)
-    if modal is not None:
-
-        @one_thread()
-        def by_modes(freq: FloatArray) -> ComplexArray:
-            data, tame = modal(points(g, freq))
-            return data if tame else _finite(data, freq)
-
-        return by_modes
-    solve = _solver(g)
-    step = max(1, CHUNK // (g.n_states * (len(g.inputs) + 2)))
+    solve, entries = _solver(g)
+    step = max(64, entries // g.n_states)
 
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
-        s = points(g, freq)
-        out = np.empty((*shape, freq.size), dtype=np.complex128)
+        s, tame = points(g, freq), True
+        out = np.empty((*g.D.shape, freq.size), dtype=np.complex128)
         out[:] = g.D[:, :, None]
-        for start in range(0, freq.size, step):
-            part = slice(start, start + step)
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                solve(s[part], out[:, :, part])
-        return _finite(out, freq)
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            for start in range(0, freq.size, step):
+                part = slice(start, start + step)
+                tame = solve(s[part], out[:, :, part]) and tame
+        return out if tame else _finite(out, freq)
 
     return found
 
@@ -108,13 +113,56 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
     return np.asarray(logs[np.isfinite(logs)] / g.dt)
 
 
-def _solver(g: StateSpace) -> Solver:
-    if g.blocks is not None and set(g.blocks) <= {1, 2}:
-        return _substitution(g, *_paired(g))
-    return _schur(g)
+def _solver(g: StateSpace | Part) -> tuple[Solver, int]:
+    """Return what solves, and for how many frequencies at a time, times states."""
+    n, m = g.B.shape
+    entries = CHUNK // (m + 2)
+    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+        owner = _components(g.A)
+        return _side_by_side(g, owner) if np.any(owner) else _schur(g), entries
+    pairs, slots, coupling = _paired(g)
+    tied = np.flatnonzero(np.any(coupling, axis=0))
+    head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
+    if head == n:
+        return _modal(g, pairs, slots), MODAL_CHUNK
+    if head and 4 * (n - head) <= n:
+        cut = int(np.searchsorted(slots[:, 0], head))
+        return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), MODAL_CHUNK
+    return _substitution(g, pairs, slots, coupling), entries
 
 
-def _paired(g: StateSpace) -> tuple[FloatArray, IntArray, FloatArray]:
+def _components(A: FloatArray) -> IntArray:
+    """Return the first state that each state is tied to, by any path."""
+    tied = (A != 0) | (A.T != 0)
+    np.fill_diagonal(tied, True)
+    owner = np.arange(len(A))
+    while True:
+        before = owner
+        owner = np.where(tied, owner, len(A)).min(axis=1)
+        owner = owner[owner]
+        if np.array_equal(owner, before):
+            return np.asarray(owner)
+
+
+def _side_by_side(g: StateSpace | Part, owner: IntArray) -> Solver:
+    """Systems that share no state, such as the axes of a servo: each with its own channels."""
+    solvers = []
+    for own in (np.flatnonzero(owner == i) for i in np.unique(owner)):
+        fed, seen = np.flatnonzero(g.B[own].any(axis=0)), np.flatnonzero(g.C[:, own].any(axis=1))
+        one = Part(g.A[np.ix_(own, own)], g.B[np.ix_(own, fed)], g.C[np.ix_(seen, own)], g.dt)
+        solvers.append((_schur(one), np.ix_(seen, fed)))
+
+    def add(s: ComplexArray, out: ComplexArray) -> bool:
+        for solve, channels in solvers:
+            found = np.zeros((channels[0].size, channels[1].size, s.size), dtype=np.complex128)
+            solve(s, found)
+            out[channels] += found
+        return False
+
+    return add
+
+
+def _paired(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
     """Return the diagonal blocks as (b, 2, 2), the states of each (b, 2; -1 none), and the rest."""
     sizes = np.asarray(g.blocks)
     starts = np.cumsum(sizes) - sizes
@@ -129,7 +177,7 @@ def _paired(g: StateSpace) -> tuple[FloatArray, IntArray, FloatArray]:
     return pairs, slots, coupling
 
 
-def _modal(g: StateSpace) -> Modal | None:
+def _modal(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> Solver:
     """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
 
     With m half the trace of a block, N = A - m I and N^2 = q I (Cayley-Hamilton),
@@ -137,12 +185,7 @@ def _modal(g: StateSpace) -> Modal | None:
     for slow modes of a sampled system. A 1 x 1 block is N = 0. Complex numbers are pairs of real
     columns, so that no complex product is formed.
     """
-    if g.blocks is None or not set(g.blocks) <= {1, 2}:
-        return None
-    pairs, slots, coupling = _paired(g)
-    if np.any(coupling):
-        return None
-    real = slots >= 0
+    real, pairs = slots >= 0, pairs.copy()
     pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]  # N = 0 for a 1 x 1 block
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs.copy()
@@ -152,50 +195,40 @@ def _modal(g: StateSpace) -> Modal | None:
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
     B = g.B[slots] * real[:, :, None]  # (b, 2, m)
     C = (g.C[:, slots] * real).transpose(1, 2, 0)  # (b, 2, p)
-    with_s = np.einsum("bip,bim->pmb", C, B).reshape(g.D.size, -1)
-    without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(g.D.size, -1)
+    channels = len(g.C) * g.B.shape[1]
+    with_s = np.einsum("bip,bim->pmb", C, B).reshape(channels, -1)
+    without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(channels, -1)
     moving, fixed = _chosen(with_s), _chosen(without)
-    through = g.D.reshape(-1, 1) if np.any(g.D) else np.zeros((g.D.size, 0))
-    residues = np.hstack([with_s[:, moving], without[:, fixed], through])
+    residues = np.hstack([with_s[:, moving], without[:, fixed]])
     n_moving = with_s[:, moving].shape[1]
-    n_both = n_moving + without[:, fixed].shape[1]
-
     # functions below this, times the residues, cannot overflow
     ceiling = 1e300 / (float(np.abs(residues).sum(axis=1).max(initial=0.0)) or 1.0)
 
-    def found(s: ComplexArray) -> tuple[ComplexArray, bool]:
-        data = np.empty((*g.D.shape, s.size), dtype=np.complex128)
-        out = data.reshape(g.D.size, -1).view(np.float64)
-        tame = True
-        for start in range(0, s.size, MODAL_STEP):
-            part = s[start : start + MODAL_STEP]
-            y = part.imag
-            # on the imaginary axis a mode's x is one number: what stays (b, 1) costs nothing
-            x = part.real - mean[:, None] if g.dt else -mean[:, None]
-            functions = np.empty((residues.shape[1], part.size, 2))
-            with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-                real_part = (swing[:, None] - y) * (swing[:, None] + y)
-                real_part += (x - split[:, None]) * (x + split[:, None])
-                imag_part = (2.0 * x) * y
-                size = real_part * real_part
-                size += imag_part * imag_part
-                np.divide(1.0, size, out=size)
-                real_part *= size
-                imag_part *= np.negative(size, out=size)
-                # (real_part, imag_part) is 1 / ((s - m)^2 - q) now
-                if n_moving:
-                    x, r, i = x[moving], real_part[moving], imag_part[moving]
-                    np.subtract(x * r, y * i, out=functions[:n_moving, :, 0])
-                    np.add(x * i, y * r, out=functions[:n_moving, :, 1])
-                functions[n_moving:n_both, :, 0] = real_part[fixed]
-                functions[n_moving:n_both, :, 1] = imag_part[fixed]
-                functions[n_both:] = (1.0, 0.0)
-                flat = functions.reshape(residues.shape[1], 2 * part.size)
-                tame = tame and -ceiling < flat.min(initial=0.0) and flat.max(initial=0.0) < ceiling
-                np.matmul(residues, flat, out=out[:, 2 * start : 2 * (start + part.size)])
-        return data, tame
+    def add(s: ComplexArray, out: ComplexArray) -> bool:
+        y = s.imag
+        # on the imaginary axis a mode's x is one number: what stays (b, 1) costs nothing
+        x = s.real - mean[:, None] if g.dt else -mean[:, None]
+        functions = np.empty((residues.shape[1], s.size, 2))
+        real_part = (swing[:, None] - y) * (swing[:, None] + y)
+        real_part += (x - split[:, None]) * (x + split[:, None])
+        imag_part = (2.0 * x) * y
+        size = real_part * real_part
+        size += imag_part * imag_part
+        np.divide(1.0, size, out=size)
+        real_part *= size
+        imag_part *= np.negative(size, out=size)
+        # (real_part, imag_part) is 1 / ((s - m)^2 - q) now
+        if n_moving:
+            x, r, i = x[moving], real_part[moving], imag_part[moving]
+            np.subtract(x * r, y * i, out=functions[:n_moving, :, 0])
+            np.add(x * i, y * r, out=functions[:n_moving, :, 1])
+        functions[n_moving:, :, 0] = real_part[fixed]
+        functions[n_moving:, :, 1] = imag_part[fixed]
+        flat = functions.reshape(-1, 2 * s.size)
+        out += (residues @ flat).view(np.complex128).reshape(out.shape)
+        return bool(-ceiling < flat.min(initial=0.0) and flat.max(initial=0.0) < ceiling)
 
-    return found
+    return add
 
 
 def _chosen(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
@@ -204,55 +237,37 @@ def _chosen(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
     return slice(None) if some.all() else some
 
 
-def _fed_by_lines(g: StateSpace) -> Modal | None:
-    """Modes fed by a few further states, such as the delay lines of a sampled plant.
+def _fed_by_lines(g: StateSpace | Part, head: int, pairs: FloatArray, slots: IntArray) -> Solver:
+    """Modes, the first states, fed by a few further ones, such as a sampled plant's delay lines.
 
     With A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
     sparse (a line belongs to one input), and the head is again one matrix product: that of the
     inputs [B_h, A_ht].
     """
-    if g.blocks is None or not set(g.blocks) <= {1, 2}:
-        return None
-    ends = np.cumsum(g.blocks)
-    starts = ends - np.asarray(g.blocks)
-    tied = np.array([np.any(g.A[:i, i:j]) for i, j in zip(starts, ends, strict=True)])
-    cut = int(np.argmax(tied))
-    head = int(starts[cut]) if np.any(tied) else 0
     n, m = g.B.shape
-    if not head or 4 * (n - head) > n:
-        return None
-    blocks, rest = list(g.blocks[:cut]), list(g.blocks[cut:])
     feeding = np.flatnonzero(np.any(g.A[:head, head:], axis=0))
-    names = [f"x{i}" for i in range(m + feeding.size)]
     inputs = np.hstack([g.B[:head], g.A[:head, head + feeding]])
-    through = np.hstack([g.D, g.C[:, head + feeding]])
-    driven = _modal(
-        StateSpace(g.A[:head, :head], inputs, g.C[:, :head], through, g.dt, names, blocks=blocks)
-    )
-    if driven is None:
-        return None
-    lines = StateSpace(
-        g.A[head:, head:], g.B[head:], np.eye(n - head), np.zeros((n - head, m)), g.dt, blocks=rest
-    )
-    tail = _solver(lines)
-    reached = _reached(g.A[head:, head:], g.B[head:])
-    direct = np.setdiff1d(np.flatnonzero(np.any(g.C[:, head:], axis=0)), feeding)
+    driven = _modal(Part(g.A[:head, :head], inputs, g.C[:, :head], g.dt), pairs, slots)
+    rest = list(g.blocks or ())[len(slots) :]
+    lines = Part(g.A[head:, head:], g.B[head:], np.eye(n - head), g.dt, rest)
+    (tail, _), reached = _solver(lines), _reached(lines.A, lines.B)
+    seen = np.flatnonzero(np.any(g.C[:, head:], axis=0))
 
-    def found(s: ComplexArray) -> tuple[ComplexArray, bool]:
+    def add(s: ComplexArray, out: ComplexArray) -> bool:
         X = np.zeros((n - head, m, s.size), dtype=np.complex128)
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            tail(s, X)
-        both, _ = driven(s)
-        data = np.ascontiguousarray(both[:, :m])
+        tail(s, X)
+        both = np.zeros((len(out), m + feeding.size, s.size), dtype=np.complex128)
+        driven(s, both)
+        out += both[:, :m]
         for i, line in enumerate(feeding):
             for j in np.flatnonzero(reached[line]):
-                data[:, j] += both[:, m + i] * X[line, j]
-        for line in direct:
+                out[:, j] += both[:, m + i] * X[line, j]
+        for line in seen:
             for j in np.flatnonzero(reached[line]):
-                data[:, j] += g.C[:, head + line, None] * X[line, j]
-        return data, False
+                out[:, j] += g.C[:, head + line, None] * X[line, j]
+        return False
 
-    return found
+    return add
 
 
 def _reached(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
@@ -264,7 +279,7 @@ def _reached(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _closed_form(
-    g: StateSpace, pairs: FloatArray, real: npt.NDArray[np.bool_]
+    g: StateSpace | Part, pairs: FloatArray, real: npt.NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, ComplexArray, ComplexArray]:
     a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
     # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
@@ -277,7 +292,7 @@ def _closed_form(
 
 
 def _substitution(
-    g: StateSpace, pairs: FloatArray, slots: IntArray, coupling: FloatArray
+    g: StateSpace | Part, pairs: FloatArray, slots: IntArray, coupling: FloatArray
 ) -> Solver:
     """Block upper triangular A: all blocks of one level (no coupling among them) at once."""
     real = slots >= 0
@@ -291,37 +306,47 @@ def _substitution(
         used = np.flatnonzero(coupling[slots[i][real[i]]].any(axis=0))
         level[i] = 1 + level[owner[used]].max() if used.size else 0
 
-    def add(s: ComplexArray, out: ComplexArray) -> None:
+    steps = []
+    for rank in range(int(level.max(initial=0)) + 1):
+        blocks = np.flatnonzero(level == rank)
+        rows, sides = slots[blocks], []
+        for i in (0, 1):
+            there = real[blocks, i]
+            into = rows[there, i]
+            used = np.flatnonzero(coupling[into].any(axis=0))
+            sides.append((i, there, g.B[into][:, :, None], used, coupling[np.ix_(into, used)]))
+        steps.append((blocks, rows, sides[: 1 + real[blocks, 1].any()]))
+
+    def add(s: ComplexArray, out: ComplexArray) -> bool:
         X = np.zeros((n + 1, m, s.size), dtype=np.complex128)  # the last row takes padding
-        for rank in range(int(level.max(initial=0)) + 1):
-            blocks = np.flatnonzero(level == rank)
-            rows = slots[blocks]
-            right = np.zeros((len(blocks), 2, m, s.size), dtype=np.complex128)
-            for i in (0, 1):
-                there = real[blocks, i]
-                into = rows[there, i]
-                right[there, i] = g.B[into][:, :, None]
-                used = np.flatnonzero(coupling[into].any(axis=0))
+        for blocks, rows, sides in steps:
+            right = np.zeros((len(blocks), len(sides), m, s.size), dtype=np.complex128)
+            for i, there, driven, used, tie in sides:
+                right[there, i] = driven
                 if used.size:
-                    known = coupling[np.ix_(into, used)] @ X[used].reshape(used.size, -1)
+                    known = tie @ X[used].reshape(used.size, -1)
                     right[there, i] += known.reshape(-1, m, s.size)
-            inverse = 1.0 / ((s - first[blocks, None]) * (s - second[blocks, None]))
+            if len(sides) == 1:
+                X[rows[:, 0]] = right[:, 0] / (s - a[blocks, None])[:, None]
+                continue
             x1, x2 = right[:, 0], right[:, 1]
+            inverse = 1.0 / ((s - first[blocks, None]) * (s - second[blocks, None]))
             ab, bb, cb, db = (v[blocks, None, None] for v in (a, b, c, d))
             X[rows[:, 0]] = ((s - db) * x1 + bb * x2) * inverse[:, None]
             X[rows[:, 1]] = (cb * x1 + (s - ab) * x2) * inverse[:, None]
         out += (g.C @ X[:n].reshape(n, -1)).reshape(out.shape)
+        return False
 
     return add
 
 
-def _schur(g: StateSpace) -> Solver:
+def _schur(g: StateSpace | Part) -> Solver:
     """Any A: back substitution with the Schur form of A in even units."""
     d, T, U = g.schur_form
     n, m = g.B.shape
     turned, seen = U.conj().T @ (g.B / d[:, None]), (g.C * d) @ U
 
-    def add(s: ComplexArray, out: ComplexArray) -> None:
+    def add(s: ComplexArray, out: ComplexArray) -> bool:
         X = np.broadcast_to(turned[:, :, None], (n, m, s.size)).copy()
         for end in range(n, 0, -ROWS):  # rows below a block go into it by one matrix product
             block = slice(max(end - ROWS, 0), end)
@@ -333,5 +358,6 @@ def _schur(g: StateSpace) -> Solver:
                 X[i] += (T[i, i + 1 : end] @ known).reshape(m, s.size)
                 X[i] /= s - T[i, i]
         out += (seen @ X.reshape(n, -1)).reshape(out.shape)
+        return False
 
     return add

@@ -28,6 +28,19 @@ def state_scale(A: FloatArray, B: FloatArray, C: FloatArray) -> FloatArray:
     )
 
 
+def scaled_schur(
+    A: FloatArray, B: FloatArray, C: FloatArray
+) -> tuple[FloatArray, ComplexArray, ComplexArray]:
+    """Return units d of the states, and T, U of the Schur form ``A d / d[:, None] = U T U*``.
+
+    Units first: the orthogonal transformation mixes rounding with the norm of all of A, which plain
+    (q, dq/dt) states let grow with the square of the fastest mode.
+    """
+    d = state_scale(A, B, C)
+    T, U = la.schur(A * d / d[:, None], output="complex")
+    return d, T, U
+
+
 def bordered_scale(A: FloatArray, drive: FloatArray, sight: FloatArray) -> FloatArray:
     """Return d (n,), powers of two, that balance A bordered by a column and a row (Osborne)."""
     n = A.shape[0]

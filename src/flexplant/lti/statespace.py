@@ -25,7 +25,7 @@ from .channels import Channels, chosen_pair, rows_of
 from .direct import direct_gain
 from .foreign import foreign_fields
 from .joining import block_eigenvalues, checked_blocks, short_list
-from .scaling import state_scale
+from .scaling import scaled_schur
 from .system_arithmetic import SystemArithmetic
 from .zeros import invariant_zeros
 
@@ -146,15 +146,8 @@ class StateSpace(SystemArithmetic):
 
     @cached_property
     def schur_form(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-        """Units d of the states, and T, U of the complex Schur form ``A d / d[:, None] = U T U*``.
-
-        Kept: a system is often swept again and again. Units first: the orthogonal transformation
-        mixes rounding with the norm of all of A, which plain (q, dq/dt) states let grow with the
-        square of the fastest mode.
-        """
-        d = state_scale(self.A, self.B, self.C)
-        T, U = la.schur(self.A * d / d[:, None], output="complex")
-        return d, T, U
+        """`scaled_schur` of it, kept: a system is often swept again and again."""
+        return scaled_schur(self.A, self.B, self.C)
 
     def poles(self) -> ComplexArray:
         """Return the eigenvalues of A, block by block where its blocks are known [rad/s or 1]."""
@@ -188,6 +181,8 @@ class StateSpace(SystemArithmetic):
         """
         rows = self.output_index(self.outputs if outputs is None else outputs)
         cols = self.input_index(self.inputs if inputs is None else inputs)
+        if [*rows] == [*range(len(self.outputs))] and [*cols] == [*range(len(self.inputs))]:
+            return self
         chosen = self.replace(
             B=self.B[:, cols],
             C=self.C[rows],

@@ -16,6 +16,7 @@ from .building import rebuilt, sampled
 from .moving import Along, along, moved
 from .partition import Partition
 from .ports import Ports
+from .rigid.rigid_motion import RigidModes, rigid_modes_of
 from .uncertainty.opening import uncertain
 from .uncertainty.uncertain_plant import UncertainPlant
 from .weighting import measured_through, weighted
@@ -261,6 +262,20 @@ class StandardPlant(Partition):
             deviations=deviations,
             neglected=neglected,
         )
+
+    @cached_property
+    def rigid_motions(self) -> RigidModes:
+        """The rigid-body motions that cost no force, or only that of weak springs.
+
+        Raises
+        ------
+        ModelError
+            When it was not assembled from a structure.
+        AssumptionError
+            When the structure is held, or stiff springs bend an axis that its channels have part
+            in.
+        """
+        return rigid_modes_of(self)
 
     def to_control(self) -> Any:
         """Return the whole system as a `control.StateSpace` with the same names."""

@@ -7,7 +7,7 @@ from contextlib import suppress
 import numpy as np
 
 from ..errors import FlexplantError
-from ..lti.grid import climbed, resonance_grid
+from ..lti.grid import highest, resonance_grid
 from ..lti.preparation import Prepared
 from ..lti.responses import responses
 from ..values import ComplexArray, FloatArray
@@ -63,8 +63,8 @@ def pointwise_bound(problem: Prepared) -> float:
     def bounds(freq: FloatArray) -> FloatArray:
         return _parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
 
-    _, values = climbed(bounds, grid, _REFINEMENTS)
-    return max(float(np.max(values)), float(_parrott(system.D[None], m1, p1)[0]))
+    swept, _ = highest(bounds, grid, _REFINEMENTS)
+    return max(swept, float(_parrott(system.D[None], m1, p1)[0]))
 
 
 def _parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:

@@ -123,14 +123,14 @@ def design_servo(
             f"needs room above it. Stay below {0.2 * task.rate:g} Hz, or raise the rate."
         )
     require_weak(task.motions, bandwidth, "a servo")
-    plain = task.axis(float(bandwidth))
-    certificate = task.certified(plain)
-    axis = task.notched(plain)
-    if axis is not plain:
-        certificate = task.certified(axis)
+    axis = task.notched(task.axis(float(bandwidth)))
     closed = task.closed(axis)
-    certificate["spectral radius"] = closed.spectral_radius
-    certificate["modulus margin"] = closed.modulus_margin
+    certificate = {
+        "rigid-body spectral radius": task.rigid_radius(axis),
+        "rigid-body modulus margin": 1.0 / task.rigid_peak(axis),
+        "spectral radius": closed.spectral_radius,
+        "modulus margin": closed.modulus_margin,
+    }
     left_out = closed.left_out
     if left_out is not None:
         certificate |= left_out.certificate

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 
 import numpy as np
 
@@ -68,7 +68,7 @@ class Axis:
     @property
     def system(self) -> StateSpace:
         """Error to acceleration."""
-        return self.law.system.replace(outputs=["acceleration"])
+        return self.law.system
 
     def response(self, freq: FloatArray) -> ComplexArray:
         """Return the response at increasing frequencies [Hz] below half the rate."""
@@ -79,6 +79,7 @@ class Axis:
         return replace(self, notches=(*self.notches, freq))
 
 
+@lru_cache(maxsize=64)
 def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
     """Return one motion of the body, held and delayed: acceleration commanded to error.
 

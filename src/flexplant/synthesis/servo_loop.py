@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import FlexplantError, LabelError
+from ..loop.broken import sensitivity_size
 from ..lti.grid import resonance_grid
-from ..lti.interconnection import connect
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..plant import Foreign, Poi, StandardPlant
@@ -24,8 +24,6 @@ TARGET = 2.0
 _NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
 #: loop gain at a resonance below which a notch there serves nothing
 _QUIET = 0.3
-#: loop gain below which a frequency is left out
-_SILENT = 0.05
 
 
 @dataclass(frozen=True)
@@ -53,17 +51,7 @@ class ServoLoop:
     def peak(self, axis: Axis) -> float:
         """Return max_f sigma_max(S_u) over the grid; of an unstable loop too, so check that."""
         gain = axis.response(self.freq)
-        acts = np.abs(gain) * self._size > _SILENT  # elsewhere |S| is below 1 / (1 - _SILENT)
-        if not np.any(acts):
-            return 1.0
-        loop = gain[acts, None, None] * self.through[acts]
-        if loop.shape[-1] == 1:
-            return float(1.0 / np.min(np.abs(1.0 + loop)))
-        S = np.linalg.inv(np.eye(loop.shape[-1]) + loop)
-        # sigma_max is between the Frobenius norm and that over sqrt(m): only candidates by SVD
-        size = np.sqrt(np.sum(np.abs(S) ** 2, axis=(1, 2)))
-        near = size >= size.max() / np.sqrt(S.shape[-1])
-        return float(np.linalg.svd(S[near], compute_uv=False)[:, 0].max())
+        return float(sensitivity_size(-gain[:, None, None] * self.through).max())
 
     def resonant(self, axis: Axis) -> FloatArray:
         """Return the modes [Hz] whose resonances have loop gain, the largest first."""
@@ -134,16 +122,6 @@ def elastic(plant: StandardPlant) -> FloatArray:
     freq = np.sqrt(np.maximum(np.linalg.det(pairs), 0.0)) / (2.0 * np.pi)
     freq = freq[freq > 0]  # unstable pairs do not resonate
     return np.asarray(freq[freq * plant.dt < 0.45])
-
-
-def estimates(plant: StandardPlant, observer: StateSpace | None, poi: Poi) -> StateSpace:
-    """Return u -> estimates as one system; states of the plant first."""
-    hats = [poi.derived(axis, "hat") for axis in poi.axes]
-    if observer is None:
-        seen = [poi.channel(axis) for axis in poi.axes]
-        return plant.system.select(seen, plant.u).replace(outputs=hats)
-    read = [name for name in observer.inputs if name in plant.y]
-    return connect([plant.system.select(read, plant.u), observer], plant.u, hats)
 
 
 def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:

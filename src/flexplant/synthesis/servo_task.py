@@ -2,28 +2,25 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 
-from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, SolverError
-from ..loop import ClosedLoop, close_loop
-from ..lti.interconnection import loop_matrix
-from ..lti.joining import Matrices
+from ..errors import AssumptionError, LabelError, ModelError, SolverError
+from ..loop import ClosedLoop
+from ..loop.blocks import drives, joined
+from ..lti.interconnection import loop_poles
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant
-from ..plant.rigid.rigid_motion import RigidModes, gain_of, rigid_modes_of
+from ..plant.rigid.rigid_motion import RigidModes, rigid_gain
 from ..values import FloatArray, positive, real_array
 from .servo_axis import Axis, rigid_body, rigid_peak
 from .servo_loop import (
     ServoLoop,
     elastic,
-    estimates,
     highest,
     observer_system,
     seeing,
@@ -89,7 +86,7 @@ class ServoTask:
         """
         plant, axes, r = self.plant, self.poi.axes, self.motions.modes.size
         plant.continuous.check().require(("stabilisable",), "a servo of the rigid body")
-        gain = gain_of(plant, self.motions, [self.poi.channel(axis) for axis in axes], plant.u)
+        gain = rigid_gain(plant, self.motions, [self.poi.channel(a) for a in axes], plant.u)
         size = np.linalg.norm(gain, axis=1, keepdims=True)
         if len(axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
             raise AssumptionError(
@@ -104,10 +101,6 @@ class ServoTask:
         found = servo_loop(self.larger or self.plant, self.observer, self.poi, self.decoupling)
         return found if self.larger is None else replace(found, modes=elastic(self.plant))
 
-    @cached_property
-    def _estimates(self) -> StateSpace:
-        return estimates(self.plant, self.observer, self.poi)
-
     def notched(self, axis: Axis) -> Axis:
         """Return the axis with notches where they serve, unless they were given."""
         return axis if self.notches is not None else self.loop.notched(axis, self.is_stable)
@@ -119,21 +112,23 @@ class ServoTask:
 
     def is_stable(self, axis: Axis) -> bool:
         """Return whether the loop is stable with the modes that the plant has."""
-        K, hats = self.controller(axis), slice(-len(self.poi.axes), None)
-        feedback = (K.A, K.B[:, hats], K.C, K.D[:, hats])
-        return _radius(self._estimates, feedback) < 1.0
+        return self.closed(axis).is_stable
 
-    def closed(self, axis: Axis) -> ClosedLoop:
-        """Return the loop that will run, without a warning of its own."""
-        plant, larger, blocks = self.plant, self.larger, [self.controller(axis)]
-        if self.observer is None:
+    @cached_property
+    def closed(self) -> Callable[[Axis], ClosedLoop]:
+        """The function of an axis that gives the loop that will run."""
+        plant, larger = self.plant, self.larger
+        before = () if self.observer is None else (self.observer,)
+        if not before:
             plant = seeing(plant, self.poi)
             larger = None if larger is None else seeing(larger, self.poi)
-        else:
-            blocks = [self.observer, *blocks]
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FlexplantWarning)
-            return close_loop(plant, *blocks, larger=larger)
+
+        def found(axis: Axis) -> ClosedLoop:
+            blocks = (*before, self.controller(axis))
+            controller = joined(plant, blocks, *drives(plant, blocks, ()))
+            return ClosedLoop(plant, blocks, controller, larger=larger)
+
+        return cache(found)
 
     @cached_property
     def _bodies(self) -> list[StateSpace]:
@@ -141,8 +136,8 @@ class ServoTask:
         free = np.unique(self.motions.freq)
         return [rigid_body(self.rate, self.plant.delay, float(f)) for f in free]
 
-    def certified(self, axis: Axis) -> dict[str, float]:
-        """Return radius and margin of the worst axis of the rigid body.
+    def rigid_radius(self, axis: Axis) -> float:
+        """Return the spectral radius of the worst axis of the rigid body.
 
         All axes have the same controller, so that the loop falls apart into those of the body's own
         motions, whatever the axes: free ones (0 Hz) and suspension modes.
@@ -152,8 +147,8 @@ class ServoTask:
         SolverError
             When it is unstable.
         """
-        K = axis.system
-        radius = max(_radius(body, (K.A, K.B, K.C, K.D)) for body in self._bodies)
+        poles = [loop_poles(body, axis.system) for body in self._bodies]
+        radius = float(max(np.abs(of_body).max() for of_body in poles))
         if not radius < 1.0:
             raise SolverError(
                 f"the rigid-body loop at {axis.bandwidth:g} Hz is unstable (spectral radius "
@@ -161,11 +156,11 @@ class ServoTask:
                 "leave too little phase. Lower the bandwidth or the delay, or raise the rate or "
                 "the roll-off."
             )
-        margin = 1.0 / max(rigid_peak(body, axis) for body in self._bodies)
-        return {
-            "rigid-body spectral radius": radius,
-            "rigid-body modulus margin": margin,
-        }
+        return radius
+
+    def rigid_peak(self, axis: Axis) -> float:
+        """Return max |S| of the worst axis of the rigid body, stable or not."""
+        return max(rigid_peak(body, axis) for body in self._bodies)
 
     def largest(self, peak: float) -> float:
         """Return the largest bandwidth that holds a peak of |S| at u.
@@ -179,7 +174,7 @@ class ServoTask:
 
         def holds(bandwidth: float) -> bool:
             axis = self.axis(bandwidth)
-            if max(rigid_peak(body, axis) for body in self._bodies) > peak:
+            if self.rigid_peak(axis) > peak:
                 return False
             axis = self.notched(axis)
             return self.loop.peak(axis) <= peak and self.is_stable(axis)
@@ -231,7 +226,7 @@ def servo_task(
     centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
     for freq in centres or ():
         _below_nyquist(freq, "notch", 1.0 / plant.dt)
-    motions = rigid_modes_of(plant)
+    motions = plant.rigid_motions
     return ServoTask(
         plant,
         port,
@@ -271,11 +266,6 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
             f"such as poi={ports.z[0].name!r}."
         )
     return ports.poi(name if name is not None else ports.z[0].name)
-
-
-def _radius(g: StateSpace, K: Matrices) -> float:
-    """Return the spectral radius of the loop of g and K, channels in the same order."""
-    return float(np.abs(la.eigvals(loop_matrix((g.A, g.B, g.C, g.D), K))).max())
 
 
 def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:

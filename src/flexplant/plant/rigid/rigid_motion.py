@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -98,9 +99,11 @@ def rigid_modes_of(plant: Partition) -> RigidModes:
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     body = body_of(realisation)
     if body is not None:
-        rows = [s.static_row(realisation) for s in ports.y if s.order == 0]
-        rows += [poi.row(realisation, axis) for poi in ports.z for axis in poi.axes]
-        rows += [port.static_push(realisation) for port in ports.u]
+        rows = chain(
+            (s.static_row(realisation) for s in ports.y if s.order == 0),
+            (poi.row(realisation, axis) for poi in ports.z for axis in poi.axes),
+            (port.static_push(realisation) for port in ports.u),
+        )
         refuse_lost(body, realisation, rows, np.sqrt(1.0 - _RIGID), "")
     motions = rigid_modes(realisation, body)
     if not motions.modes.size:
@@ -156,7 +159,9 @@ def projected(rows: Sequence[FloatArray], motions: FloatArray) -> FloatArray:
     return np.array(rows).reshape(len(rows), motions.shape[0]) @ motions
 
 
-def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) -> FloatArray:
+def rigid_gain(
+    plant: Partition, motions: RigidModes, outputs: Sequence[str], inputs: Sequence[str]
+) -> FloatArray:
     """Return the accelerations at outputs per force at inputs, of the rigid body alone.
 
     ``rows R m^-1 R' pushes'`` with R the rigid-body motions and m their mass; filters of the ports
@@ -166,6 +171,8 @@ def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) 
     ----------
     plant : StandardPlant
         Assembled from a free or suspended structure.
+    motions : RigidModes
+        Its motions.
     outputs, inputs : sequences of str
         Displacements in z or y; forces in w or u.
 
@@ -175,18 +182,9 @@ def rigid_gain(plant: Partition, outputs: Sequence[str], inputs: Sequence[str]) 
 
     Raises
     ------
-    AssumptionError
-        When the structure is held.
     LabelError
         When a name is unknown.
     """
-    return gain_of(plant, rigid_modes_of(plant), outputs, inputs)
-
-
-def gain_of(
-    plant: Partition, motions: RigidModes, outputs: Sequence[str], inputs: Sequence[str]
-) -> FloatArray:
-    """Return `rigid_gain` where the motions of the plant are known."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     forces = {port.name: port for port in ports.forces}
     for name in inputs:

@@ -17,7 +17,7 @@ from ...values import Value, positive
 from ..forces import BaseAcceleration
 from ..ports import Ports
 from ..standard import StandardPlant, standard_plant
-from .rigid_motion import RigidModes, require_weak, rigid_gain, rigid_modes_of, seen
+from .rigid_motion import RigidModes, require_weak, rigid_gain, seen
 
 #: |S| of the finished loop crosses 1 below the weight's crossing by about this factor (measured:
 #: the table in `stage_weights`)
@@ -234,7 +234,7 @@ def stage_weights(
         raise AssumptionError("stage weights need a POI, actuators and sensors in the ports.")
     scale = ports.poi(_chosen([port.name for port in ports.z], poi, "POI"))
     first = scale.channel(scale.axes[0])
-    push = np.linalg.norm(rigid_gain(plant, [first], [port.name for port in ports.u]))
+    push = np.linalg.norm(rigid_gain(plant, motions, [first], [port.name for port in ports.u]))
     crossing = _HEADROOM * positive(bandwidth, "bandwidth")
     if plant.dt and crossing * plant.dt > 0.2:
         raise ModelError(
@@ -290,7 +290,7 @@ def stage_weights(
 def _stage(given: StandardPlant) -> tuple[StandardPlant, RigidModes]:
     """Return a plant that is a stage, and its rigid-body motions."""
     plant = standard_plant(given)
-    return plant, rigid_modes_of(plant)
+    return plant, plant.rigid_motions
 
 
 def _arm(plant: StandardPlant, ports: Ports, motions: RigidModes) -> float:

@@ -43,7 +43,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FlexplantWarning)
         loop = close_loop(plant, controller, larger=None)
-    poles = loop.monitored.poles()
+    poles = loop.poles()
     dt = loop.plant.dt
     size = np.abs(poles) if dt else poles.real
     least = poles[np.argmax(size)] if poles.size else np.nan

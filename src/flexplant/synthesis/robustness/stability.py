@@ -269,4 +269,4 @@ def _tried(
 def close_loop_poles(loop: UncertainLoop, plant: StandardPlant) -> Any:
     """Return the poles of the controller's loop around another machine."""
     nominal = loop.loop
-    return ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle).monitored.poles()
+    return ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle).poles()
