@@ -104,10 +104,13 @@ def table(result: dict[str, Any]) -> str:
     """Return all numbers as text."""
     lines = []
     for name, runs in result["runs"].items():
-        lines.append(f"{name}, feedforward     largest error [nm]    MA after    MSD after")
+        heads = "".join(
+            f"{head:>16s}" for head in ("largest [nm]", "MA after [nm]", "MSD after [nm]")
+        )
+        lines.append(f"{name + ', feedforward':26s}{heads}")
         for label, run in runs.items():
             peak, ma, msd = figures(run)
-            lines.append(f"  {label:24s}{peak:18.2f}{ma:12.2f}{msd:13.2f}")
+            lines.append(f"  {label:24s}{peak:16.2f}{ma:16.2f}{msd:16.2f}")
     lines.append(f"\nservo of the drawing, gains learnt on the machine:\n{result['learnt']}")
     return "\n".join(lines)
 

@@ -149,10 +149,10 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
         color=blue,
         alpha=0.3,
         lw=0,
-        label="two stated deviations",
+        label="2 standard deviations, as the filter states them",
     )
-    ax.plot(one.time[near], middle, color=blue, lw=0.8)
     what = "motion of the die" if run is None else "error of the estimate at the die"
+    ax.plot(one.time[near], middle, color=blue, lw=0.8, label=what)
     ax.set(xlabel="time [s]", ylabel=f"{what} [nm]")
     ax.legend(frameon=False, loc="upper left")
     folder.mkdir(exist_ok=True)

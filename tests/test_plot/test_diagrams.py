@@ -87,6 +87,16 @@ def test_nyquist_names_the_distance_from_minus_one():
         fx.plot.nyquist(L, channel=("x", "y"))
 
 
+def test_nyquist_of_a_closed_loop_is_broken_at_each_actuator():
+    plant = fx.testbeds.three_masses()
+    observer = fx.design_kalman(plant)
+    loop = fx.close_loop(plant, observer, fx.design_servo(plant, bandwidth=20.0, observer=observer))
+    line = fx.plot.nyquist(loop, freq=[5.0, 20.0]).get_lines()[0]
+    assert line.get_label().startswith("u1: |S| up to ")
+    L = fx.loop.loop_gain(loop, freq=[5.0, 20.0])["u1", "u1"]
+    np.testing.assert_allclose(line.get_xdata() + 1j * line.get_ydata(), -L, rtol=1e-9)
+
+
 def test_singular_values():
     g = system()
     freq = np.geomspace(0.1, 10.0, 20)
@@ -94,6 +104,8 @@ def test_singular_values():
     sizes = np.array([np.linalg.svd(g(2j * np.pi * f), compute_uv=False) for f in freq])
     np.testing.assert_allclose(high.get_ydata(), 20 * np.log10(sizes[:, 0]), rtol=1e-9)
     np.testing.assert_allclose(low.get_ydata(), 20 * np.log10(sizes[:, 1]), rtol=1e-9)
+    of_rank_one = fx.StateSpace([[-1.0]], [[1.0, 2.0]], [[1.0], [3.0]], 0)
+    assert len(fx.plot.singular_values(of_rank_one, freq=freq).get_lines()) == 1
 
 
 def test_systems_may_stand_in_a_list():

@@ -45,8 +45,9 @@ def test_steps_of_several_channels():
     )
     ax = fx.plot.step(1e-6 * g, duration=0.05)
     labels = [panel.get_ylabel() for panel in ax.figure.axes]
-    assert labels[0] == "x after a step of 1 N at f [nm]"
-    assert labels[3] == "y after a step of 1 at r"
+    assert (labels[0], labels[3]) == ("x [nm]", "y")
+    titles = [panel.get_title() for panel in ax.figure.axes]
+    assert titles == ["step of 1 N at f", "step of 1 at r", "", ""]
     assert ax.figure.axes[3].get_xlabel() == "time [ms]"
     with pytest.raises(LabelError, match="f9"):
         fx.plot.step(g, inputs="f9")
@@ -92,8 +93,12 @@ def test_spectra_side_by_side():
     ax = fx.plot.spectra({"model": Spectrum(freq, density)}, unit="m")
     np.testing.assert_allclose(ax.get_lines()[0].get_ydata(), [2.0, 1.0, 0.1])
     assert ax.get_ylabel() == "amplitude spectral density [nm/\N{SQUARE ROOT}Hz]"
-    for wrong in ({}, 1.0, {"a": (freq, density)}):
-        with pytest.raises(ModelError, match="mapping of labels to spectra"):
+    run = Response(np.arange(64) * 1e-3, np.eye(64)[:1], ["e"], {"e": "m"})
+    ax = fx.plot.spectra({"run": run}, "e")
+    assert ax.get_ylabel().endswith("m/\N{SQUARE ROOT}Hz]")
+    np.testing.assert_allclose(ax.get_lines()[0].get_xdata(), run.psd("e").freq[1:])
+    for wrong in ({}, 1.0, {"a": (freq, density)}, run):
+        with pytest.raises(ModelError, match=r"nothing to draw|a loop, a run|which signal"):
             fx.plot.spectra(wrong)
 
 

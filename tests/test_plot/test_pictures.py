@@ -184,10 +184,10 @@ def test_layout_shows_every_port_where_it_is():
     ax = fx.plot.layout(dofs, ports=ports(), desired=[z8], marked={"here": z8})
     lines = {line.get_label(): np.array(line.get_xydata()) for line in ax.get_lines()}
     assert len(lines["nodes"]) == 81
-    np.testing.assert_allclose(lines["actuators u"], [1e3 * np.array(p[:2]) for p in INSET])
-    np.testing.assert_allclose(lines["sensors y"], [1e3 * np.array(p[:2]) for p in CORNERS])
-    np.testing.assert_allclose(lines["points of interest"], [[500 * L, 500 * L]])
-    np.testing.assert_allclose(lines["1 desired DOFs"], [1e3 * np.array(Z8[:2])])
+    np.testing.assert_allclose(lines["actuators"], [1e3 * np.array(p[:2]) for p in INSET])
+    np.testing.assert_allclose(lines["sensors"], [1e3 * np.array(p[:2]) for p in CORNERS])
+    np.testing.assert_allclose(lines["POI"], [[500 * L, 500 * L]])
+    np.testing.assert_allclose(lines["1 desired DOF"], [1e3 * np.array(Z8[:2])])
     assert {"u1", "y4", "die", "here"} <= texts(ax)
     assert 0.005 < ink(ax) < 0.5
     bare = fx.plot.layout(dofs)
@@ -322,7 +322,7 @@ def test_an_estimate_with_its_band_and_what_waiting_brings():
     assert ax.get_ylabel().startswith("die:hat [")
     assert ink(ax) > 0.005
     ax = fx.plot.estimate(result, "y1:innovation", deviations=3.0)
-    assert "\N{PLUS-MINUS SIGN} 3 deviations" in texts(ax)
+    assert "\N{PLUS-MINUS SIGN} 3 standard deviations" in texts(ax)
     ax = fx.plot.estimate(result, truth=np.nan_to_num(result["die:hat"]))
     assert np.nanmax(np.abs(ax.get_lines()[0].get_ydata())) == 0.0
     with pytest.raises(ModelError, match="Estimate"):

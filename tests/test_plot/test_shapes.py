@@ -137,9 +137,9 @@ def test_the_ports_of_a_solid_where_they_are():
     )
     ax = fx.plot.layout(modes.dofs, ports=ports)
     marked = {line.get_label(): np.ravel(line.get_data_3d()) for line in ax.get_lines()}
-    np.testing.assert_allclose(marked["actuators u"], [50.0, 50.0, 0.0], atol=1e-9)
-    np.testing.assert_allclose(marked["sensors y"], [400.0, 300.0, 100.0])
-    np.testing.assert_allclose(marked["points of interest"], [200.0, 100.0, 100.0])
+    np.testing.assert_allclose(marked["actuators"], [50.0, 50.0, 0.0], atol=1e-9)
+    np.testing.assert_allclose(marked["sensors"], [400.0, 300.0, 100.0])
+    np.testing.assert_allclose(marked["POI"], [200.0, 100.0, 100.0])
     assert {"push", "side", "die"} <= {text.get_text().strip() for text in ax.texts}
     with pytest.raises(ModelError, match="three dimensions"):
         fx.plot.layout(modes.dofs, ax=plt.subplots()[1])

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import CertificateError
+from ..errors import CertificateError, counted
 from ..values import FloatArray, IntArray, Value
 from .component import Component
 from .elimination import Elimination
@@ -80,7 +80,7 @@ class JoiningCertificate(Value):
         independent = f"{self.rank} of {self.constraints} rigid constraints independent"
         errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
         errors += f", rigid force {self.rigid_force:.1g}"
-        head = f"{self.n_rigid} rigid-body motions (alone: {before}), {pieces}"
+        head = f"{counted(self.n_rigid, 'rigid-body motion')} (alone: {before}), {pieces}"
         text = [f"<JoiningCertificate: {head}, {self.mass:.6g} kg", f" {independent}, {errors}"]
         text += [f" {name}: compliance to {error:.2g}" for name, error in self.patches.items()]
         return "\n".join(text) + ">"

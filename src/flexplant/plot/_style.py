@@ -43,6 +43,12 @@ CYCLE: Sequence[Style] = (
     {"color": PURPLE, "linestyle": (0, (4, 1, 1, 1, 1, 1)), "linewidth": 1.6},
     {"color": SKY, "linestyle": ":", "linewidth": 1.8},
 )
+#: where ports are, in views of a structure
+PORTS: Mapping[str, Style] = {
+    "sensors": {"marker": "P", "color": BLACK, "markeredgecolor": "white", "markersize": 11},
+    "actuators": {"marker": "^", "color": RED, "markeredgecolor": "white", "markersize": 11},
+    "POI": {"marker": "o", "color": RED, "fillstyle": "none", "markersize": 12},
+}
 #: a measurement beside models over frequency: points, none of which hides a line
 POINTS: Style = {
     "color": BLACK, "linestyle": "none", "marker": ".", "markersize": 3.0, "zorder": 1.8,

@@ -201,7 +201,7 @@ def estimate(
     second, time = shown_in(ax.xaxis, float(np.max(np.abs(result.time), initial=0.0)), "s")
     low, high = (np.where(known, middle + s * spread, np.nan) / factor for s in (-1.0, 1.0))
     ax.fill_between(result.time / second, low, high, color=BLUE, alpha=0.25, linewidth=0.0,
-                    label=f"\N{PLUS-MINUS SIGN} {deviations:g} deviations")  # fmt: skip
+                    label=f"\N{PLUS-MINUS SIGN} {deviations:g} standard deviations")  # fmt: skip
     ax.plot(result.time / second, signal / factor, color=BLUE, linewidth=0.8, label=label)
     legend(ax, given=given)
     return finish(ax, x=named("time", time), y=named(label, unit))

@@ -11,7 +11,7 @@ from ..errors import ModelError
 from ..labels import DofSet
 from ..updating import Localisation
 from ..updating.parameters.added import Parameter, PointParameter
-from ..values import FloatArray, instance
+from ..values import FloatArray, instance, with_unit
 from ._axes import axes, finish, legend_below, plan
 from ._style import BLUE, GREY, LIGHT, RED
 
@@ -80,9 +80,10 @@ def _bars(found: Localisation, ax: Axes | None) -> Axes:
             share = [100 * found[names[i]] for i in mine]
             ax.barh(mine, share, color=colour, label=kind, height=0.7)
     for i, name in enumerate(names):
-        value = found.values[found.candidates.index(name)]
+        at = found.candidates.index(name)
+        value, unit = float(found.values[at]), found.units[at] if found.units else ""
         if np.isfinite(value):
-            ax.text(1.0, i, f" {value:.4g} alone", va="center", fontsize=8)
+            ax.text(1.0, i, f" {with_unit(value, unit)} alone", va="center", fontsize=8)
     ax.set_yticks(rows, names)
     ax.invert_yaxis()
     ax.set_xlim(0, 105)

@@ -18,7 +18,7 @@ from ..plant import Ports, StandardPlant
 from ..structure import Disc
 from ..values import FloatArray, in_unit, instance, whole
 from ._axes import axes, finish, legend, legend_below, named, plan
-from ._style import BLACK, BLUE, LIGHT, RED, STYLES
+from ._style import BLUE, LIGHT, PORTS, RED, STYLES
 
 
 def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None = None) -> Axes:
@@ -195,24 +195,18 @@ def _devices(
         np.array([port.at] if isinstance(port.at, tuple) else np.zeros((0, 3)))
         for port in (*sensors, *actuators)
     ]
-    kinds = (
-        ("sensors", listed[: len(sensors)], "P", BLACK),
-        ("actuators", listed[len(sensors) :], "^", RED),
-    )
-    for label, parts, marker, color in kinds:
+    kinds = ("sensors", listed[: len(sensors)]), ("actuators", listed[len(sensors) :])
+    for label, parts in kinds:
         if parts and len(found := np.vstack(parts) / factor):
-            style: dict[str, Any] = {"color": color, "markeredgecolor": "white", "zorder": 4}
-            ax.plot(
-                found[:, 0], found[:, 1], marker, label=label, markersize=11, clip_on=False, **style
-            )
+            over: dict[str, Any] = {"linestyle": "", "zorder": 4, "clip_on": False}
+            ax.plot(found[:, 0], found[:, 1], label=label, **over, **PORTS[label])
 
 
 def _pois(ax: Axes, factor: float, points: Sequence[FloatArray]) -> None:
     """Mark POIs."""
     if points:
         at = np.array(points) / factor
-        style: dict[str, Any] = {"fillstyle": "none", "markersize": 12, "zorder": 4}
-        ax.plot(at[:, 0], at[:, 1], "o", color=RED, label="POI", **style)
+        ax.plot(at[:, 0], at[:, 1], linestyle="", zorder=4, label="POI", **PORTS["POI"])
 
 
 def _patch(zone: Zone, factor: float, **style: Any) -> Patch:

@@ -63,6 +63,7 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
         if zeros:
             _draw(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
     ax.set_xscale("log")
+    _wide(ax)
     if _unstable(ax):
         ax.set_yscale("symlog", linthresh=1e-4)
         ax.axhline(0.0, color="0.3", linewidth=0.9)
@@ -74,6 +75,14 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
         ax.axhline(ratio, color=GREY, linewidth=0.6, linestyle=":")
     legend(ax, given=given)
     return finish(ax, x="frequency |s| / 2 pi [Hz]", y="damping ratio [-]")
+
+
+def _wide(ax: Axes) -> None:
+    """Show a decade at least: ticks between those of decades lie on each other in a part of one."""
+    low, high = ax.get_xlim()
+    room = np.sqrt(10.0 * low / high)
+    if room > 1.0:
+        ax.set_xlim(low / room, high * room, auto=True)
 
 
 def _unstable(ax: Axes) -> bool:

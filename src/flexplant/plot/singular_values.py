@@ -11,6 +11,9 @@ from ..values import FloatArray
 from ._axes import axes, finish, legend
 from .gains import curves, decibel, readable, shared_reference
 
+#: singular values smaller than this part of the largest one are rounding
+_ROUNDING = 1e-12
+
 
 def singular_values(
     systems: Any, *, freq: FloatArray | None = None, ax: Axes | None = None
@@ -18,7 +21,9 @@ def singular_values(
     """Draw the singular values of responses: the largest as a line, the area down to the smallest.
 
     The largest one is the gain of the worst direction of the inputs at each frequency; its peak is
-    the H-infinity norm of a stable system. Channels should have one unit, or be weighted.
+    the H-infinity norm of a stable system. Channels should have one unit, or be weighted. Singular
+    values that are zero at all frequencies are left out: a controller of fewer motions than
+    channels has such.
 
     Parameters
     ----------
@@ -49,9 +54,10 @@ def singular_values(
     drawn = curves(systems, freq)
     for curve in drawn:
         values = np.linalg.svd(np.moveaxis(curve.response.data, 2, 0), compute_uv=False)
-        largest, smallest = (decibel(np.asarray(values[:, k])) for k in (0, -1))
+        rank = int(np.max(np.sum(values > _ROUNDING * values[:, :1], axis=1), initial=1))
+        largest, smallest = (decibel(np.asarray(values[:, k])) for k in (0, rank - 1))
         ax.semilogx(curve.response.freq, largest, label=curve.label or None, **curve.line)
-        if values.shape[1] > 1:
+        if rank > 1:
             ax.semilogx(curve.response.freq, smallest, **{**curve.line, "linewidth": 0.6})
             ax.fill_between(
                 curve.response.freq, smallest, largest, color=curve.line["color"], alpha=0.12

@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from ..errors import ModelError, unknown_label
+from ..loop import ClosedLoop
+from ..loop.known import references
 from ..lti.discretisation import held_exactly
 from ..lti.recursion import Recursion
 from ..lti.responses import continuous_poles
@@ -44,7 +46,8 @@ def step(
     systems : StateSpace, ClosedLoop, or mapping {label: one of these} or list of them
         What to draw; several share their axes. Systems of python-control and SciPy too.
     outputs, inputs : str or sequence of str, optional
-        Channels of the first one; all when not given. Others are drawn by the same names.
+        Channels of the first one; all when not given, of a loop with references these and the
+        motions of their POIs. Others are drawn by the same names.
     duration : float [s], optional
         When not given, until the slowest pole has decayed to 1 % or for 20 of its periods.
     ax : Axes, optional
@@ -68,10 +71,12 @@ def step(
     >>> fx.plot.step(fx.lowpass(10.0)).get_xlabel()
     'time [ms]'
     """
-    found = {label: as_statespace(g) for label, g in labelled(systems).items()}
+    given = labelled(systems)
+    found = {label: as_statespace(g) for label, g in given.items()}
     first = next(iter(found.values()))
-    rows = list(first.outputs if outputs is None else name_list(outputs, "outputs"))
-    columns = list(first.inputs if inputs is None else name_list(inputs, "inputs"))
+    moved, moves = _set_points(next(iter(given.values()))) or (first.outputs, first.inputs)
+    rows = list(moved if outputs is None else name_list(outputs, "outputs"))
+    columns = list(moves if inputs is None else name_list(inputs, "inputs"))
     for label, g in found.items():
         for name, known in [(r, g.outputs) for r in rows] + [(c, g.inputs) for c in columns]:
             if name not in known:
@@ -87,10 +92,20 @@ def step(
                 _draw(panels[i, j], time, data[i, j], g, (output, name), label or None, look)
     for panel in panels[:-1].ravel():
         panel.set_xlabel("")
+    for panel, name in zip(panels[0], columns, strict=True):
+        panel.set_title(f"step of {f'1 {first.units.get(name, str())}'.rstrip()} at {name}")
     if any(found):
         legend(panels[0, -1], given=ax is not None)
     shown: Axes = panels[0, 0]
     return shown
+
+
+def _set_points(found: Any) -> tuple[list[str], list[str]] | None:
+    """Return what references move, and these, of a loop that has some."""
+    if not isinstance(found, ClosedLoop) or not (refs := references(found.plant)):
+        return None
+    owners = {name.rpartition(":")[0] for name in refs}
+    return [name for name in found.plant.z if name.rpartition(":")[0] in owners], refs
 
 
 def _panels(ax: Axes | None, rows: int, columns: int) -> Any:
@@ -122,10 +137,7 @@ def _draw(
     factor, unit = shown_in(ax.yaxis, size, g.units.get(channel[0]))
     form: dict[str, Any] = {"drawstyle": "steps-post"} if g.dt else {}
     ax.plot(time / second, signal / factor, label=text, **look, **form)
-    one = f"1 {g.units.get(channel[1], '')}".rstrip()
-    label = f"{channel[0]} after a step of {one} at {channel[1]}"
-    finish(ax, x=named("time", clock), y=named(label, unit))
-    ax.yaxis.label.set_fontsize("small")
+    finish(ax, x=named("time", clock), y=named(channel[0], unit))
 
 
 def _duration(g: StateSpace) -> float:

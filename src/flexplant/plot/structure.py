@@ -9,11 +9,12 @@ import numpy as np
 from matplotlib.axes import Axes
 from mpl_toolkits.mplot3d.art3d import Line3DCollection, Poly3DCollection
 
+from ..errors import counted
 from ..labels import DofSet
 from ..plant import Ports
 from ..values import FloatArray, in_unit
 from ._axes import axes, legend_below, plan, solid_axes
-from ._style import BLACK, BLUE, GREEN, GREY, LIGHT, PURPLE, RED, Style
+from ._style import BLACK, GREY, LIGHT, PORTS, PURPLE, Style
 from ._surface import Surface, surface_of
 
 
@@ -73,7 +74,8 @@ def layout(
     wanted = list(desired)
     if wanted:
         xyz = dofs.xyz[dofs.indices(wanted)] / factor
-        ax.plot(xyz[:, 0], xyz[:, 1], "x", color=PURPLE, label=f"{len(wanted)} desired DOFs")
+        text = counted(len(wanted), "desired DOF")
+        ax.plot(xyz[:, 0], xyz[:, 1], "x", color=PURPLE, label=text)
     if ports is not None:
         for kind, listed, look in _kinds(ports):
             _mark(ax, dofs, factor, kind, listed, **look)
@@ -88,9 +90,9 @@ def layout(
 def _kinds(ports: Ports) -> tuple[tuple[str, Sequence[Any], Style], ...]:
     """Return what is marked, and how."""
     return (
-        ("actuators u", ports.u, {"marker": "o", "color": GREEN, "markersize": 12}),
-        ("sensors y", ports.y, {"marker": "P", "color": BLUE, "markersize": 9}),
-        ("points of interest", ports.z, {"marker": "*", "color": RED, "markersize": 15}),
+        ("sensors", ports.y, dict(PORTS["sensors"])),
+        ("actuators", ports.u, dict(PORTS["actuators"])),
+        ("POI", ports.z, dict(PORTS["POI"])),
     )
 
 
@@ -113,12 +115,12 @@ def _solid(
     wanted = list(desired)
     if wanted:
         xyz = dofs.xyz[dofs.indices(wanted)] / factor
-        ax.plot(*xyz.T, "x", color=PURPLE, label=f"{len(wanted)} desired DOFs")
+        ax.plot(*xyz.T, "x", color=PURPLE, label=counted(len(wanted), "desired DOF"))
     for kind, listed, look in _kinds(ports) if ports is not None else ():
         points = [_point(dofs, port.at) / factor for port in listed]
         if not points:
             continue
-        ax.plot(*np.array(points).T, ls="", fillstyle="none", label=kind, zorder=3, **look)
+        ax.plot(*np.array(points).T, linestyle="", label=kind, zorder=3, **look)
         for port, point in zip(listed, points, strict=True):
             ax.text(*point, f"  {port.name}")
             along = _along(port)
@@ -149,7 +151,7 @@ def _mark(
     points = [_point(dofs, port.at) / factor for port in listed]
     if not points:
         return
-    ax.plot(*np.array(points).T[:2], linestyle="", fillstyle="none", label=kind, **style)
+    ax.plot(*np.array(points).T[:2], linestyle="", label=kind, **style)
     for port, point in zip(listed, points, strict=True):
         ax.annotate(port.name, (point[0], point[1]), (7, 7), textcoords="offset points")
 

@@ -17,6 +17,7 @@ from ..updating.search import Objective
 from ..values import FloatArray, in_unit, instance
 from ._axes import finish, legend, named, shown_in
 from ._style import BLUE, GREY, LIGHT, POINTS, STYLES
+from .updating import error_label
 
 #: parameters that are drawn by themselves; the rest are left to the repr
 SHOWN = 12
@@ -163,7 +164,7 @@ def _parameters(ax: Axes, fit: UpdateResult, level: float) -> None:
             fmt="o",
             color=BLUE,
             capsize=4,
-            label=f"after, {100 * level:g} %",
+            label=f"after, bar: {100 * level:g} %",
         )
         row.set(ylim=(-1.0, 1.0), yticks=[])
         row.margins(x=0.08)
@@ -184,7 +185,7 @@ def _convergence(ax: Axes, fit: UpdateResult) -> None:
     steps = np.arange(len(fit.history) + 1)
     ax.semilogy(steps, np.maximum(fit.history.error, 1e-300), "o-", color=BLUE, markersize=4)
     ax.xaxis.set_major_locator(MaxNLocator(integer=True))
-    finish(ax, x="iteration", y="sum of squares of model less measured", title="convergence")
+    finish(ax, x="iteration", y=error_label(fit), title="convergence")
 
 
 def _response(ax: Axes, residual: FrfResidual, before: Any, after: Any) -> None:

@@ -80,7 +80,7 @@ def residual(fit: UpdateResult, *, ax: Axes | None = None) -> Axes:
     error = np.maximum(fit.history.error, 1e-300)
     ax.semilogy(steps, error, "o-", color=BLUE)
     ax.set_xticks(steps)
-    return finish(ax, x="iteration", y="sum of squares of model less measured")
+    return finish(ax, x="iteration", y=error_label(fit))
 
 
 def parameters(
@@ -126,3 +126,9 @@ def parameters(
             legend(ax, given=given)
         drawn.append(finish(ax, x="iteration", y=named(name, unit)))
     return drawn
+
+
+def error_label(fit: UpdateResult) -> str:
+    """Return the label of an update's error: in units of the noise where that is known."""
+    unit = "SI units squared" if fit.chi2 is None else "-"
+    return f"sum of squares, model less measured [{unit}]"

@@ -130,10 +130,7 @@ class DesiredDofs(ReductionMethod):
             dofs=modes.dofs.select(labels),
             full_dofs=modes.dofs,
             rigid_body=partition[:, : modes.n_rigid],
-            method=(
-                f"{counted(modes.n_modes, 'mode')} and "
-                f"{counted(modes.n_vectors, 'attachment vector')}"
-            ),
+            method=_named(modes),
             condition=condition,
             truncated=truncated,
             n_vectors=modes.n_vectors,
@@ -253,3 +250,9 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
     if not isinstance(method, DesiredDofs):
         refuse_unstable(model, f"reduction by {type(method).__name__}")
     return method.reduced(model)
+
+
+def _named(modes: Modes) -> str:
+    found = counted(modes.n_modes, "mode")
+    vectors = counted(modes.n_vectors, "attachment vector")
+    return f"{found} and {vectors}" if modes.n_vectors else found

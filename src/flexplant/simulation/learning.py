@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..loop.known import force_name
 from ..values import FloatArray, Value, instance, positive, short, whole
@@ -42,7 +42,7 @@ class LearnedFeedforward(Value):
         self._set(errors=self.errors, gains=self.gains)
 
     def __repr__(self) -> str:
-        lines = [f"<LearnedFeedforward {self.errors.size} moves>"]
+        lines = [f"<LearnedFeedforward {counted(self.errors.size, 'move')}>"]
         lines += [f"  move {i}: rms {e:.4g} m" for i, e in enumerate(self.errors[:5], 1)]
         return "\n".join(lines)
 

@@ -11,8 +11,6 @@ import numpy as np
 from ...certificates import in_words, stability_name
 from ...errors import FlexplantError
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
-from ...loop import sensitivity as sensitivity_of
-from ...lti.frequency import Frf
 from ...simulation import ExposureErrors, Verdict
 from ...values import with_unit
 from ..budget import budget
@@ -70,7 +68,7 @@ def loops_section(design: Design, gallery: Gallery) -> Chapter | None:
         drawn = gallery.picture(lambda: sensitivity(stable), caption)
         name, first = next(iter(stable.items()))
         caption = f"{name}: each loop broken at its actuator while the others stay closed"
-        drawn += gallery.picture(lambda: nyquist(_loop_gains(first)), caption)
+        drawn += gallery.picture(lambda: nyquist(first), caption)
         parts.append(f'<div class="pictures">{drawn}</div>')
     for name, loop in loops.items():
         parts += [f"<h3>{escape(name)}</h3>", loop._repr_html_()]
@@ -133,15 +131,6 @@ def _margins(row: LoopFigures) -> list[Tile]:
         most = f"|S| at most {20.0 * np.log10(row.peak):.1f} dB, at {row.peak_freq:.4g} Hz"
         tiles.append(("|S| < 1 up to", f"{row.bandwidth:.4g} Hz", most, ""))
     return tiles
-
-
-def _loop_gains(loop: ClosedLoop) -> dict[str, Frf]:
-    """Return ``L_i = 1 / S_ii - 1`` of each actuator, the sign being that of ``1 + L_i``."""
-    S = sensitivity_of(loop)
-    return {
-        name: Frf(S.freq, 1.0 / S.data[[i]][:, [i]] - 1.0, [name], [name])
-        for i, name in enumerate(S.inputs)
-    }
 
 
 def _margin_table(loop: ClosedLoop) -> str:

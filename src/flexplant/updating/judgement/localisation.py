@@ -48,6 +48,8 @@ class Localisation(Value):
         What the chosen subset leaves, None where the noise is not known.
     dof : int
         Residuals less the parameters that were fitted.
+    units : sequence of c str, optional
+        Of the candidates.
 
     Examples
     --------
@@ -74,6 +76,7 @@ class Localisation(Value):
     nuisance_values: FloatArray = field(default_factory=lambda: np.zeros(0))
     chi2: float | None = None
     dof: int = 0
+    units: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         self._set(

@@ -143,6 +143,7 @@ def localise(
         nuisance_values=np.array(p[len(best) :]),
         chi2=chi2,
         dof=dof,
+        units=tuple(q.unit for q in listed),
     )
     if fit is not None and is_bad(found.p_value):
         full = len(best) >= most
