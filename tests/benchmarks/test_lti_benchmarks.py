@@ -15,6 +15,7 @@ import scipy.linalg as la
 import scipy.signal
 
 from flexplant.lti import (
+    StateSpace,
     balanced,
     discretized,
     frequency_response,
@@ -111,7 +112,7 @@ def slycot_hinf(g):
     return slycot.ab13dd("D" if g.dt else "C", "I", "S", "D", n, m, p, *parts, 1e-9)[0]
 
 
-@pytest.mark.parametrize("modes", [24, 100])
+@pytest.mark.parametrize("modes", [24, 100, 174])
 @pytest.mark.parametrize("zeta", [1e-2, 1e-3])
 @pytest.mark.parametrize("sampled", [False, True])
 def test_hinf_norm(modes, zeta, sampled):
@@ -129,6 +130,19 @@ def test_hinf_norm(modes, zeta, sampled):
         assert hinf_norm(h) == pytest.approx(truth, rel=1e-8, abs=0)
     print(f"  off the independent search: ours {hinf_norm(g) / truth - 1:+.1e}, ", end="")
     print(f"slycot {slycot_hinf(g) / truth - 1:+.1e}")
+
+
+@pytest.mark.parametrize("n", [48, 200, 348])
+def test_hinf_norm_of_a_random_dense_system(n):
+    """Well damped, its eigenvectors far from orthogonal."""
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(n, n)) / np.sqrt(n) - 1.2 * np.eye(n)
+    g = StateSpace(A, rng.normal(size=(n, 3)), rng.normal(size=(3, n)), np.zeros((3, 3)))
+    found = hinf_norm(g)
+    times = race(lambda: hinf_norm(fresh(g)), lambda: slycot_hinf(g), 5 if n < 100 else 2)
+    print()
+    line(f"Hinf norm, {n} states, random", times, "slycot ab13dd", abs(found / slycot_hinf(g) - 1))
+    assert found == pytest.approx(peak_by_search(g.A, g.B, g.C, g.D, 0.0), rel=1e-8, abs=0)
 
 
 @pytest.mark.parametrize("modes", [24, 100])

@@ -9,8 +9,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import ModelError
-from flexplant.lti import StateSpace, h2_norm, hinf_norm, lft, norms, peak_gain
+from flexplant.lti import StateSpace, h2_norm, hinf_norm, level_set, lft, norms, peak_gain
 from flexplant.lti.discretisation import discretized
+from flexplant.lti.peaks import Peaks, climbed, exceeding, proved_peak
+from flexplant.lti.residues import residues
+from flexplant.progress import Progress
 from oracles_lti import largest_gain, lyapunov, peak_by_search, stein, sweep
 from systems_lti import machine
 
@@ -183,7 +186,8 @@ def test_the_level_set_alone_finds_the_peak(monkeypatch, start, feedthrough, del
     def poor(g, find, top):
         return largest_gain(g.A, g.B, g.C, g.D, g.dt, np.array([start])), start
 
-    monkeypatch.setattr(norms, "_searched", poor)
+    monkeypatch.setattr(level_set, "_searched", poor)
+    monkeypatch.setattr(norms, "residues", lambda g: (None, None))
     assert hinf_norm(g) == pytest.approx(expected, rel=1e-8, abs=0)
 
 
@@ -200,10 +204,48 @@ def test_crossings_of_a_level_are_where_a_singular_value_equals_it(part, delay):
         H = np.moveaxis(sweep(g.A, g.B, g.C, g.D, g.dt, freq), 2, 0)
         return np.linalg.svd(H, compute_uv=False)
 
-    crossings = norms._Level(g).crossings(level)
+    crossings = level_set._Level(g).crossings(level)
     np.testing.assert_allclose(np.abs(values(crossings) - level).min(axis=1), 0, atol=1e-6 * level)
     above = values(np.linspace(0.0, 5000.0, 20_001)) > level
     assert np.count_nonzero(above[1:] != above[:-1]) == crossings.size > 0
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_the_proof_by_intervals_agrees_with_the_level_set(seed):
+    """Modes and dense systems, feedthrough, sampled: two ways to the same peak."""
+    rng = np.random.default_rng(seed)
+    m, p = rng.integers(1, 6, 2)
+    if seed % 2:
+        A = rng.standard_normal((9, 9))
+        A -= np.eye(9) * (la.eigvals(A).real.max() + 0.1)
+        g = StateSpace(A, rng.standard_normal((9, m)), rng.standard_normal((p, 9)), np.ones((p, m)))
+    else:
+        g = machine(0, 9, zeta=10.0 ** -rng.uniform(1, 5), m=m, p=p, seed=seed)
+    g = discretized(g, 1.5 * np.abs(g.poles()).max()) if seed % 3 == 0 else g
+    model, _ = residues(g)
+    gain, omega = proved_peak(model, 1e-9)
+    wanted, freq = level_set.level_set_peak(g, 1e-9, Progress(0, "", progress=False))
+    assert gain == pytest.approx(wanted, rel=4e-9, abs=0)
+    assert norms._proved(g, model) == (pytest.approx(gain, rel=1e-9, abs=0), peak_gain(g)[1])
+    # a level below the peak is not proved, wherever the climb begins
+    none = Peaks(*np.zeros((3, 0)))
+    above = exceeding(model, 0.999 * gain, none)
+    freq = np.arctan(above) / (np.pi * g.dt) if g.dt else above / (2 * np.pi)
+    assert above.size and largest_gain(g.A, g.B, g.C, g.D, g.dt, freq) >= 0.999 * gain * (1 - 1e-9)
+    # what lies around a peak: nothing higher; further away there may be
+    omega, height, zone = climbed(model, np.array([omega]), 1e-9)
+    around = model.series(omega + zone * np.linspace(-1, 1, 401), 0)[0]
+    assert zone > 0 and np.linalg.norm(around, 2, axis=(1, 2)).max() <= height * (1 + 1e-9)
+
+
+def test_a_flat_gain_is_left_to_the_level_set():
+    """An all-pass beside a resonance just below it; repeated peaks in two directions."""
+    lag = StateSpace([[-1.0]], [[1.0]], [[-2.0]], [[1.0]])
+    assert norms._proved(lag, residues(lag)[0]) is None
+    twice = np.kron(np.eye(2), [[0, 1.0], [-1, -0.2]])
+    both = StateSpace(twice, np.eye(4)[:, 1::2], np.eye(4)[::2], np.zeros((2, 2)))
+    assert norms._proved(both, residues(both)[0]) is None
+    assert hinf_norm(both) == pytest.approx(1 / (0.2 * np.sqrt(1 - 0.01)), rel=1e-9, abs=0)
 
 
 def test_units_scale_the_norm():

@@ -177,24 +177,48 @@ def _paired(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
     return pairs, slots, coupling
 
 
-def _modal(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> Solver:
-    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
+class ModalPairs(NamedTuple):
+    """Blocks ``m I + N`` (b of them) with ``N^2 = q I`` (Cayley-Hamilton), and their B and C.
 
-    With m half the trace of a block, N = A - m I and N^2 = q I (Cayley-Hamilton),
-    ``(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)``: no cancellation near s = m, which matters
-    for slow modes of a sampled system. A 1 x 1 block is N = 0. Complex numbers are pairs of real
-    columns, so that no complex product is formed.
+    m is half the trace: the poles are m +- q^(1/2), as exact as the block. Of one state: N = 0.
     """
+
+    mean: FloatArray
+    N: FloatArray
+    q: FloatArray
+    B: FloatArray  # (b, 2, m)
+    C: FloatArray  # (b, 2, p)
+
+
+def modal_pairs(g: StateSpace) -> ModalPairs | None:
+    """Return the blocks of a block-diagonal A, None for another."""
+    if g.blocks is None or not set(g.blocks) <= {1, 2}:
+        return None
+    pairs, slots, coupling = _paired(g)
+    return None if np.any(coupling) else _halved(g, pairs, slots)
+
+
+def _halved(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> ModalPairs:
     real, pairs = slots >= 0, pairs.copy()
-    pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]  # N = 0 for a 1 x 1 block
+    pairs[~real[:, 1], 1, 1] = pairs[~real[:, 1], 0, 0]
     mean = 0.5 * (pairs[:, 0, 0] + pairs[:, 1, 1])
     N = pairs.copy()
     N[:, 0, 0] = 0.5 * (pairs[:, 0, 0] - pairs[:, 1, 1])
     N[:, 1, 1] = -N[:, 0, 0]
     q = N[:, 0, 0] ** 2 + N[:, 0, 1] * N[:, 1, 0]
+    C = (g.C[:, slots] * real).transpose(1, 2, 0)
+    return ModalPairs(mean, N, q, g.B[slots] * real[:, :, None], C)
+
+
+def _modal(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> Solver:
+    """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
+
+    ``(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`` of each block: no cancellation near s = m,
+    which matters for slow modes of a sampled system. Complex numbers are pairs of real columns, so
+    that no complex product is formed.
+    """
+    mean, N, q, B, C = _halved(g, pairs, slots)
     split, swing = np.sqrt(np.maximum(q, 0.0)), np.sqrt(np.maximum(-q, 0.0))
-    B = g.B[slots] * real[:, :, None]  # (b, 2, m)
-    C = (g.C[:, slots] * real).transpose(1, 2, 0)  # (b, 2, p)
     channels = len(g.C) * g.B.shape[1]
     with_s = np.einsum("bip,bim->pmb", C, B).reshape(channels, -1)
     without = np.einsum("bip,bij,bjm->pmb", C, N, B, optimize=True).reshape(channels, -1)

@@ -1,0 +1,194 @@
+"""The largest gain over all frequencies, proved by intervals: no eigenvalue problem."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from ..values import ComplexArray, FloatArray
+from .residues import Residues
+
+#: peaks that are climbed: how many, and their least part of the largest gain seen
+PEAKS, PART = 5, 0.7
+#: steps of Newton, and how far from it [distance to the nearest pole] a peak may be left
+STEPS, SETTLED = 12, 1e-5
+#: an interval is examined by its series once its radius is such a part of the distance to the
+#: poles
+NEAR = 0.6
+#: where it is cut when that does not suffice, from -1 to 1: finer towards its ends
+CUTS = np.array([-1.0, -0.9, -0.4, 0.4, 0.9, 1.0])
+MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
+#: radii tried around a peak, in distances to the nearest pole
+ZONES = np.array([0.4, 0.3, 0.2, 0.1, 0.03, 0.01])
+
+
+class Peaks(NamedTuple):
+    """Frequencies [rad/s], largest gains there, and the radius within which none is larger."""
+
+    omega: FloatArray
+    gain: FloatArray
+    zone: FloatArray
+
+
+def proved_peak(model: Residues, tolerance: float) -> tuple[float, float] | None:
+    """Return the largest gain and its frequency [rad/s], None where it is not proved."""
+    if model.through.shape[0] < model.through.shape[1]:
+        model = model.transposed
+    start = np.concatenate([[0.0], model.resonances])
+    size = np.linalg.norm(model.series(start, 0)[0], axis=(1, 2))
+    best = np.argsort(size)[: -PEAKS - 1 : -1]
+    start = start[best[size[best] >= PART * size[best[0]]]]
+    for _ in range(STEPS):
+        omega, gain, zone = peaks = climbed(model, start, tolerance)
+        highest = int(np.argmax(gain))
+        if not zone[highest] > 0.0:
+            return None
+        higher = exceeding(model, gain[highest] * (1.0 + tolerance), peaks)
+        if higher is None:
+            return None
+        if not higher.size:
+            return float(gain[highest]), float(omega[highest])
+        start = np.append(omega, higher)
+    return None
+
+
+class _Expansion(NamedTuple):
+    """``G* G = A_0 + A_1 d + A_2 d^2`` beside frequencies, in the singular vectors there."""
+
+    values: FloatArray
+    A1: ComplexArray
+    A2: ComplexArray
+    T: list[ComplexArray]
+
+    @property
+    def slope(self) -> FloatArray:
+        """First derivative of the largest eigenvalue."""
+        return self.A1[:, 0, 0].real
+
+    @property
+    def bend(self) -> FloatArray:
+        """Half its second derivative."""
+        gaps = np.maximum(self.values[:, :1] - self.values[:, 1:], 1e-300)
+        pull = np.abs(self.A1[:, 1:, 0]) ** 2 / gaps
+        return np.asarray(self.A2[:, 0, 0].real + np.sum(pull, axis=1))
+
+
+def _expansion(model: Residues, omega: FloatArray) -> _Expansion:
+    T = model.series(omega, 2)
+    _, sizes, Vh = np.linalg.svd(T[0], full_matrices=False)
+    V = Vh.conj().swapaxes(1, 2)
+    X = [part @ V for part in T]
+    H0 = X[0].conj().swapaxes(1, 2)
+    A1, A2 = H0 @ X[1], H0 @ X[2]
+    A1 = A1 + A1.conj().swapaxes(1, 2)
+    A2 = A2 + A2.conj().swapaxes(1, 2) + X[1].conj().swapaxes(1, 2) @ X[1]
+    return _Expansion(sizes**2, A1, A2, T)
+
+
+def climbed(model: Residues, start: FloatArray, tolerance: float) -> Peaks:
+    """Return where Newton's steps lead from frequencies to maxima of the largest gain."""
+    omega = start
+    for _ in range(STEPS):
+        one, near = _expansion(model, omega), model.nearest(omega)
+        slope, bend, height = one.slope, one.bend, one.values[:, 0]
+        uphill = bend < 0.0
+        move = -0.5 * slope / np.where(uphill, bend, -1.0)
+        move = np.where(uphill, move, np.sign(slope) * near)
+        move = np.clip(move, -0.5 * near, 0.5 * near)
+        if np.all(np.abs(move) <= SETTLED * near):
+            break
+        keep = height >= PART * height.max()
+        omega = np.abs(omega + move)[keep]
+    return Peaks(omega, np.sqrt(height), _zones(model, omega, near, one, tolerance))
+
+
+def _zones(
+    model: Residues, omega: FloatArray, near: FloatArray, one: _Expansion, tolerance: float
+) -> FloatArray:
+    """Return the radius around each frequency within which no gain is higher than there.
+
+    With G = T_0 + T_1 d + T_2 d^2 + O(d^3), in the singular vectors v of T_0: t - G*G is positive
+    when the Schur complement of its first entry is, for which bounds of the others suffice.
+    """
+    t0, t1, t2 = (np.linalg.norm(T, axis=(1, 2))[:, None] for T in one.T)
+    r = near[:, None] * ZONES  # (n_omega, n_zones)
+    beta = model.rest(np.repeat(omega, ZONES.size), r.reshape(-1), 2).reshape(r.shape)
+    whole = t0 + t1 * r + t2 * r**2
+    cubic = 2 * t1 * t2 + t2**2 * r + 2 * beta * whole + beta**2 * r**3
+    top = one.values[:, :1]
+    spread = np.linalg.norm(one.A1, axis=(1, 2))[:, None] * r
+    spread = spread + np.linalg.norm(one.A2, axis=(1, 2))[:, None] * r**2 + cubic * r**3
+    gaps = top[:, :, None] - one.values[:, None, 1:] - spread[:, :, None]
+    along = np.abs(one.A1[:, None, 1:, 0]) + np.abs(one.A2[:, None, 1:, 0]) * r[:, :, None]
+    along = along + (cubic * r**2)[:, :, None]
+    free = np.all(gaps > 0.0, axis=2)
+    pull = np.sum(along**2 / np.where(gaps > 0.0, gaps, 1.0), axis=2)
+    fall = -(one.A2[:, 0, 0].real[:, None] + cubic * r + pull)
+    fits = free & (fall > 0.0) & (one.slope[:, None] ** 2 <= 8.0 * tolerance * top * fall)
+    return np.asarray(np.max(np.where(fits, r, 0.0), axis=1))
+
+
+def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
+    """Return frequencies at which the gain is above a level, empty when proved: there are none.
+
+    None: undecided, at as much work as an eigenvalue problem.
+    """
+    through = float(np.linalg.norm(model.through, 2))
+    if not level > through * (1.0 + 1e-6):
+        return None
+    speed = float(np.abs(model.poles).max())
+    # beyond the end |G - D| <= sum 2 |R_i| / (omega - |p_i|)
+    end = 1.001 * speed + 2.0 * float(model.sizes.sum()) / (level - through)
+    beyond = 1.001 * speed * 4.0 ** np.arange(1 + int(np.log2(end / speed)) // 2)
+    low, high = peaks.omega - peaks.zone, peaks.omega + peaks.zone
+    edges = np.sort(np.concatenate([model.poles.imag, np.maximum(low, 0.0), high, beyond]))
+    edges = np.concatenate([[0.0], np.minimum(edges, end), [end]])
+    centre, radius = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+    free = np.all((centre < low[:, None]) | (centre > high[:, None]), axis=0) & (radius > 0.0)
+    centre, radius = centre[free], radius[free]
+    left = 100 + model.poles.size**2 // 10
+    while centre.size:
+        rough = through + model.rest(centre, radius, -1) > level
+        centre, radius = centre[rough], radius[rough]
+        fine = radius <= NEAR * model.nearest(centre)
+        left -= int(np.count_nonzero(fine))
+        if left < 0:
+            return None
+        higher, passed = _examined(model, centre[fine], radius[fine], level)
+        if higher.size:
+            return higher
+        stay = np.ones(centre.size, dtype=bool)
+        stay[np.flatnonzero(fine)[passed]] = False
+        centre, radius = centre[stay, None], radius[stay, None]
+        centre = (centre + radius * MIDDLES).reshape(-1)
+        radius = (radius * HALVES).reshape(-1)
+    return np.zeros(0)
+
+
+def _examined(
+    model: Residues, centre: FloatArray, radius: FloatArray, level: float
+) -> tuple[FloatArray, npt.NDArray[np.bool_]]:
+    """Return centres with gains above the level, and which intervals certainly stay below it.
+
+    ``|G| <= max |T_0 +- r T_1| + r^2 |T_2| + O(r^3)``: the norm of a line is convex.
+    """
+    if not centre.size:
+        return centre, np.zeros(0, dtype=bool)
+    T0, T1, T2 = model.series(centre, 2)
+    r = radius[:, None, None]
+    rest = radius**2 * np.linalg.norm(T2, axis=(1, 2)) + radius**3 * model.rest(centre, radius, 2)
+    ends = np.stack([T0 + r * T1, T0 - r * T1])
+    bound = np.linalg.norm(ends, axis=(2, 3)).max(axis=0) + rest
+    unsure = np.flatnonzero((bound > level) & (rest < level))
+    bound[unsure] = _largest(ends[:, unsure]).max(axis=0) + rest[unsure]
+    unsure = unsure[bound[unsure] > level]
+    return centre[unsure[_largest(T0[unsure]) > level]], bound <= level
+
+
+def _largest(X: ComplexArray) -> FloatArray:
+    """Return the largest singular value of each of a stack of matrices."""
+    if X.shape[-1] == 1:
+        return np.asarray(np.linalg.norm(X, axis=(-2, -1)))
+    return np.asarray(np.linalg.svd(X, compute_uv=False)[..., 0])
