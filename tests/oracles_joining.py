@@ -27,6 +27,17 @@ def poles(M, D, K):
     return found[np.argsort(np.abs(found))]
 
 
+def slow_poles(M, D, K):
+    """Return all poles [rad/s] by magnitude, inverses of an eigenproblem's: slow ones have digits.
+
+    ``(K + s D + s^2 M) x = 0`` divided by s: ``K^-1 (D + s M) x = -x / s``.
+    """
+    n = M.shape[0]
+    lower = -la.solve(K, np.hstack([M, D]))
+    found = 1 / la.eigvals(np.block([[np.zeros((n, n)), np.eye(n)], [lower]]))
+    return found[np.argsort(np.abs(found))]
+
+
 def receptance(M, D, K, B, freq, out, load):
     """Return ``c x`` of ``[A B'; B 0] [x; forces] = [b; 0]``, A the dynamic stiffness, by freq."""
     m, found = B.shape[0], []

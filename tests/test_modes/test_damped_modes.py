@@ -1,10 +1,13 @@
 """Complex modes of large sparse models: beside a dense solution, with dampers and by regions."""
 
+import warnings
+
 import numpy as np
 import pytest
 
 import flexplant as fx
-from flexplant.errors import ModelError, SolverError
+import oracles_joining as oracle
+from flexplant.errors import FlexplantWarning, ModelError, SolverError
 from flexplant.modes import damped_modes, normal_form, solve
 
 PLATE = {"thickness": 0.0272, "density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
@@ -43,6 +46,46 @@ def test_complex_modes_of_a_large_model(region, monkeypatch):
     band = fx.solve_modes(model, below=float(found.freq[9]) * 1.0001)
     np.testing.assert_allclose(band.poles, found.poles[: band.n_modes], rtol=1e-8)
     assert band.n_modes == 10
+
+
+def halves(rate):
+    """A plate of two halves, held at one end, on springs and dampers between all nodes."""
+    half = fx.kirchhoff_plate(size=(0.3, 0.6), elements=(3, 4), **PLATE)
+    edge = half.dofs.where(box=[(0, 0, 0), (0, 1, 0)]).labels
+    models, placed = {"a": half.fixed(edge), "b": half}, {"b": fx.Pose((0.3, 0.0, 0.0))}
+    rates, springs = rate * np.array([1, 0.01, 0.01]), [1e7, 1e5, 1e5]
+    joints = [
+        fx.Joint(joint.first, joint.second, axes=joint.axes, stiffness=springs, rate=rates)
+        for joint in fx.joining.coincident_joints(models, placed=placed)
+    ]
+    return fx.joined(models, joints, placed=placed)
+
+
+@pytest.mark.parametrize(("rate", "slow"), [(300.0, False), (3e4, True), (3e6, True)])
+def test_overdamped_motions_are_set_apart(rate, slow, monkeypatch):
+    """Far above the wanted modes, in silence; with a warning where their poles are among them."""
+    model = halves(rate)
+    poles = oracle.slow_poles(*(part.toarray() for part in (model.M, model.D, model.K)))
+    swing = poles[poles.imag > 1e-6 * np.abs(poles)][:8]
+    still = poles[np.abs(poles.imag) <= 1e-6 * np.abs(poles)].real
+    assert still.size > 10
+    among = np.count_nonzero(np.abs(still) < np.abs(swing[-1]))
+    at_dampers = model.dofs.where(box=[(0.29, -1, -1), (0.31, 1, 1)]).labels
+    rom = fx.reduce(model, fx.CraigBampton(at_dampers, 30))
+    for is_large in (False, True):
+        monkeypatch.setattr(solve, "_is_large", lambda model, large=is_large: large)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            modes = fx.solve_modes(model, count=8)
+        np.testing.assert_allclose(modes.poles, swing, rtol=1e-8)
+        np.testing.assert_allclose(modes.zeta, -swing.real / np.abs(swing), rtol=1e-6)
+        texts = [str(one.message) for one in said]
+        assert texts == list(modes.notes)
+        assert bool(texts) == bool(among) == slow
+        if among:
+            assert f"{among} real poles of overdamped motions ({still[0]:.4g}, " in texts[0]
+    with pytest.warns(FlexplantWarning, match="real poles of overdamped motions"):
+        np.testing.assert_allclose(rom.modes().freq[:4], modes.freq[:4], rtol=1e-3)
 
 
 def test_what_is_not_found_is_refused(monkeypatch):

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
 from typing import Any
 
 import numpy as np
+import scipy.linalg as la
 
-from ..errors import SolverError
+from ..errors import FlexplantWarning, SolverError
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.orthonormal import beyond
 from ..sparse.pardiso import Pardiso
@@ -16,7 +18,7 @@ from ..structure.negative_stiffness import signed_square
 from ..values import ComplexArray, FloatArray
 from .modes import Modes
 from .normal_form import NormalForm, normal_form
-from .shifted import StiffnessFactor, stiffness_factor
+from .shifted import stiffness_factor
 
 #: what a mode may leave: part of its inertia forces, and of its elastic ones in absolute size
 _RESIDUAL = (1e-8, 1e-12)
@@ -26,6 +28,10 @@ _ENTRY = 1e-3
 _STEPS = 30
 #: part of a correction, beyond the basis, below which it is rounding
 _NEW = 1e-7
+#: DOFs at which dampers act, at most, and their forces, at most: more of them are a material's
+_TOUCHED, _FORCES = 600, 200
+#: relative: a damper below this is none
+_NONE = 1e-12
 #: more undamped modes than wanted, as a part and at least; and how far beyond a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 
@@ -54,9 +60,10 @@ def damped_modes(
 ) -> Modes:
     """Return the complex modes of a large model, by a basis that grows until they are right.
 
-    Rayleigh-Ritz in real vectors V: the undamped modes, and ``(K - sigma M)^-1`` times what the
-    complex modes leave in ``(lambda^2 M + lambda D + K) x = 0``, again and again (Davidson's
-    method for the quadratic problem), until they leave no more than undamped modes may.
+    Rayleigh-Ritz in real vectors V: the undamped modes, the static responses to the forces of
+    dampers, and ``(K - sigma M)^-1`` times what the complex modes leave in ``(lambda^2 M + lambda D
+    + K) x = 0``, again and again (Davidson's method for the quadratic problem), until they leave no
+    more than undamped modes may.
 
     Parameters
     ----------
@@ -88,26 +95,32 @@ def damped_modes(
     ----------
     [Sleijpen1996]_.
     """
-    V, r = phi, model.rigid_body.shape[1]
-    factor: StiffnessFactor | None = None
+    factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
+    V = np.hstack([phi, beyond(model.M, phi, factor.solve(_dampers(model.D)))])
     for _ in range(_STEPS):
         form, keep = _ritz(model, V, r, count, top)
         shapes: Any = V @ form.phi[:, keep]
-        rest, size, limit = _rest(model, form, shapes, keep)
+        slow = np.abs(form.overdamped) <= np.abs(form.poles[keep]).max(initial=0.0)
+        still = V @ form.overdamped_phi[:, slow]
+        poles, every = form.poles[keep], _growing(form, shapes, keep)
+        rest, size, limit = _rest(
+            model, np.concatenate([poles, form.overdamped[slow]]), np.hstack([every, still]), r
+        )
         wrong = np.flatnonzero(size > limit)
         if not wrong.size:
             part = np.where(limit > 0, size / np.where(limit > 0, limit, 1.0), 0.0)
-            return Modes(
-                form.omega[keep],
-                form.zeta[keep],
-                shapes,
-                model.dofs,
-                n_rigid=r,
-                residual=_RESIDUAL[0] * part,
-                certificate={"basis": V.shape[1]},
+            return leaving_overdamped(
+                form,
+                Modes(
+                    form.omega[keep],
+                    form.zeta[keep],
+                    shapes,
+                    model.dofs,
+                    n_rigid=r,
+                    residual=_RESIDUAL[0] * part[: keep.size],
+                    certificate={"basis": V.shape[1]},
+                ),
             )
-        if factor is None:
-            factor = stiffness_factor(model, method)
         step = factor.solve(np.hstack([rest[:, wrong].real, rest[:, wrong].imag]))
         more = beyond(by_rows(model.M), V, step, dependent=_NEW)
         if not more.shape[1]:
@@ -127,7 +140,7 @@ def _ritz(
     M, D, K = (_projected(part, V) for part in (model.M, model.D, model.K))
     rigid = np.eye(V.shape[1], r)
     body = V.T @ np.asarray(model.M @ model.body_motions) if model.n_unstable else rigid
-    form = normal_form(M, D, K, rigid, lambda: body)
+    form = normal_form(M, D, K, rigid, lambda: body, lowest=max(count - r, 0))
     return form, np.flatnonzero(signed_square(form.omega) <= top)[:count]
 
 
@@ -136,14 +149,40 @@ def _projected(matrix: Any, V: FloatArray) -> FloatArray:
     return np.asarray(0.5 * (product + product.T))
 
 
+def _dampers(D: Any) -> FloatArray:
+    """Return the forces (n, m) that dampers make, orthonormal; none when they are at many DOFs."""
+    rows = by_rows(D)
+    touched = np.flatnonzero(np.diff(rows.indptr))
+    if touched.size > _TOUCHED:
+        return np.zeros((D.shape[0], 0))
+    values, vectors = la.eigh(rows[touched][:, touched].toarray())
+    kept = np.flatnonzero(values > _NONE * values.max(initial=0.0))
+    if kept.size > _FORCES:
+        return np.zeros((D.shape[0], 0))
+    forces = np.zeros((D.shape[0], kept.size))
+    forces[touched] = vectors[:, kept]
+    return forces
+
+
+def leaving_overdamped(form: NormalForm, modes: Modes) -> Modes:
+    """Return modes with a note of the real poles among them, which are warned of."""
+    note = form.overdamped_below(float(np.abs(modes.poles).max(initial=0.0)))
+    if not note:
+        return modes
+    warnings.warn(note, FlexplantWarning, 4)
+    return modes.replace(notes=(*modes.notes, note))
+
+
+def _growing(form: NormalForm, shapes: Any, keep: np.ndarray) -> Any:
+    """Return shapes, those of unstable modes of the growing pole."""
+    unstable = form.omega[keep] < 0
+    return np.where(unstable, shapes.real + shapes.imag, shapes) if unstable.any() else shapes
+
+
 def _rest(
-    model: FEModel, form: NormalForm, shapes: FloatArray | ComplexArray, keep: np.ndarray
+    model: FEModel, poles: ComplexArray, x: Any, n_rigid: int
 ) -> tuple[ComplexArray, FloatArray, FloatArray]:
     """Return what modes leave in the eigenvalue problem (n, k), its size and its limit (k,)."""
-    poles = form.poles[keep]
-    x: Any = np.array(shapes)
-    unstable = form.omega[keep] < 0
-    x[:, unstable] = x[:, unstable].real + x[:, unstable].imag  # that of the growing pole
     K, M, D = by_rows(model.K), by_rows(model.M), by_rows(model.D)
     inertia = (M @ x) * poles**2
     rest = inertia + (D @ x) * poles + K @ x
@@ -152,8 +191,11 @@ def _rest(
     size = np.linalg.norm(weight * rest, axis=0)
     # an entry of a shape is known to a rounding of its largest ones, as in undamped modes
     moved = np.abs(x)
-    whole = absolute(K) @ (moved + _ENTRY * moved.max(axis=0))
+    moved = moved + _ENTRY * moved.max(axis=0)
+    whole = absolute(K) @ moved + np.abs(poles) * (absolute(D) @ moved)
     limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
-    limit = limit + _RESIDUAL[1] * np.linalg.norm(weight * whole, axis=0)
-    size[: form.n_rigid] = 0.0  # at zero by convention: checked as undamped modes
+    # real poles are not among what is returned: their place suffices
+    part = np.where(poles.imag == 0, _RESIDUAL[0], _RESIDUAL[1])
+    limit = limit + part * np.linalg.norm(weight * whole, axis=0)
+    size[:n_rigid] = 0.0  # at zero by convention: checked as undamped modes
     return np.asarray(rest), np.asarray(size), np.asarray(limit)

@@ -7,25 +7,19 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
-from ..errors import ModelError, SolverError, counted
+from ..errors import ModelError, counted
 from ..sparse.factor import dense
 from ..structure.eigen import elastic_modes
 from ..structure.negative_stiffness import signed_square
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray, Matrix, Value, real_array
+from .complex_modes import PLANT, check_oscillating, complex_modes
 
 #: coupling of modes by D, relative to the largest modal damping, that still counts as rounding
 PROPORTIONAL = 1e-9
 #: damping rate of a rigid-body motion, relative to the first elastic frequency, that is let pass
 RIGID_DRAG = 1e-4
-#: eigenvalues closer than this (relative) have no eigenvectors of their own
-_CLUSTER = 1e-7
-#: mixing of shapes by rounding that one Newton step takes out
-_MIXED = 1e-2
-#: what a plant makes of damping that modes cannot express
-_PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form."
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -46,6 +40,10 @@ class NormalForm(Value):
         How many rigid-body modes there are.
     decaying : (u,) array [1/s]
         The decaying poles s2 < 0 of the unstable pairs.
+    overdamped : (m,) array [1/s]
+        Negative real poles of motions that do not oscillate, by magnitude: no modes.
+    overdamped_phi : (n, m) array
+        Their shapes, of any length.
 
     Examples
     --------
@@ -60,15 +58,19 @@ class NormalForm(Value):
     phi: FloatArray | ComplexArray
     n_rigid: int
     decaying: FloatArray = field(default_factory=lambda: np.zeros(0))
+    overdamped: FloatArray = field(default_factory=lambda: np.zeros(0))
+    overdamped_phi: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
         self._set(poles=self.poles, phi=self.phi, decaying=self.decaying)
+        self._set(overdamped=self.overdamped, overdamped_phi=self.overdamped_phi)
 
     def __repr__(self) -> str:
         kind = "real" if self.is_real else "complex"
+        more = f", {counted(self.overdamped.size, 'real pole')}" if self.overdamped.size else ""
         return (
             f"<NormalForm: {counted(self.poles.size, 'mode')}, {self.n_rigid} rigid-body, {kind} "
-            "shapes>"
+            f"shapes{more}>"
         )
 
     @property
@@ -91,6 +93,17 @@ class NormalForm(Value):
         rate[: self.n_rigid] = 0.0
         return np.asarray(rate / np.where(omega > 0, omega, 1.0))
 
+    def overdamped_below(self, rate: float) -> str:
+        """Return a note of the real poles up to a rate [1/s], "" when there are none."""
+        slow = self.overdamped[np.abs(self.overdamped) <= rate]
+        if not slow.size:
+            return ""
+        listed = ", ".join(f"{pole:.4g}" for pole in slow[:3]) + (", ..." if slow.size > 3 else "")
+        return (
+            f"{counted(slow.size, 'real pole')} of overdamped motions ({listed} 1/s) left out: "
+            f"modes cannot express them. {PLANT}"
+        )
+
     @property
     def _unstable(self) -> slice:
         return slice(self.n_rigid, self.n_rigid + self.decaying.size)
@@ -102,6 +115,8 @@ def normal_form(
     K: Matrix,
     rigid: FloatArray,
     motions: Callable[[], FloatArray] | None = None,
+    *,
+    lowest: int | None = None,
 ) -> NormalForm:
     """Return poles and shapes of a second-order model, rigid-body motions deflated.
 
@@ -113,11 +128,14 @@ def normal_form(
         Independent vectors with ``K rigid = 0`` (up to rounding); (n, 0) for a held structure.
     motions : function, optional
         Gives the M-orthonormal rigid-body motions (n, m), held or not: K may be negative for them.
+    lowest : int, optional
+        How many of the elastic modes that oscillate, at most, overdamped motions being set apart
+        (`overdamped`). None: all modes, and overdamped ones are refused.
 
     Returns
     -------
     NormalForm
-        All n modes.
+        All n modes, or the lowest.
 
     Raises
     ------
@@ -144,23 +162,36 @@ def normal_form(
     real = real_form(M, D, K, rigid, motions)
     if D is not None:
         check_drag(real.phi[:, : real.n_rigid], dense(D), real.omega[real.n_rigid :])
-    return modal(real)
+    return modal(real, lowest=lowest)
 
 
-def modal(real: RealForm) -> NormalForm:
+def modal(real: RealForm, *, lowest: int | None = None) -> NormalForm:
     """Return the poles and shapes of a model given in its undamped modes; see `normal_form`."""
     r, rate = real.n_rigid, np.diag(real.C)[real.n_rigid :]
     zero, omega = np.zeros(r, dtype=np.complex128), real.omega[r:]
     if real.is_proportional:
         root = signed_square(omega) - 0.25 * rate**2
-        _check_oscillating((root > 0) | (omega < 0), omega)
-        swing = np.sqrt(np.abs(root))
-        poles = -0.5 * rate + np.where(omega < 0, 1.0, 1j) * swing
-        decaying = (-0.5 * rate - swing)[omega < 0]
-        return NormalForm(np.concatenate([zero, poles]), real.phi, r, decaying)
-    poles, decaying, mix = _complex_modes(omega, real.C[r:, r:])
-    shapes = np.hstack([real.phi[:, :r], real.phi[:, r:] @ mix])
-    return NormalForm(np.concatenate([zero, poles]), shapes, r, decaying)
+        swings = (root > 0) | (omega < 0)
+        if lowest is None:
+            check_oscillating(swings, omega)
+        swing, half = np.sqrt(np.abs(root)), -0.5 * rate
+        poles = (half + np.where(omega < 0, 1.0, 1j) * swing)[swings]
+        decaying = (half - swing)[omega < 0]
+        still = np.stack([half + swing, half - swing], axis=-1)[~swings].ravel()
+        order = np.argsort(np.abs(still), kind="stable")
+        some = np.concatenate([np.arange(r), r + np.flatnonzero(swings)[:lowest]])
+        shapes = np.repeat(real.phi[:, r:][:, ~swings], 2, axis=1)[:, order]
+        poles = np.concatenate([zero, poles[:lowest]])
+        return NormalForm(poles, real.phi[:, some], r, decaying, still[order], shapes)
+    found = complex_modes(omega, real.C[r:, r:], lowest=lowest)
+    return NormalForm(
+        np.concatenate([zero, found.poles]),
+        np.hstack([real.phi[:, :r], real.phi[:, r:] @ found.mix]),
+        r,
+        found.decaying,
+        found.overdamped,
+        real.phi[:, r:] @ found.overdamped_mix,
+    )
 
 
 class RealForm(NamedTuple):
@@ -259,7 +290,7 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {RIGID_DRAG:g} of the first "
             f"elastic frequency ({first:.4g} rad/s): dampers to ground, and those between "
-            f"places that a rigid rotation moves apart, leave no modes at 0. {_PLANT} Else let the "
+            f"places that a rigid rotation moves apart, leave no modes at 0. {PLANT} Else let the "
             "damper act along the line between its ends, or close it as a loop."
         )
 
@@ -268,111 +299,3 @@ def _first(omega: FloatArray) -> float:
     """Return the lowest frequency above 0, or 0."""
     above = omega[omega > 0]
     return float(above[0]) if above.size else 0.0
-
-
-def _check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) -> None:
-    if not np.all(oscillates):
-        i = int(np.argmin(oscillates))
-        raise ModelError(
-            f"the elastic mode at {omega[i] / (2 * np.pi):.4g} Hz is overdamped: it has two real "
-            f"poles and no oscillation, which modes cannot express. {_PLANT} Else lower the "
-            "damping."
-        )
-
-
-def _complex_modes(
-    omega: FloatArray, C: FloatArray
-) -> tuple[ComplexArray, FloatArray, ComplexArray]:
-    """Return poles (k,), decaying poles (u,) and mixes (k, k) of ``p'' + C p' + Omega^2 p = 0``.
-
-    The u unstable pairs come first, in the form of `NormalForm`.
-    """
-    k, size = omega.size, np.abs(omega)
-    # states (|Omega| p, p'): all entries are rates, nothing to balance
-    A = np.block([[np.zeros((k, k)), np.diag(size)], [-np.diag(omega), -C]])
-    values, vectors = la.eig(A)
-    real = np.abs(values.imag) <= 1e-9 * np.abs(values)
-    upper = np.flatnonzero((values.imag > 0) & ~real)
-    up, down = np.flatnonzero(real & (values.real > 0)), np.flatnonzero(real & (values.real < 0))
-    u = int(np.count_nonzero(omega < 0))
-    if upper.size < k - u:
-        share = np.sum(np.abs(vectors[:, real]) ** 2, axis=1)
-        share = np.where(omega > 0, share[:k] + share[k:], -1.0)
-        _check_oscillating(np.arange(k) != np.argmax(share), omega)
-    # growing and decaying, the fastest first as in `elastic_modes`, then oscillating
-    size_of = np.abs(values)
-    up, down = (part[np.argsort(-size_of[part], kind="stable")] for part in (up, down))
-    upper = upper[np.argsort(size_of[upper], kind="stable")]
-    listed = np.concatenate([up, down, upper])
-    poles, mix = values[listed], vectors[k:, listed] / values[listed]
-    poles[: 2 * u] = poles[: 2 * u].real
-    mix = mix / np.linalg.norm(mix, axis=0)
-    # what x^T (2 lambda + C) x is made: s1 - s2, s2 - s1 and 2 i Im(lambda)
-    apart = poles[:u].real - poles[u : 2 * u].real
-    scale = np.concatenate([apart, -apart, 2j * poles[2 * u :].imag])
-    start = 0
-    for i in range(1, listed.size + 1):
-        if i == listed.size or abs(poles[i] - poles[i - 1]) > _CLUSTER * abs(poles[i]):
-            cluster = slice(start, i)
-            mix[:, cluster] = _normalised(poles[cluster], mix[:, cluster], C, scale[cluster])
-            start = i
-    mix = _polished(poles, mix, C, scale)
-    residual = mix * poles**2 + (C @ mix) * poles + signed_square(omega)[:, None] * mix
-    worst = float(
-        (np.linalg.norm(residual, axis=0) / np.linalg.norm(mix, axis=0) / np.abs(poles)).max()
-        / size.max()
-    )
-    if not worst < 1e-10:
-        raise SolverError(
-            f"complex modes leave a relative residual of {worst:.2g} (limit 1e-10): the damping is "
-            f"close to critical for two modes at once. {_PLANT} Else change D, or lower it."
-        )
-    if not u:
-        return poles, np.zeros(0), mix
-    if np.abs(mix[:, : 2 * u].imag).max() > 1e-9 * np.abs(mix[:, : 2 * u]).max():
-        raise SolverError(
-            f"the real poles of an unstable mode cannot be paired: damping and negative stiffness "
-            f"mix them with other motions. {_PLANT} Else lower the damping."
-        )
-    grow, decay = mix[:, :u].real, mix[:, u : 2 * u].real
-    decay = decay * np.where(np.sum(grow * decay, axis=0) < 0, -1.0, 1.0)
-    pairs = 0.5 * (grow + decay) + 0.5j * (grow - decay)
-    kept = np.concatenate([np.arange(u), np.arange(2 * u, poles.size)])
-    return poles[kept], poles[u : 2 * u].real, np.hstack([pairs, mix[:, 2 * u :]])
-
-
-def _normalised(
-    poles: ComplexArray, mix: ComplexArray, C: FloatArray, scale: ComplexArray
-) -> ComplexArray:
-    """Return the shapes of one (nearly) repeated pole with ``x^T (2 lambda + C) x = scale``."""
-    mean, goal = poles.mean(), scale.mean()
-    gram = mix.T @ (2 * mean * mix + C @ mix)
-    if poles.size == 1:
-        mix = mix * np.sqrt(goal / gram[0, 0])
-    else:
-        try:
-            mix = mix @ la.inv(la.sqrtm(gram / goal))
-        except la.LinAlgError:
-            raise SolverError(
-                f"the repeated pole {mean:.6g} rad/s has no complete set of shapes: two modes "
-                f"coalesce. {_PLANT} Else change D, or lower it."
-            ) from None
-    top = np.argmax(np.abs(mix), axis=0)
-    return mix * np.where(mix[top, np.arange(poles.size)].real < 0, -1.0, 1.0)
-
-
-def _polished(
-    poles: ComplexArray, mix: ComplexArray, C: FloatArray, scale: ComplexArray
-) -> ComplexArray:
-    """Return shapes with ``x_i^T (lambda_i + lambda_j + C) x_j = 0``, by one Newton step.
-
-    Rounding mixes the shapes of slow modes that are close by far more than their own size: by that
-    of the fastest mode over their distance.
-    """
-    root = np.sqrt(scale)
-    unit = mix / root
-    gram = (unit.T @ unit) * np.add.outer(poles, poles) + unit.T @ (C @ unit)
-    off = gram - np.eye(poles.size)
-    if not np.abs(off).max() < _MIXED:
-        return mix
-    return np.asarray((unit - 0.5 * unit @ off) * root)

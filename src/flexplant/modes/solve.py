@@ -21,7 +21,7 @@ from ..structure.eigen import elastic_modes, signed
 from ..structure.negative_stiffness import signed_root, signed_square
 from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
-from .damped_modes import damped_modes, is_rayleigh, wider
+from .damped_modes import damped_modes, is_rayleigh, leaving_overdamped, wider
 from .lanczos import STEPS
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
@@ -100,7 +100,8 @@ def solve_modes(
     Warns
     -----
     FlexplantWarning
-        When loss factors of regions couple modes, which their damping ratios leave out.
+        When loss factors of regions couple modes, which their damping ratios leave out; when
+        overdamped motions have real poles among the modes, which no modes express.
 
     References
     ----------
@@ -383,7 +384,15 @@ def _complex_modes(
         )
     if _is_large(model):
         return damped_modes(model, phi, count, top, factor)
-    form = normal_form(model.M, model.D, model.K, model.rigid_body, lambda: model.body_motions)
+    form = normal_form(
+        model.M,
+        model.D,
+        model.K,
+        model.rigid_body,
+        lambda: model.body_motions,
+        lowest=max(count - model.rigid_body.shape[1], 0),
+    )
     omega = form.omega
     keep = np.flatnonzero(signed_square(omega) <= top)[:count]
-    return Modes(omega[keep], form.zeta[keep], form.phi[:, keep], model.dofs, n_rigid=form.n_rigid)
+    found = Modes(omega[keep], form.zeta[keep], form.phi[:, keep], model.dofs, form.n_rigid)
+    return leaving_overdamped(form, found)

@@ -11,6 +11,7 @@ import scipy.linalg as la
 
 from ..errors import ModelError, counted
 from ..labels import DofSet, Place
+from ..modes.damped_modes import leaving_overdamped
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
 from ..structure import FEModel
@@ -269,20 +270,32 @@ class ReducedModel(Spanned, Value):
 
         Shapes are in the desired DOFs where all coordinates are DOFs, else those of the full
         structure, ``T phi_k``. Complex where D is not proportional (after a damper was added).
-        Massless coordinates make no modes.
+        Massless coordinates make no modes, and overdamped motions neither.
 
         Raises
         ------
         ModelError
-            When M is no longer positive definite, D drags the rigid-body motions, or a mode is
-            overdamped.
+            When M is no longer positive definite, or D drags the rigid-body motions.
+
+        Warns
+        -----
+        FlexplantWarning
+            When overdamped motions have real poles among the modes.
         """
         model, _, _ = self.condensed()
-        form = normal_form(model.M, model.D, model.K, model.rigid_body, lambda: model.body_motions)
+        form = normal_form(
+            model.M,
+            model.D,
+            model.K,
+            model.rigid_body,
+            lambda: model.body_motions,
+            lowest=model.n_dof,
+        )
         phi, dofs = form.phi, model.dofs
         if not self.is_physical:
             phi, dofs = model.expand(phi), model.full_dofs
-        return Modes(form.omega, form.zeta, phi, dofs, n_rigid=form.n_rigid)
+        found = Modes(form.omega, form.zeta, phi, dofs, n_rigid=form.n_rigid)
+        return leaving_overdamped(form, found)
 
     def quality(
         self,
