@@ -31,7 +31,7 @@ def read_abaqus(
     inp: str | Path | None = None,
     dofs: DofSet | None = None,
 ) -> FEMatrices:
-    """Return the matrices that Abaqus wrote with `*MATRIX OUTPUT`.
+    r"""Return the matrices that Abaqus wrote with `*MATRIX OUTPUT`.
 
     FORMAT=MATRIX INPUT (the default) and FORMAT=LABELS (lines `node, dof, node, dof, value`, one
     triangle or both) or FORMAT=COORDINATE (lines `row column value`, counted from 1). Degrees of
@@ -70,6 +70,17 @@ def read_abaqus(
     -----
     Format: Abaqus Analysis User's Guide, "Generating structural matrices"; Keywords Reference,
     `*MATRIX INPUT` and `*MATRIX OUTPUT`. Units are those of the model: `.converted(...)`.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import pathlib, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "job_STIF2.mtx")
+    ...     _ = file.write_text("1,1, 1,1, 4e5\n2,1, 1,1, -4e5\n2,1, 2,1, 4e5\n")
+    ...     found = fx.io.read_abaqus(file)
+    >>> found.dofs.labels, found.K.toarray().tolist()
+    (('1:x', '2:x'), [[400000.0, -400000.0], [-400000.0, 400000.0]])
     """
     files = [stiffness, mass, damping]
     parts = [

@@ -71,6 +71,27 @@ def read_exodus_modes(
     Notes
     -----
     Format: Schoof and Yarberry, "EXODUS II: A Finite Element Data Model", SAND92-2137.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import os, scipy.io, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "modes.exo")
+    ...     with scipy.io.netcdf_file(path, "w") as file:
+    ...         for name, size in (("time_step", None), ("num_nodes", 2), ("num_nod_var", 1)):
+    ...             file.createDimension(name, size)
+    ...         file.createDimension("len_name", 5)
+    ...         for axis, at in zip("xyz", ([0.0, 1.0], [0.0, 0.0], [0.0, 0.0])):
+    ...             file.createVariable(f"coord{axis}", "d", ("num_nodes",))[:] = at
+    ...         names = file.createVariable("name_nod_var", "c", ("num_nod_var", "len_name"))
+    ...         names[:] = [list("DispX")]
+    ...         file.createVariable("time_whole", "d", ("time_step",))[:1] = [100.0]
+    ...         shape = file.createVariable("vals_nod_var1", "d", ("time_step", "num_nodes"))
+    ...         shape[:1] = [[1.0, -1.0]]
+    ...     modes = fx.io.read_exodus_modes(path, zeta=0.01)
+    >>> modes.freq, modes.at("2:x")
+    (array([100.]), array([-1.]))
     """
     omega, phi, dofs = read_shapes(path, times, variables)
     omega, n_rigid, order = frequencies(omega, rigid_below, str(path))

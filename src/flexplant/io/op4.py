@@ -32,7 +32,7 @@ def read_op4(
     damping: str | None = USUAL,
     dofs: DofSet | None = None,
 ) -> FEMatrices:
-    """Return the stiffness, mass and damping matrices of a Nastran OUTPUT4 file.
+    r"""Return the stiffness, mass and damping matrices of a Nastran OUTPUT4 file.
 
     The file names its matrices, but neither nodes nor units. Rows that are zero are kept.
 
@@ -67,6 +67,20 @@ def read_op4(
     -----
     Format: MSC Nastran Quick Reference Guide and DMAP manual, OUTPUT4; matrices of form 6
     (symmetric) with one triangle only are completed.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import pathlib, tempfile
+    >>> text = "       2       2       6       2KAA     1P,3E16.9\n"
+    >>> for i, (a, b) in enumerate([(4e5, -4e5), (-4e5, 4e5), (1.0, None)], 1):
+    ...     text += f"{i:8d}{1:8d}{2 if b else 1:8d}\n{a:16.9E}" + (f"{b:16.9E}\n" if b else "\n")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "run.op4")
+    ...     _ = file.write_text(text)
+    ...     found = fx.io.read_op4(file, dofs=fx.chain(masses=[1, 1], stiffnesses=[1]).dofs)
+    >>> found.K.toarray().tolist(), found.digits
+    ([[400000.0, -400000.0], [-400000.0, 400000.0]], 10)
     """
     found = _read(path, None)
     given = {"stiffness": stiffness, "mass": mass, "damping": damping}
@@ -81,7 +95,7 @@ def read_op4(
 def read_op4_matrices(
     path: str | Path, *, names: Iterable[str] | None = None
 ) -> dict[str, Op4Matrix]:
-    """Return the matrices of a Nastran OUTPUT4 file by their names.
+    r"""Return the matrices of a Nastran OUTPUT4 file by their names.
 
     Parameters
     ----------
@@ -104,6 +118,20 @@ def read_op4_matrices(
         When there is no matrix of such a name.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import pathlib, tempfile
+    >>> text = "       2       2       6       2KAA     1P,3E16.9\n"
+    >>> for i, (a, b) in enumerate([(4e5, -4e5), (-4e5, 4e5), (1.0, None)], 1):
+    ...     text += f"{i:8d}{1:8d}{2 if b else 1:8d}\n{a:16.9E}" + (f"{b:16.9E}\n" if b else "\n")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "run.op4")
+    ...     _ = file.write_text(text)
+    ...     found = fx.io.read_op4_matrices(file)
+    >>> found["KAA"].tolist()
+    [[400000.0, -400000.0], [-400000.0, 400000.0]]
     """
     found = _read(path, None if names is None else name_list(names, "matrices"))
     return {name: matrix for name, (matrix, _, _) in found.items()}

@@ -35,7 +35,7 @@ def read_sierra(
     exodus: str | Path | None = None,
     dofs: DofSet | None = None,
 ) -> FEMatrices:
-    """Return the matrices that Sierra/SD (formerly Salinas) wrote as MATLAB text.
+    r"""Return the matrices that Sierra/SD (formerly Salinas) wrote as MATLAB text.
 
     The first bracketed table of each file is read: lines `row column value` counted from 1, one
     triangle or both.
@@ -68,6 +68,17 @@ def read_sierra(
         When rows are no motion of a node, or a map and `dofs` are both given.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import pathlib, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "Kssr.m")
+    ...     _ = file.write_text("A = [\n1 1 4e5\n1 2 -4e5\n2 2 4e5\n];\n")
+    ...     found = fx.io.read_sierra(file, dofs=fx.chain(masses=[1, 1], stiffnesses=[1]).dofs)
+    >>> found.K.toarray().tolist()
+    [[400000.0, -400000.0], [-400000.0, 400000.0]]
     """
     if dof_map is not None and dofs is not None:
         raise ModelError("the rows are named twice, by dof_map and by dofs: give one of them.")

@@ -80,6 +80,23 @@ def read_frf_uff(
     -----
     Format: Structural Dynamics Research Laboratory, University of Cincinnati, "Universal File
     Formats for Modal Analysis Testing", dataset 58.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np, os, pyuff, tempfile
+    >>> record = pyuff.prepare_58(
+    ...     func_type=4, binary=0, rsp_node=41, rsp_dir=3, ref_node=7, ref_dir=3,
+    ...     x=np.array([1.0, 2.0]), data=np.array([1.0, 2.0j]), abscissa_spec_data_type=18,
+    ...     ordinate_spec_data_type=8, ordinate_axis_units_lab="m",
+    ...     orddenom_spec_data_type=13, orddenom_axis_units_lab="N",
+    ... )
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "shaker.uff")
+    ...     pyuff.UFF(path).write_sets(record, "overwrite")
+    ...     frf = fx.io.read_frf_uff(path)
+    >>> frf["41:z", "u 7:z"]
+    array([1.+0.j, 0.+2.j])
     """
     if quantity is not None and quantity not in ORDERS:
         raise unknown_label("quantity", quantity, ORDERS)
@@ -168,6 +185,22 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
         When a mode has zero frequency (a rigid-body mode), or a pole is not stable.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np, os, pyuff, tempfile
+    >>> mode = pyuff.prepare_55(
+    ...     model_type=1, analysis_type=2, data_ch=2, spec_data_type=8, data_type=2,
+    ...     n_data_per_node=3, load_case=1, mode_n=1, freq=100.0, modal_m=1.0, modal_damp_vis=0.01,
+    ...     modal_damp_his=0.0, node_nums=[41], r1=np.zeros(1), r2=np.zeros(1), r3=np.ones(1),
+    ... )
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "modes.uff")
+    ...     pyuff.UFF(path).write_sets(mode, "overwrite")
+    ...     found = fx.io.read_modes_uff(path)
+    >>> found, found.shapes.real
+    (<MeasuredModes: 1 pole at 100.0 Hz>, array([[1.]]))
     """
     parts: dict[int, AnalysisData] = {}
     for part in mode_records(file_path(path), measured=True):
@@ -202,7 +235,7 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
 
 
 def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "z")) -> DofSet:
-    """Return the nodes of a universal file (datasets 15 and 2411) as DOFs with coordinates.
+    r"""Return the nodes of a universal file (datasets 15 and 2411) as DOFs with coordinates.
 
     Parameters
     ----------
@@ -226,6 +259,18 @@ def read_nodes_uff(path: str | Path, *, directions: Sequence[str] = ("x", "y", "
         When a direction is unknown or a node appears twice.
     FileNotFoundError
         When there is no such file.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import pathlib, tempfile
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = pathlib.Path(folder, "nodes.uff")
+    ...     line = f"{41:10d}{0:10d}{0:10d}{11:10d}{0.1:13.5E}{0.2:13.5E}{0.0:13.5E}"
+    ...     _ = file.write_text(f"    -1\n    15\n{line}\n    -1\n")
+    ...     dofs = fx.io.read_nodes_uff(file, directions="z")
+    >>> dofs.location("41:z").tolist()
+    [0.1, 0.2, 0.0]
     """
     ids, xyz, (length, _) = raw_nodes(path)
     count = len(directions)

@@ -45,6 +45,17 @@ class Patch(Value):
     ------
     LabelError, ModelError, ShapeError
         When neither nodes nor a box are given, or weights are not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> size, mesh = {"size": (0.2, 0.2), "thickness": 0.01}, {"elements": (2, 2)}
+    >>> steel = {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
+    >>> plate = fx.kirchhoff_plate(**size, **mesh, **steel)
+    >>> foot = fx.Patch("lower", box=[(0.0, 0.0, 0.0), (0.2, 0.2, 0.0)])
+    >>> joint = fx.Joint(foot, "upper/5:z", stiffness=1e6)
+    >>> foot, fx.joined({"lower": plate, "upper": plate}, joint)
+    (<Patch of lower, in a box>, <FEModel: 54 DOFs, sparse, 5 rigid-body motions, D not given>)
     """
 
     component: str

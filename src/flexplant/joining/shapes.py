@@ -30,6 +30,16 @@ class PlacedShape(Interpolation):
         Where it stands.
     C : (n, n) sparse array
         Its DOFs in the directions of the machine by those of its own, ``q = C q_own``.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
+    >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
+    >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
+    >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
+    >>> machine.dofs.interpolation.parts[1].interpolation
+    <PlacedShape of <BeamShape 0.2 m, 2 elements>>
     """
 
     own: Interpolation
@@ -90,6 +100,16 @@ class JoinedShape(Interpolation):
         All DOFs of all components, one after the other, by those that are left. None: all are.
     motions : (n_all, k) array, optional
         All motions of a reduced machine: by these, places of two components move alike or not.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
+    >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
+    >>> joint, shift = fx.Joint("left/3:z", "right/1:z"), fx.Pose(shift=(0.2, 0.0, 0.0))
+    >>> machine = fx.joined({"left": beam, "right": beam}, joint, placed={"right": shift})
+    >>> machine.dofs.interpolation, machine.dofs.nearest((0.4, 0.0, 0.0), "z")
+    (<JoinedShape of left, right>, 'right/3:z')
     """
 
     names: tuple[str, ...]

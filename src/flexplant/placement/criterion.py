@@ -15,7 +15,17 @@ from .candidates import Port, Side, sides_of, with_side
 
 
 class Scorer:
-    """The scores of choices among fixed candidates; choices are rows of indices, ascending."""
+    """The scores of choices among fixed candidates; choices are rows of indices, ascending.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> sensors = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> scorer = fx.PoiVariance().scorer(plant, sensors)
+    >>> bool(scorer.value([0, 2]) < scorer.value([0]))
+    True
+    """
 
     def value(self, chosen: Sequence[int]) -> Any:
         """Return the score of one choice, smaller is better.

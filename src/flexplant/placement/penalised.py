@@ -142,6 +142,15 @@ class Penalised(Wrapping):
     ------
     ModelError
         When one of them is not callable, or the weight not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> sensors = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> cautious = fx.placement.Penalised(fx.PoiVariance(), penalty=lambda plant: 0.1)
+    >>> fx.place_sensors(plant, sensors, 1, cautious).chosen
+    ('s1',)
     """
 
     penalty: Any = None

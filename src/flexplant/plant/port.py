@@ -64,7 +64,15 @@ def seen(
 
 
 class ForcePort(Value):
-    """A port in w or u. A new kind has a `name`, and says by `push` where it acts."""
+    """A port in w or u. A new kind has a `name`, and says by `push` where it acts.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> force = fx.Disturbance("floor", at="41:z", asd=1e-3)
+    >>> isinstance(force, fx.plant.ForcePort), force.home, force.unit
+    (True, 'w', 'N')
+    """
 
     #: the side of Ports that holds it
     home: ClassVar = "w"
@@ -128,6 +136,13 @@ class SensorPort(Value):
         What is measured.
     absolute : bool, optional
         Whether the motion of the ground is part of it; that of accelerations when not given.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> gauge = fx.Sensor("y1", at="41:z", asd=1e-12, latency=20e-6)
+    >>> isinstance(gauge, fx.plant.SensorPort), gauge.home, gauge.latency
+    (True, 'y', 2e-05)
     """
 
     home: ClassVar = "y"

@@ -61,6 +61,17 @@ def consistency(
     References
     ----------
     [BarShalom2001]_, ch. 5.4; [Bartlett1955]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> estimate = observer.estimate(fx.simulate(loop, duration=0.2, rng=1))
+    >>> fx.plot.consistency(estimate).get_ylabel()
+    'NIS per sensor [-]'
     """
     instance(estimate, Estimate, "estimate", "Pass what observer.estimate returned.")
     instance(found, Consistency | None, "found", "Pass what consistency returned.")

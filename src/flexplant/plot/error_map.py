@@ -32,6 +32,16 @@ def error_map(found: ErrorMap, *, what: str = "ma", ax: Axes | None = None) -> A
     ------
     ModelError
         When `found` is no ErrorMap, has fewer than three points, or `what` is neither.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> points = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.3, 0.3, 0.0)])
+    >>> ma, msd = np.array([3e-9, 2e-9, 2e-9, 1e-9]), np.full(4, 1e-9)
+    >>> found = fx.simulation.ErrorMap("z", "m", points, ma, msd, window=5e-3)
+    >>> fx.plot.error_map(found).get_xlabel()
+    'x [mm]'
     """
     instance(found, ErrorMap, "found", "Pass what error_map returned.")
     if what not in ("ma", "msd"):

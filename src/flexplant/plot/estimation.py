@@ -54,6 +54,13 @@ def predictions(
         When there is no such mapping, or an error is not positive.
     ShapeError
         When a row has not four columns, or there are not as many names as cases.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> rows = {"filter": [[0.5e-9, 0.51e-9, 0.48e-9, 0.53e-9]]}  # predicted, found, 95 % from, to
+    >>> fx.plot.predictions(rows).get_xlabel()
+    'rms error [pm]'
     """
     title = ""
     if isinstance(rows, Sequence) and all(isinstance(c, EstimatorComparison) for c in rows):

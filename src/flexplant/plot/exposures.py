@@ -58,6 +58,15 @@ def exposures(
         When the channel is unknown, or the run has no error.
     ShapeError
         When `exposures` are no pairs.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> time = np.arange(1000) * 1e-4
+    >>> run = fx.Response(time, 1e-8 * np.sin(600 * time)[None], ["die:error"], {"die:error": "m"})
+    >>> fx.plot.exposures(run, "die:error", window=5e-3).get_ylabel()
+    'error [nm]'
     """
     instance(run, Response, "run", "Pass what simulate returned.")
     known = error_channels(run)

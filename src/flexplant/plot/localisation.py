@@ -50,6 +50,17 @@ def localisation(
     ------
     ModelError
         When `found` is no Localisation, or candidates are not those of it.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> masses = [fx.AddedMass(place) for place in drawing.dofs.labels]
+    >>> found = fx.localise(drawing, [fx.Eigenvalues(measured)], masses, most=1)
+    >>> fx.plot.localisation(found).get_xlabel()
+    'of the misfit explained alone [%]'
     """
     instance(found, Localisation, "found", "Pass what localise returned.")
     if (candidates is None) != (dofs is None):

@@ -43,6 +43,15 @@ def sensor_map(found: SensorMap, *, ports: Ports | None = None, ax: Axes | None 
     ------
     ModelError
         When `found` is no SensorMap, or its points lie on one line.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> points = np.array([(0.0, 0.0, 0.0), (0.3, 0.0, 0.0), (0.0, 0.3, 0.0), (0.3, 0.3, 0.0)])
+    >>> found = fx.placement.SensorMap(points, np.array([4.0, 3.0, 2.0, 1.0]), 5.0, "PoiVariance()")
+    >>> fx.plot.sensor_map(found).get_ylabel()
+    'y [mm]'
     """
     instance(found, SensorMap, "found", "Pass what sensor_map returned.")
     if np.linalg.matrix_rank(found.points[:, :2] - found.points[:1, :2]) < 2:
@@ -149,6 +158,22 @@ def placed(
     ------
     ModelError
         When the plant has no structure, the mode does not exist, or there are no z-DOFs to draw.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> size, mesh = {"size": (0.2, 0.2), "thickness": 0.01}, {"elements": (2, 2)}
+    >>> steel = {"density": 7800.0, "youngs_modulus": 2.1e11, "poisson_ratio": 0.3}
+    >>> modes = fx.solve_modes(fx.kirchhoff_plate(**size, **mesh, **steel), count=6)
+    >>> corners = [(x, y, 0.0) for x in (0.0, 0.2) for y in (0.0, 0.2)]
+    >>> ports = fx.Ports(
+    ...     w=[fx.Disturbance("floor", at=(0.1, 0.1, 0.0), asd=1e-3)],
+    ...     u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(corners, 1)],
+    ...     z=[fx.Poi("die", at=(0.1, 0.1, 0.0))],
+    ...     y=[fx.Sensor(f"y{i}", at=p, asd=1e-11) for i, p in enumerate(corners, 1)],
+    ... )
+    >>> fx.plot.placed(fx.assemble_plant(modes, ports), mode=4).get_title()
+    'mode 4, 851.5 Hz'
     """
     own = instance(plant, StandardPlant, "plant", "Pass placement.on(plant).").assembled
     ax = axes(ax, figsize=(6.4, 5.4))

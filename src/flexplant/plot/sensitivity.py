@@ -132,6 +132,16 @@ def sensitivities(
     ModelError
         When one is no loop, weights are of other names or of several channels, or there are not
         three axes.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> [ax.get_ylabel() for ax in fx.plot.sensitivities(loop).figure.axes]
+    ['|S| [dB]', '|T| [dB]', '|KS| [dB, 0 dB = 1 N/m]']
     """
     named, limits = _named(loops), dict(weights or {})
     if unknown := set(limits) - set(_LIMITED):

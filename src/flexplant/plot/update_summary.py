@@ -59,6 +59,17 @@ def update(
     ------
     ModelError
         When `fit` is no UpdateResult, or a residual does not fit the model.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> residuals = [fx.Eigenvalues(measured)]
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], residuals)
+    >>> sorted(fx.plot.update(fit, drawing, residuals))
+    ['convergence', 'damping', 'frequencies', 'parameters']
     """
     instance(fit, UpdateResult, "fit", "Pass what update returned.")
     old, new = correlate(before, residuals), correlate(fit.model, residuals)

@@ -28,6 +28,16 @@ def eigenvalues(fit: UpdateResult, measured: ComplexArray, *, ax: Axes | None = 
     Axes
         Distance of the real and the imaginary part to the measured one [rad/s] over iterations, on
         a log scale.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> modes = fx.solve_modes(fx.chain(masses=[1.0, 1.0, 1.0], stiffnesses=[4e5, 4e5]), count=3)
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> measured = fx.MeasuredModes(poles=[615.0j], modes=[2])
+    >>> fit = fx.update(drawing, [fx.AddedMass("3:x")], [fx.Eigenvalues(measured)])
+    >>> fx.plot.eigenvalues(fit, measured.poles).get_ylabel()
+    'distance to the measured eigenvalue [rad/s]'
     """
     given, ax = ax is not None, axes(ax, figsize=(9.0, 4.0))
     steps = np.arange(len(fit.history) + 1)

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import ModelError, counted
 from ..loop import ClosedLoop, close_loop
 from ..loop.known import force_name
-from ..values import FloatArray, Value, instance, positive, short, whole
+from ..values import FloatArray, Value, instance, positive, short, whole, with_unit
 from .feedforward import Feedforward, known_forces, term_numbers, tracked
 from .motion import SetPoint
 from .response import Response
@@ -32,6 +32,16 @@ class LearnedFeedforward(Value):
         Rms of the error in each move.
     gains : (trials, r, 5) array
         The gains of each move.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> import numpy as np
+    >>> start = fx.design_feedforward(fx.testbeds.three_masses())
+    >>> fx.simulation.LearnedFeedforward(start, np.array([8e-9, 1e-9]), np.zeros((2, 1, 5)))
+    <LearnedFeedforward 2 moves>
+      move 1: rms 8 nm
+      move 2: rms 1 nm
     """
 
     feedforward: Feedforward
@@ -43,7 +53,7 @@ class LearnedFeedforward(Value):
 
     def __repr__(self) -> str:
         lines = [f"<LearnedFeedforward {counted(self.errors.size, 'move')}>"]
-        lines += [f"  move {i}: rms {e:.4g} m" for i, e in enumerate(self.errors[:5], 1)]
+        lines += [f"  move {i}: rms {with_unit(e, 'm')}" for i, e in enumerate(self.errors[:5], 1)]
         return "\n".join(lines)
 
 
@@ -101,6 +111,22 @@ def learn_feedforward(
     References
     ----------
     [VandeWijdevenBosgra2010]_.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> observer = fx.design_kalman(plant)
+    >>> servo = fx.design_servo(plant, bandwidth=20.0, observer=observer)
+    >>> loop = fx.close_loop(plant, observer, servo)
+    >>> move = fx.setpoint(1e-3, velocity=0.1, acceleration=5.0, jerk=500.0)
+    >>> def trial(forward):  # on the machine, here the model
+    ...     closed = fx.close_loop(plant, observer, servo, forward)
+    ...     return fx.simulate(closed, reference=move, duration=0.3, noise=False)
+    >>> start = fx.design_feedforward(plant).up_to("acceleration")
+    >>> found = fx.simulation.learn_feedforward(start, trial, loop, move, duration=0.3, trials=2)
+    >>> bool(found.errors[1] < 0.2 * found.errors[0])
+    True
     """
     _check(start, loop, move)
     orders = term_numbers(terms)

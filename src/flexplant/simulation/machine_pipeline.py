@@ -105,6 +105,16 @@ class MachinePipeline(Value):
     ------
     ModelError
         When a value is of another kind or out of range.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> chain = fx.chain(masses=[1.0] * 3, stiffnesses=[4e5] * 2)
+    >>> drawing = chain.with_damping(fx.ModalDamping(0.02))
+    >>> rom = fx.reduce(fx.solve_modes(drawing, count=3), fx.DesiredDofs(["1:x", "2:x", "3:x"]))
+    >>> ports = fx.testbeds.three_masses().assembled.ports
+    >>> fx.simulation.MachinePipeline(rom, drawing, [fx.AddedMass("3:x")], ports, rate=2e3, delay=1)
+    <MachinePipeline: 1 parameter updated, H-infinity, 50 Hz>
     """
 
     model: ReducedModel

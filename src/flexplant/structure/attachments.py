@@ -191,6 +191,15 @@ class HeldShape(Interpolation):
         Of the structure with all its DOFs.
     rows_left : (n,) array of int
         Which of those are left, in order.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> bar = {"length": 0.2, "elements": 2, "area": 1e-4, "inertia": 1e-9}
+    >>> beam = fx.beam(**bar, density=7800.0, youngs_modulus=2.1e11)
+    >>> held = beam.fixed(["1:z", "1:ry"])
+    >>> held.dofs.interpolation
+    <HeldShape of 4 DOFs in <BeamShape 0.2 m, 2 elements>>
     """
 
     free: Interpolation

@@ -63,6 +63,13 @@ class RobustStability(Value):
         left out.
     left_out : SpillOver, optional
         How the nominal loop stands on the plant with the modes left out, where these are known.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> found = fx.synthesis.RobustStability(0.8, 0.5, 120.0, {"mode7:freq": 2.0}, None, [], [], {})
+    >>> found.is_robust  # and unstable at twice the uncertainty
+    True
     """
 
     upper: float
@@ -156,6 +163,26 @@ def robust_stability(
     References
     ----------
     [ZhouDoyleGlover1996]_, chapter 11.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> model = fx.chain(masses=[1.0, 1.0], stiffnesses=[4e5])
+    >>> modes = fx.solve_modes(model, count=2, damping=fx.ModalDamping(0.02))
+    >>> drawing = fx.reduce(modes, fx.DesiredDofs(["1:x", "2:x"]))
+    >>> spread = [[1.0, 0.0], [0.0, 4.0]]
+    >>> measured = fx.MeasuredModes(poles=[-17 + 890j], modes=[2], covariance=spread)
+    >>> fit = fx.update(drawing, [fx.AddedMass("2:x")], [fx.Eigenvalues(measured)])
+    >>> ports = fx.Ports(
+    ...     w=[fx.Disturbance("d", "1:x", "x", asd=1e-3)],
+    ...     u=[fx.Actuator("u1", "1:x", "x")],
+    ...     z=[fx.Poi("tip", "2:x", ("x",))],
+    ...     y=[fx.Sensor("y1", "1:x", "x", asd=1e-9)],
+    ... )
+    >>> plant = fx.assemble_plant(fit.model, ports)
+    >>> lead = -1e3 * fx.lti.tf([0.05, 1.0], [0.002, 1.0]).replace(inputs=["y1"], outputs=["u1"])
+    >>> fx.synthesis.robust_stability(plant.uncertain(fit), lead, machines=3).is_robust
+    True
     """
     count = whole(machines, "machines", minimum=0)
     chance = generator(rng)
