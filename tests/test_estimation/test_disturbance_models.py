@@ -108,6 +108,7 @@ def with_accelerometers():
     return assemble_plant(modes(1e-2, 8), held_ports()).discretized(2e3, delay=1)
 
 
+@pytest.mark.slow
 def test_accelerometers_by_the_textbook():
     """Simon, Optimal State Estimation, section 7.1: correlated process and sensor noise, run
     until it is stationary in states, sensors and noises of unit size."""

@@ -57,6 +57,7 @@ def test_the_stated_deviations_are_those_of_repeated_records():
     assert low < np.sum(scores) < high
 
 
+@pytest.mark.slow
 def test_it_is_the_exact_maximum_likelihood():
     """Scalar: the exact likelihood of the stationary filter, maximised without gradients."""
     records = scalar_record(3, 4000)

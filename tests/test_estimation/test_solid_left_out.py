@@ -1,6 +1,7 @@
 """Modes left out of a solid's filter: bending, twisting and stretching in all six directions."""
 
 import numpy as np
+import pytest
 
 from flexplant.estimation import design_kalman
 from flexplant.modes import solve_modes
@@ -25,6 +26,7 @@ def sampled(modes):
     return assemble_plant(modes, ports).discretized(40e3, delay=1)
 
 
+@pytest.mark.slow
 def test_the_prediction_on_a_solid_is_the_error_by_frequency():
     body = solid_block(
         size=SIZE, elements=(6, 4, 2), density=2700, youngs_modulus=70e9, poisson_ratio=0.33

@@ -117,6 +117,7 @@ def test_a_missing_extra_gives_the_line_to_type(monkeypatch, tmp_path):
         fx.io.read_ansys(tmp_path / "x.full")
 
 
+@pytest.mark.slow
 def test_other_files_are_refused(tmp_path):
     pytest.importorskip("ansys.mapdl.reader")
     (tmp_path / "x.full").write_bytes(bytes(range(256)) * 20)

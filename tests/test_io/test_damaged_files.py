@@ -110,6 +110,7 @@ def test_one_count_of_an_op4_file_takes_no_memory(tmp_path):
     tracemalloc.stop()
 
 
+@pytest.mark.slow
 def test_a_parser_that_dies_leaves_this_process_alive(tmp_path):
     """An unknown type of numbers in a .mat file: SciPy reads memory that is not there."""
     path = tmp_path / "K.mat"

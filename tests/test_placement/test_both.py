@@ -170,6 +170,7 @@ def test_what_one_more_device_buys(make, tmp_path):
         pareto_curve(plant, sensors, [1, 2])
 
 
+@pytest.mark.slow
 def test_the_worth_of_each_device(make):
     plant, sensors, actuators = make(45)
     best = place_sensors(plant, sensors, 5, PoiVariance("die"))

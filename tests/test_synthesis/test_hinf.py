@@ -142,6 +142,7 @@ def test_python_control_systems_serve_and_give_the_same():
         )
 
 
+@pytest.mark.slow
 def test_nanometres_and_milliseconds_make_no_difference():
     """z and y in nm, u in kN, time in ms: gamma and the feedback are the same physics."""
     _, _, problem, found = stage()

@@ -247,6 +247,7 @@ def test_posterior_covariance_is_that_of_the_linear_problem(chain):
     assert (high - low) / 2 == pytest.approx(1.959964 * fit.std[0], rel=1e-6)
 
 
+@pytest.mark.slow
 def test_laplace_and_ensemble_draws_agree(chain):
     parts = changed(chain, mass=[(1, 0.3), (2, 0.2)])
     residuals = [Eigenvalues(measured(parts, 0.005))]
