@@ -11,7 +11,11 @@ import oracles_updating as oracle
 from bridges import FILE, Bridge, ends, noisy_fits
 from flexplant.errors import FlexplantWarning
 from flexplant.identification import MeasuredModes
-from flexplant.updating import AddedMass, Eigenvalues, update
+from flexplant.modes import solve_modes
+from flexplant.reduction import DesiredDofs, reduce, select_dofs
+from flexplant.structure import ModalDamping, PointMass, kirchhoff_plate
+from flexplant.updating import AddedMass, Eigenvalues, ModeShapes, localise, update
+from flexplant.updating.judgement import subsets
 from flexplant.updating.search import Objective
 from noisy_plate import Campaign, judged
 from other_plate import TRUTH as OTHER_TRUTH
@@ -102,6 +106,56 @@ def test_four_hundred_updates_from_noisy_responses():
     assert taken < 20
     assert 0.92 <= covered <= 0.98
     assert error < 0.01
+
+
+class Places:
+    """0.4 kg hidden at one of 99 places of a plate; ten poles and their shapes at 25 sensors."""
+
+    def __init__(self):
+        size = {"size": (0.6, 0.5), "thickness": 0.02, "elements": (10, 8)}
+        material = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
+        self.full = kirchhoff_plate(**size, **material).with_damping(ModalDamping(ZETA))
+        self.labels = [label for label in self.full.dofs.labels if label.endswith("z")]
+        self.hidden = self.full.dofs.nearest((0.31, 0.17, 0.0), "z")
+        modes = solve_modes(self.full.with_parts([PointMass(self.hidden, 0.4)]), count=13)
+        omega, rng, sensors = modes.omega[3:], np.random.default_rng(0), self.labels[::4]
+        std = 1e-4 * omega
+        noise = (rng.normal(size=10) + 1j * rng.normal(size=10)) / np.sqrt(2)
+        poles = omega * (-ZETA + 1j * np.sqrt(1 - ZETA**2)) + std * noise
+        phi = np.real(modes.phi[[self.full.dofs.index(label) for label in sensors], 3:])
+        phi = phi / np.abs(phi).max(axis=0)
+        measured = MeasuredModes(poles, modes=range(4, 14), covariance=std**2)
+        phi = phi + 0.01 * rng.normal(size=phi.shape)
+        self.data = [Eigenvalues(measured), ModeShapes(measured, phi, sensors, std=0.01)]
+
+    @property
+    def reduced(self):
+        modes = solve_modes(self.full, count=52, damping=ModalDamping(ZETA))
+        return reduce(modes, DesiredDofs(select_dofs(modes, 52)))
+
+
+@pytest.mark.parametrize("kind", ["reduced", "full"])
+def test_ninety_nine_places_with_shapes(kind, monkeypatch):
+    """In few coordinates, and in all of them: the same place, value and criterion."""
+    places = Places()
+    model = getattr(places, kind)
+    pool = [AddedMass(label, name=label) for label in places.labels]
+    taken, found = [], []
+    for few in (True, False):
+        if not few:
+            monkeypatch.setattr(subsets, "coordinates", lambda *arguments: None)
+        begun = time.process_time()
+        found.append(localise(model, places.data, pool, most=2))
+        taken.append(time.process_time() - begun)
+    known = np.isfinite(found[1].bic)
+    apart = float(np.abs(found[0].bic[known] - found[1].bic[known]).max())
+    print(
+        f"\nlocalise, 99 candidates, {model.M.shape[0]} DOFs: {taken[0]:.2f} s in few "
+        f"coordinates, {taken[1]:.2f} s in all; BIC of single places {apart:.1g} apart"
+    )
+    assert found[0].chosen == found[1].chosen == (places.hidden,)
+    assert apart < 0.1
+    assert found[0].chosen_bic == pytest.approx(found[1].chosen_bic, abs=1e-5)
 
 
 @pytest.fixture(scope="module")

@@ -24,10 +24,10 @@ from .parameters.polynomial import PolynomialParameter as PolynomialParameter
 from .residuals.eigenvalues import Eigenvalues as Eigenvalues
 from .residuals.frf_residual import FrfResidual as FrfResidual
 from .residuals.mode_shapes import ModeShapes as ModeShapes
-from .residuals.mode_shapes import ShapeCorrelation as ShapeCorrelation
 from .residuals.point_residuals import Antiresonances as Antiresonances
 from .residuals.point_residuals import StaticCompliance as StaticCompliance
 from .residuals.residual import Residual as Residual
+from .residuals.shape_correlation import ShapeCorrelation as ShapeCorrelation
 from .search import GaussNewton as GaussNewton
 from .search import Lasso as Lasso
 from .search import Tikhonov as Tikhonov

@@ -102,12 +102,14 @@ class Family:
         if self.massive.size < k:
             self.V, self.rigid = np.eye(k), rigid
             self.M, self.D, self.K = M, D, K
-            self._terms = self.physical
+            self.terms = self.physical
         else:
             self.massive, self.rigid = np.arange(k), np.eye(k)[:, : self.n_rigid]
             omega, self.V = _modal_basis(M, K, rigid)
             self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
-            self._terms = [self.V.T @ stack @ self.V for stack in self.physical]
+            self.terms = [
+                self.V.T @ stack @ self.V if np.any(stack) else stack for stack in self.physical
+            ]
         self.condensed = self.massive.size < k
         self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
@@ -122,8 +124,19 @@ class Family:
         terms = [j for b in chosen for j, owner in enumerate(self.owner) if owner == b]
         part.owner = [chosen.index(self.owner[j]) for j in terms]
         part.physical = [stack[terms] for stack in self.physical]
-        part._terms = [stack[terms] for stack in self._terms]
+        part.terms = [stack[terms] for stack in self.terms]
         part._derive(np.zeros(len(chosen)))
+        return part
+
+    def confined(self, B: FloatArray) -> Family:
+        """Return the family in the span of B (k, k'), M-orthonormal and diagonal in K."""
+        part = copy(self)
+        part.V, part.rigid = self.V @ B, B.T @ self.rigid
+        part.massive = np.arange(B.shape[1])
+        part.M, part.D, part.K = (B.T @ whole @ B for whole in (self.M, self.D, self.K))
+        part.terms = [np.matmul(B.T, stack @ B) for stack in self.terms]
+        part._unchanged, part._weight = [], None
+        part._derive(np.zeros(len(part.parameters)))
         return part
 
     def tangent(self, p: FloatArray) -> Family:
@@ -137,11 +150,11 @@ class Family:
     def _derive(self, p: FloatArray) -> None:
         """Set the derivatives dM, dD and dK (q, k, k) to those at `p`."""
         if len(self.owner) == len(self.parameters):
-            self.dM, self.dD, self.dK = self._terms
+            self.dM, self.dD, self.dK = self.terms
         else:
             slopes = np.zeros((len(self.parameters), len(self.owner)))
             slopes[self.owner, range(len(self.owner))] = self._curves(p)[1]
-            self.dM, self.dD, self.dK = (np.tensordot(slopes, part, axes=1) for part in self._terms)
+            self.dM, self.dD, self.dK = (np.tensordot(slopes, part, axes=1) for part in self.terms)
         self._stacks = [_stacked(stack) for stack in (self.dM, self.dD, self.dK)]
 
     def _curves(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -164,7 +177,7 @@ class Family:
         """Return the rigid-body modes (r, r') that no spring to the ground holds at `p`."""
         r = self.n_rigid
         sizes = self._curves(p)[0]
-        acting = self._terms[2][sizes != 0]
+        acting = self.terms[2][sizes != 0]
         active = [part @ self.rigid / np.abs(part).max() for part in acting if part.any()]
         if not r or not active:
             return np.eye(r)
@@ -202,10 +215,11 @@ class Family:
     def matrices(self, p: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return M, D and K at `p` in the coordinates of the family."""
         sizes = self._curves(p)[0]
+        acting = np.flatnonzero(sizes)
         M, D, K = (
-            start + np.tensordot(sizes, change, axes=1) if used else start
+            start + np.tensordot(sizes[acting], change[acting], axes=1) if used else start
             for start, used, change in zip(
-                (self.M, self.D, self.K), self._used, self._terms, strict=True
+                (self.M, self.D, self.K), self._used, self.terms, strict=True
             )
         )
         return M, D, K
@@ -213,7 +227,7 @@ class Family:
     @cached_property
     def _used(self) -> list[bool]:
         """Which of M, D and K the parameters change."""
-        return [bool(np.any(part)) for part in self._terms]
+        return [bool(np.any(part)) for part in self.terms]
 
     def moved(self, X: ComplexArray, factors: Sequence[ComplexArray]) -> ComplexArray:
         """Return ``f0 dM X + f1 dD X + f2 dK X`` (q, k, m), each column with its own factors."""

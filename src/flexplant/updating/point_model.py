@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
-import scipy.linalg as la
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray, IntArray
 from .family import Eigen, Family
 from .pairing import pair
+
+#: entries of bordered systems that are solved together
+TOGETHER = 1_000_000
 
 
 class Point:
@@ -81,10 +83,16 @@ class Point:
         modes in the group, as long as no other mode comes near. One mode alone gives d lambda and
         the derivative of its vector at fixed ``x^T (2 lambda M + D) dx = 0``.
         """
-        key = tuple(numbers)
-        if key not in self._known:
-            self._known[key] = _bordered(self, self.columns(key))
-        return self._known[key]
+        return self.subspaces([numbers])[0]
+
+    def subspaces(self, sets: Sequence[Sequence[int]]) -> list[tuple[ComplexArray, ComplexArray]]:
+        """Return `subspace` of sets of modes of one size, solved together."""
+        keys = [tuple(numbers) for numbers in sets]
+        new = [key for key in dict.fromkeys(keys) if key not in self._known]
+        if new:
+            groups = np.array([self.columns(key) for key in new])
+            self._known |= dict(zip(new, _bordered(self, groups), strict=True))
+        return [self._known[key] for key in keys]
 
     def continued(self, p: FloatArray) -> Point:
         """Return the model at other parameters, its modes paired by shape with those here."""
@@ -103,31 +111,33 @@ def first_point(family: Family, p: FloatArray) -> Point:
     return Point(family, p, eigen, labels)
 
 
-def _bordered(point: Point, columns: list[int]) -> tuple[ComplexArray, ComplexArray]:
+def _bordered(point: Point, groups: IntArray) -> list[tuple[ComplexArray, ComplexArray]]:
+    """Return dX (q, k, s) and dL (q, s, s) of groups of modes, columns (g, s)."""
     M, D, K = point.matrices
-    family, X, poles = point.family, point.eigen.X[:, columns], point.eigen.poles[columns]
-    k, s = X.shape
-    q = point.p.size
-    dX, dL = np.zeros((q, k, s), complex), np.zeros((q, s, s), complex)
+    count, s = groups.shape
+    X, poles = point.eigen.X[:, groups.ravel()], point.eigen.poles[groups.ravel()]
+    k, q = X.shape[0], point.p.size
+    changes = point.family.moved(X, (poles**2, poles, np.ones_like(poles))).transpose(2, 1, 0)
     MX, DX = M @ X, D @ X
-    real = not np.any(DX) and not np.any(X.imag) and not np.any(poles.real)
-    changes = family.moved(X, (poles**2, poles, np.ones_like(poles)))
-    for j, lam in enumerate(poles):
-        moved = changes[:, :, j]
-        border = MX * (poles + lam) + DX
-        size = np.sqrt(np.linalg.norm(K, 1) / np.abs(border).max())
-        # undamped: all is real but the border, imaginary, and its unknown
-        whole = real and not np.any(moved.imag)
-        turn = -1j if whole else 1.0
-        kind = np.float64 if whole else np.complex128
-        system = np.zeros((k + s, k + s), kind)
-        system[:k, :k] = (lam**2).real * M + K if whole else lam**2 * M + lam * D + K
+    # undamped: all is real but the border, imaginary, and its unknown
+    real = not (np.any(DX) or np.any(X.imag) or np.any(poles.real) or np.any(changes.imag))
+    turn = -1j if real else 1.0
+    kind = np.float64 if real else np.complex128
+    dX, dL = np.zeros((count, s, k, q), complex), np.zeros((count, s, s, q), complex)
+    together = max(1, TOGETHER // (k + s) ** 2)
+    for first in range(0, count * s, together):
+        own = np.arange(first, min(first + together, count * s))
+        lam, members = poles[own], (own // s * s)[:, None] + np.arange(s)
+        border = MX.T[members] * (poles[members] + lam[:, None])[:, :, None] + DX.T[members]
+        size = np.sqrt(np.linalg.norm(K, 1) / np.abs(border).max(axis=(1, 2)))[:, None, None]
         edge = border * size * turn
-        system[:k, k:] = edge.real if whole else edge
-        system[k:, :k] = system[:k, k:].T
-        right = np.zeros((k + s, q), kind)
-        right[:k] = -moved.T.real if whole else -moved.T
-        solved = la.lu_solve(la.lu_factor(system, check_finite=False), right, check_finite=False)
-        dX[:, :, j] = solved[:k].T
-        dL[:, :, j] = solved[k:].T * size * turn
-    return dX, dL
+        whole = lam[:, None, None] ** 2 * M + lam[:, None, None] * D + K
+        system = np.zeros((own.size, k + s, k + s), kind)
+        system[:, :k, :k] = whole.real if real else whole
+        system[:, k:, :k] = edge.real if real else edge
+        system[:, :k, k:] = system[:, k:, :k].transpose(0, 2, 1)
+        right = np.zeros((own.size, k + s, q), kind)
+        right[:, :k] = -changes[own].real if real else -changes[own]
+        solved = np.linalg.solve(system, right)
+        dX[own // s, own % s], dL[own // s, own % s] = solved[:, :k], solved[:, k:] * size * turn
+    return list(zip(dX.transpose(0, 3, 2, 1), dL.transpose(0, 3, 2, 1), strict=True))

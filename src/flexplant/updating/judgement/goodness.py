@@ -38,14 +38,13 @@ def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[fl
     dof = r.size - int(np.sum(free))
     if not objective.noise_known:
         return None, max(dof, 0)
-    J = objective.slopes(point)[:, free]
-    weighted = any(bound.noise is not None for bound, _ in objective.rows(point))
-    for bound, rows in objective.rows(point):
-        if bound.noise is not None:
-            r[rows] = _whitened(bound.noise, r[rows])
-            J[rows] = _whitened(bound.noise, J[rows])
+    weighted = [one for one in objective.rows(point) if one[0].noise is not None]
+    J = objective.slopes(point)[:, free] if weighted else np.zeros((r.size, 0))
+    for bound, rows in weighted:
+        r[rows] = _whitened(bound.noise, r[rows])
+        J[rows] = _whitened(bound.noise, J[rows])
     total = float(r @ r)
-    if weighted and J.shape[1]:
+    if J.shape[1]:
         length = np.linalg.norm(J, axis=0)
         Q = la.qr(J / np.where(length > 0, length, 1.0), mode="economic")[0]
         total -= float(np.sum((Q.T @ r) ** 2))

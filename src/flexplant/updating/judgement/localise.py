@@ -41,9 +41,14 @@ def localise(
     """Find which of many candidate changes explains a measurement.
 
     All candidates are screened together, each alone, by linearisation (one rank-one change each,
-    in one product); the best `screen` of them are fitted exactly. Then subsets of up to `most`
+    in one product); the best `screen` of them are fitted. Then subsets of up to `most`
     candidates grow: all candidates are screened again on what the best subsets leave, all pairs
-    to first order, and members are exchanged while that helps. The least extended Bayesian
+    to first order, and members are exchanged while that helps; a candidate that explains, to first
+    order, less than a quarter of what would lower the criterion does not join. Where modes are
+    compared and candidates are of low rank (masses, springs, dampers), each fit is made in few
+    coordinates, the modes of the band and how the others follow the candidate's force, with its
+    error corrected to second order; the chosen subset is fitted again in all. The least extended
+    Bayesian
     information criterion ``chi^2 + k ln n + 2 ln C(c, k)`` (``n ln(e/n)`` for ``chi^2`` where the
     noise is not known) chooses; its last term counts in how many ways k of c places can be chosen,
     so that c places without a change name none. To find what stands out, give more data than
@@ -150,8 +155,8 @@ def localise(
         warnings.warn(
             f"{' and '.join(found.chosen) or 'no change'}, the best that {len(listed)} candidates "
             f"give, {'leave' if len(best) > 1 else 'leaves'} more than noise: chi-square "
-            f"{chi2:.4g} for {dof} degrees of freedom. It fits worst {fit.worst}. Something else "
-            "differs between model and machine, or the noise is understated: give "
+            f"{chi2:.4g} for {dof} degrees of freedom. It fits worst {fits.worst(best)}. "
+            "Something else differs between model and machine, or the noise is understated: give "
             f"{'most= more, ' if full else ''}candidates at other places or of another kind, "
             "or what is wrong everywhere as nuisance=.",
             FlexplantWarning,

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from math import comb, log
+from math import comb, expm1, log
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import ModelError, SolverError
 from ...values import FloatArray
+from ..confined import coordinates, lifted, load_vectors
+from ..point_model import Point
 from ..search import Objective, TrustRegion
 from ..search.lasso import bic
+from ..search.update_method import SearchEnd
 from .goodness import chance, chi_square, is_bad, worst
 
 #: best subsets of each size that grow
@@ -26,6 +29,10 @@ COMPARED, CHOSEN = 1e-4, 1e-9
 WAY = (0.0, 0.25, 0.5, 0.75)
 #: least MAC of every mode with itself at which it is the same mode without a step between
 SAME = 0.8
+#: part of the residuals, or of those without a change, by which few coordinates may be off
+FAITHFUL, NEGLIGIBLE = 1e-2, 1e-6
+#: how much more than to first order a candidate may explain of what noise could have left
+REACH = 4.0
 
 Subset = tuple[int, ...]
 
@@ -38,12 +45,14 @@ class SubsetFit(NamedTuple):
     error: float
     #: the same in units of the noise and its correlation, None where that is not known
     chi2: float | None
-    #: the residuals that fit worst, in words
-    worst: str
 
 
 class Subsets:
-    """Exact fits of subsets of the candidates, the nuisance beside them, each done once.
+    """Fits of subsets of the candidates, the nuisance beside them, each done once.
+
+    Where modes alone are compared and the changes are of low rank, each is fitted in few
+    coordinates (see `flexplant.updating.confined`); what it leaves is that of all coordinates to
+    second order, and it is fitted in all of them where these differ, or by `polish`.
 
     Parameters
     ----------
@@ -62,16 +71,23 @@ class Subsets:
         self.done: dict[Subset, SubsetFit | None] = {}
         #: what each candidate would be alone, to first order
         self.linear: FloatArray | None = None
-        #: the points each fit went through
+        #: the points each fit went through, and the model where it ended
         self.ways: dict[Subset, list[FloatArray]] = {(): [self.start[self.beside]]}
+        self.ends: dict[Subset, Point] = {}
+        point = whole.begin(np.where(np.arange(self.start.size) < count, 0.0, self.start))
+        self.rows = whole.values(point).size
+        modal = not any(residual.loaded for residual in residuals)
+        self.confines = modal and bool(whole.numbers) and not whole.family.condensed
+        highest = np.abs(whole.poles(point)).max(initial=0.0) if self.confines else 0.0
+        self.top = max([float(highest), *(residual.top for residual in residuals)])
+        self.loads: dict[int, FloatArray | None] = {}
+        self.error_without = float(np.sum(whole.values(point) ** 2))
         if self.beside:
             self.done[()] = self._fitted(())
             self.start = self.start.copy()
             self.start[self.beside] = self.ways[()][-1]
-        point = whole.begin(self.start)
-        self.rows = whole.values(point).size
-        if not self.beside:
-            self.done[()] = _left(whole, self.start[:0], whole.default_start)
+        else:
+            self.done[()], self.ends[()] = _left(whole, self.start[:0], point), point
 
     def fit(self, subset: Subset) -> SubsetFit | None:
         """Return the fit of a subset, None when it cannot be fitted."""
@@ -91,7 +107,14 @@ class Subsets:
         end = self.ways[subset][-1]
         found = TrustRegion().search(objective, end, most=50, tolerance=CHOSEN)
         self.ways[subset] = [*self.ways[subset], *found.trail.p[1:]]
-        self.done[subset] = _left(objective, found.p, found.p)
+        point = objective.at(found.p)
+        self.done[subset], self.ends[subset] = _left(objective, found.p, point), point
+
+    def worst(self, subset: Subset) -> str:
+        """Return the residuals that the fit of a subset explains least, in words."""
+        picked = [*subset, *self.beside]
+        objective = self._objective(picked)
+        return worst(objective, self._end_of(objective, range(len(picked)), subset))
 
     def score(self, subset: Subset) -> float:
         """Return the extended BIC, ``chi^2 + k ln n + 2 ln C(c, k)``; infinite without a fit."""
@@ -128,13 +151,18 @@ class Subsets:
             better = self.score(ranked[0]) < self.score(best)
             best = ranked[0] if better else best
             # more are worth a try while something is gained, or missing
-            if not better and self.whole.noise_known and not is_bad(chance(*self.chi2(best))):
+            enough = self._is_enough(best)
+            if not better and enough:
                 break
             grown: set[Subset] = {
                 tuple(sorted((*subset, i))) for subset in ranked for i in self._joining(subset)
             }
-            layer = sorted(grown.union(self._pairs() if size == 1 else []))
+            layer = sorted(grown.union(self._pairs() if size == 1 and not enough else []))
         return best
+
+    def _is_enough(self, subset: Subset) -> bool:
+        """Return whether noise could have left what a subset leaves, where it is known."""
+        return self.whole.noise_known and not is_bad(chance(*self.chi2(subset)))
 
     def explained(self, subset: Subset) -> FloatArray:
         """Return what each candidate explains to first order of what a subset leaves.
@@ -146,7 +174,7 @@ class Subsets:
             return np.zeros(self.count)
         fixed = [*subset, *self.beside]
         try:
-            point = self._followed(self.whole, fixed, subset)
+            point = self._end_of(self.whole, fixed, subset)
             r = self.whole.values(point)
             if not point.turned:
                 J = self.whole.slopes(point)
@@ -163,25 +191,32 @@ class Subsets:
             return 0.0
         fixed = [*subset, *self.beside]
         alone = self._objective([candidate, *fixed])
-        J = alone.slopes(self._followed(alone, range(1, len(fixed) + 1), subset))
+        J = alone.slopes(self._end_of(alone, range(1, len(fixed) + 1), subset))
         return float(_share(J[:, :1], J[:, 1:], r)[0])
 
-    def _followed(self, objective: Objective, rows: Sequence[int], subset: Subset) -> Any:
-        """Return the end of the fit of a subset, its modes followed as they were by the fit.
+    def _end_of(self, objective: Objective, rows: Sequence[int], subset: Subset) -> Point:
+        """Return the end of the fit of a subset as a point of `objective`.
 
         The fitted parameters are the `rows` of those of the objective, the others are zero.
         """
-        for i, values in enumerate(self.ways[subset]):
-            p = np.zeros(len(objective.parameters))
-            p[list(rows)] = values
-            point = objective.begin(p) if i == 0 else objective.at(p, refer=True)
-        return point
+        end, p = self.ends[subset], np.zeros(len(objective.parameters))
+        p[list(rows)] = self.ways[subset][-1]
+        return objective.place(Point(objective.family, p, end.eigen, end.labels))
 
     def _joining(self, subset: Subset) -> list[int]:
+        """Return the candidates that explain most beside a subset, as far as that could pay."""
         explained = self.explained(subset)
         explained[list(subset)] = -1.0
         order = np.argsort(-explained, kind="stable")[:JOIN]
-        return [int(i) for i in order if explained[i] > 0]
+        return [int(i) for i in order if explained[i] > self._least(subset) / REACH]
+
+    def _least(self, subset: Subset) -> float:
+        """Return what a candidate beside a subset must explain to lower the BIC, 0 if unknown."""
+        c, k = self.count, len(subset)
+        price = log(self.rows) + 2 * log(comb(c, min(k + 1, c)) / comb(c, k))
+        if not self.whole.noise_known:
+            return self._error(subset) * -expm1(-price / self.rows)
+        return price if self.whole.noisy and self._is_enough(subset) else 0.0
 
     def _exchanged(self, subset: Subset) -> Subset:
         """Return the best subset that differs from this one in one member at a time."""
@@ -202,7 +237,7 @@ class Subsets:
 
     def _pairs(self) -> list[Subset]:
         """Return the pairs that explain most together, to first order."""
-        point = self._followed(self.whole, self.beside, ())
+        point = self._end_of(self.whole, self.beside, ())
         if point.turned:
             return []
         J, r = self.whole.slopes(point), self.whole.values(point)
@@ -219,14 +254,49 @@ class Subsets:
         order = np.argsort(-gain[i, j], kind="stable")[: 2 * JOIN]
         return [(int(i[n]), int(j[n])) for n in order]
 
-    def _objective(self, picked: list[int]) -> Objective:
+    def _objective(self, picked: list[int], B: FloatArray | None = None) -> Objective:
+        """Return the objective of some parameters, in the coordinates B where they are given."""
         family = self.whole.family.of(picked)
+        family = family if B is None else family.confined(B)
         parameters = [self.whole.parameters[i] for i in picked]
         return Objective(family.model, parameters, self.residuals, prior=False, family=family)
 
+    def _coordinates(self, picked: list[int]) -> FloatArray | None:
+        """Return few coordinates in which some parameters are fitted, None for all of them."""
+        if not self.confines:
+            return None
+        found = []
+        for i in picked:
+            if i not in self.loads:
+                self.loads[i] = load_vectors(self.whole.family, i)
+            loads = self.loads[i]
+            if loads is None:
+                return None
+            found.append(loads)
+        return coordinates(self.whole.family, np.hstack(found), self.top)
+
     def _fitted(self, subset: Subset) -> SubsetFit:
         picked = [*subset, *self.beside]
-        objective = self._objective(picked)
+        exact = self._objective(picked)
+        B = self._coordinates(picked)
+        if B is not None:
+            few = self._objective(picked, B)
+            found, way = self._searched(few, subset)
+            made = few.at(found.p)
+            point = lifted(exact.family, B, made, exact.numbers)
+            r = exact.values(point)
+            off = float(np.sum((r - few.values(made)) ** 2))
+            if off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without):
+                self.ways[subset], self.ends[subset] = way, point
+                return _left(exact, found.p, point)
+        found, way = self._searched(exact, subset)
+        point = exact.at(found.p)
+        self.ways[subset], self.ends[subset] = way, point
+        return _left(exact, found.p, point)
+
+    def _searched(self, objective: Objective, subset: Subset) -> tuple[SearchEnd, list[FloatArray]]:
+        """Return the end of the search for a subset's values, and the points on the way there."""
+        picked = [*subset, *self.beside]
         first, guess = self.start[picked], self._guess(subset)
         method = TrustRegion()
         if guess is not None:
@@ -237,12 +307,10 @@ class Subsets:
             except (ModelError, SolverError, np.linalg.LinAlgError):
                 found = None
             if found is not None and found.trail.error[-1] < self._error(()):
-                self.ways[subset] = [*objective.path, *found.trail.p]
-                return _left(objective, found.p, found.p)
-            objective = self._objective(picked)
+                return found, [*objective.path, *found.trail.p]
+            objective.path = []
         found = method.search(objective, first, most=50, tolerance=COMPARED)
-        self.ways[subset] = found.trail.p
-        return _left(objective, found.p, found.p)
+        return found, found.trail.p
 
     def _way(self, objective: Objective, first: FloatArray, guess: FloatArray) -> list[FloatArray]:
         """Return the points through which modes are followed from the start to a guess."""
@@ -285,13 +353,11 @@ class Subsets:
         return np.inf if found is None else found.error
 
 
-def _left(objective: Objective, values: FloatArray, p: FloatArray) -> SubsetFit:
-    """Return what the model at `p` leaves; `values` are those parameters that were fitted."""
-    point = objective.at(p)
+def _left(objective: Objective, values: FloatArray, point: Point) -> SubsetFit:
+    """Return what the model at a point leaves; `values` are those parameters that were fitted."""
     r = objective.values(point)
-    fitted = np.full(p.size, bool(values.size))
-    chi2, _ = chi_square(objective, point, fitted)
-    return SubsetFit(values, float(r @ r), chi2, worst(objective, point))
+    chi2, _ = chi_square(objective, point, np.full(point.p.size, bool(values.size)))
+    return SubsetFit(values, float(r @ r), chi2)
 
 
 def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:

@@ -130,53 +130,12 @@ class ModeShapes(Residual):
 
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to a family."""
-        return _BoundShapes(self, family)
+        return BoundShapes(self, family)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class ShapeCorrelation(ModeShapes):
-    """Residuals ``(1 - sqrt(MAC)) / sqrt(MAC)`` of measured mode shapes, one for each mode.
+class BoundShapes(Bound):
+    """Shapes at unit variance, each compared with the nearest multiple of the model's."""
 
-    Without a derivative near a perfect fit: `ModeShapes` says more with the same data. For
-    comparison with published studies.
-
-    Parameters
-    ----------
-    measured : MeasuredModes
-        Poles with their mode numbers.
-    shapes : (m, modes) real or complex array, optional
-        In the order of the poles; any scale. None: those of `measured`.
-    at : sequence of m places or mapping, optional
-        DOF labels, points or mappings; as in `ModeShapes`.
-    direction : str
-        Of the motion at points.
-    std : float or (m, modes) array, optional
-        Weighs the entries in the MAC by 1/std; the residuals themselves have no known noise.
-    covariance : (modes, m, m) array, optional
-        Instead of `std`.
-    assign : bool
-        Whether modes are assigned by MAC with the measured shapes.
-
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        As `ModeShapes`.
-
-    Examples
-    --------
-    >>> import flexplant as fx
-    >>> shape = {"shapes": [[1.0], [0.0], [-1.0]], "dofs": ["1:x", "2:x", "3:x"]}
-    >>> measured = fx.MeasuredModes(poles=[630.0j], modes=[2], **shape)
-    >>> fx.updating.ShapeCorrelation(measured)
-    <ShapeCorrelation: modes 2 at 3 places, noise not known>
-    """
-
-    def bound(self, family: Family) -> Bound:
-        """Return the residual tied to a family."""
-        return _BoundMac(self, family)
-
-
-class _BoundShapes(Bound):
     def __init__(self, residual: ModeShapes, family: Family) -> None:
         measured = residual.measured
         own = measured.modes or ()
@@ -184,6 +143,7 @@ class _BoundShapes(Bound):
         alone = [[i] for i in range(len(own)) if not any(i in group for group in near)]
         #: columns of the measurement that are compared together
         self.sets = [*alone, *near]
+        self.alone, self.near = [i for (i,) in alone], near
         self.own = own
         self.numbers = own
         self.noisy = residual.std is not None or residual.covariance is not None
@@ -191,6 +151,10 @@ class _BoundShapes(Bound):
         self.poles = measured.poles
         self.psi = np.asarray(residual.shapes)
         self.white = _whitening(self.psi, residual)
+        m = self.psi.shape[0]
+        #: of the modes that are compared by themselves, all at once
+        self.whites = np.array([self.white[i] for i in self.alone]).reshape(-1, m, m)
+        self.psis = np.matmul(self.whites, self.psi.T[self.alone][:, :, None])
         self.assign = residual.assign
         order = [i for group in self.sets for i in group]
         lengths = [float(np.linalg.norm(self.white[i] @ self.psi[:, i])) for i in order]
@@ -200,9 +164,11 @@ class _BoundShapes(Bound):
         self.name = f"shapes of modes {', '.join(map(str, own))}"
 
     def row_name(self, row: int) -> str:
+        """Return the mode of a row."""
         return f"the shape of mode {self.own[self._order[row // self._rows_each]]}"
 
     def assigned(self, point: Point) -> Point:
+        """Return the point with modes relabelled by the measured shapes."""
         if not self.assign:
             return point
         eigen = point.eigen
@@ -230,23 +196,35 @@ class _BoundShapes(Bound):
         Q = Phi / np.linalg.norm(Phi) if len(group) == 1 else np.linalg.qr(Phi)[0]
         return Phi, Q, white @ self.psi[:, i]
 
+    def _singles(self, point: Point) -> tuple[Any, Any, Any]:
+        """Return |phi| (a, 1, 1), phi/|phi| (a, m, 1) and the rest of psi, of modes alone."""
+        X = point.eigen.X[:, point.columns([self.own[i] for i in self.alone])]
+        Phi = np.matmul(self.whites, (self.rows @ X).T[:, :, None])
+        if not np.any(Phi.imag):
+            Phi = Phi.real
+        length = np.linalg.norm(Phi, axis=1, keepdims=True)
+        q = Phi / length
+        return length, q, self.psis - q * _along(q, self.psis)
+
     def values(self, point: Point) -> FloatArray:
-        found = []
-        for group in self.sets:
+        """Return what of the measured shapes the model's do not explain."""
+        found = [self._stacked(one[:, 0]) for one in self._singles(point)[2]]
+        for group in self.near:
             for i in group:
                 _, Q, psi = self._parts(point, group, i)
                 found.append(self._stacked(psi - Q @ (Q.conj().T @ psi)))
         return np.concatenate(found)
 
     def slopes(self, point: Point) -> FloatArray:
-        found = []
-        for group in self.sets:
+        """Return their derivatives."""
+        found = [self._slopes_alone(point)] if self.alone else []
+        for group in self.near:
             dX, _ = point.subspace([self.own[j] for j in group])
             dY = self.rows @ dX
             for i in group:
                 Phi, Q, psi = self._parts(point, group, i)
                 dPhi = self.white[i] @ (dY if np.iscomplexobj(Phi) else dY.real)
-                plus = _inverse(Phi, Q)
+                plus = np.linalg.pinv(Phi)
                 left = psi - Q @ (Q.conj().T @ psi)
                 inner = dPhi @ (plus @ psi)
                 inner = inner - (inner @ Q.conj()) @ Q.T
@@ -254,48 +232,26 @@ class _BoundShapes(Bound):
                 found.append(self._stacked(-(inner + outer).T))
         return np.concatenate(found)
 
+    def _slopes_alone(self, point: Point) -> FloatArray:
+        """Return the rows of modes by themselves, all at once."""
+        length, q, left = self._singles(point)
+        sets = point.subspaces([[self.own[i]] for i in self.alone])
+        # (a, m, q)
+        dPhi = np.array([self.rows @ dX[:, :, 0].T for dX, _ in sets])
+        dPhi = np.matmul(self.whites, dPhi if np.iscomplexobj(q) else dPhi.real)
+        inner = dPhi * (_along(q, self.psis) / length)
+        inner = inner - q * _along(q, inner)
+        outer = q / length * np.matmul(left.transpose(0, 2, 1), dPhi.conj())
+        return np.concatenate([self._stacked(one) for one in -(inner + outer)])
+
     def _stacked(self, part: Any) -> FloatArray:
         complex_data = np.iscomplexobj(self.psi)
         return split_parts(np.asarray(part, dtype=complex)) if complex_data else np.real(part)
 
 
-class _BoundMac(_BoundShapes):
-    """sqrt(MAC) = |Q^H psi| / |psi|; r = 1/sqrt(MAC) - 1."""
-
-    def __init__(self, residual: ModeShapes, family: Family) -> None:
-        super().__init__(residual, family)
-        self.noisy, self.size, self._rows_each = False, 1.0, 1
-
-    def values(self, point: Point) -> FloatArray:
-        found = []
-        for group in self.sets:
-            for i in group:
-                _, Q, psi = self._parts(point, group, i)
-                found.append(np.linalg.norm(psi) / np.linalg.norm(Q.conj().T @ psi) - 1)
-        return np.array(found)
-
-    def slopes(self, point: Point) -> FloatArray:
-        found = []
-        for group in self.sets:
-            dX, _ = point.subspace([self.own[j] for j in group])
-            dY = self.rows @ dX
-            for i in group:
-                Phi, Q, psi = self._parts(point, group, i)
-                dPhi = self.white[i] @ dY
-                plus = _inverse(Phi, Q)
-                left = psi - Q @ (Q.conj().T @ psi)
-                # d |P psi|^2 = 2 Re (left^H dPhi Phi^+ psi)
-                change = np.real((dPhi @ (plus @ psi)) @ left.conj())
-                inside = float(np.linalg.norm(Q.conj().T @ psi))
-                found.append(-float(np.linalg.norm(psi)) * change / inside**3)
-        return np.array(found)
-
-
-def _inverse(Phi: Any, Q: Any) -> Any:
-    """Return the pseudo-inverse of shapes, of one with its unit vector Q at once."""
-    if Phi.shape[1] > 1:
-        return np.linalg.pinv(Phi)
-    return Q.conj().T / np.linalg.norm(Phi)
+def _along(q: Any, X: Any) -> Any:
+    """Return q^H X of stacks of vectors and matrices."""
+    return np.matmul(q.conj().transpose(0, 2, 1), X)
 
 
 def chosen_modes(measured: MeasuredModes, modes: Sequence[int]) -> tuple[MeasuredModes, list[int]]:
