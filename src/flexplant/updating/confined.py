@@ -17,6 +17,8 @@ BEYOND = 1.5
 SHIFTS, WORTHWHILE = 3, 0.7
 #: largest rank of one matrix of a parameter, and relative size below which one is rounding
 FEW, ROUNDING = 4, 1e-11
+#: part of the softest mode's stiffness by which rounding may leave K negative
+NEARLY = 1e-3
 
 
 def load_vectors(family: Family, parameter: int) -> FloatArray | None:
@@ -91,6 +93,20 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     B[np.flatnonzero(low), np.arange(kept)] = 1.0
     B[high, kept:] = Z @ turn
     return B
+
+
+def is_physical(family: Family, p: FloatArray) -> bool:
+    """Return whether M is positive definite and K indefinite nowhere, in all coordinates.
+
+    A negative mass that few coordinates allow may be more than there is at its place.
+    """
+    M, _, K = family.matrices(p)
+    elastic = np.sort(np.diag(family.K))[family.n_rigid]
+    try:
+        la.cholesky(M)
+    except la.LinAlgError:
+        return False
+    return K is family.K or float(la.eigvalsh(K, subset_by_index=(0, 0))[0]) > -NEARLY * elastic
 
 
 def lifted(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:

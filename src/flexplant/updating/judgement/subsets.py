@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import ModelError, SolverError
 from ...values import FloatArray
-from ..confined import coordinates, lifted, load_vectors
+from ..confined import coordinates, is_physical, lifted, load_vectors
 from ..point_model import Point
 from ..search import Objective, TrustRegion
 from ..search.lasso import bic
@@ -286,7 +286,8 @@ class Subsets:
             point = lifted(exact.family, B, made, exact.numbers)
             r = exact.values(point)
             off = float(np.sum((r - few.values(made)) ** 2))
-            if off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without):
+            close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
+            if close and is_physical(exact.family, found.p):
                 self.ways[subset], self.ends[subset] = way, point
                 return _left(exact, found.p, point)
         found, way = self._searched(exact, subset)
