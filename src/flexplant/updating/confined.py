@@ -106,7 +106,8 @@ def is_physical(family: Family, p: FloatArray) -> bool:
         la.cholesky(M)
     except la.LinAlgError:
         return False
-    return K is family.K or float(la.eigvalsh(K, subset_by_index=(0, 0))[0]) > -NEARLY * elastic
+    softest = 0.0 if K is family.K else float(la.eigvalsh(K, subset_by_index=(0, 0))[0])
+    return softest > -NEARLY * float(elastic)
 
 
 def lifted(family: Family, B: FloatArray, point: Point, numbers: Sequence[int]) -> Point:

@@ -81,6 +81,8 @@ class Subsets:
         highest = np.abs(whole.poles(point)).max(initial=0.0) if self.confines else 0.0
         self.top = max([float(highest), *(residual.top for residual in residuals)])
         self.loads: dict[int, FloatArray | None] = {}
+        #: the least criterion of all fits
+        self.least = np.inf
         self.error_without = float(np.sum(whole.values(point) ** 2))
         if self.beside:
             self.done[()] = self._fitted(())
@@ -93,7 +95,9 @@ class Subsets:
         """Return the fit of a subset, None when it cannot be fitted."""
         if subset not in self.done:
             try:
-                self.done[subset] = self._fitted(subset)
+                found = self._fitted(subset)
+                self.done[subset] = found
+                self.least = min(self.least, self._criterion(found, len(subset)))
             except (ModelError, SolverError):
                 self.done[subset] = None
         return self.done[subset]
@@ -118,10 +122,11 @@ class Subsets:
 
     def score(self, subset: Subset) -> float:
         """Return the extended BIC, ``chi^2 + k ln n + 2 ln C(c, k)``; infinite without a fit."""
-        found, k, c = self.fit(subset), len(subset), self.count
-        if found is None:
-            return np.inf
-        known = found.chi2 is not None
+        found = self.fit(subset)
+        return np.inf if found is None else self._criterion(found, len(subset))
+
+    def _criterion(self, found: SubsetFit, k: int) -> float:
+        c, known = self.count, found.chi2 is not None
         misfit = found.error if found.chi2 is None else found.chi2
         return bic(misfit, self.rows, k + len(self.beside), known) + 2 * log(comb(c, k))
 
@@ -287,9 +292,12 @@ class Subsets:
             r = exact.values(point)
             off = float(np.sum((r - few.values(made)) ** 2))
             close = off <= max(FAITHFUL**2 * float(r @ r), NEGLIGIBLE**2 * self.error_without)
-            if close and is_physical(exact.family, found.p):
+            left = _left(exact, found.p, point)
+            # what is not physical leaves less than what is: of interest if it is the best
+            worse = self._criterion(left, len(subset)) > self.least
+            if close and (worse or is_physical(exact.family, found.p)):
                 self.ways[subset], self.ends[subset] = way, point
-                return _left(exact, found.p, point)
+                return left
         found, way = self._searched(exact, subset)
         point = exact.at(found.p)
         self.ways[subset], self.ends[subset] = way, point
