@@ -79,7 +79,7 @@ class ReducedModel(Spanned, Value):
     joint_motions : (k, m) array, optional
         Of a joined machine: motions of its components as rigid bodies that its rigid joints allow.
     joining : Value, optional
-        Of a joined machine: how it was joined, with the checks that were made.
+        Of a joined machine: how it was joined, with the checks that were made; not after an update.
 
     Raises
     ------

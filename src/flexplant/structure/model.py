@@ -53,7 +53,7 @@ class FEModel(Placed, Value):
         Of a joined machine: M-orthonormal motions of its components as rigid bodies that its rigid
         joints allow (a slide, a hinge), in place of those that follow from the coordinates.
     joining : Value, optional
-        Of a joined machine: how it was joined, with the checks that were made.
+        Of a joined machine: how it was joined, with its checks; None once M or K is changed.
 
     Raises
     ------
@@ -396,4 +396,5 @@ class FEModel(Placed, Value):
         return self._with(D=frozen(D))
 
     def _with(self, **changes: Any) -> Self:
+        changes = changes if {"M", "K"}.isdisjoint(changes) else {"joining": None} | changes
         return type(self)._proven(**(self._fields() | changes))

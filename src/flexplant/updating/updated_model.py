@@ -106,7 +106,9 @@ def _replaced(
     model: Any, changes: dict[str, Any], parameters: Sequence[Parameter], p: FloatArray
 ) -> Any:
     try:
-        return model.replace(**changes)
+        # how a machine was joined was checked with the matrices before
+        gone = {"joining": None} if getattr(model, "joining", None) is not None else {}
+        return model.replace(**changes, **gone)
     except ModelError as error:
         text = ", ".join(q.text(v) for q, v in zip(parameters, p.tolist(), strict=True))
         raise ModelError(
