@@ -212,6 +212,9 @@
 .. [TimoshenkoGoodier1970] Timoshenko, Goodier, Theory of Elasticity, 3rd ed., McGraw-Hill, 1970.
 .. [TombsPostlethwaite1987] Tombs, Postlethwaite, Truncated balanced realization of a stable
    non-minimal state-space system, Int. J. Control 46, 1987.
+.. [vanderSeijs2013] van der Seijs, van den Bosch, Rixen, de Klerk, An improved methodology for the
+   virtual point transformation of measured frequency response functions in dynamic substructuring,
+   COMPDYN, 2013.
 .. [VandeWijdevenBosgra2010] Van de Wijdeven, Bosgra, Using basis functions in iterative learning
    control: analysis and design theory, Int. J. Control 83, 2010.
 .. [VanLoan1978] Van Loan, Computing integrals involving the matrix exponential, IEEE Trans. Autom.

@@ -85,17 +85,107 @@ def test_a_component_is_taken_out_again():
     np.testing.assert_allclose(rest.data, stage.data, rtol=1e-5)
 
 
+def placed_parts():
+    """A stage above a frame, their DOFs where they stand."""
+    found = models()
+    stage = found["stage"].dofs
+    raised = stage.replace(xyz=stage.xyz + np.array([0.05, 0.08, 0.1]), interpolation=None)
+    return found, {"stage": raised, "frame": found["frame"].dofs}
+
+
+def response_of(model, outputs, inputs):
+    """Receptances between named DOFs, by dense algebra; inputs are named as test software does."""
+    parts, none = [A.toarray() for A in (model.M, model.D, model.K)], np.zeros((0, model.n_dof))
+    out, into = (np.array([model.row(x) for x in names]) for names in (outputs, inputs))
+    data = np.array([oracles.receptance(*parts, none, FREQ, out, load) for load in into])
+    names = [f"u {name}" for name in inputs]
+    return fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), names, outputs, "displacement")
+
+
+def mean_rows(nodes, dofs, point):
+    """z, rx and ry at a point that fit the z of some nodes best."""
+    x, y, _ = (dofs.xyz[[dofs.index(f"{n}:z") for n in nodes]] - point).T
+    return np.linalg.pinv(np.column_stack([np.ones(x.size), y, -x]))
+
+
+@pytest.mark.filterwarnings("ignore:.* bends")
+@pytest.mark.parametrize("pushed", [(6, 7, 10, 11), (5, 7, 11, 9)])
+def test_patches_and_lever_arms_of_responses(pushed):
+    """Mean motions of sensors, forces at other places, and a node with an arm, by hand."""
+    parts, dofs = placed_parts()
+    sensed = {"stage": (1, 2, 4, 5), "frame": (6, 7, 10, 11)}
+    forced = {"stage": (1, 2, 4, 5), "frame": pushed}
+    more = {"stage": ["12:z", "12:rx", "12:ry"], "frame": ["20:z", "20:rx", "20:ry"]}
+    frfs = {
+        name: response_of(
+            model,
+            [*(f"{n}:z" for n in sensed[name]), *more[name]],
+            [*(f"{n}:z" for n in forced[name]), *more[name]],
+        )
+        for name, model in parts.items()
+    }
+    points = np.array([0.2, 0.2, 0.05]), np.array([0.4, 0.3, 0.05])
+    nodes = {name: sorted({*sensed[name], *forced[name]}) for name in parts}
+    joints = [
+        fx.Joint(*(fx.Patch(name, nodes[name]) for name in parts), point=points[0]),
+        fx.Joint("stage/12", "frame/20", axes=["z"], stiffness=3e5, rate=8.0, point=points[1]),
+    ]
+    with pytest.warns(FlexplantWarning, match=r"<Patch of frame, \d nodes> bends: \d\d %"):
+        found = fx.joined(frfs, joints, dofs=dofs)
+    if pushed == sensed["frame"]:  # models joined say the same
+        machine = fx.joined(parts, joints, placed={"stage": fx.Pose((0.05, 0.08, 0.1))})
+        direct = response_of(machine, found.outputs, ["stage/1:z", "frame/20:rx"])
+        some = found.select(inputs=["stage/u 1:z", "frame/u 20:rx"])
+        np.testing.assert_allclose(some.data, direct.data, rtol=1e-6)
+    B_out, B_in = (np.zeros((4, 14)) for _ in range(2))
+    for i, (name, sign) in enumerate((("stage", 1.0), ("frame", -1.0))):
+        for B, some in ((B_out, sensed), (B_in, forced)):
+            B[:3, 7 * i : 7 * i + 4] = sign * mean_rows(some[name], dofs[name], points[0])
+            at = more[name][0]
+            arm = points[1] - dofs[name].xyz[dofs[name].index(at)]
+            B[3, 7 * i + 4 : 7 * i + 7] = sign * np.array([1.0, arm[1], -arm[0]])
+    for k, f in enumerate(FREQ):
+        Y = la.block_diag(*(frf.data[:, :, k] for frf in frfs.values()))
+        Z = np.diag([0, 0, 0, 1 / (3e5 + 2j * np.pi * f * 8.0)])
+        wanted = Y - Y @ B_in.T @ la.solve(B_out @ Y @ B_in.T + Z, B_out @ Y)
+        np.testing.assert_allclose(
+            found.data[:, :, k], wanted, rtol=1e-6, atol=1e-12 * abs(Y).max()
+        )
+    # the stage comes back when the frame is taken out, its channels named as in the machine
+    rest = fx.uncoupled(found, {"frame": frfs["frame"]}, joints[:1], dofs=dofs)
+    alone = fx.uncoupled(
+        fx.joined(frfs, joints[:1], dofs=dofs), {"frame": frfs["frame"]}, joints[:1], dofs=dofs
+    )
+    assert rest.inputs == tuple(f"stage/{name}" for name in frfs["stage"].inputs)
+    np.testing.assert_allclose(alone.data, frfs["stage"].data, rtol=1e-5)
+
+
 def test_what_responses_cannot_say_is_refused():
     frfs = {name: measured(name) for name in CHANNELS}
     with pytest.raises(LabelError, match="named alike"):
         fx.joined(frfs, fx.Joint("stage/2:z", "frame/1:z"))
     with pytest.raises(LabelError, match="no component 'base'"):
         fx.joined(frfs, fx.Joint("base/2:z", "frame/1:z"))
-    with pytest.raises(ModelError, match="needs places or lever arms"):
+    with pytest.raises(ModelError, match="between points, whose motion no channel is"):
         fx.joined(frfs, fx.Joint(("stage", (0, 0, 0)), "frame/1:z"))
+    patch = fx.Joint(fx.Patch("stage", [1, 4, 9]), "frame/1:z", axes=["z"])
+    with pytest.raises(LabelError, match=r"has nodes \[2\] that are not measured"):
+        fx.joined(
+            frfs,
+            fx.Joint(fx.Patch("stage", [1, 2, 9]), "frame/1:z", axes=["z"]),
+            dofs={"stage": models()["stage"].dofs},
+        )
+    with pytest.raises(ModelError, match=r"needs the places of the channels of 'stage'.*dofs="):
+        fx.joined(frfs, patch)
+    with pytest.raises(LabelError, match="no coordinates for nodes"):
+        fx.joined(frfs, patch, dofs={"stage": fx.chain(masses=[1, 1], stiffnesses=[1]).dofs})
+    with pytest.raises(LabelError, match="dofs has places of 'base'"):
+        fx.joined(frfs, patch, dofs={"base": models()["frame"].dofs})
+    with pytest.raises(ModelError, match="models have their DOFs"):
+        fx.joined(models(), JOINTS, dofs={"stage": models()["stage"].dofs})
     with pytest.raises(ModelError, match="are one channel"):
         fx.joined(frfs, fx.Joint("stage/1:z", "stage/1:z"))
-    with pytest.raises(LabelError, match="has no axis 'x': it is along z"):
+    with pytest.raises(LabelError, match="has no axis 'x': it moves along z"):
         fx.joined(frfs, fx.Joint("stage/1:z", "frame/1:z", axes=["x"]))
     with pytest.raises(ModelError, match="no place and no name"):
         fx.joined(frfs, JOINTS, name="machine")

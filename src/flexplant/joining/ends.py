@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
 from ..errors import LabelError, unknown_label
-from ..labels import DIRECTIONS
+from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray
-from .component import Component
+from .joint import Joint
 from .patch import Patch, mean_motions
 
 #: lever arms below this part of the machine's size are none
@@ -20,12 +20,26 @@ _NO_ARM = 1e-9
 _SHORT_ARM, _NEIGHBOURS = 1e-4, 12
 
 
+class Jointed(Protocol):
+    """What has ends of joints: a component, or channels that were measured on it."""
+
+    @property
+    def name(self) -> str:
+        """What labels begin with."""
+        ...
+
+    @property
+    def dofs(self) -> DofSet:
+        """All that moves."""
+        ...
+
+
 class JointEnd:
     """One end of a joint.
 
     Parameters
     ----------
-    parts : sequence of Component
+    parts : sequence of Jointed
         All components.
     end : str, (str, (3,) array) or Patch
         As in `Joint`.
@@ -52,7 +66,7 @@ class JointEnd:
     """
 
     def __init__(
-        self, parts: Sequence[Component], end: Any, size: float, motions: Sequence[FloatArray]
+        self, parts: Sequence[Jointed], end: Any, size: float, motions: Sequence[FloatArray]
     ) -> None:
         self.text = repr(end) if isinstance(end, Patch) else str(end)
         name = end.component if isinstance(end, Patch) else end[0]
@@ -180,6 +194,27 @@ class JointEnd:
         """Return what a row (n,) gives for the six rigid-body motions of the machine (6,)."""
         some = np.flatnonzero(row)
         return np.asarray(row[some] @ self._motions[some])
+
+
+def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
+    """Return the axes that a joint joins: those given, that of a DOF, or those of both ends.
+
+    Raises
+    ------
+    LabelError
+        When the ends have different ones and none are given.
+    """
+    if joint.axes is not None:
+        return tuple(joint.axes)
+    for place in (first, second):
+        if place is not None and place.label:
+            return place.axes
+    if second is not None and first.axes != second.axes:
+        raise LabelError(
+            f"the ends of {joint!r} move along {', '.join(first.axes)} and along "
+            f"{', '.join(second.axes)}: it is not clear what is joined. Name axes=[...]."
+        )
+    return first.axes
 
 
 def _split(text: str, names: Sequence[str]) -> tuple[str, str]:

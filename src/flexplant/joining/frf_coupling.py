@@ -9,9 +9,18 @@ from typing import Any
 import numpy as np
 
 from ..errors import CertificateError, FlexplantWarning, LabelError, ModelError
+from ..labels import DofSet
 from ..lti import Frf
 from ..values import ComplexArray, FloatArray, instance
-from .frf_joints import FrfLink, channel_rows, frf_links, independent, softness
+from .channels import channels_of, known_places, parts_of
+from .frf_joints import (
+    FrfLink,
+    channel_rows,
+    frf_links,
+    independent,
+    softness,
+    warn_of_bending,
+)
 from .joint import Joint
 
 #: condition of the interface beyond which errors of a measurement hide the answer
@@ -20,20 +29,29 @@ _CONDITION = 1e8
 _SINGULAR = 1e14
 #: largest gap in a joint of the answer, relative
 _GAP = 1e-9
+#: before the names of components that are taken out
+_KNOWN = "known "
 
 
-def joined_frfs(frfs: Mapping[str, Frf], joints: Iterable[Joint] | Joint) -> Frf:
+def joined_frfs(
+    frfs: Mapping[str, Frf],
+    joints: Iterable[Joint] | Joint,
+    dofs: Mapping[str, DofSet] | None = None,
+) -> Frf:
     """Return the responses of a machine from those of its components; see `joined`.
 
-    ``Y - Y B^T (B Y B^T + Z)^-1 B Y``, Y being block-diagonal, B the stretches of the joints and Z
-    what they give way: dual coupling by Lagrange multipliers (LM-FBS).
+    ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y``, Y being block-diagonal, B the stretches of the joints by
+    outputs, B_f their forces by inputs and Z what they give way: dual coupling by Lagrange
+    multipliers (LM-FBS).
 
     References
     ----------
-    [deKlerk2008]_.
+    [deKlerk2008]_, [vanderSeijs2013]_.
     """
     _same_lines(frfs)
-    links = frf_links(_listed(joints), {name: _collocated(frf) for name, frf in frfs.items()})
+    parts, listed = parts_of(frfs, dofs), _listed(joints)
+    links = frf_links(listed, parts)
+    warn_of_bending(listed, parts, frfs)
     outputs = [f"{name}/{channel}" for name, frf in frfs.items() for channel in frf.outputs]
     inputs = [f"{name}/{channel}" for name, frf in frfs.items() for channel in frf.inputs]
     first = next(iter(frfs.values()))
@@ -52,7 +70,13 @@ def joined_frfs(frfs: Mapping[str, Frf], joints: Iterable[Joint] | Joint) -> Frf
     return Frf(first.freq, coupled, inputs, outputs, first.quantity, units=units)
 
 
-def uncoupled(machine: Frf, known: Mapping[str, Frf], joints: Iterable[Joint] | Joint) -> Frf:
+def uncoupled(
+    machine: Frf,
+    known: Mapping[str, Frf],
+    joints: Iterable[Joint] | Joint,
+    *,
+    dofs: Mapping[str, DofSet] | None = None,
+) -> Frf:
     """Return the responses of a machine without some of its components.
 
     The negative of a known component is coupled to the machine where its joints are: what is left
@@ -69,6 +93,8 @@ def uncoupled(machine: Frf, known: Mapping[str, Frf], joints: Iterable[Joint] | 
         The components that are taken out, on the same frequencies.
     joints : Joint or sequence of Joint
         How they are joined to the rest.
+    dofs : mapping {str: DofSet}, optional
+        Where the channels of components are, known or not: for patches and lever arms.
 
     Returns
     -------
@@ -106,17 +132,16 @@ def uncoupled(machine: Frf, known: Mapping[str, Frf], joints: Iterable[Joint] | 
     if isinstance(known, Frf) or not isinstance(known, Mapping) or not known:
         raise ModelError("known must be a mapping of responses by component: {'frame': frf}.")
     _same_lines({"the machine": machine, **known})
-    ends = _interface(_collocated(machine), known, _listed(joints))
-    outputs = [*machine.outputs, *(f"known {name}" for name, _, _ in ends)]
-    inputs = [*machine.inputs, *(f"known {name}" for name, _, _ in ends)]
-    n_out, n_in = len(machine.outputs), len(machine.inputs)
+    links = _taken_out(machine, known, _listed(joints), dofs)
+    outputs = [*machine.outputs, *(f"{_KNOWN}{n}/{c}" for n in known for c in known[n].outputs)]
+    inputs = [*machine.inputs, *(f"{_KNOWN}{n}/{c}" for n in known for c in known[n].inputs)]
     Y = np.zeros((len(outputs), len(inputs), machine.freq.size), dtype=np.complex128)
-    Y[:n_out, :n_in] = machine.data
-    for i, (_, owner, channel) in enumerate(ends):
-        for j, (_, other, source) in enumerate(ends):
-            if owner == other:
-                Y[n_out + i, n_in + j] = -known[owner][channel, source]
-    links = [FrfLink(name, f"known {name}", None, 0.0) for name, _, _ in ends]
+    row, column = len(machine.outputs), len(machine.inputs)
+    Y[:row, :column] = machine.data
+    for frf in known.values():
+        rows, columns = len(frf.outputs), len(frf.inputs)
+        Y[row : row + rows, column : column + columns] = -frf.data
+        row, column = row + rows, column + columns
     coupled = _coupled(Y, outputs, inputs, links, machine.freq, machine.quantity)
     kept_out = [i for i, name in enumerate(machine.outputs) if name.partition("/")[0] not in known]
     kept_in = [i for i, name in enumerate(machine.inputs) if name.partition("/")[0] not in known]
@@ -132,34 +157,51 @@ def uncoupled(machine: Frf, known: Mapping[str, Frf], joints: Iterable[Joint] | 
     return Frf(machine.freq, data, rest_in, rest_out, machine.quantity, units=units)
 
 
-def _interface(
-    there: Sequence[str], known: Mapping[str, Frf], joints: Sequence[Any]
-) -> list[tuple[str, str, str]]:
-    """Return (channel of the machine, component, its channel) at each joint of known components."""
-    channels = {name: _collocated(frf) for name, frf in known.items()}
-    for label in there:
-        name, _, channel = label.partition("/")
-        if name not in known:
-            channels[name] = (*channels.get(name, ()), channel)
-    found: dict[str, tuple[str, str, str]] = {}
-    for link in frf_links(joints, channels):
-        for end, other in ((link.first, link.second), (link.second, link.first)):
-            owner, _, channel = (end or "").partition("/")
-            if owner not in known or end is None:
-                continue
-            at = end if end in there else other if link.stiffness is None else None
-            if at is None or at not in there:
-                raise LabelError(
-                    f"the machine has no channel {end!r} that is both an output and an input: "
-                    "measure it there, where the component is joined."
-                )
-            found.setdefault(end, (at, owner, channel))
+def _taken_out(
+    machine: Frf,
+    known: Mapping[str, Frf],
+    joints: Sequence[Any],
+    dofs: Mapping[str, DofSet] | None,
+) -> list[FrfLink]:
+    """Return rigid joints between the machine and the negatives of known components."""
+    labels = [*machine.outputs, *machine.inputs]
+    names = dict.fromkeys([*known, *(x.partition("/")[0] for x in labels if "/" in x)])
+    places = known_places(dofs, names)
+    there = [channels_of(name, machine, places.get(name), inside=True) for name in names]
+    alone = [
+        channels_of(part.name, known[part.name], places.get(part.name))
+        if part.name in known
+        else part
+        for part in there
+    ]
+    found = []
+    for joint in joints:
+        links, missing = frf_links([joint], alone), None
+        inside = links
+        try:
+            inside = frf_links([joint], there)
+        except LabelError as error:
+            missing = error
+        for link, same in zip(links, inside, strict=True):
+            for i, end in enumerate(link.ends):
+                if end.owner not in known:
+                    continue
+                at = same.ends[i]
+                if missing is not None:
+                    # both ends of a rigid joint move alike
+                    if link.stiffness is not None or len(link.ends) == 1:
+                        raise missing
+                    at = link.ends[1 - i].turned()
+                    if at.owner in known:
+                        raise missing
+                own = end.turned()._replace(owner=f"{_KNOWN}{end.owner}")
+                found.append(FrfLink(link.name, (at, own), None, 0.0))
     if not found:
         raise LabelError(
             f"no joint holds {', '.join(known)}: the machine without it would be the machine. Pass "
             "the joints between it and the rest."
         )
-    return list(found.values())
+    return found
 
 
 def _coupled(
@@ -170,10 +212,11 @@ def _coupled(
     freq: FloatArray,
     quantity: str | None,
 ) -> ComplexArray:
-    """Return ``Y - Y B^T (B Y B^T + Z)^-1 B Y`` (n_out, n_in, n_freq), frequency by frequency."""
+    """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` (n_out, n_in, n_freq), line by line."""
     if not links:
         return Y
-    B_out, B_in = channel_rows(links, outputs), channel_rows(links, inputs)
+    B_out = channel_rows(links, outputs, "outputs")
+    B_in = channel_rows(links, inputs, "inputs")
     Z = softness(links, freq, quantity)
     kept = independent(B_out, links)
     B_out, B_in, Z = B_out[kept], B_in[kept], Z[kept]
@@ -206,10 +249,6 @@ def _coupled(
             f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
         )
     return np.asarray(np.moveaxis(found, 0, 2))
-
-
-def _collocated(frf: Frf) -> tuple[str, ...]:
-    return tuple(name for name in frf.outputs if name in frf.inputs)
 
 
 def _listed(joints: Any) -> list[Any]:

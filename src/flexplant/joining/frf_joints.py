@@ -1,118 +1,205 @@
-"""Joints between measured frequency responses: rows over their channels."""
+"""Joints between measured frequency responses: rows over their outputs and their inputs."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, unknown_label
-from ..labels import DIRECTIONS
+from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
+from ..lti import Frf
+from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, instance
+from .channels import Channels
+from .ends import JointEnd, joint_axes
 from .joint import Joint
+from .patch import Patch
 
 #: time derivatives in the outputs of a measurement
 ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: a joint that adds less than this part to the others repeats them
 _RANK = 1e-9
+#: part of the motion of a patch beside its mean, at the median frequency, that is warned of
+_BENDS = 0.1
+
+
+class FrfEnd(NamedTuple):
+    """What one end of a joint feels, and how its force is spread.
+
+    Attributes
+    ----------
+    owner : str
+        The component.
+    outputs, inputs : mapping {str: float}
+        The motion of the end by the component's outputs, and what a unit force on it is on the
+        component's inputs; negative at the second end.
+    """
+
+    owner: str
+    outputs: Mapping[str, float]
+    inputs: Mapping[str, float]
+
+    def turned(self) -> FrfEnd:
+        """Return the end with the opposite sign."""
+        rows = ({name: -w for name, w in row.items()} for row in (self.outputs, self.inputs))
+        return FrfEnd(self.owner, *rows)
 
 
 class FrfLink(NamedTuple):
-    """One axis of a joint: the channels of its ends, stiffness and rate (None: rigid)."""
+    """One axis of a joint: its ends, stiffness and rate (None: rigid)."""
 
-    first: str
-    second: str | None
+    name: str
+    ends: tuple[FrfEnd, ...]
     stiffness: float | None
     rate: float
 
 
-def frf_links(joints: Sequence[Any], channels: Mapping[str, tuple[str, ...]]) -> list[FrfLink]:
+def frf_links(joints: Sequence[Any], parts: Sequence[Channels]) -> list[FrfLink]:
     """Return all axes of joints between responses.
 
     Parameters
     ----------
     joints : sequence of Joint
-        Between DOFs, "stage/41:z", or nodes, "stage/41": their channels are "41:z".
-    channels : mapping {str: tuple of str}
-        The channels of each component that are both outputs and inputs.
+        Between DOFs, "stage/41:z", nodes, "stage/41", or, where places are known, patches and
+        nodes with lever arms.
+    parts : sequence of Channels
+        Of all components.
 
     Raises
     ------
     LabelError
         When a channel is not both an output and an input of its component.
     ModelError
-        When an end is no DOF and no node, or lever arms would be needed.
+        When an end is none of responses, or places would be needed.
     """
-    found = []
-    for joint in joints:
-        instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
-        ends = [joint.first] if joint.second is None else [joint.first, joint.second]
-        if joint.point is not None or not all(isinstance(end, str) for end in ends):
+    return [link for joint in joints for link in _links(joint, parts)]
+
+
+def _links(joint: Any, parts: Sequence[Channels]) -> list[FrfLink]:
+    instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
+    given = [joint.first] if joint.second is None else [joint.first, joint.second]
+    owners = [_owner(end, parts) for end in given]
+    for end, owner in zip(given, owners, strict=True):
+        if isinstance(end, tuple):
             raise ModelError(
-                f"{joint!r} needs places or lever arms, which measured responses do not have. Join "
-                "channels: Joint('stage/41:z', 'frame/7:z')."
+                f"{joint!r} is between points, whose motion no channel is. Join channels, "
+                "Joint('stage/41:z', 'frame/7:z'), or a Patch of nodes around the point."
             )
-        axes, named = _axes(joint, [str(end) for end in ends], channels)
-        for axis, k, c in zip(axes, *joint.values(axes), strict=True):
-            sides = [_channel(end, axis, channels) for end in named]
-            if len(set(sides)) < len(sides):
-                raise ModelError(f"both ends of {joint!r} are one channel: it would do nothing.")
-            second = sides[1] if len(sides) > 1 else None
-            stiffness = None if joint.is_rigid else float(k)
-            found.append(FrfLink(sides[0], second, stiffness, float(c)))
+        if (isinstance(end, Patch) or joint.point is not None) and not owner.is_placed:
+            raise ModelError(
+                f"{joint!r} needs the places of the channels of {owner.name!r} for its lever "
+                f"arms: pass dofs={{{owner.name!r}: DofSet(...)}}, or join channels, "
+                "Joint('stage/41:z', 'frame/7:z')."
+            )
+    seen, pushed = ([_end(parts, end, side) for end in given] for side in ("outputs", "inputs"))
+    axes = joint_axes(joint, seen[0], seen[-1] if len(seen) > 1 else None)
+    point = seen[0].point if joint.point is None else np.asarray(joint.point, dtype=np.float64)
+    found = []
+    for axis, k, c in zip(axes, *joint.values(axes), strict=True):
+        ends = tuple(
+            FrfEnd(
+                owner.name,
+                owner.named(sign * out.row(axis, point), "outputs"),
+                owner.named(sign * into.row(axis, point), "inputs"),
+            )
+            for sign, owner, out, into in zip((1.0, -1.0), owners, seen, pushed, strict=False)
+        )
+        if len(ends) > 1 and ends[0].owner == ends[1].owner and not _summed(ends, "outputs"):
+            raise ModelError(f"both ends of {joint!r} are one channel: it would do nothing.")
+        stiffness = None if joint.is_rigid else float(k)
+        found.append(FrfLink(f"{joint!r} along {axis}", ends, stiffness, float(c)))
     return found
 
 
-def _axes(
-    joint: Joint, ends: list[str], channels: Mapping[str, tuple[str, ...]]
-) -> tuple[tuple[str, ...], list[str]]:
-    if joint.axes is not None:
-        return tuple(joint.axes), ends
-    labelled = [end for end in ends if ":" in end]
-    if labelled:
-        return (labelled[0].rpartition(":")[2],), ends
-    known = []
+def _owner(end: Any, parts: Sequence[Channels]) -> Channels:
+    name = end.component if isinstance(end, Patch) else end[0]
+    if isinstance(end, str):
+        name = end.partition("/")[0]
+    for part in parts:
+        if part.name == name:
+            return part
+    raise unknown_label("component", name, [part.name for part in parts])
+
+
+def _end(parts: Sequence[Channels], end: Any, side: str) -> JointEnd:
+    sides = [part.side(side) for part in parts]
+    size = np.ptp(np.vstack([part.dofs.xyz for part in sides]), axis=0).max(initial=0.0)
+    try:
+        if isinstance(end, Patch):
+            end = _measured(end, _owner(end, parts), side)
+        return JointEnd(
+            sides, end, float(size) or 1.0, [rigid_motions(part.dofs) for part in sides]
+        )
+    except LabelError as error:
+        raise LabelError(
+            f"{error} These are the {side}: a joint needs the response to a force at its own "
+            "place, channels that are outputs and inputs, named alike ('41:z', or an input "
+            "'u 41:z')."
+        ) from None
+
+
+def _measured(patch: Patch, owner: Channels, side: str) -> Patch:
+    """Return the part of a patch that is measured: sensors may be at other nodes than hammers."""
+    if patch.nodes is None:
+        return patch
+    both = {*owner.outputs.dofs.nodes.tolist(), *owner.inputs.dofs.nodes.tolist()}
+    nodes, there = list(patch.nodes), set(owner.side(side).dofs.nodes.tolist())
+    if not both.issuperset(nodes):
+        raise LabelError(
+            f"{patch!r} has nodes {sorted(set(nodes) - both)[:6]} that are not measured. Leave "
+            "them out."
+        )
+    kept = [i for i, node in enumerate(nodes) if node in there]
+    weights = None if patch.weights is None else np.asarray(patch.weights)[kept]
+    return patch.replace(nodes=[nodes[i] for i in kept], weights=weights)
+
+
+def _summed(ends: Sequence[FrfEnd], side: str) -> dict[str, float]:
+    """Return the weights of machine's channels in a stretch, those that are not zero."""
+    total: dict[str, float] = {}
     for end in ends:
-        name, _, node = end.partition("/")
-        there = channels.get(name, ())
-        known.append(tuple(axis for axis in DIRECTIONS if f"{node}:{axis}" in there))
-    if not known[0] or known[-1] != known[0]:
-        raise LabelError(
-            f"the ends of {joint!r} have channels along {known[0]} and {known[-1]}: it is not "
-            "clear what is joined. Name axes=[...], measured at both ends as output and input."
-        )
-    return known[0], ends
+        for channel, weight in getattr(end, side).items():
+            name = f"{end.owner}/{channel}"
+            total[name] = total.get(name, 0.0) + weight
+    return {name: weight for name, weight in total.items() if weight}
 
 
-def _channel(end: str, axis: str, channels: Mapping[str, tuple[str, ...]]) -> str:
-    name, _, rest = end.partition("/")
-    if name not in channels:
-        raise unknown_label("component", name, channels)
-    if ":" in rest and rest.rpartition(":")[2] != axis:
-        raise LabelError(
-            f"the joint at {end!r} has no axis {axis!r}: it is along {rest.rpartition(':')[2]}. "
-            "Join channels of one direction; of a node, 'stage/41', name axes=[...]."
-        )
-    channel = rest if ":" in rest else f"{rest}:{axis}"
-    if channel not in channels[name]:
-        raise LabelError(
-            f"{unknown_label('channel', channel, channels[name], name)} A joint needs the response "
-            "to a force at its own place: a channel that is an output and an input, named alike."
-        )
-    return f"{name}/{channel}"
-
-
-def channel_rows(links: Sequence[FrfLink], names: Sequence[str]) -> FloatArray:
-    """Return the stretches (m, n) of links by named channels."""
+def channel_rows(links: Sequence[FrfLink], names: Sequence[str], side: str) -> FloatArray:
+    """Return the stretches (m, n) of links by named outputs, or their forces by inputs."""
     place = {name: i for i, name in enumerate(names)}
     B = np.zeros((len(links), len(names)))
     for row, link in zip(B, links, strict=True):
-        row[place[link.first]] += 1.0
-        if link.second is not None:
-            row[place[link.second]] -= 1.0
+        for name, weight in _summed(link.ends, side).items():
+            row[place[name]] = weight
     return B
+
+
+def warn_of_bending(
+    joints: Sequence[Any], parts: Sequence[Channels], frfs: Mapping[str, Frf]
+) -> None:
+    """Warn of patches whose measured motion is not that of a rigid body."""
+    for joint in joints:
+        for end in (joint.first, joint.second):
+            if not isinstance(end, Patch):
+                continue
+            owner = _owner(end, parts)
+            side, frf, patch = owner.outputs, frfs[owner.name], _measured(end, owner, "outputs")
+            mean, A, _ = patch.mean(side.dofs, patch.point(side.dofs))
+            channels = [side.channels[row] for row in patch.rows(side.dofs)]
+            moved = frf.data[[frf.outputs.index(channel) for channel in channels]]
+            beside = moved - np.einsum("ij,jkf->ikf", A @ mean, moved)
+            part = np.linalg.norm(beside, axis=(0, 1)) / np.linalg.norm(moved, axis=(0, 1))
+            if np.median(part) > _BENDS:
+                warnings.warn(
+                    f"{end!r} bends: {100 * np.median(part):.0f} % of its measured motion, at the "
+                    "median frequency, is beside its mean, which alone is joined. Take nodes "
+                    "nearer to each other, or look for a wrong direction of a channel.",
+                    FlexplantWarning,
+                    4,
+                )
 
 
 def softness(links: Sequence[FrfLink], freq: FloatArray, quantity: str | None) -> ComplexArray:
@@ -139,8 +226,8 @@ def softness(links: Sequence[FrfLink], freq: FloatArray, quantity: str | None) -
         force = link.stiffness + s * link.rate
         if not np.all(force):
             raise ModelError(
-                f"the joint at {link.first!r} has neither stiffness nor damping at a frequency: "
-                "leave it out, or leave out zero frequency."
+                f"{link.name} has neither stiffness nor damping at a frequency: leave it out, or "
+                "leave out zero frequency."
             )
         row[:] = s ** ORDERS[quantity] / force
     return found

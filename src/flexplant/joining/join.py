@@ -36,7 +36,12 @@ _STIFFEST = 1e10
 
 
 @overload
-def joined(components: Mapping[str, Frf], joints: Iterable[Joint] | Joint = ()) -> Frf: ...
+def joined(
+    components: Mapping[str, Frf],
+    joints: Iterable[Joint] | Joint = (),
+    *,
+    dofs: Mapping[str, DofSet] | None = None,
+) -> Frf: ...
 
 
 @overload
@@ -55,6 +60,7 @@ def joined(
     *,
     placed: Mapping[str, Pose] | None = None,
     name: str | None = None,
+    dofs: Mapping[str, DofSet] | None = None,
 ) -> FEModel | ReducedModel | Frf:
     """Return a machine of components, held together by joints.
 
@@ -67,7 +73,8 @@ def joined(
     ----------
     components : mapping {str: FEModel or ReducedModel}, or {str: Frf}
         Labels of the machine begin with their names: "stage/41:z". Of measured responses, all
-        must be; their joints are between channels that are both outputs and inputs.
+        must be; their joints are between channels that are outputs "41:z" and inputs "41:z" or
+        "u 41:z".
     joints : Joint or sequence of Joint
         What holds them together. The second end of a rigid joint follows the first.
     placed : mapping {str: Pose}, optional
@@ -75,6 +82,11 @@ def joined(
         machine after that.
     name : str, optional
         Of an FEModel, for display.
+    dofs : mapping {str: DofSet}, optional
+        Of measured responses: where the nodes of components are, in the coordinates of the
+        machine, for joints with lever arms and of patches. The mean motion of a `Patch` is that of
+        its outputs, and its force acts on its inputs, which may be other channels (virtual point
+        transformation).
 
     Returns
     -------
@@ -121,7 +133,9 @@ def joined(
             raise ModelError(
                 "measured responses have no place and no name: leave placed= and name= out."
             )
-        return joined_frfs(components, joints)
+        return joined_frfs(components, joints, dofs)
+    if dofs is not None:
+        raise ModelError("models have their DOFs: leave dofs= out, which is for responses.")
     parts = components_of(components, placed)
     links = links_of(joints, parts)
     warn_of_missing_statics(links, parts)

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, LabelError, ModelError
+from ..errors import FlexplantWarning, ModelError
 from ..labels import DIRECTIONS
 from ..structure.rigid import rigid_motions
 from ..values import FloatArray, IntArray, instance
 from .component import Component
-from .ends import JointEnd
+from .ends import JointEnd, joint_axes
 from .joint import Joint
 
 #: relative: what a joint feels of a motion of the whole machine below this is rounding
@@ -99,7 +99,7 @@ def _links(
     instance(joint, Joint, "a joint", "Pass Joint('stage/41:z', 'frame/7:z').")
     first = JointEnd(parts, joint.first, size, motions)
     second = None if joint.second is None else JointEnd(parts, joint.second, size, motions)
-    axes = _axes(joint, first, second)
+    axes = joint_axes(joint, first, second)
     point = first.point if joint.point is None else np.asarray(joint.point, dtype=np.float64)
     if joint.point is None and second is not None and second.is_near(point):
         point = second.point  # the second end follows, by the rotations of the first
@@ -123,20 +123,6 @@ def _links(
 def _felt(index: int, row: FloatArray) -> Felt:
     columns = np.flatnonzero(row)
     return Felt(index, columns, row[columns])
-
-
-def _axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
-    if joint.axes is not None:
-        return tuple(joint.axes)
-    for place in (first, second):
-        if place is not None and place.label:
-            return place.axes
-    if second is not None and first.axes != second.axes:
-        raise LabelError(
-            f"the ends of {joint!r} move along {', '.join(first.axes)} and along "
-            f"{', '.join(second.axes)}: it is not clear what is joined. Name axes=[...]."
-        )
-    return first.axes
 
 
 def _check_balance(joint: Joint, axis: str, carried: FloatArray, size: float) -> None:
