@@ -22,9 +22,12 @@ def test_mass_and_stiffness_swapped():
     free = fx.beam(length=1, elements=3, density=1, youngs_modulus=1e9, area=1, inertia=1)
     with pytest.raises(ModelError, match=r"swapped\. The order is FEModel\(M, K, D\)"):
         fx.FEModel(free.K, free.M, dofs=free.dofs)
-    held = fx.chain(masses=[1.0, 2.0], stiffnesses=[1e6], ground=1e6)
-    with pytest.warns(FlexplantWarning, match=r"swapped \(the order is FEModel\(M, K, D\)\)"):
+    held = fx.chain(masses=[1.0, 2.0], stiffnesses=[1e6], ground=[1e6, 0.0])
+    with pytest.raises(ModelError, match=r"swapped: no sqrt.* M gives 1 of its DOFs no inertia"):
         fx.FEModel(held.K, held.M, dofs=held.dofs)
+    alone = held.fixed(["2:x"])  # of one DOF nobody can be sure
+    with pytest.warns(FlexplantWarning, match=r"swapped \(the order is FEModel\(M, K, D\)\)"):
+        fx.FEModel(alone.K, alone.M, dofs=alone.dofs)
     with pytest.raises(ModelError, match="no inertia, or a negative one"):  # not that mistake
         fx.FEModel(np.diag([1.0, -1.0]), np.eye(2), dofs=held.dofs)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -96,15 +97,37 @@ def without_inertia(M: Matrix, K: Matrix) -> str:
     )
 
 
-def slow(M: Matrix, K: Matrix) -> str:
-    """Return in words that no motion of a structure is as fast as one has; empty when one is."""
+def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
+    """Return in words that no motion of a structure is as fast as one has; empty when one is.
+
+    Raises
+    ------
+    ModelError
+        When M, too, is a stiffness: DOFs that all move alike by it feel no force.
+    """
     fastest = float(np.sqrt(np.max(diagonal(K) / diagonal(M), initial=0.0)))
     if not 0.0 < fastest < _SLOW:
         return ""
-    return (
-        f"no sqrt(K_ii / M_ii) is above {fastest:.3g} rad/s, slower than any machine: are K and M "
-        "swapped (the order is FEModel(M, K, D)), or in different units?"
-    )
+    found = f"no sqrt(K_ii / M_ii) is above {fastest:.3g} rad/s, slower than any machine"
+    if (still := _unmoved(M, directions)) > _unmoved(K, directions):
+        raise ModelError(
+            f"K and M are swapped: {found}, and M gives {still} of its DOFs no inertia when the "
+            "structure moves as a whole, as a stiffness does. The order is FEModel(M, K, D)."
+        )
+    return f"{found}: are K and M swapped (the order is FEModel(M, K, D)), or in different units?"
+
+
+def _unmoved(matrix: Matrix, directions: Sequence[str]) -> int:
+    """Return at how many DOFs a matrix makes no force of its own when all of one axis move alike.
+
+    Of a stiffness these are the DOFs away from supports; a mass has a force at every one.
+    """
+    count = 0
+    for axis in "xyz":
+        along = np.array([one == axis for one in directions])
+        force, size = matrix @ along.astype(float), abs(matrix) @ along.astype(float)
+        count += int(np.sum((np.abs(force) <= SEMIDEFINITE * size) & along))
+    return count
 
 
 def lowest(matrix: Matrix) -> str:

@@ -60,7 +60,7 @@ class FEModel(Placed, Value):
     ShapeError
         When the sizes of the matrices and of `dofs` differ.
     ModelError
-        When a matrix is not finite, not symmetric, or M, K, D are not (semi-)definite; a K is
+        When a matrix is not finite, not symmetric, M, K, D not (semi-)definite, or swapped; a K is
         taken whose negative eigenvalues move the structure as a rigid body.
 
     Warns
@@ -113,7 +113,7 @@ class FEModel(Placed, Value):
             self._set(held_inertia=real_array(self.held_inertia, "held_inertia", (n, 6)))
         if self.joint_motions is not None:
             self._set(joint_motions=real_array(self.joint_motions, "joint_motions", (n, None)))
-        remarks: list[str | None] = [slow(M, K)]
+        remarks: list[str | None] = [slow(M, K, self.dofs.directions)]
         if digits is not None:
             remarks.append(endangered(K, M, digits))
             remarks.append(held_by_rounding(K, M, self.dofs, digits, self.rigid_body))
