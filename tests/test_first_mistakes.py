@@ -1,10 +1,13 @@
 """Mistakes of a first hour: the message says which one it was."""
 
+import re
+
 import numpy as np
 import pytest
 
 import flexplant as fx
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
+from flexplant.foreign_names import OURS
 
 
 def test_records_with_time_as_first_axis():
@@ -50,3 +53,33 @@ def test_channels_by_number():
         g[0.0, 1]
     with pytest.raises(LabelError, match="a channel is a pair"):
         g[0]
+
+
+def test_names_of_matlab_and_python_control_lead_to_ours():
+    with pytest.raises(AttributeError, match=r"call so is flexplant\.discretized"):
+        _ = fx.c2d
+    for name, ours in OURS.items():
+        assert not hasattr(fx, name)
+        for one in re.findall(r"[\w.]+\w", re.sub(r"\bor\b|\bthen\b", "", ours)):
+            item = fx
+            for part in one.split("."):
+                item = getattr(item, part)
+
+
+def test_one_over_one_plus_l():
+    """S and its margins as python-control writes them, of a loop gain with negative feedback."""
+    L = fx.lti.tf([25.0], [1.0, 2.0, 0.0])
+    S = 1 / (1 + L)
+    s = 3.0j
+    assert S(s) == pytest.approx(1 / (1 + L(s)), rel=1e-12)
+    assert (1 - S)(s) == pytest.approx(L(s) / (1 + L(s)), rel=1e-12)
+    peak = fx.peak_gain(S)[0]
+    assert fx.modulus_margin(L) == pytest.approx(1 / peak, rel=1e-6)
+    (found,) = fx.loop.report_loops(L).loops
+    assert found.phase_margin == pytest.approx(22.6, abs=0.1)  # 2 atan(1 / 5) of zeta = 0.2
+    with pytest.raises(ModelError, match="its D is not invertible"):
+        1 / L
+    with pytest.raises(ModelError, match="as many outputs as inputs, got 1 and 2"):
+        fx.modulus_margin(fx.StateSpace([[-1.0]], [[1.0, 2.0]], [[1.0]], 0))
+    with pytest.raises(ModelError, match="need a ClosedLoop, "):
+        fx.modulus_margin("L")

@@ -16,7 +16,7 @@ ROOMS = (
     (
         *("errors", "values", "notebook", "store", "certificates", "versions"),
         *("surviving", "progress", "parallel", "checkpoint", "work"),
-        *("places", "dof_columns", "dof_index", "labels", "bibliography"),
+        *("places", "dof_columns", "dof_index", "labels", "bibliography", "foreign_names"),
     ),
     "lti",
     "sparse",

@@ -152,6 +152,9 @@ def __getattr__(name: str) -> _Any:
         return _import_module(".plot", __name__)
     rooms = [n for n, v in globals().items() if hasattr(v, "__path__") and hasattr(v, name)]
     where = "".join(f" Use flexplant.{room}.{name}." for room in rooms)
+    ours = _import_module(".foreign_names", __name__).OURS.get(name)
+    if ours and not where:
+        where = f" What MATLAB or python-control call so is flexplant.{ours}."
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}.{where}")
 
 

@@ -12,14 +12,14 @@ from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.interconnection import loop_poles
 from ..lti.responses import remembered, responder
-from ..lti.statespace import StateSpace
+from ..lti.statespace import StateSpace, as_statespace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, short
 from .broken import BrokenLoop, inverted, moved
 from .closed import ClosedLoop
 
-#: a closed loop, or a plant (StandardPlant, StateSpace or measured Frf) and a controller
-Loop: TypeAlias = "ClosedLoop | tuple[Any, Any]"
+#: a closed loop; a plant (StandardPlant, StateSpace or measured Frf) and a controller; a loop gain
+Loop: TypeAlias = "ClosedLoop | tuple[Any, Any] | StateSpace | Frf"
 
 
 def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u", "y"] = "u") -> Frf:
@@ -27,10 +27,11 @@ def loop_gain(loop: Loop, *, freq: npt.ArrayLike | None = None, at: Literal["u",
 
     Parameters
     ----------
-    loop : ClosedLoop, or (plant, controller)
+    loop : ClosedLoop, (plant, controller), or StateSpace or Frf
         The plant a StandardPlant, a StateSpace or a measured Frf (with the delay that the loop
         will have), those of python-control too; the controller y -> u with the sign of the
-        feedback in it, or a ClosedLoop, whose controller is then closed on this plant.
+        feedback in it, or a ClosedLoop, whose controller is then closed on this plant. A system
+        or an Frf alone is a loop gain closed by negative feedback, ``S = (I + L)^-1``.
     freq : (n_freq,) array, optional [Hz]
         A grid refined at resonances when not given; those of the Frf for a measured plant.
     at : {"u", "y"}
@@ -205,11 +206,10 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     """
     if isinstance(loop, ClosedLoop):
         return loop.broken
-    if not isinstance(loop, tuple) or len(loop) != 2:
-        raise ModelError(
-            f"need a ClosedLoop or a tuple (plant, controller), got {short(loop)}. Type "
-            "close_loop(plant, controller) or (plant, controller)."
-        )
+    if not isinstance(loop, tuple):
+        loop = _fed_back(loop)
+    if len(loop) != 2:
+        raise ModelError(f"need a tuple (plant, controller), got {short(loop)}.")
     plant: Any = loop[0]
     controller = _controller(loop[1])
     if hasattr(plant, "frdata"):  # python-control's
@@ -233,6 +233,36 @@ def taken_apart(loop: Loop) -> BrokenLoop:
     plant = plant.select(controller.inputs, driven)
     # the peaks of S are at the poles of the closed loop, not at those of its parts
     return _modelled(plant, controller, lambda: loop_poles(plant, controller))
+
+
+def _fed_back(gain: Any) -> tuple[Any, StateSpace]:
+    """Return a loop gain as a plant, and the negative unity feedback that closes it.
+
+    Raises
+    ------
+    ModelError
+        When it is none.
+    """
+    if isinstance(gain, Frf) or hasattr(gain, "frdata"):
+        gain = gain if isinstance(gain, Frf) else Frf.from_control(gain)
+    elif hasattr(gain, "system") or not hasattr(gain, "dt"):
+        raise ModelError(
+            "need a ClosedLoop, (plant, controller) or a loop gain L of negative feedback, got "
+            f"{short(gain)}. Type close_loop(plant, controller) or (plant, controller)."
+        )
+    else:
+        gain = as_statespace(gain)
+    outputs, inputs = tuple(gain.outputs), tuple(gain.inputs)
+    if len(outputs) != len(inputs):
+        raise ModelError(
+            f"a loop gain has as many outputs as inputs, got {len(outputs)} and {len(inputs)}: "
+            "pass (plant, controller), the controller with the sign of the feedback in it."
+        )
+    n = len(inputs)
+    return gain, StateSpace(
+        np.zeros((0, 0)), np.zeros((0, n)), np.zeros((n, 0)), -np.eye(n),
+        inputs=outputs, outputs=inputs,
+    )  # fmt: skip
 
 
 def _modelled(
