@@ -14,7 +14,7 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "values", "notebook", "store", "certificates", "versions"),
+        *("errors", "values", "arguments", "notebook", "store", "certificates", "versions"),
         *("surviving", "progress", "parallel", "checkpoint", "work"),
         *("places", "dof_columns", "dof_index", "labels", "bibliography", "foreign_names"),
     ),

@@ -148,7 +148,7 @@ def test_the_table_in_a_closed_loop():
     loop = fx.close_loop(machine(), kalman, law)
     assert table.values[0, 2] == pytest.approx(kalman.rms("die", on=loop), rel=1e-12, abs=0)
     for wrong in ([], machine(), [1.0]):
-        with pytest.raises(ModelError, match="StandardPlants"):
+        with pytest.raises(ModelError, match="StandardPlant"):
             errors_on_machines(kalman, wrong, "die")
     with pytest.raises(ModelError, match="by name"):
         errors_on_machines({"a": 1.0}, [machine()], "die")

@@ -284,7 +284,7 @@ def test_cut_files_are_named_or_noted(tmp_path):
         silent += found.M is not None and not found.notes
     assert silent <= 25
     part.write_bytes(content[: content.rindex(b"D")])
-    with pytest.raises(FlexplantError, match="a whole line is due"):
+    with pytest.raises(FlexplantError, match="last number is shorter"):
         read_dmig(part)
 
 

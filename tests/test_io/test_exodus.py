@@ -141,7 +141,7 @@ def test_cut_or_foreign_files(tmp_path):
         with pytest.raises(FlexplantError):
             read_exodus_modes(part, rigid_below=0.1)
     part.write_text("no netCDF at all")
-    with pytest.raises(FlexplantError, match="another format"):
+    with pytest.raises(FlexplantError, match="Is it an Exodus"):
         read_exodus_modes(part)
     rng = np.random.default_rng(1)
     for _ in range(100):

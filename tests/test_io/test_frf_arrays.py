@@ -96,7 +96,7 @@ def test_a_single_pair(tmp_path, kind):
         ({"freq": FREQ}, LabelError, "no array 'data'"),
         ({"frequency": FREQ, "data": DATA}, LabelError, "no array 'freq'.*'frequency'"),
         ({"freq": np.append(FREQ, 11.0), "data": DATA}, ShapeError, "is not the 5 frequencies"),
-        ({"freq": FREQ, "data": DATA[0]}, ShapeError, "must have shape"),
+        ({"freq": FREQ, "data": DATA[0]}, ShapeError, "has shape"),
         ({"freq": FREQ[::-1], "data": DATA}, ModelError, "increase"),
         ({"freq": FREQ + 0.1j, "data": DATA}, ModelError, "complex"),
         ({"freq": FREQ, "data": "none"}, FlexplantError, "holds no numbers"),

@@ -208,5 +208,5 @@ def test_what_wrappers_refuse(make):
         with pytest.raises(AssumptionError, match="s0 have no noise"):
             place_sensors(plant, mixed, 4, criterion)
     for wrong in (lambda: AfterLoss("die"), lambda: Penalised(PoiVariance(), 3.0)):
-        with pytest.raises(ModelError, match="callable"):
+        with pytest.raises(ModelError, match="must be a function"):
             wrong()

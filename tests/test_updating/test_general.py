@@ -642,7 +642,7 @@ def test_bad_input_is_refused(chain):
         MatrixParameter("x", dM=np.triu(np.ones((4, 4))))
     with pytest.raises(LabelError, match="name"):
         MatrixParameter("", dM=np.eye(4))
-    with pytest.raises(LabelError, match="mode"):
+    with pytest.raises(ModelError, match="mode"):
         ModeDamping(0)
     with pytest.raises(LabelError, match="no elastic mode 9"):
         update(chain, [ModeDamping(9)], residuals)

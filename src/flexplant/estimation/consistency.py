@@ -8,11 +8,12 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
+from ..arguments import between
 from ..errors import ModelError, ShapeError
 from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, instance, positive, real_array, short
+from ..values import FloatArray, Value, instance, real_array, short
 from .channels import poi_channels, row_of
 from .estimate import Estimate
 from .estimator import KalmanEstimator
@@ -166,9 +167,7 @@ def consistency(
             f"consistency needs a KalmanEstimator and its Estimate, got {short(wrong)}. Pass "
             "observer and observer.estimate(records)."
         )
-    share = positive(level, "level")
-    if not 0.5 <= share < 1:
-        raise ModelError(f"level must be from 0.5 to below 1, got {share:g}. Pass 0.95.")
+    share = between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
     alpha = 1 - share ** (1 / 3)
     white = estimate.whitened.T
     there = np.isfinite(white).all(axis=1)

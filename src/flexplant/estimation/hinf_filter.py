@@ -7,13 +7,14 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import CertificateError, ModelError, SolverError
+from ..arguments import between
+from ..errors import CertificateError, SolverError
 from ..lti.norms import hinf_norm
 from ..lti.riccati import solve_dare
 from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, positive
+from ..values import FloatArray
 from .filter_model import FilterModel
 from .filter_system import error_system, filter_system, own_variances
 from .kalman import design_kalman
@@ -73,12 +74,8 @@ def design_hinf_filter(plant: StandardPlant | System, *, accuracy: float = 1e-3)
     >>> found.certificate.gamma >= found.certificate.lower
     True
     """
-    accuracy = positive(accuracy, "accuracy")
-    if not 1e-6 <= accuracy <= 1:
-        raise ModelError(
-            f"accuracy must lie between 1e-6 and 1, got {accuracy:g}: closer to the optimum the "
-            "Riccati equation has no digits left. Pass 1e-3, say."
-        )
+    why = "Closer to the optimum the Riccati equation has no digits left. Pass 1e-3, say."
+    accuracy = between(accuracy, "accuracy", 1e-6, 1.0, why, ends="[]")
     kalman = design_kalman(plant, larger=plant)  # type: ignore[arg-type]
     plant = kalman.plant
     sizes = np.sqrt(kalman.variances)

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import FlexplantError, ModelError, unknown_label
+from ..arguments import positive_array
+from ..errors import FlexplantError, unknown_label
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from ..plant import StandardPlant
@@ -141,9 +142,7 @@ def lag_report(
     ``var(l) = var(filter) - T M_l T'``, M_l what l further samples say of the state, up to
     ``M = F' M F + C2' S^-1 C2`` of the smoother.
     """
-    wanted = real_array(lags, "lags", (None,))
-    if wanted.size and not np.min(wanted) > 0:
-        raise ModelError(f"lags must be positive times [s], got {np.min(wanted):g}. Try 1e-3.")
+    wanted = positive_array(lags, "lags", (None,), hint="They are times [s]: try 1e-3.")
     counts = {f"{1e3 * s:.4g} ms": round(s / plant.dt) for s in sorted(wanted.tolist())}
     counts = {name: count for name, count in counts.items() if count}
     g, F = steady.gains, steady.F

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import members
 from ..errors import AssumptionError, FlexplantWarning, ModelError, unknown_label
 from ..loop import close_loop
 from ..plant import StandardPlant
@@ -129,12 +130,9 @@ def errors_on_machines(
     ('filter',)
     """
     given = estimators if isinstance(estimators, Mapping) else {"estimator": estimators}
-    listed = list(machines) if isinstance(machines, Sequence) else []
-    if not listed or not all(isinstance(machine, StandardPlant) for machine in listed):
-        raise ModelError(
-            f"machines must be a list of StandardPlants, got {short(machines)}. Draw them: "
-            "plant.uncertain(fit).sample(rng, 20)."
-        )
+    listed = members(
+        machines, StandardPlant, "machines", "Pass plant.uncertain(fit).sample(rng, 20)."
+    )
     if not given or not all(hasattr(one, "rms") for one in given.values()):
         raise ModelError(
             f"estimators must be estimators by name, got {short(estimators)}. Pass "

@@ -7,13 +7,14 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..arguments import members
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..lti.lyapunov import scale_of
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, UncertainPlant
 from ..progress import Progress, tick
-from ..values import FloatArray, short, whole
+from ..values import FloatArray, whole
 from .channels import same_pois
 from .error import error_variances
 from .filter_system import filter_system, own_variances
@@ -147,12 +148,10 @@ def _checked(plant: StandardPlant, machines: Sequence[StandardPlant]) -> list[St
             "machines are sampled plants, got an UncertainPlant: draw them from it, "
             "uncertain.sample(rng, 20), so that it is known which ones the worst case is of."
         )
-    if isinstance(machines, StandardPlant) or not isinstance(machines, Sequence) or not machines:
-        raise ModelError(
-            f"machines must be a list of at least one StandardPlant, got {short(machines)}. Pass "
-            "those that plant.uncertain(fit).sample(rng, 20) draws."
-        )
-    return [same_pois(plant, other) for other in machines]
+    listed = members(
+        machines, StandardPlant, "machines", "Pass plant.uncertain(fit).sample(rng, 20)."
+    )
+    return [same_pois(plant, other) for other in listed]
 
 
 def _means(machines: Sequence[StandardPlant], system: StateSpace, sizes: FloatArray) -> FloatArray:

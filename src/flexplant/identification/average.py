@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from ..arguments import members
 from ..errors import ModelError, ShapeError
 from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray
@@ -58,12 +59,8 @@ def average_frfs(repeated: Iterable[Frf]) -> Frf:
     >>> mean.variance.round(4)
     array([[[0.01, 0.01]]])
     """
-    frfs = list(repeated)
-    if len(frfs) < 2 or not all(isinstance(frf, Frf) for frf in frfs):
-        raise ModelError(
-            f"average_frfs takes at least two Frf, got {len(frfs)} items: one measurement says "
-            "nothing about its noise."
-        )
+    why = "One measurement says nothing about its noise: pass two or more."
+    frfs = members(repeated, Frf, "repeated measurements", why, least=2)
     first = frfs[0]
     for frf in frfs[1:]:
         same = (frf.inputs, frf.outputs) == (first.inputs, first.outputs)

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import between
 from ..errors import ModelError, ShapeError, SolverError, counted
-from ..values import ComplexArray, FloatArray, IntArray, Value, positive, real_array
+from ..values import ComplexArray, FloatArray, IntArray, Value, real_array
 from .plscf import OrderPoles
 
 #: flags of a pole, each including the ones before
@@ -148,8 +149,7 @@ class StabilisationDiagram(Value):
         SolverError
             When no pole stays.
         """
-        if not 0 < positive(presence, "presence") <= 1:
-            raise ModelError(f"presence must lie between 0 and 1, got {presence:g}.")
+        presence = between(presence, "presence", 0.0, 1.0, "Try 0.5.", ends="]")
         known = np.unique(self.orders)
         kept = []
         for track in np.unique(self.tracks):

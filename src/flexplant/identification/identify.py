@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import between
 from ..errors import LabelError, ModelError, ShapeError, SolverError, unknown_label
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
@@ -88,9 +89,7 @@ def stabilisation_diagram(
             "tolerances are (frequency, damping, MAC), positive, the MAC below 1, got "
             f"{tolerances!r}."
         )
-    top = positive(max_zeta, "max_zeta")
-    if top >= 1:
-        raise ModelError(f"max_zeta must be below 1, where nothing oscillates, got {top:g}.")
+    top = between(max_zeta, "max_zeta", 0.0, 1.0, "From 1 on nothing oscillates: pass 0.2, say.")
     ready, listed = prepared(frf, band), checked_orders(orders)
     if not ready.known:
         ready = weighted_by_remainder(ready, _affordable(listed, ready)[-1])

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import between
 from ..errors import LabelError, ModelError
 from ..labels import Place
 from ..modes import Modes
@@ -86,8 +87,7 @@ def numbered(
     modes = model.modes() if hasattr(model, "modes") and not isinstance(model, Modes) else model
     instance(modes, Modes, "model", "Solve it first: solve_modes(model, count=...).")
     width = positive(tolerance, "tolerance")
-    if not 0 <= positive(least_mac, "least_mac", zero=True) < 1:
-        raise ModelError(f"least_mac must be below 1, got {least_mac:g}.")
+    least_mac = between(least_mac, "least_mac", 0.0, 1.0, "Try 0.5.", ends="[")
     elastic = np.flatnonzero(modes.omega > 0)
     if not elastic.size:
         raise ModelError("the model has no elastic modes to compare with.")

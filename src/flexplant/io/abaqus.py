@@ -10,13 +10,14 @@ from typing import Any, cast
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, LabelError, ModelError
+from ..dof_columns import at_nodes
+from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
 from .formats import Format
-from .numbers import cut_short, decimal, printed_digits, rows_of_numbers, wrong_line
-from .paths import check_size, file_path
+from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
+from .paths import check_size, check_whole, damaged, file_path, no_motion, unread, wrong_line_of
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
 _HELD = 1e35
@@ -104,7 +105,7 @@ def read_abaqus(
     if there[0].named:
         if dofs is not None:
             raise ModelError("the files name their rows: dofs= is for FORMAT=COORDINATE only.")
-        dofs, located = _dofs(order, inp, str(stiffness)), inp is not None
+        dofs, located = _dofs(order, inp), inp is not None
     found = FEMatrices(
         K,
         M,
@@ -142,10 +143,8 @@ class _Triplets:
         n = order.size
         counts = np.unique(i * n + j, return_counts=True)[1]
         if np.any(counts > 1):
-            raise FlexplantError(
-                f"{self.path!r} gives {int(np.count_nonzero(counts > 1))} entries twice: matrices "
-                "of several steps in one file, or a damaged one. Write it again."
-            )
+            what = f"{int(np.count_nonzero(counts > 1))} entries twice (several steps?)"
+            raise damaged(self.path, what)
         return symmetric(sp.csc_array(sp.coo_array((self.values, (i, j)), shape=(n, n))))
 
 
@@ -191,23 +190,18 @@ def _triplets(path: str | Path) -> _Triplets:
     whole: Any = labels.astype(np.int64)
     inner = whole[:, :: 2 if width == 5 else 1]
     if np.any(inner < 1):
-        raise ModelError(
-            f"{str(path)!r} has internal nodes {np.unique(inner[inner < 1])[:6].tolist()}: "
-            "Lagrange multipliers (of contact, couplings, hybrid elements) make the system "
-            "indefinite, which is no M, D, K of a structure. Use penalty or direct constraints."
+        what = (
+            f"has internal nodes {np.unique(inner[inner < 1])[:6].tolist()}: Lagrange multipliers "
+            "(of contact, couplings, hybrid elements) make the system indefinite"
         )
+        raise unread(path, what, "Use penalty or direct constraints.")
     if width == 3:
         whole = np.column_stack([whole[:, 0], 0 * whole[:, 0], whole[:, 1], 0 * whole[:, 1]])
     elif np.any((whole[:, 1::2] < 1) | (whole[:, 1::2] > 6)):
         other = np.unique(whole[:, 1::2])
-        raise ModelError(
-            f"{str(path)!r} has degrees of freedom {other[(other < 1) | (other > 6)].tolist()}: "
-            "only displacements and rotations (1 to 6) are a structure's; 7 is warping, 8 "
-            "pressure, 11 temperature. Use other elements."
-        )
+        raise no_motion(path, other[(other < 1) | (other > 6)].tolist())
     words = [_WORD.findall(line)[-1] for line in data[:: max(1, len(data) // 1000)]]
-    if cut_short(content.replace(b",", b" "), words):
-        raise _wrong(path, lines, data[-1], width)
+    check_whole(content.replace(b",", b" "), words, path)
     return _Triplets(
         str(path),
         width == 5,
@@ -227,25 +221,19 @@ def _scale(word: bytes, path: str | Path) -> float:
 
 def _wrong(path: str | Path, lines: list[bytes], line: bytes, width: int) -> FlexplantError:
     form = "node, dof, node, dof, value" if width == 5 else "row column value"
-    return FlexplantError(
-        f"{str(path)!r}, line {lines.index(line) + 1}: {form!r} is due, got "
-        f"{line[:72].decode('latin-1')!r}. Write it with *MATRIX OUTPUT, FORMAT=MATRIX INPUT."
-    )
+    do = "Write it with *MATRIX OUTPUT, FORMAT=MATRIX INPUT."
+    return wrong_line_of(path, lines.index(line) + 1, f"{form!r} is", line, do)
 
 
-def _dofs(order: IntArray, inp: str | Path | None, path: str) -> DofSet:
+def _dofs(order: IntArray, inp: str | Path | None) -> DofSet:
     ids = order >> 4
     directions = [DIRECTIONS[i - 1] for i in (order & 15).tolist()]
     if inp is None:
         return DofSet(ids, tuple(directions), np.zeros((ids.size, 3)))
     places = _nodes(inp)
-    missing = sorted(set(ids.tolist()) - set(places))
-    if missing:
-        raise LabelError(
-            f"{len(missing)} nodes of {path!r} are in no *NODE block of {str(inp)!r}, the first "
-            f"{missing[:6]}. Are they generated or included? Write the flattened input file."
-        )
-    return DofSet(ids, tuple(directions), np.array([places[i] for i in ids.tolist()]))
+    xyz = np.array(list(places.values())).reshape(-1, 3)
+    known = np.array(list(places), dtype=np.int64)
+    return DofSet(ids, tuple(directions), at_nodes(ids, known, xyz, f"{inp}, *NODE"))
 
 
 def _nodes(path: str | Path) -> dict[int, list[float]]:
@@ -255,48 +243,36 @@ def _nodes(path: str | Path) -> dict[int, list[float]]:
     for number, raw in enumerate(
         file_path(path, "inp").read_text(encoding="latin-1").splitlines(), 1
     ):
-        line = raw.strip()
+        line, at = raw.strip(), f"is not read from line {number}"
         if not line or line.startswith("**"):
             continue
         if line.startswith("*"):
             word, *options = [part.strip().upper() for part in line.split(",")]
-            where = f"{str(path)!r}, line {number}: {word}"
             settings = dict(part.split("=", 1) for part in options if "=" in part)
             if word in ("*TRANSFORM", "*SYSTEM") or settings.get("SYSTEM", "R") != "R":
-                raise ModelError(
-                    f"{where}: nodes in another coordinate system than the global one are not "
-                    "read. Remove it, or name rows and places yourself: .with_dofs(DofSet(...))."
-                )
+                raise unread(path, f"{at}: nodes in another coordinate system", _PLACE)
             if word in ("*INCLUDE", "*NGEN", "*NFILL", "*NCOPY", "*NMAP") or (
                 word == "*NODE" and "INPUT" in settings
             ):
-                raise ModelError(
-                    f"{where}: nodes that are generated or in another file are not read. Write "
-                    "the flattened input file."
-                )
+                raise unread(path, f"{at}: nodes generated or in another file", _FLAT)
             instances += word == "*INSTANCE"
             in_instance = word == "*INSTANCE"
             if instances > 1:
-                raise ModelError(
-                    f"{where}: with several instances, nodes are numbered anew in the matrices. "
-                    "Write a flat input file (no parts and assemblies)."
-                )
+                raise unread(path, f"{at}: several instances, whose nodes get new numbers", _FLAT)
             inside = word == "*NODE"
         elif in_instance:
-            raise ModelError(
-                f"{str(path)!r}, line {number}: an instance that is moved is not read. Write a "
-                "flat input file (no parts and assemblies)."
-            )
+            raise unread(path, f"{at}: an instance that is moved", _FLAT)
         elif inside:
             try:
                 node, *xyz = [part.strip() for part in line.rstrip(",").split(",")]
                 places[int(node)] = ([decimal(part or "0") for part in xyz[:3]] + [0.0] * 3)[:3]
             except ValueError:
-                raise FlexplantError(
-                    f"{str(path)!r}, line {number}: a node and its coordinates are due, got "
-                    f"{line[:72]!r}. Correct the line."
-                ) from None
+                due = "a node and its coordinates are"
+                raise wrong_line_of(path, number, due, line, "Correct the line.") from None
     return places
 
 
+#: what to do with an input file that is not flat, or turns its nodes
+_FLAT = "Write the flattened input file (no parts and assemblies)."
+_PLACE = "Remove it, or name rows and places yourself: .with_dofs(DofSet(...))."
 ABAQUS = Format((".mtx",), read_abaqus, mesh=(".inp",), mesh_option="inp")

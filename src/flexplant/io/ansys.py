@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 
 from ..dof_columns import at_nodes
-from ..errors import FlexplantError, ModelError
+from ..errors import FlexplantError
 from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra
 from .child import in_child
 from .formats import Elsewhere, Format, is_text
-from .paths import file_path
+from .paths import file_path, no_motion, unread
 from .tables import read_nodes_table
 
 #: a local coordinate system turned less than this [deg] is none
@@ -77,17 +77,12 @@ def read_ansys(
         )
     table, K, M = full["table"], full["K"], full["M"]
     if K is None or M is None:
-        raise ModelError(
-            f"{path.name!r} holds no {'stiffness' if K is None else 'mass'} matrix. Write the file "
-            "with a modal analysis: ANTYPE,MODAL; MODOPT,LANB; WRFULL."
-        )
+        do = "Write it with a modal analysis: ANTYPE,MODAL; MODOPT,LANB; WRFULL."
+        raise unread(path.name, f"holds no {'stiffness' if K is None else 'mass'} matrix", do)
     kinds = np.asarray(table[:, 1], dtype=np.int64)
     strange = sorted(set(kinds.tolist()) - set(range(6)))
     if strange:
-        raise ModelError(
-            f"{path.name!r} has DOFs that are no displacement or rotation (ANSYS numbers {strange} "
-            "from 0: temperature, pressure, voltage, warping). Export the structural part alone."
-        )
+        raise no_motion(path.name, f"ANSYS numbers {strange} from 0")
     notes = []
     if full["damped"]:
         notes.append("the damping matrix in the file is not read: give damping by mode")
@@ -141,10 +136,8 @@ def read_parsed(function: str, path: Path) -> dict[str, Any]:
     if kind in ("ImportError", "ModuleNotFoundError"):
         raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}")
     if kind == "NotImplementedError":
-        raise ModelError(
-            f"{path.name!r}: {found}. Write a consistent, symmetric pair: LUMPM,OFF; no contact "
-            "with friction, no rotating frame."
-        )
+        do = "Write a symmetric pair: LUMPM,OFF; no contact with friction, no rotating frame."
+        raise unread(path.name, f"is not supported: {found}", do)
     if kind != "value":
         raise FlexplantError(
             f"{path.name!r} cannot be read as an ANSYS {path.suffix} file ({kind}: {found!s:.99}). "

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 
 from ..dof_columns import at_nodes
-from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
 from .ansys import read_parsed
+from .paths import no_motion, unread
 from .shapes import FileShapes, ModesFormat
 
 _KINDS = dict(zip(("UX", "UY", "UZ", "ROTX", "ROTY", "ROTZ"), DIRECTIONS, strict=True))
@@ -36,16 +36,12 @@ def read_rst_shapes(path: Path, nodes: Path | None) -> FileShapes:
     """
     found = read_parsed("ansys_modes", path)
     if found["analysis"] != _MODAL or found["cyclic"]:
-        raise ModelError(
-            f"{path.name!r} is of {'a cyclic sector' if found['cyclic'] else 'another analysis'}: "
-            "its steps are no modes of a structure. Write it with ANTYPE,MODAL of the whole model."
-        )
+        what = "a cyclic sector" if found["cyclic"] else "another analysis"
+        do = "Write it with ANTYPE,MODAL of the whole model."
+        raise unread(path.name, f"is of {what}: its steps are no modes of a structure", do)
     strange = [name for name in found["kinds"] if name not in _KINDS]
     if strange or not found["kinds"]:
-        raise ModelError(
-            f"{path.name!r} has DOFs {strange} that are no displacement or rotation: temperature, "
-            "pressure, voltage. Export the structural part alone."
-        )
+        raise no_motion(path.name, strange)
     directions = tuple(_KINDS[name] for name in found["kinds"])
     ids = np.asarray(found["ids"], dtype=np.int64)
     values = np.asarray(found["shapes"], dtype=np.float64)  # (k, nodes, DOFs)

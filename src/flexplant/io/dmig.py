@@ -16,8 +16,8 @@ from ..values import FloatArray, IntArray
 from .formats import USUAL, Format
 from .nastran import Nodes, nastran_float, read_nodes
 from .nastran_names import named_matrices
-from .numbers import cut_short, fixed_numbers, printed_digits
-from .paths import damaged, file_path
+from .numbers import fixed_numbers, printed_digits
+from .paths import check_whole, damaged, file_path, unread, wrong_line_of
 
 _ENDINGS = ("AAX", "AA", "GG", "2GG", "2PP", "")
 
@@ -89,10 +89,7 @@ def read_dmig(
     content = file_path(path).read_bytes()
     lines = content.splitlines()
     blocks = _blocks(lines, str(path))
-    if blocks and cut_short(
-        content, [line[8:].split()[-1] for line in lines[-9:-1] if line[8:].split()]
-    ):
-        raise _wrong(str(path), len(lines) - 1, lines[-1], "a whole line")
+    check_whole(content, [line[8:].split()[-1] for line in lines[-9:-1] if line[8:].split()], path)
     if not blocks:
         raise FlexplantError(
             f"{str(path)!r} has no DMIG cards. Request them in the run: PARAM,EXTOUT,DMIGPCH or "
@@ -153,28 +150,22 @@ class _Block:
     digits: int
 
     def matrix(self, order: IntArray, path: str) -> sp.csc_array:
-        where = f"matrix {self.name} of {path!r}"
-        if self.kind > 2:
-            raise ModelError(f"{where} is complex: a structure's M, D and K are real.")
-        if self.form not in (1, 6):
-            raise ModelError(
-                f"{where} has form {self.form}: a square (1) or symmetric (6) matrix is needed."
-            )
+        if self.kind > 2 or self.form not in (1, 6):
+            kind = "complex" if self.kind > 2 else f"of form {self.form}"
+            do = "A structure's M, D and K are real, square (1) or symmetric (6): write them so."
+            raise unread(path, f"holds the matrix {self.name}, which is {kind}", do)
         if not np.all(np.isfinite(self.values)):
-            raise FlexplantError(f"{where} has NaN or infinite entries. Write the file again.")
+            raise damaged(path, f"NaN or infinite entries of {self.name}")
         i, j = np.searchsorted(order, self.rows), np.searchsorted(order, self.columns)
         n = order.size
         low, high = (i, j) if self.form == 1 else (np.minimum(i, j), np.maximum(i, j))
         keys, counts = np.unique(low * n + high, return_counts=True)
         if np.any(counts > 1):
             twice = int(keys[np.argmax(counts > 1)])
-            names = [
-                f"{code >> 4} component {code & 15}" for code in order[[twice // n, twice % n]]
-            ]
-            raise ModelError(
-                f"{where} gives the entry of node {' and '.join(names)} twice: a symmetric matrix "
-                "has one triangle only. Write the file again."
-            )
+            codes = order[[twice // n, twice % n]]
+            nodes = " and ".join(f"{code >> 4} component {code & 15}" for code in codes)
+            do = "A symmetric matrix has one triangle only: write the file again."
+            raise unread(path, f"gives the entry of {self.name}, node {nodes} twice", do)
         half = sp.coo_array((self.values, (i, j)), shape=(n, n))
         if self.form == 1:
             return sp.csc_array(half)
@@ -192,9 +183,10 @@ def _blocks(lines: list[bytes], path: str) -> dict[str, _Block]:
         last = heads[at + 1] if at + 1 < len(heads) else len(lines)
         try:
             name, form, kind = fields[0].strip(), int(fields[2]), int(fields[3])
+            sound = bool(name) and kind in (1, 2, 3, 4)
         except (ValueError, IndexError):
-            raise _wrong(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN") from None
-        if not name or kind not in (1, 2, 3, 4):
+            sound = False
+        if not sound:
             raise _wrong(path, head, lines[head], "a header DMIG, NAME, 0, IFO, TIN")
         if name in blocks:
             raise _wrong(path, head, lines[head], f"one matrix {name} only, here is a second")
@@ -366,9 +358,8 @@ def _dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path: str) -
 
 
 def _wrong(path: str, at: int, line: bytes, due: str) -> FlexplantError:
-    return FlexplantError(
-        f"{path!r}, line {at + 1}: {due} is due, got {line[:72].decode('latin-1')!r}. The file is "
-        "cut off or damaged: write it again."
+    return wrong_line_of(
+        path, at + 1, f"{due} is", line, "It is cut off or damaged: write it again."
     )
 
 

@@ -2,22 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self, cast
+from typing import Any, cast
 
 import numpy as np
 import scipy.io
 
-from ..errors import FlexplantError, LabelError, ShapeError
+from ..errors import FlexplantError, LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
 from ..values import FloatArray, Matrix, one_of, real_array
+from .assembled import missing_extra
 from .formats import Elsewhere
-from .paths import file_path
+from .paths import damaged, file_path, parsing
 from .shapes import check_mass, frequencies
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
@@ -99,13 +100,7 @@ def read_exodus_modes(
     damping[:n_rigid] = 0.0
     phi = phi[:, order]
     if M is not None:
-        mass: Any = M
-        if mass.shape != (phi.shape[0], phi.shape[0]):
-            raise ShapeError(
-                f"M must have shape ({phi.shape[0]}, {phi.shape[0]}), node by node, got "
-                f"{mass.shape}. Give that of the same nodes and directions."
-            )
-        check_mass(phi, mass, str(path))
+        check_mass(phi, M, str(path))
     return Modes(omega, damping, phi, dofs, n_rigid)
 
 
@@ -129,15 +124,12 @@ def read_shapes(
     if not k:
         raise FlexplantError(f"{str(path)!r} has no time steps, hence no modes. Write them.")
     if any(shape.shape != (k, n) for shape in shapes):
-        raise FlexplantError(
-            f"{str(path)!r}: shapes of {[shape.shape for shape in shapes]} do not belong to {k} "
-            f"steps and {n} nodes: the file is damaged. Write it again."
-        )
+        raise damaged(path, f"shapes of other sizes than {k} steps and {n} nodes")
     names = list(chosen)
     phi = np.stack(shapes).transpose(2, 0, 1).reshape(n * len(names), k)
     dofs = DofSet(np.repeat(ids, len(names)), tuple(names) * n, np.repeat(xyz, len(names), axis=0))
     if not np.all(np.isfinite(values)):
-        raise FlexplantError(f"{str(path)!r} has NaN in the place of time: write it again.")
+        raise damaged(path, "NaN in the place of time")
     if times == "eigenvalue":
         return np.sign(values) * np.sqrt(np.abs(values)), phi, dofs
     return values * (2 * np.pi if times == "frequency" else 1.0), phi, dofs
@@ -168,7 +160,8 @@ def _chosen(names: list[str], given: Mapping[str, str] | None, path: str) -> dic
     return {d: found[d][0] for d in DIRECTIONS if d in found}
 
 
-def opened(path: str | Path) -> ExodusFile:
+@contextlib.contextmanager
+def opened(path: str | Path) -> Iterator[ExodusFile]:
     """Return an Exodus file, netCDF-3 or netCDF-4, to be used in a `with` block.
 
     Parameters
@@ -183,57 +176,38 @@ def opened(path: str | Path) -> ExodusFile:
     FileNotFoundError
         When there is no such file.
     """
-    with file_path(path).open("rb") as file:
-        start = file.read(8)
-    if start == b"\x89HDF\r\n\x1a\n":
+    with file_path(path).open("rb") as raw:
+        is_hdf = raw.read(8) == b"\x89HDF\r\n\x1a\n"
+    h5py: Any = None
+    if is_hdf:
         try:
             h5py = importlib.import_module("h5py")
         except ImportError:
-            raise FlexplantError(
-                f"{str(path)!r} is a netCDF-4 file, which needs h5py. Install it: "
-                "pip install 'flexplant[hdf5]'."
-            ) from None
-        return ExodusFile(str(path), lambda: h5py.File(path, "r"))
-    return ExodusFile(str(path), lambda: scipy.io.netcdf_file(path, "r", mmap=False))
+            what = f"{str(path)!r} is a netCDF-4 file, and reading it"
+            raise missing_extra("h5py", "hdf5", what) from None
+    do = "Is it an Exodus (netCDF) file, and whole? Write it again."
+    with parsing(path, do), np.errstate(all="ignore"):  # sizes of a damaged file overflow
+        file = h5py.File(path, "r") if is_hdf else scipy.io.netcdf_file(path, "r", mmap=False)
+        with contextlib.closing(file):
+            yield ExodusFile(str(path), file)
 
 
 class ExodusFile:
-    """Arrays of an Exodus file by name; what fails in a `with` block becomes an error of the file.
+    """Arrays of an Exodus file by name.
 
     Parameters
     ----------
     path : str
         For messages.
-    opener : callable
-        Opens the netCDF file.
+    file : netCDF or HDF5 file
+        Open.
     """
 
-    def __init__(self, path: str, opener: Any) -> None:
-        self.path = path
-        try:
-            with np.errstate(all="ignore"):  # sizes of a damaged file overflow
-                self.file = opener()
-        except Exception as error:  # its bytes lead anywhere
-            raise self._wrong(error) from None
+    def __init__(self, path: str, file: Any) -> None:
+        self.path, self.file = path, file
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self.file.close()
-        if isinstance(error, Exception) and not isinstance(error, FlexplantError):
-            raise self._wrong(error) from None
-
-    def _wrong(self, what: object) -> FlexplantError:
-        return FlexplantError(
-            f"{self.path!r} cannot be read as an Exodus (netCDF) file: {what!s:.120}. It is cut "
-            "off, damaged or another format: write it again."
-        )
+    def _wrong(self, what: str) -> FlexplantError:
+        return damaged(self.path, what)
 
     def _names(self) -> Any:
         return getattr(self.file, "variables", self.file)

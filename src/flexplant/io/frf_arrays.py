@@ -76,9 +76,7 @@ def read_frf_npz(
                 # letters beyond those of Unicode would fail where they are printed
                 array.astype(array.dtype.newbyteorder("=")).tobytes().decode("utf-32")
     if "__flexplant__" in content:
-        raise FlexplantError(
-            f"{str(path)!r} was saved by flexplant: flexplant.load(path) reads it."
-        )
+        raise FlexplantError(f"{str(path)!r} is flexplant's own: flexplant.load(path) reads it.")
     return _frf(content, path, freq, data, quantity, frequency_axis)
 
 
@@ -177,21 +175,13 @@ def _ordered(array: Any, n: int, axis: int | None, name: str, path: str | Path) 
     squeezed = array.reshape(-1) if array.size == n and axis is None else array
     if squeezed.ndim == 1 and squeezed.size == n:
         return squeezed.reshape(1, 1, n)
-    if array.ndim != 3:
-        raise ShapeError(
-            f"{name!r} of {str(path)!r} must have shape (n_out, n_in, {n}), or ({n},) for a single "
-            f"pair, got {array.shape}. Add the axes that are missing before saving."
-        )
     fits = [i for i, size in enumerate(array.shape) if size == n]
-    if axis is None and len(fits) > 1:
-        raise ShapeError(
-            f"{name!r} of {str(path)!r} has shape {array.shape}, of which axes {fits} have the "
-            f"length {n} of freq. Say which is frequency: frequency_axis=2."
-        )
     chosen = fits[0] if axis is None and fits else axis
-    if chosen is None or not -3 <= chosen < 3 or array.shape[chosen] != n:
-        raise ShapeError(
-            f"{name!r} of {str(path)!r} has shape {array.shape}, in which axis {chosen} is not the "
-            f"{n} frequencies. Save all frequencies of all pairs."
-        )
+    wrong = ""
+    if array.ndim != 3 or chosen is None or not -3 <= chosen < 3 or array.shape[chosen] != n:
+        wrong = f"axis {chosen} is not the {n} frequencies. Save (n_out, n_in, {n}), or ({n},)"
+    elif axis is None and len(fits) > 1:
+        wrong = f"axes {fits} are as long as freq. Say which it is: frequency_axis=2"
+    if wrong or chosen is None:
+        raise ShapeError(f"{name!r} of {str(path)!r} has shape {array.shape}: {wrong}.")
     return np.moveaxis(array, chosen, 2)

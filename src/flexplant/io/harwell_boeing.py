@@ -15,8 +15,8 @@ from ..structure import FEMatrices
 from .assembled import one_matrix_each, text_digits
 from .foreign import sound
 from .formats import Format
-from .numbers import cut_short, fixed_numbers, spaced_numbers
-from .paths import check_size, damaged, parsing
+from .numbers import fixed_numbers, spaced_numbers
+from .paths import check_size, check_whole, parsing
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -119,8 +119,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     start = 4 + right_hand + counts[1] + counts[2]
     sample = lines[start : start + _SAMPLE // max(per_line, 1) + 1]
     words = [line[i : i + width] for line in sample for i in range(0, len(line.rstrip()), width)]
-    if cut_short(content, words):
-        raise damaged(path, "the last number is shorter than all others")
+    check_whole(content, words, path)
     return matrix, text_digits(words)
 
 

@@ -13,14 +13,14 @@ import numpy as np
 import scipy.sparse as sp
 from scipy.io import mmread
 
-from ..errors import FlexplantError, ModelError, ShapeError
+from ..errors import FlexplantError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray
 from .assembled import one_matrix_each, text_digits
 from .formats import Format
-from .numbers import cut_short, rows_of_numbers, wrong_line
-from .paths import check_size, damaged
+from .numbers import rows_of_numbers, wrong_line
+from .paths import check_size, check_whole, damaged, unread, wrong_line_of
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -105,8 +105,7 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
         return matrix, None
     lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
     words = [line.split()[-1] for line in lines if line.strip()]
-    if cut_short(content, words):
-        raise damaged(path, "the last number is shorter than all others")
+    check_whole(content, words, path)
     return matrix, text_digits(words)
 
 
@@ -118,16 +117,10 @@ def _numbers(body: bytes, head: _Header, path: Path) -> FloatArray:
         lines = body.split(b"\n")
         at = wrong_line(lines, width) or 0
         due = "row, column and value" if head.listed else "one number"
-        raise FlexplantError(
-            f"{str(path)!r}, line {head.lines + at + 1}: expected {due}, got "
-            f"{lines[at].strip()[:72].decode('latin-1')!r}. A number is finite, has a decimal "
-            "point and may end in E, D or no letter and its exponent. Is the file cut short?"
-        )
+        do = "A number is finite, with a decimal point and E, D or a sign before its exponent."
+        raise wrong_line_of(path, head.lines + at + 1, f"expected {due} is", lines[at], do)
     if len(table) != head.entries:
-        raise FlexplantError(
-            f"{str(path)!r} announces {head.entries} entries and holds {len(table)}. Is it cut "
-            "short?"
-        )
+        raise damaged(path, f"announces {head.entries} entries and holds {len(table)}")
     return table
 
 
@@ -153,10 +146,8 @@ def _header(content: bytes, path: Path) -> _Header:
         )
     form, kind, symmetry = words[2:5]
     if kind in ("complex", "pattern") or symmetry in ("skew-symmetric", "hermitian"):
-        raise ModelError(
-            f"{str(path)!r} is {kind} {symmetry}: a stiffness, mass or damping matrix is real and "
-            "symmetric. Gyroscopic and structural (complex) terms have no place here."
-        )
+        do = "M, D and K are real and symmetric: leave gyroscopic and complex terms out."
+        raise unread(path, f"is {kind} {symmetry}", do)
     lines = 1
     line = b"%"
     while start < len(content) and (not line.strip() or line[:1] == b"%"):
@@ -165,10 +156,8 @@ def _header(content: bytes, path: Path) -> _Header:
     sizes = [int(word) if word.isdigit() else -1 for word in line.split()]
     known = form in ("coordinate", "array") and symmetry in ("general", "symmetric")
     if not known or len(sizes) != (3 if form == "coordinate" else 2) or min(sizes) < 0:
-        raise FlexplantError(
-            f"{str(path)!r}, line {lines}: the size of a matrix of {form} {symmetry} form cannot "
-            f"be read from {line[:72]!r}. Is it cut short?"
-        )
+        due = f"the size of a matrix of {form} {symmetry} form is"
+        raise wrong_line_of(path, lines, due, line, "Is it cut short?")
     n, m = sizes[:2]
     if symmetry == "symmetric" and n != m:
         raise ShapeError(f"{str(path)!r} is called symmetric and is not square: {n} x {m}.")
@@ -206,11 +195,9 @@ def _entries(table: FloatArray, head: _Header, path: Path) -> Any:
     at = table[:, :2]
     wrong = np.any((at != np.floor(at)) | (at < 1) | (at > head.shape), axis=1)
     if wrong.any():
-        i, j = at[int(np.argmax(wrong))]
-        raise FlexplantError(
-            f"{str(path)!r}, entry {int(np.argmax(wrong)) + 1}: row {i:g}, column {j:g} of a "
-            f"matrix of {head.shape[0]} x {head.shape[1]}, counted from 1. Write it again."
-        )
+        k, size = int(np.argmax(wrong)), f"{head.shape[0]} x {head.shape[1]}, counted from 1"
+        i, j = at[k]
+        raise damaged(path, f"entry {k + 1}: row {i:g}, column {j:g} of a matrix of {size}")
     i, j = at.T.astype(np.int64) - 1
     return sp.coo_array((table[:, 2], (i, j)), shape=head.shape)
 

@@ -12,7 +12,6 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices, FEModel
-from ..values import short
 from . import (
     abaqus,
     ansys,
@@ -27,7 +26,7 @@ from . import (
 )
 from .elsewhere import OTHERS
 from .formats import HEAD, USUAL, Elsewhere, Format, ends
-from .paths import file_path
+from .paths import file_path, three_units
 from .tables import read_dofs, read_nodes_table
 
 FORMATS: tuple[Format, ...] = (
@@ -229,12 +228,7 @@ def read_model(
     array([[ 2000., -1000.],
            [-1000.,  1000.]])
     """
-    sizes = tuple(units) if isinstance(units, Iterable) and not isinstance(units, str) else ()
-    if len(sizes) != 3:
-        raise ModelError(
-            f"units must be three, of length, mass and time, got {short(units)}: "
-            "give ('mm', 't', 's') for instance."
-        )
+    sizes = three_units(units)
     found = read_matrices(
         path,
         stiffness=stiffness,

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ..errors import FlexplantError
+from ..errors import FlexplantError, ModelError
 from ..values import short
+from .numbers import cut_short
 
 
 def file_path(path: Any, name: str = "path") -> Path:
@@ -31,7 +32,68 @@ def file_path(path: Any, name: str = "path") -> Path:
 
 def damaged(path: object, what: object, do: str = "Write it again.") -> FlexplantError:
     """Return the error of a file that is not what its format says; `what` is cut to 200 letters."""
-    return FlexplantError(f"{str(path)!r}, {what!s:.200}: the file is damaged. {do}")
+    return FlexplantError(f"{str(path)!r}, {what!s:.200}: the file is damaged or cut off. {do}")
+
+
+def wrong_line_of(
+    path: object, number: int, due: str, line: str | bytes, do: str = "Write it again."
+) -> FlexplantError:
+    """Return the error of a line, counted from 1, that does not hold what is due there."""
+    got = line.decode("latin-1") if isinstance(line, bytes) else line
+    return FlexplantError(
+        f"{str(path)!r}, line {number}: {due} due, got {got.strip()[:72]!r}. {do}"
+    )
+
+
+def unread(path: object, what: str, do: str) -> ModelError:
+    """Return the error of a file that holds what is no M, D, K or shape of a structure."""
+    return ModelError(f"{str(path)!r} {what}. {do}")
+
+
+def no_motion(path: object, kinds: object) -> ModelError:
+    """Return the error of a file with DOFs that are no displacement or rotation."""
+    what = (
+        f"has DOFs that are no displacement or rotation ({kinds}): temperature, pressure, voltage"
+    )
+    return unread(path, f"{what}, warping or a multiplier", "Export the structural part alone.")
+
+
+def three_units(units: Any) -> tuple[Any, ...]:
+    """Return the units of length, mass and time.
+
+    Raises
+    ------
+    ModelError
+        When they are not three.
+    """
+    sizes = tuple(units) if isinstance(units, Iterable) and not isinstance(units, str) else ()
+    if len(sizes) != 3:
+        raise ModelError(
+            f"units must be three, of length, mass and time, got {short(units)}: "
+            "give ('mm', 't', 's') for instance."
+        )
+    return sizes
+
+
+def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
+    """Refuse a text that ends, without a line end, in a number shorter than all others.
+
+    Parameters
+    ----------
+    content : bytes
+        The text.
+    words : iterable of bytes
+        Numbers of it as printed, some or all.
+    path : object
+        The file, for the message.
+
+    Raises
+    ------
+    FlexplantError
+        When it does: a number without its last digits still is a number.
+    """
+    if cut_short(content, words):
+        raise damaged(path, "the last number is shorter than all others")
 
 
 @contextmanager

@@ -11,6 +11,7 @@ from ..errors import FlexplantError
 from ..values import FloatArray
 from .nastran_shapes import shapes_at
 from .numbers import decimal
+from .paths import damaged, wrong_line_of
 from .shapes import FileShapes, ModesFormat
 
 _EIGENVALUE = re.compile(rb"\$EIGENVALUE\s*=\s*(\S+)\s+MODE\s*=\s*(\d+)")
@@ -69,7 +70,7 @@ def read_punch_shapes(path: Path, nodes: Path | None) -> FileShapes:
     parts = [part for part in parts if part[1]]
     ids = np.array(list(parts[0][1]), dtype=np.int64)
     if any(list(points) != list(parts[0][1]) for _, points in parts):
-        raise FlexplantError(f"{str(path)!r}: the modes are at different nodes. Write it again.")
+        raise damaged(path, "the modes are at different nodes")
     kinds = np.array([1 if kind == b"G" else 2 for kind, _ in parts[0][1].values()])
     columns = [np.array([values for _, values in points.values()]) for _, points in parts]
     eigenvalues: FloatArray = np.array([value for value, _ in parts])
@@ -86,10 +87,8 @@ def _number(text: bytes, path: Path, at: int, line: bytes) -> float:
 
 
 def _wrong(path: Path, at: int, line: bytes) -> FlexplantError:
-    return FlexplantError(
-        f"{str(path)!r}, line {at + 1}: a point of an eigenvector is due, got "
-        f"{line.decode('latin-1')!r}. The file is cut off or damaged: write it again."
-    )
+    do = "The file is cut off or damaged: write it again."
+    return wrong_line_of(path, at + 1, "a point of an eigenvector is", line, do)
 
 
 def _begins(head: bytes) -> bool:

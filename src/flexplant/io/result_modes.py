@@ -11,10 +11,10 @@ from ..errors import FlexplantError, LabelError, ModelError
 from ..modes import Modes
 from ..structure import FEMatrices, FEModel
 from ..structure.units import units as unit_system
-from ..values import FloatArray, instance, short
+from ..values import FloatArray, instance
 from . import ansys_modes, exodus_modes, op2, punch_modes, uff_modes
 from .formats import HEAD, ends
-from .paths import file_path
+from .paths import file_path, three_units
 from .shapes import ModesFormat, check_mass, modes_of
 
 FORMATS: tuple[ModesFormat, ...] = (
@@ -99,12 +99,7 @@ def read_modes(
     (('7:z',), array([200.]), array([[2.]]))
     """
     path = file_path(path)
-    sizes = tuple(units or ()) if not isinstance(units, str) else ()
-    if units is not None and len(sizes) != 3:
-        raise ModelError(
-            f"units must be three, of length, mass and time, got {short(units)}: "
-            "give ('mm', 't', 's') for instance."
-        )
+    sizes = () if units is None else three_units(units)
     with path.open("rb") as file:
         head = file.read(HEAD).lower()
     form = next((f for f in FORMATS if ends(path, f.suffixes) and f.begins(head)), None)

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, ModelError, ShapeError, counted
+from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure.units import Units
 from ..values import FloatArray, positive, real_array
+from .paths import damaged
 
 #: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits
 _ONE = 1e-5
@@ -93,7 +94,7 @@ def modes_of(
         When damping is not known, masses are not positive, or modes are near zero.
     """
     if not (np.all(np.isfinite(shapes.phi)) and np.all(np.isfinite(shapes.omega))):
-        raise FlexplantError(f"{path!r} has NaN or infinite numbers in its modes: write it again.")
+        raise damaged(path, "NaN or infinite numbers in its modes")
     shapes = _unit_mass(shapes, path)
     damping = shapes.zeta if zeta is None else zeta
     if damping is None:
@@ -179,6 +180,12 @@ def check_mass(phi: FloatArray, M: Any, path: str) -> float:
     ModelError
         When it is farther.
     """
+    n = phi.shape[0]
+    if M.shape != (n, n):
+        raise ShapeError(
+            f"M must have shape ({n}, {n}), node by node, got {M.shape}. Give that of the same "
+            "nodes and directions."
+        )
     gram = phi.T @ np.asarray(M @ phi)
     off = np.abs(gram - np.eye(gram.shape[0]))
     if off.max(initial=0.0) > _SINGLE:

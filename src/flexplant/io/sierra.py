@@ -15,8 +15,8 @@ from ..values import FloatArray, IntArray
 from .abaqus import symmetric
 from .exodus import opened
 from .formats import Format
-from .numbers import cut_short, printed_digits, rows_of_numbers, wrong_line
-from .paths import check_size, damaged, file_path
+from .numbers import printed_digits, rows_of_numbers, wrong_line
+from .paths import check_size, check_whole, damaged, file_path, no_motion, wrong_line_of
 
 _WORD = re.compile(rb"[^\s,;]+")
 #: a map has so many entries a node: x, y, z, rx, ry, rz and two or three that are no motion
@@ -94,7 +94,7 @@ def read_sierra(
         at = table[:, :2].astype(np.int64) - 1
         counts = np.unique(at[:, 0] * n + at[:, 1], return_counts=True)[1]
         if np.any(counts > 1):
-            raise FlexplantError(f"{str(file)!r} gives an entry twice. Write it again.")
+            raise damaged(file, "an entry stands twice")
         entries = sp.coo_array((table[:, 2], (at[:, 0], at[:, 1])), shape=(n, n))
         return symmetric(sp.csc_array(entries))
 
@@ -121,9 +121,7 @@ def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
     if start < 0:  # a bare table
         start, stop = -1, len(content)
     if stop < start:
-        raise FlexplantError(
-            f"{str(path)!r}: the table does not end with ']': the file is cut off."
-        )
+        raise damaged(path, "the table does not end with ']'")
     first = content[: start + 1].count(b"\n") + 1
     lines = [
         line.split(b"%")[0].strip(b" \t\r;,") for line in content[start + 1 : stop].split(b"\n")
@@ -135,21 +133,17 @@ def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
     if table is None or not kept or not np.all(np.isfinite(table)):
         at = wrong_line((b" ".join(row) for row in words), width)
         if at is not None:
-            raise FlexplantError(
-                f"{str(path)!r}, line {first + at}: {counted(width, 'number')} are due, "
-                f"got {lines[at][:72].decode('latin-1')!r}. Write it again with 'mfile'."
-            )
+            due = f"{counted(width, 'number')} are"
+            raise wrong_line_of(path, first + at, due, lines[at], "Write it again with 'mfile'.")
         raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
     whole = table[:, : width - 1] if width > 1 else table
     wrong = (whole != np.round(whole)) | ((whole < 1) & (width > 1))
     if np.any(wrong):
-        raise FlexplantError(
-            f"{str(path)!r}: {whole[wrong][0]:g} is no row or column, which are counted from 1. "
-            "Write it again with 'mfile'."
-        )
+        what = f"{whole[wrong][0]:g} is no row or column, which are counted from 1"
+        raise damaged(path, what, "Write it again with 'mfile'.")
     shown = [row[-1] for row in words if row][:: max(1, len(kept) // 1000)]
-    if stop == len(content) and cut_short(content, shown):
-        raise damaged(path, "the last number is shorter than all others")
+    if stop == len(content):
+        check_whole(content, shown, path)
     return table, printed_digits(shown)
 
 
@@ -210,10 +204,7 @@ def _per_node(path: str | Path, size: int, entry: IntArray, nodes: int | None) -
     if len(moving) == 1:
         return moving[0]
     if fits and not moving:
-        raise ModelError(
-            f"{str(path)!r} maps rows that are no motion of a node: temperature, potential or a "
-            "Lagrange multiplier are no part of M, D, K."
-        )
+        raise no_motion(path, "by its map")
     raise ShapeError(
         f"{str(path)!r} has {size} entries"
         + (

@@ -108,10 +108,8 @@ def read_dofs(
     needed = ("node", "direction") if nodes is not None else ("node", "direction", "x", "y", "z")
     missing = [name for name in needed if name not in columns]
     if missing:
-        raise LabelError(
-            f"{str(path)!r} has no column {missing}, got {list(columns)}. One line a DOF: node, "
-            "direction, x, y, z; or give nodes=table of coordinates, or directions=(...)."
-        )
+        do = "One line a DOF: node, direction, x, y, z; or give nodes=table or directions=(...)."
+        raise table.lacks(missing, do)
     numbers = table.whole("node")
     kinds = [_direction(name, path) for name in columns["direction"]]
     if nodes is None:
@@ -150,10 +148,7 @@ def read_nodes_table(path: str | Path) -> tuple[IntArray, FloatArray]:
 def _nodes(table: _Table) -> tuple[IntArray, FloatArray]:
     missing = [name for name in ("node", "x", "y", "z") if name not in table.columns]
     if missing:
-        raise LabelError(
-            f"{table.path!r} has no column {missing}, got {list(table.columns)}: a table of nodes "
-            "has node, x, y, z."
-        )
+        raise table.lacks(missing, "A table of nodes has node, x, y, z: add them.")
     return table.whole("node"), np.column_stack([table.numbers(c) for c in "xyz"])
 
 
@@ -164,6 +159,10 @@ class _Table:
     path: str
     columns: dict[str, list[str]]
     lines: list[int]
+
+    def lacks(self, missing: list[str], do: str) -> LabelError:
+        """Return the error of columns that are missing."""
+        return LabelError(f"{self.path!r} has no column {missing}, got {list(self.columns)}. {do}")
 
     def numbers(self, column: str) -> FloatArray:
         """Return a column of numbers (n,)."""

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import mapping
 from ..errors import CertificateError, FlexplantWarning, LabelError, ModelError
 from ..labels import DofSet
 from ..lti import Frf
@@ -129,8 +130,8 @@ def uncoupled(
     True
     """
     instance(machine, Frf, "machine", "Pass the responses of the whole.")
-    if isinstance(known, Frf) or not isinstance(known, Mapping) or not known:
-        raise ModelError("known must be a mapping of responses by component: {'frame': frf}.")
+    whose = None if isinstance(known, Frf) else known
+    mapping(whose, "known", "Pass responses by component: {'frame': frf}.", least=1)
     _same_lines({"the machine": machine, **known})
     links = _taken_out(machine, known, _listed(joints), dofs)
     outputs = [*machine.outputs, *(f"{_KNOWN}{n}/{c}" for n in known for c in known[n].outputs)]

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..arguments import positive_array
 from ..dof_columns import node_numbers
-from ..errors import LabelError, ModelError
+from ..errors import LabelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.rigid import rigid_motions
 from ..values import FloatArray, IntArray, Value, instance, real_array, short
@@ -78,9 +79,7 @@ class Patch(Value):
             )
         weights = self.weights
         if weights is not None:
-            weights = real_array(weights, "weights of a patch", (len(nodes or ()),))
-            if not np.all(weights > 0):
-                raise ModelError("weights of a patch must be positive, one for each of its nodes.")
+            weights = positive_array(weights, "weights of a patch", (len(nodes or ()),))
         self._set(
             nodes=nodes,
             box=None if self.box is None else real_array(self.box, "box", (2, 3)),

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
+from ..arguments import between
 from ..errors import ModelError
 from ..values import FloatArray, IntArray, positive
 from .joining import Matrices
@@ -263,9 +264,8 @@ def tustin(sys: System, rate: float, *, prewarp: float | None = None) -> StateSp
         raise ModelError(f"{g!r} is sampled already. Pass the continuous system.")
     a = 2.0 * positive(rate, "rate")
     if prewarp is not None:
-        if not 0.0 < prewarp < 0.5 * rate:
-            raise ModelError(f"prewarp must lie between 0 and {0.5 * rate:g} Hz, got {prewarp:g}.")
-        w = 2.0 * np.pi * prewarp
+        why = "It is in Hz, below half the rate."
+        w = 2.0 * np.pi * between(prewarp, "prewarp", 0.0, 0.5 * rate, why)
         a = w / np.tan(w / a)
     if _has_pole_at(a, g.A):
         raise ModelError(f"{g!r} has a pole at {a:g} rad/s, which Tustin maps to infinity.")

@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
+from ..arguments import positive_array
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
 from ..values import (
     ComplexArray,
@@ -137,9 +138,8 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
                 raise ModelError("coherence must lie between 0 and 1.")
         variance = self.variance
         if variance is not None:
-            variance = real_array(variance, "variance", data.shape)
-            if variance.size and variance.min() < 0:
-                raise ModelError("variance must not be negative: it is E|error|^2.")
+            why = "It is E|error|^2."
+            variance = positive_array(variance, "variance", data.shape, zero=True, hint=why)
         correlation = self.correlation
         if correlation is not None:
             correlation = checked_correlation(correlation, data.shape)

@@ -7,8 +7,9 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 
+from ..arguments import positive_array
 from ..errors import ModelError
-from ..values import ComplexArray, FloatArray, IntArray, positive, real_array
+from ..values import ComplexArray, FloatArray, IntArray, positive
 from .responses import continuous_poles, responder
 from .statespace import StateSpace, System, as_statespace
 
@@ -262,10 +263,7 @@ def _rise(x: FloatArray, y: FloatArray) -> FloatArray:
 
 def checked_freq(freq: npt.ArrayLike) -> FloatArray:
     """Return frequencies as a finite array (n,) that is not negative."""
-    freq = real_array(freq, "freq", (None,))
-    if freq.size and freq.min() < 0:
-        raise ModelError(f"freq must not be negative, got {freq.min():g} Hz.")
-    return freq
+    return positive_array(freq, "freq", (None,), zero=True)
 
 
 def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:

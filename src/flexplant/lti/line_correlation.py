@@ -7,8 +7,9 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..arguments import between
 from ..errors import ModelError, ShapeError
-from ..values import ComplexArray, FloatArray, positive
+from ..values import ComplexArray, FloatArray
 
 #: samples of a window that stand for all lengths
 SAMPLES = 256
@@ -55,10 +56,7 @@ def checked_window(window: Any) -> str | tuple[Any, ...]:
 
 def checked_overlap(overlap: Any) -> float:
     """Return an overlap below 0.95."""
-    share = positive(overlap, "overlap", zero=True)
-    if share >= 0.95:
-        raise ModelError(f"overlap must be below 0.95, got {share:g}: it brings nothing new.")
-    return share
+    return between(overlap, "overlap", 0.0, 0.95, "More brings nothing new: try 0.5.", ends="[")
 
 
 def line_correlation(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..arguments import between
 from ..errors import ModelError
 from ..values import positive
 from .sections import zpk_fields
@@ -56,7 +57,6 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
     """
     g = as_statespace(sys)
     h = 1.0 / positive(rate, "rate")
-    at = positive(at, "at", zero=True)
     if g.dt and g.n_states:
         raise ModelError(f"{g!r} is sampled already. Pass the continuous system.")
     if g.D.shape != (1, 1):
@@ -65,8 +65,7 @@ def matched(sys: System, rate: float, *, at: float = 0.0) -> StateSpace:
             "zeros of several channels cannot be mapped one by one. Use tustin, or sample each "
             "channel by itself: append(matched(g['y1', 'u1'], rate), ...)."
         )
-    if at >= 0.5 * rate:
-        raise ModelError(f"at must lie below half the rate ({0.5 * rate:g} Hz), got {at:g}.")
+    at = between(at, "at", 0.0, 0.5 * rate, "It is in Hz, below half the rate.", ends="[")
     if not g.n_states:
         return g.replace(dt=h)
     wanted = _gain(g, 2j * np.pi * at, at)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import FloatArray, positive
+from ..arguments import between
+from ..values import FloatArray
 from .factors import controllability_factor, observability_factor
 from .interconnection import parallel
 from .joining import is_block_diagonal
@@ -59,8 +59,7 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     array([-1.])
     """
     g = as_statespace(sys)
-    if not positive(tol, "tol") < 1.0:
-        raise ModelError(f"tol must lie between 0 and 1, got {tol:g}.")
+    tol = between(tol, "tol", 0.0, 1.0, "Try 1e-9.")
     if not g.n_states:
         return g
     split = split_stable(g)

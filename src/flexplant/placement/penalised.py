@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import AssumptionError, ModelError
+from ..arguments import function
+from ..errors import AssumptionError
 from ..plant import StandardPlant, larger_plant
-from ..values import FloatArray, one_of, positive, short
+from ..values import FloatArray, one_of, positive
 from .candidates import side_of, sides_of
 from .criterion import Criterion, Scorer, as_criterion
 from .shapes import Shapes, shapes_of
@@ -158,8 +159,7 @@ class Penalised(Wrapping):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not callable(self.penalty):
-            raise ModelError(f"a penalty is callable, got {short(self.penalty)}. Name one.")
+        function(self.penalty, "a penalty", "Name one.")
         self._set(weight=positive(self.weight, "weight"))
 
     def __call__(self, plant: StandardPlant) -> float:

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
-from ..values import short, whole
+from ..arguments import function
+from ..values import whole
 from ..work import Work
 from .exchange import Exchange
 from .layouts import layouts_of
@@ -56,8 +56,7 @@ class Screened(Search):
     starts: int = field(default=6, kw_only=True)
 
     def __post_init__(self) -> None:
-        if not callable(self.by):
-            raise ModelError(f"by is a criterion, got {short(self.by)}. Pass PoiVariance(), say.")
+        function(self.by, "by, a criterion,", "Pass PoiVariance(), say.")
         self._set(keep=whole(self.keep, "keep"), starts=whole(self.starts, "starts"))
 
     def __repr__(self) -> str:

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import ModelError
+from ..arguments import function
 from ..plant import StandardPlant
-from ..values import short
 from .candidates import sides_of
 from .criterion import Criterion, as_criterion
 
@@ -31,10 +30,7 @@ class Wrapping(Criterion):
     criterion: Any
 
     def __post_init__(self) -> None:
-        if not callable(self.criterion):
-            raise ModelError(
-                f"a criterion is callable, got {short(self.criterion)}. Pass PoiVariance(), say."
-            )
+        function(self.criterion, "a criterion", "Pass PoiVariance(), say.")
 
     @property
     def inner(self) -> Criterion:

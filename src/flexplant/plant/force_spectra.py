@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
+from ..arguments import between
 from ..labels import Place
 from ..lti.statespace import StateSpace
-from ..values import Value, positive, short
+from ..values import Value, positive
 from .forces import BaseAcceleration, Disturbance
 from .rigid_force import RigidForce
 
@@ -161,11 +161,7 @@ class NarrowBand(_Spectrum):
     zeta: float = 0.01
 
     def __post_init__(self) -> None:
-        zeta = positive(self.zeta, "zeta")
-        if zeta >= 1:
-            raise ModelError(
-                f"zeta must be below 1, got {short(zeta)}: no band is that wide. Use FirstOrder."
-            )
+        zeta = between(self.zeta, "zeta", 0.0, 1.0, "No band is that wide: use FirstOrder.")
         self._set(rms=positive(self.rms, "rms"), freq=positive(self.freq, "freq"), zeta=zeta)
 
     @property

@@ -9,10 +9,11 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
+from ..arguments import between
 from ..errors import ModelError
 from ..estimation import Consistency, Estimate
 from ..estimation.whiteness import spectrum_of
-from ..values import FloatArray, instance, positive
+from ..values import FloatArray, instance
 from ._axes import finish, legend, named, shown_in
 from ._style import BLACK, BLUE, CYCLE, STYLES
 
@@ -75,8 +76,7 @@ def consistency(
     """
     instance(estimate, Estimate, "estimate", "Pass what observer.estimate returned.")
     instance(found, Consistency | None, "found", "Pass what consistency returned.")
-    if not 0.5 <= positive(level, "level") < 1:
-        raise ModelError(f"level must be from 0.5 to below 1, got {level:g}. Pass 0.95.")
+    between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
     white = estimate.whitened.T
     there = _there(white)
     if int(there.sum()) < _FEWEST:

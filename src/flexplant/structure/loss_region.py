@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ..arguments import between, element_mask
 from ..errors import ModelError, ShapeError
 from ..labels import DofSet
-from ..values import FloatArray, Matrix, Value, instance, positive, real_array, short
+from ..values import FloatArray, Matrix, Value, instance, real_array
 from .attachments import Spring, added_matrices
 
 
@@ -103,12 +104,7 @@ class LossRegion(Value):
         ...                        youngs_modulus=70e9)
         <LossRegion: loss factor 0.1, a matrix of 27 DOFs>
         """
-        mask = np.asarray(elements)
-        if mask.dtype != bool or not mask.any():
-            raise ShapeError(
-                f"elements must be True or False for each element and choose some, got "
-                f"{short(elements)}. Pass a comparison, x < 0.3, say."
-            )
+        mask = element_mask(elements, "elements")
         modulus = np.broadcast_to(real_array(youngs_modulus, "youngs_modulus"), mask.shape)
         more: Any = build(modulus * (1.0 + mask)).K - build(np.array(modulus)).K
         return cls(loss_factor, sp.csc_array(more))
@@ -142,10 +138,8 @@ def checked_loss_factor(value: Any) -> float:
     ModelError
         When it is not there.
     """
-    eta = positive(value, "loss_factor", zero=True)
-    if eta >= 2:
-        raise ModelError(
-            f"loss_factor must be below 2, got {eta:g}: the equivalent damping ratio is half "
-            "of it, and from 1 on there is no oscillation left. Give 0.02 for 2 %."
-        )
-    return eta
+    why = (
+        "The equivalent damping ratio is half of it, and from 1 on there is no oscillation left: "
+        "give 0.02 for 2 %."
+    )
+    return between(value, "loss_factor", 0.0, 2.0, why, ends="[")

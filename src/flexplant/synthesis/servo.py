@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
+from ..arguments import between
 from ..errors import FlexplantWarning, ModelError, SolverError
 from ..loop import ClosedLoop
 from ..loop.spill_over import growing_modes, named
@@ -208,8 +209,7 @@ def servo_bandwidth(
     >>> fx.servo_bandwidth(plant, observer=fx.design_kalman(plant)) > 20.0
     True
     """
-    if positive(peak, "peak") <= 1.0:
-        raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")
+    peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     task = servo_task(
         plant,
         poi=poi,

@@ -9,6 +9,7 @@ from typing import Protocol, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ..arguments import function
 from ..errors import FlexplantError, ModelError, ShapeError
 from ..lti.balancing import balanced
 from ..lti.discretisation import bilinear, tustin
@@ -328,8 +329,7 @@ class Parametrised:
         *,
         spread: float = 0.3,
     ) -> None:
-        if not callable(make):
-            raise ModelError("make must be a function of the parameters. Pass one.")
+        function(make, "make", "Pass one of the parameters, which returns a StateSpace.")
         self.make, self.start = make, real_array(start, "start", (None,))
         self.spread = float(real_array(spread, "spread", ()))
 

@@ -7,7 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import ModelError, SolverError
+from ..arguments import between
+from ..errors import SolverError
 from ..loop import report_loops
 from ..lti.frequency import Frf, frequency_response
 from ..lti.grid import resonance_grid
@@ -15,7 +16,7 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..progress import Progress
-from ..values import FloatArray, positive, whole
+from ..values import FloatArray, whole
 from .axis_law import AxisLaw
 from .law import Law
 from .law_search import FoundLaw, LawSearch
@@ -99,8 +100,7 @@ def tune_loops(
     >>> design.report.is_stable
     True
     """
-    if positive(peak, "peak") <= 1.0:
-        raise ModelError(f"peak must be above 1, got {peak:g}: no loop keeps |S| below 1. Try 2.")
+    peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
     axes = axes_of(plant, before, after, rate, delay, hold)
     measured = isinstance(axes.plant, Frf)
     if rigid is None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import ModelError, ShapeError
-from ..values import FloatArray, Rng, generator, real_array, short
+from ..values import FloatArray, Rng, generator, real_array, whole
 from .parameters.added import PointParameter
 from .search import Objective, SearchEnd
 from .sensitivities import checked_values
@@ -27,9 +27,7 @@ def all_starts(objective: Objective, start: Any, starts: Any, rng: Rng) -> list[
     if starts is None:
         return [first]
     if np.ndim(starts) == 0:
-        if isinstance(starts, bool) or not isinstance(starts, int | np.integer) or starts < 1:
-            raise ModelError(f"starts must be whole or values, got {short(starts)}. Pass 20, say.")
-        return [first, *_drawn(objective, int(starts) - 1, rng)]
+        return [first, *_drawn(objective, whole(starts, "starts") - 1, rng)]
     values = real_array(starts, "starts")
     if values.ndim != 2 or values.shape[1] != first.size or not values.shape[0]:
         raise ShapeError(f"starts must have shape (any, {first.size}), got {values.shape}.")

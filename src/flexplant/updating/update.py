@@ -156,7 +156,7 @@ def update(
     if method is not None:
         instance(method, UpdateMethod, "method", "Pass GaussNewton() or TrustRegion().")
     if max_iterations is not None:
-        _checked_count(max_iterations)
+        whole(max_iterations, "max_iterations")
     enough = positive(tolerance, "tolerance")
     rng = generator(rng)
     takes_part = flag(prior, "prior")
@@ -288,11 +288,3 @@ def _at_bound(objective: Objective, p: FloatArray) -> tuple[str, ...]:
     near = AT_BOUND * np.where(np.isfinite(width), width, np.maximum(np.abs(p), 1e-12))
     at = (p - low <= near) | (high - p <= near)
     return tuple(q.name for q, there in zip(objective.parameters, at, strict=True) if there)
-
-
-def _checked_count(value: Any) -> int:
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ModelError(
-            f"max_iterations must be a whole number from 1, got {value!r}. Pass an int."
-        )
-    return int(value)

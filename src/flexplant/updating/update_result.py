@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..arguments import between
 from ..errors import ModelError, counted, unknown_label
 from ..modes import Modes, solve_modes
-from ..values import ComplexArray, FloatArray, Rng, Value, generator, positive, short, whole
+from ..values import ComplexArray, FloatArray, Rng, Value, generator, short, whole
 from .judgement.goodness import chance
 from .parameters.added import AddedMass, Parameter
 from .updated_model import applied
@@ -254,9 +255,7 @@ class UpdateResult(Value):
         ModelError
             When the covariance is not known, or the level is no probability.
         """
-        share = positive(level, "level")
-        if share >= 1:
-            raise ModelError(f"level must be below 1, got {share:g}. Choose 0.95, say.")
+        share = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
         std = self._known_std()
         from scipy.special import ndtri
 
@@ -274,9 +273,7 @@ class UpdateResult(Value):
             When the covariance is not known, or the count is no whole number from 1.
         """
         std = self._known_std()
-        if isinstance(count, bool) or not isinstance(count, int | np.integer) or count < 1:
-            raise ModelError(f"count must be a whole number from 1, got {count!r}.")
-        white = generator(rng).standard_normal((int(count), std.size))
+        white = generator(rng).standard_normal((whole(count, "count"), std.size))
         values, vectors = np.linalg.eigh(np.asarray(self.covariance) / np.outer(std, std))
         root = vectors * np.sqrt(np.maximum(values, 0.0))
         return np.asarray(self.values + (white @ root.T) * std, dtype=np.float64)

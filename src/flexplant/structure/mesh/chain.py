@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ...arguments import positive_array
 from ...errors import ModelError, ShapeError
 from ...labels import DofSet
-from ...values import FloatArray, frozen, positive, real_array
+from ...values import FloatArray, frozen, positive
 from ..model import FEModel
 
 
@@ -57,16 +58,13 @@ def chain(
     >>> chain(masses=[1, 2, 3], stiffnesses=[5, 7])
     <FEModel 'chain': 3 DOFs, sparse, 1 rigid-body motion, D not given>
     """
-    m = real_array(masses, "masses", (None,))
+    m = positive_array(masses, "masses", (None,), hint="Leave massless ones out.")
     n = m.size
     if not n:
         raise ModelError("masses is empty: a chain needs one mass at least. Pass [1.0], say.")
-    if np.any(m <= 0):
-        raise ModelError(f"masses must be positive, got {m.min():g} kg. Leave massless ones out.")
-    held = np.zeros(n) + real_array(ground, "ground", None if np.ndim(ground) == 0 else (n,))
+    shape = None if np.ndim(ground) == 0 else (n,)
+    held = np.zeros(n) + positive_array(ground, "ground", shape, zero=True)
     k = _between(stiffnesses, "stiffnesses", n)
-    if np.any(held < 0):
-        raise ModelError(f"ground must not be negative, got {held.min():g} N/m. Check its sign.")
     xyz = np.zeros((n, 3))
     xyz[:, 0] = positive(spacing, "spacing") * np.arange(n)
     return FEModel._proven(
@@ -81,14 +79,12 @@ def chain(
 
 
 def _between(given: Any, name: str, n: int) -> FloatArray:
-    values = real_array(given, name, (None,))
+    values = positive_array(given, name, (None,), zero=True)
     if values.size != n - 1:
         raise ShapeError(
             f"{n} masses have {n - 1} {name} between them, got {values.size}. Springs to the "
             "ground are given by ground=, dampers by model.with_parts([Damper(...)])."
         )
-    if np.any(values < 0):
-        raise ModelError(f"{name} must not be negative, got {values.min():g}. Check the sign.")
     return values
 
 

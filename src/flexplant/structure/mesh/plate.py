@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ModelError
-from ...values import FloatArray, short
+from ...arguments import members
+from ...values import FloatArray
 from ..model import FEModel
 from .assembly import Grid
 from .elements import plate_mass, plate_stiffness
@@ -129,10 +129,6 @@ def _weighted(parts: tuple[FloatArray, FloatArray], bending: Any, nu: Any) -> An
 
 
 def _ribs(ribs: Any) -> list[Rib]:
-    listed = [ribs] if isinstance(ribs, Rib) else list(ribs) if isinstance(ribs, Iterable) else ribs
-    if not isinstance(listed, list) or not all(isinstance(rib, Rib) for rib in listed):
-        raise ModelError(
-            f"ribs must be a list of Rib, got {short(ribs)}. Rib((0, 0.3), (0.6, 0.3), width=0.01, "
-            "height=0.02), say."
-        )
-    return listed
+    listed = [ribs] if isinstance(ribs, Rib) else ribs
+    hint = "Rib((0, 0.3), (0.6, 0.3), width=0.01, height=0.02), say."
+    return list(members(listed, Rib, "ribs", hint, least=0))

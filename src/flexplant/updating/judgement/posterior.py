@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...arguments import between
 from ...errors import ModelError
 from ...parallel import Progress
 from ...values import FloatArray, Rng, Value, generator
@@ -75,8 +76,7 @@ class Posterior(Value):
         ModelError
             When the level is no probability.
         """
-        if not 0 < level < 1:
-            raise ModelError(f"level must lie between 0 and 1, got {level!r}.")
+        level = between(level, "level", 0.0, 1.0, "Choose 0.95, say.")
         return np.quantile(self.draws, [(1 - level) / 2, (1 + level) / 2], axis=0).T
 
     def __repr__(self) -> str:

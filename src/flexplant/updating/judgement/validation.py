@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ...arguments import between
 from ...errors import ModelError
 from ...sparse.factor import dense
-from ...values import FloatArray, Rng, Value, generator, positive
+from ...values import FloatArray, Rng, Value, generator
 from ..parameters.added import Parameter
 from ..residuals.residual import Residual
 from ..search import Objective, checked_residuals
@@ -203,8 +204,7 @@ def split(residual: Any, *, share: float = 0.5, rng: Rng = 0) -> tuple[Any, Any]
             f"split takes modes or lines apart, got {type(residual).__name__}. Pass Eigenvalues, "
             "ModeShapes or an FrfResidual."
         )
-    if not positive(share, "share") < 1:
-        raise ModelError(f"share must lie between 0 and 1, got {share:g}. Choose 0.7, say.")
+    share = between(share, "share", 0.0, 1.0, "Choose 0.7, say.")
     items = np.asarray(parts)
     count = round(share * items.size)
     if not 0 < count < items.size:

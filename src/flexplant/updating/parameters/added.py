@@ -13,6 +13,8 @@ from ...errors import LabelError, ModelError, unknown_label
 from ...labels import DIRECTIONS, Place
 from ...values import FloatArray, Matrix, Value, real_array, short
 
+#: how the function that builds a model is written
+MAKES = "It returns an FEModel: lambda t: kirchhoff_plate(thickness=t, ...), say."
 #: derivatives of M, D and K to one parameter, None where zero
 Derivatives: TypeAlias = "tuple[Matrix | None, Matrix | None, Matrix | None]"
 

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ...arguments import element_mask, function, mapping
 from ...errors import LabelError, ModelError, ShapeError
 from ...modes import solve_modes
 from ...sparse.factor import DENSE_LIMIT, dense
 from ...structure import ModalDamping
 from ...structure.eigen import elastic_modes
-from ...values import FloatArray, Matrix, positive, real_array, short
-from .added import Derivatives, Parameter, checked_bounds, checked_prior, checked_text
+from ...values import FloatArray, Matrix, positive, real_array, short, whole
+from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 
 #: entries of a symmetric matrix differ by less than this, relatively, from their mirror images
 SYMMETRIC = 1e-9
@@ -119,11 +120,7 @@ class MatrixParameter(Parameter):
         ShapeError
             When the DOFs change.
         """
-        if not callable(build):
-            raise ModelError(
-                f"build must be a function from the value to an FEModel, got {short(build)}. Pass "
-                "e.g. lambda t: kirchhoff_plate(thickness=t, ...)."
-            )
+        function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))
         h = positive(1e-3 * abs(middle) if step is None else step, "step")
         low, high = build(middle - h), build(middle + h)
@@ -190,16 +187,8 @@ class MatrixParameter(Parameter):
         >>> MatrixParameter.regions(build, {"E left": left}, value=70e9)
         [<MatrixParameter: E left of K>]
         """
-        if not isinstance(regions, Mapping) or not regions:
-            raise LabelError(
-                f"regions must be a mapping {{name: elements}} with one at least, got "
-                f"{short(regions)}. Give {{'left': mask}}."
-            )
-        if not callable(build):
-            raise ModelError(
-                f"build must be a function from the elements' values to an FEModel, got "
-                f"{short(build)}. Pass e.g. lambda t: kirchhoff_plate(thickness=t, ...)."
-            )
+        mapping(regions, "regions", "Give {'left': mask}.", error=LabelError, least=1)
+        function(build, "build", MAKES)
         masks = {name: _mask(mask, name) for name, mask in regions.items()}
         shape = next(iter(masks.values())).shape
         given = real_array(value, "value")
@@ -273,15 +262,10 @@ class ModeDamping(Parameter):
     unit = ""
 
     def __post_init__(self) -> None:
-        number = self.mode
-        if isinstance(number, bool) or not isinstance(number, int | np.integer) or number < 1:
-            raise LabelError(
-                f"mode must be a whole number from 1, got {short(number)}. Pass an int, "
-                "rigid-body modes counted."
-            )
+        number = whole(self.mode, "mode")
         name = checked_text(self.name, "name") or f"damping ratio of mode {number}"
         bounds, prior = checked_bounds(self.bounds, name), checked_prior(self.prior, name)
-        self._set(mode=int(number), name=name, bounds=bounds, prior=prior)
+        self._set(mode=number, name=name, bounds=bounds, prior=prior)
 
     def __repr__(self) -> str:
         return f"<ModeDamping: {self.name}>"
@@ -340,15 +324,7 @@ def projected(part: Matrix | None, model: Any, name: str) -> Matrix | None:
 def _mask(value: Any, name: Any) -> Any:
     if not isinstance(name, str) or not name:
         raise LabelError(f"a region needs a name, got {short(name)}. Use a text.")
-    mask = np.asarray(value)
-    if mask.dtype != bool:
-        raise ShapeError(
-            f"region {name!r} must be True or False for each element, got {short(value)}. Pass a "
-            "comparison, x < 0.3, say."
-        )
-    if not mask.any():
-        raise ShapeError(f"region {name!r} has no elements: its change would do nothing.")
-    return mask
+    return element_mask(value, f"region {name!r}")
 
 
 def checked_matrix(value: Any, name: str) -> Matrix | None:

@@ -9,9 +9,10 @@ from typing import Any
 
 import numpy as np
 
+from ...arguments import function
 from ...errors import LabelError, ModelError, ShapeError
-from ...values import FloatArray, Matrix, positive, real_array, short, whole
-from .added import Derivatives, Parameter, checked_bounds, checked_prior, checked_text
+from ...values import FloatArray, Matrix, positive, real_array, whole
+from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 from .matrix_parameters import checked_matrix, projected
 
 #: relative to the change of a matrix: what its polynomial may miss between the points of it
@@ -132,11 +133,7 @@ class PolynomialParameter(Parameter):
         ShapeError
             When the DOFs change.
         """
-        if not callable(build):
-            raise ModelError(
-                f"build must be a function from the value to an FEModel, got {short(build)}. Pass "
-                "e.g. lambda t: kirchhoff_plate(thickness=t, ...)."
-            )
+        function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))
         half = positive(0.2 * abs(middle) if width is None else width, "width")
         powers = whole(degree, "degree")

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 import numpy as np
 import scipy.linalg as la
 
-from ...errors import LabelError, ModelError
+from ...arguments import positive_array
+from ...errors import LabelError
 from ...identification import MeasuredModes
-from ...values import ComplexArray, FloatArray, instance, positive, real_array
+from ...values import ComplexArray, FloatArray, instance, positive
 from ..family import Family, groups
 from ..point_model import Point
 from .mode_shapes import chosen_modes
@@ -67,13 +68,9 @@ class Eigenvalues(Residual):
                 "modes."
             )
         if self.weights is not None:
-            weights = real_array(self.weights, "weights", (len(self.measured),))
-            if weights.min() <= 0:
-                raise ModelError(
-                    f"weights must be positive, got {weights.min():g}: W of (12) is positive "
-                    "definite. Leave a pole out of the measurement instead of weighting it zero."
-                )
-            self._set(weights=weights)
+            why = "W of (12) is positive definite: leave a pole out of the measurement instead."
+            shape = (len(self.measured),)
+            self._set(weights=positive_array(self.weights, "weights", shape, hint=why))
         self._set(clusters=positive(self.clusters, "clusters", zero=True))
 
     def __repr__(self) -> str:

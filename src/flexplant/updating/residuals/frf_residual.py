@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
+from ...arguments import positive_array
 from ...errors import FlexplantWarning, ModelError, ShapeError, counted
 from ...labels import Place
 from ...lti import Frf
-from ...values import ComplexArray, FloatArray, flag, instance, positive, real_array, short
+from ...values import ComplexArray, FloatArray, flag, instance, positive, short
 from ..family import Family
 from ..parameters.added import checked_direction
 from ..point_model import Point
@@ -97,7 +98,7 @@ class FrfResidual(Residual):
         if variance is None:
             variance = _fair(frf)
         if variance is not None:
-            given = real_array(variance, "variance")
+            given = positive_array(variance, "variance")
             try:
                 variance = np.broadcast_to(given, frf.data.shape).copy()
             except ValueError:
@@ -105,10 +106,6 @@ class FrfResidual(Residual):
                     f"variance of shape {given.shape} does not spread to the data's "
                     f"{frf.data.shape}."
                 ) from None
-            if variance.min() <= 0:
-                raise ModelError(
-                    f"variance must be positive, got {variance.min():g}. Check its sign."
-                )
         checked_direction(self.direction)
         channel_places([*frf.outputs, *frf.inputs], self.places)
         lines = _checked_lines(self.lines, frf, variance)

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ...arguments import positive_array
 from ...errors import LabelError, ModelError, ShapeError, counted
 from ...identification import MeasuredModes
 from ...labels import Place
@@ -93,9 +94,7 @@ class ModeShapes(Residual):
         std = self.std
         if std is not None:
             std = np.broadcast_to(real_array(std, "std"), shape).copy() if np.ndim(std) < 2 else std
-            std = real_array(std, "std", shape)
-            if std.min() <= 0:
-                raise ModelError(f"std must be positive, got {std.min():g}. Check its sign.")
+            std = positive_array(std, "std", shape)
         covariance = self.covariance
         if covariance is None and self.shapes is None and std is None:
             covariance = getattr(self.measured, "shape_covariance", None)

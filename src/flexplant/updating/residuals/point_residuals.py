@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ...arguments import positive_array
 from ...errors import ModelError, ShapeError
 from ...labels import Place
 from ...values import ComplexArray, FloatArray, positive, real_array
@@ -293,8 +294,5 @@ def _check_places(residual: Antiresonances | StaticCompliance) -> None:
 def _checked_std(value: Any, count: int) -> FloatArray | None:
     if value is None:
         return None
-    std = real_array(value, "std")
-    std = np.full(count, float(std)) if std.ndim == 0 else real_array(std, "std", (count,))
-    if std.min() <= 0:
-        raise ModelError(f"std must be positive, got {std.min():g}. Check its sign.")
-    return std
+    std = positive_array(value, "std")
+    return np.full(count, float(std)) if std.ndim == 0 else real_array(std, "std", (count,))

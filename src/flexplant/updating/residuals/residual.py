@@ -7,9 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ...arguments import mapping
 from ...errors import LabelError
 from ...labels import Place
-from ...values import ComplexArray, FloatArray, Matrix, Value, short
+from ...values import ComplexArray, FloatArray, Matrix, Value
 from ..family import Family
 from ..point_model import Point
 
@@ -82,12 +83,8 @@ def channel_places(
     channels: Sequence[str], places: Mapping[str, Place] | None
 ) -> tuple[Place, ...]:
     """Return the place of each channel: of `places` where named there, else its name."""
-    if places is not None and not isinstance(places, Mapping):
-        raise LabelError(
-            f"places must be a mapping {{channel: place}}, got {short(places)}. Pass "
-            "{'y1': '41:z'}, say."
-        )
-    known = dict(places or {})
+    hint = "Pass {'y1': '41:z'}, channel and place."
+    known = {} if places is None else mapping(places, "places", hint, error=LabelError)
     unknown = sorted(set(known) - set(channels))
     if unknown:
         raise LabelError(

@@ -6,8 +6,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...arguments import between
 from ...errors import ModelError, SolverError
-from ...values import FloatArray, positive
+from ...values import FloatArray
 from ..point_model import Point
 from .objective import Objective
 from .update_method import SearchEnd, Trail, UpdateMethod
@@ -58,10 +59,8 @@ class GaussNewton(UpdateMethod):
     weighs_poles = True
 
     def __post_init__(self) -> None:
-        value = positive(self.truncate, "truncate", zero=True)
-        if value >= 1:
-            raise ModelError(f"truncate must be below 1, got {value:g}. Choose 1e-3, say.")
-        self._set(truncate=value)
+        why = "Choose 1e-3, say."
+        self._set(truncate=between(self.truncate, "truncate", 0.0, 1.0, why, ends="["))
 
     @property
     def penalised(self) -> bool:
