@@ -149,6 +149,8 @@ def _side_by_side(g: StateSpace | Part, owner: IntArray) -> Solver:
     solvers = []
     for own in (np.flatnonzero(owner == i) for i in np.unique(owner)):
         fed, seen = np.flatnonzero(g.B[own].any(axis=0)), np.flatnonzero(g.C[:, own].any(axis=1))
+        if not fed.size * seen.size:
+            continue
         one = Part(g.A[np.ix_(own, own)], g.B[np.ix_(own, fed)], g.C[np.ix_(seen, own)], g.dt)
         solvers.append((_schur(one), np.ix_(seen, fed)))
 

@@ -15,7 +15,7 @@ from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from .certificate import certified_norm
-from .lower_bound import lower_bound, pointwise_bound
+from .lower_bound import lower_bound, pointwise_bound, raised_bound
 from .method import SolvedController, SynthesisMethod
 from .riccati import Riccati
 from .singular import ADDED
@@ -139,7 +139,8 @@ class _Search:
             self.broken.append((method, found))
         else:
             self.answers.append(one)
-            self.lower = max(self.lower, one.lower)
+            known = max(self.lower, one.lower)
+            self.lower = raised_bound(self.problem, one.gamma, known)
 
     def bounded(self, lmi: StructuredLmi) -> SmallestGamma | None:
         """Return what the LMIs say of the smallest gamma, and raise the lower bound to it."""

@@ -246,3 +246,9 @@ def stabilising(
     else:
         raise la.LinAlgError("the stabilising solution is too inaccurate.")
     return X, np.asarray(-(BR @ X + SR))
+
+
+def indefinite(X: FloatArray, size: float) -> bool:
+    """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
+    values = la.eigvalsh(X) if X.size else np.zeros(1)
+    return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)

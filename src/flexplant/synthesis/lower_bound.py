@@ -11,6 +11,7 @@ from ..lti.grid import highest, resonance_grid
 from ..lti.preparation import Prepared
 from ..lti.responses import responses
 from ..values import ComplexArray, FloatArray
+from .relaxed import relaxed_bound
 from .structured_lmi import StructuredLmi
 
 #: points of the sweep, and times that it is refined
@@ -26,8 +27,8 @@ _UNDAMPED = 1e-6
 def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
     """Return the best lower bound on what controllers reach, at most gamma.
 
-    The largest of the one that the method gives, the pointwise one, and for small problems where
-    these are far from gamma that of the LMIs.
+    The largest of the one that the method gives and the pointwise one; where these are far from
+    gamma that of the Riccati equations (`relaxed_bound`), and for small problems that of the LMIs.
 
     Parameters
     ----------
@@ -38,11 +39,16 @@ def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
     known : float
         A bound that the method proved.
     """
-    found = max(known, pointwise_bound(problem))
+    found = raised_bound(problem, gamma, max(known, pointwise_bound(problem)))
     if found * (1.0 + _CLOSE) < gamma and problem.A.shape[0] <= _STATES:
         with suppress(FlexplantError):  # what is known stays
             found = max(found, StructuredLmi(time_limit=_SECONDS).smallest(problem).lower)
     return min(found, gamma)
+
+
+def raised_bound(problem: Prepared, gamma: float, known: float) -> float:
+    """Return a known bound, or where it is far from gamma that of the Riccati equations."""
+    return known if known * (1.0 + _CLOSE) >= gamma else relaxed_bound(problem, gamma, known)
 
 
 def pointwise_bound(problem: Prepared) -> float:

@@ -15,8 +15,8 @@ from ..lti.preparation import Prepared
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..parallel import Progress
-from ..values import FloatArray, Value, positive
-from .central import OnAxisError, central, quadratic, riccati_solutions
+from ..values import Value, positive
+from .central import OnAxisError, central, indefinite, quadratic, riccati_solutions
 from .method import SolvedController
 from .reach import beyond_rounding
 from .singular import made_regular, missing_ranks, require_ranks
@@ -263,15 +263,9 @@ def _attempt(problem: Prepared, gamma: float) -> _Attempt:
     coupling = float(np.max(la.eigvals(X @ Y).real, initial=0.0))
     speed = float(np.linalg.norm(problem.A)) or 1.0
     sizes = (float(np.linalg.norm(part)) ** 2 / speed for part in (problem.C1, problem.B1))
-    if any(map(_indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
+    if any(map(indefinite, (X, Y), sizes)) or coupling > gamma**2 * (1.0 + 1e-5):
         return _Attempt(None, True)
     try:
         return _Attempt(central(problem, gamma, X, F, Y, H))
     except (la.LinAlgError, FlexplantError):
         return _Attempt(None)
-
-
-def _indefinite(X: FloatArray, size: float) -> bool:
-    """Return whether X has a negative eigenvalue beyond rounding; size is what X comes from."""
-    values = la.eigvalsh(X) if X.size else np.zeros(1)
-    return bool(values[0] < -1e-5 * max(values[-1], -values[0]) and values[0] < -1e-9 * size)

@@ -30,7 +30,7 @@ _SAME = 1e-6
 #: gamma falls by so much from level to level where its infimum is zero
 _FALL = 0.5
 #: and by so much in all
-_SMALL = 1e-2
+_SMALL = 2e-2
 #: a gamma that grows by less from one level to the next has settled, by more it is rounding
 _SETTLED = 1.2
 #: a fastest pole that grows so much when the level is a tenth has no limit
@@ -224,7 +224,7 @@ def _with_notes(
 ) -> SolvedController:
     one, finer = found[index], found[min(index + 1, len(found) - 1)]
     K = one.K
-    cost = max(one.gamma / finer.gamma - 1.0, 0.0)
+    cost = max(one.gamma / finer.gamma - 1.0, 0.0) if finer.gamma else 0.0
     note = (
         f"{'; '.join(lacking)}. Designed with noise of {one.level:.0e} on each sensor and as much "
         "effort of each actuator, relative to the plant's own channels, and verified without them"
