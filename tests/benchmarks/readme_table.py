@@ -23,6 +23,7 @@ import slycot
 import test_identification_benchmarks as identification
 import test_modes_benchmarks as large
 import test_op4_benchmarks as op4
+import test_response_benchmarks as responses
 import test_simulation_benchmarks as simulation
 import test_synthesis_benchmarks as synthesis
 from pyyeti.nastran import op4 as pyyeti
@@ -76,6 +77,13 @@ def modes_of_a_small_plate():
     )
     near(ours[3:], peer[3:], 1e-7)
     return f"all {plate.n_dof} modes of a plate, dense", "scipy eigh", *times
+
+
+def responses_of_a_plate():
+    n, ours, peer, gap = responses.race()
+    near(1.0 + gap, 1.0, 1e-4)  # of the peaks
+    what = f"{responses.LINES} lines of a plate's responses, {n:_} DOFs".replace("_", " ")
+    return what, f"scipy splu ({responses.SOLVED} of them)", ours, peer
 
 
 def frequency_response():
@@ -246,6 +254,7 @@ def read():
 ROWS = (
     modes_of_a_solid,
     modes_of_a_small_plate,
+    responses_of_a_plate,
     frequency_response,
     hinf_norm,
     dense_hinf_norm,
@@ -266,7 +275,8 @@ def shown(seconds):
     """Return a time in s or ms with two digits, or a dash."""
     if seconds is None:
         return "-"
-    return f"{seconds:.2g} s" if seconds >= 0.1 else f"{1e3 * seconds:.2g} ms"
+    size, unit = (seconds, "s") if seconds >= 0.1 else (1e3 * seconds, "ms")
+    return f"{float(f'{size:.2g}'):g} {unit}"
 
 
 def row(task):
