@@ -15,6 +15,8 @@
 Every message says what is wrong, what was got, why it matters and what to do next.
 """
 
+import sys
+import warnings
 from collections.abc import Iterable
 from difflib import get_close_matches
 
@@ -78,6 +80,14 @@ class FlexplantWarning(UserWarning):
 def counted(number: int, noun: str) -> str:
     """Return a number with its noun: `1 mode`, `2 modes`."""
     return f"{number} {noun}{'s' * (number != 1)}"
+
+
+def warn(said: str) -> None:
+    """Warn with a FlexplantWarning, at the line outside this package that led there."""
+    level, frame = 2, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(__package__):
+        level, frame = level + 1, frame.f_back
+    warnings.warn(said, FlexplantWarning, level)
 
 
 def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = "") -> LabelError:

@@ -420,8 +420,9 @@ def test_what_is_refused(monkeypatch):
 
     with pytest.raises(ModelError, match="would hold the machine's motion rx, ry against"):
         join(fx.Joint("stage/1:z", "frame/1:z"))
-    with pytest.warns(FlexplantWarning, match="would hold the machine's motion"):
+    with pytest.warns(FlexplantWarning, match="would hold the machine's motion") as said:
         join(fx.Joint("stage/1:z", "frame/1:z", stiffness=1e4))
+    assert {one.filename for one in said} == {__file__}  # at the caller's line
     with pytest.raises(LabelError, match=r"component 'frame': no DOF '1:rz'"):
         join(fx.Joint("stage/1:z", "frame/1:rz"))
     with pytest.raises(LabelError, match="needs its rotation r"):

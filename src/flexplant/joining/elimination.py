@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..errors import FlexplantWarning
+from ..errors import warn
 from ..values import FloatArray, IntArray
 
 #: a diagonal entry of R below this part of the first one is none: the joint repeats others
@@ -140,12 +139,10 @@ def _solved(block: FloatArray, size: FloatArray, order: IntArray) -> tuple[IntAr
     diagonal = np.abs(np.diag(R))
     rank = int(np.count_nonzero(diagonal > _RANK * diagonal[0]))
     if rank and diagonal[rank - 1] < _DOUBTFUL * diagonal[0]:
-        warnings.warn(
+        warn(
             f"joints nearly repeat each other (a pivot is {diagonal[rank - 1] / diagonal[0]:.1g} "
             "of the first): coordinates with few digits make them stiffer than they are. Join "
-            "fewer axes.",
-            FlexplantWarning,
-            4,
+            "fewer axes."
         )
     lead = np.asarray(pivots[:rank], dtype=np.int64)
     rest = np.setdiff1d(np.arange(k), lead)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..arguments import mapping
-from ..errors import CertificateError, FlexplantWarning, LabelError, ModelError
+from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
 from ..values import ComplexArray, FloatArray, instance
@@ -238,7 +237,7 @@ def _coupled(
         )
         if not condition[worst] < _SINGULAR:
             raise ModelError(said)
-        warnings.warn(said, FlexplantWarning, 4)
+        warn(said)
     forces = np.linalg.solve(scaled, gap / size[:, :, None]) / size[:, :, None]
     found = lines - load @ forces
     # what opens is what springs and dampers give way, and nothing of rigid joints

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantWarning, LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, unknown_label, warn
 from ..lti import Frf
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, instance
@@ -193,12 +192,10 @@ def warn_of_bending(
             beside = moved - np.einsum("ij,jkf->ikf", A @ mean, moved)
             part = np.linalg.norm(beside, axis=(0, 1)) / np.linalg.norm(moved, axis=(0, 1))
             if np.median(part) > _BENDS:
-                warnings.warn(
+                warn(
                     f"{end!r} bends: {100 * np.median(part):.0f} % of its measured motion, at the "
                     "median frequency, is beside its mean, which alone is joined. Take nodes "
-                    "nearer to each other, or look for a wrong direction of a channel.",
-                    FlexplantWarning,
-                    4,
+                    "nearer to each other, or look for a wrong direction of a channel."
                 )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, overload
 
@@ -10,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..labels import DIRECTIONS, DofSet
 from ..lti import Frf
 from ..reduction import ReducedModel
@@ -217,11 +216,9 @@ def _matrices(
     rates = any(link.rate for link in soft)
     if any(damped) and not all(damped):
         bare = [part.name for part, there in zip(parts, damped, strict=True) if not there]
-        warnings.warn(
+        warn(
             f"components {bare} have no D, others have: they are undamped in the machine. Give "
-            "them one first, model.with_damping(ModalDamping(...)), or damp the machine's modes.",
-            FlexplantWarning,
-            3,
+            "them one first, model.with_damping(ModalDamping(...)), or damp the machine's modes."
         )
     weights = {"K": [link.stiffness for link in soft], "D": [link.rate for link in soft]}
     found: dict[str, Any] = {}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..labels import DIRECTIONS
 from ..structure.rigid import rigid_motions
 from ..values import FloatArray, IntArray, instance
@@ -139,7 +138,7 @@ def _check_balance(joint: Joint, axis: str, carried: FloatArray, size: float) ->
     )
     if joint.is_rigid:
         raise ModelError(said)
-    warnings.warn(said, FlexplantWarning, 5)
+    warn(said)
 
 
 def rows_of(links: Sequence[Link], parts: Sequence[Component]) -> sp.csr_array:
@@ -182,11 +181,9 @@ def warn_of_missing_statics(links: Sequence[Link], parts: Sequence[Component]) -
         lost = [name for name, share in zip(names, part_left, strict=True) if share > _STATIC]
         if lost:
             more = f" and {len(lost) - 1} more" if len(lost) > 1 else ""
-            warnings.warn(
+            warn(
                 f"component {part.name!r} ({part.model!r}) holds no static shape for the load of "
                 f"{lost[0]}{more}: without the compliance of the modes left out, the joint is too "
                 "stiff. Solve with compliance_at=[...] there, or reduce by "
-                "CraigBampton(boundary=[...]) or Rubin.",
-                FlexplantWarning,
-                4,
+                "CraigBampton(boundary=[...]) or Rubin."
             )

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantWarning, SolverError
+from ..errors import SolverError, warn
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.orthonormal import beyond
 from ..sparse.pardiso import Pardiso
@@ -169,7 +168,7 @@ def leaving_overdamped(form: NormalForm, modes: Modes) -> Modes:
     note = form.overdamped_below(float(np.abs(modes.poles).max(initial=0.0)))
     if not note:
         return modes
-    warnings.warn(note, FlexplantWarning, 4)
+    warn(note)
     return modes.replace(notes=(*modes.notes, note))
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 import weakref
 from collections.abc import Iterable
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError, SolverError
+from ..errors import ModelError, SolverError, warn
 from ..labels import Place
 from ..progress import Progress
 from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
@@ -255,13 +254,11 @@ def _loss_coupling(model: FEModel, omega: FloatArray, phi: FloatArray, law: Hyst
     errors = law.coupling_errors(omega, phi, model.dofs)
     worst = int(np.argmax(errors))
     if errors[worst] > _COUPLED:
-        warnings.warn(
+        warn(
             f"{law!r} couples modes: the loss factor of mode {worst + 1} at "
             f"{omega[worst] / (2 * np.pi):.5g} Hz, by its strain energy, is "
             f"{100 * errors[worst]:.0f} % off that of the complex stiffness. Take the law itself "
-            "where this mode matters: frequency_response(model, ports, freq, damping=law).",
-            FlexplantWarning,
-            3,
+            "where this mode matters: frequency_response(model, ports, freq, damping=law)."
         )
     return float(errors.max(initial=0.0))
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,7 +11,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..dof_columns import at_nodes, node_numbers
-from ..errors import FlexplantWarning, LabelError, ModelError, ShapeError, counted
+from ..errors import LabelError, ModelError, ShapeError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
@@ -371,7 +370,7 @@ class FEMatrices(Value):
                 raise ModelError(f"K is not positive semi-definite. {held[0].upper()}{held[1:]}")
             for said in (endangered(ready.K, ready.M, self.digits), held):
                 if said:
-                    warnings.warn(f"{self.source or 'K'}: {said}", FlexplantWarning, 2)
+                    warn(f"{self.source or 'K'}: {said}")
         return model
 
     def freed(self) -> FEMatrices:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -11,7 +10,7 @@ from typing import Any, Self
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError, counted
+from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, is_positive_definite
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
@@ -118,7 +117,7 @@ class FEModel(Placed, Value):
             remarks.append(endangered(K, M, digits))
             remarks.append(held_by_rounding(K, M, self.dofs, digits, self.rigid_body))
         for said in filter(None, remarks):
-            warnings.warn(f"{self.name or 'K'}: {said}", FlexplantWarning, 3)
+            warn(f"{self.name or 'K'}: {said}")
 
     def __repr__(self) -> str:
         named = f" {self.name!r}" if self.name else ""
