@@ -383,6 +383,18 @@ def test_joints_that_repeat_others_do_no_harm():
     np.testing.assert_allclose(elastic(twice, 12), elastic(once, 12), rtol=1e-9)
 
 
+def test_a_joint_within_a_component_stretches_no_rigid_motion():
+    """A bar between two of its nodes, rigid or a spring: three motions at zero stay."""
+    model = plate(3)
+    for stiffness in (None, [1e6, 1e3]):
+        bar = fx.Joint("a/1", "a/8", axes=["z", "rx"], stiffness=stiffness)
+        machine = fx.joined({"a": model}, bar)
+        assert machine.joining.n_rigid == machine.rigid_body.shape[1] == 3
+        zeros = np.linalg.eigvalsh(machine.K.toarray())[:4]
+        assert np.abs(zeros[:3]).max() < 1e-9 * zeros[3]
+        assert fx.solve_modes(machine, count=4).freq[3] > fx.solve_modes(model, count=4).freq[3]
+
+
 def test_very_unlike_components():
     """A rubber pad below steel: 1e6 between their stiffnesses, exact zeros and inertia kept."""
     steel = fx.solid_block(size=(0.3, 0.2, 0.1), elements=(3, 2, 1), density=7850,

@@ -74,7 +74,10 @@ def left_motions(
         scale = np.abs(motions).max(axis=0, initial=0.0)
         motions = motions / np.where(scale > 0, scale, 1.0)
         whole = np.vstack(mixes) * scale[:, None]
-        allowed = null_space(np.asarray(rows @ motions))
+        stretch = np.asarray(rows @ motions)
+        most = np.asarray(abs(rows) @ np.abs(motions)).max(axis=1, initial=0.0)
+        stretch[np.abs(stretch) <= _NONE * most[:, None]] = 0.0  # rounding of what cancels
+        allowed = null_space(stretch)
         beside = np.linalg.norm(whole - allowed @ (allowed.T @ whole), axis=0)
         size = np.linalg.norm(whole, axis=0)
         clean = (missed < SPANNED) & (size > 0) & (beside <= _NONE * size)

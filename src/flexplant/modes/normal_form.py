@@ -289,9 +289,10 @@ def check_drag(rigid: FloatArray, D: Matrix, omega: FloatArray) -> None:
     if drag > RIGID_DRAG * first:
         raise ModelError(
             f"D damps rigid-body motion at {drag:.3g} 1/s, more than {RIGID_DRAG:g} of the first "
-            f"elastic frequency ({first:.4g} rad/s): dampers to ground, and those between "
-            f"places that a rigid rotation moves apart, leave no modes at 0. {PLANT} Else let the "
-            "damper act along the line between its ends, or close it as a loop."
+            f"elastic frequency ({first:.4g} rad/s): dampers to ground, between bodies that no "
+            "spring joins, and between places that a rigid rotation moves apart leave no modes at "
+            f"0. {PLANT} Else let the damper act along the line between its ends, or close it as a "
+            "loop."
         )
 
 
