@@ -283,9 +283,13 @@ def turned(P, condition, seed=3, speed=1.0):
 
 @needs_data
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["AC4", "HE1", "TMD", "WEC1", "BDT1", "CM1", "JE3"])
+@pytest.mark.parametrize("name", ["AC4", "HE1", "TMD", "WEC1", "DLR1", "BDT1", "CM1", "JE3"])
 def test_coordinates_and_units_of_time_change_nothing(name):
-    """0.1 % of gamma, or one closer to the bound, or a message that blames the coordinates."""
+    """The same gamma within 0.1 %, or a message that blames the coordinates.
+
+    WEC1 alone may differ: two of its poles coincide, which dense coordinates split into nearly
+    parallel modes. The Riccati equations may fail there; the LMIs come nearer to the bound.
+    """
     P, u, y = compleib(name)
     best = design_hinf(P, u=u, y=y)
     for condition, speed in ((1.0, 1.0), (1e3, 1.0), (1.0, 1e6), (1.0, 1e-6), (1e5, 1.0), (1e6, 1)):
@@ -295,9 +299,26 @@ def test_coordinates_and_units_of_time_change_nothing(name):
             assert condition > 1e3
             assert "coordinates of the plant's states are badly conditioned" in str(error)
         else:
-            assert found.lower <= found.gamma * (1 + 1e-3)
-            assert best.lower * (1 - 1e-3) <= found.gamma <= best.gamma * (1 + 1e-3)
-            assert found.gamma >= best.gamma * (1 - 1e-3) or found.gamma < 1.01 * found.lower
+            assert found.lower <= found.gamma
+            if name == "WEC1" and condition > 1.0 and found.gamma < 1.01 * found.lower:
+                assert found.gamma >= best.lower * (1 - 1e-3)
+            else:
+                assert found.gamma == pytest.approx(best.gamma, rel=1e-3, abs=0)
+
+
+def test_a_gamma_that_hangs_on_the_last_digits_of_the_plant_is_refused():
+    """Damping of 1e-6 in dense coordinates: what condition 1e4 keeps is lost at 1e5."""
+    zeta = 1e-6
+    A = np.kron(np.diag([1.0, 3.0]), [[0, 1.0], [-1, -2 * zeta]])
+    B = np.array([[0, 0, 0], [1, 0, 1.0], [0, 0, 0], [1, 0, -1.0]])
+    C = np.array([[1.0, 0, 1, 0], [0, 0, 0, 0], [1, 0, 1, 0]])
+    D = np.array([[0, 0, 0], [0, 0, 1 / zeta], [0, 0.1 / zeta, 0]])
+    P, u, y = named(A, B, C, D, 1, 1)
+    best = design_hinf(P, u=u, y=y).gamma
+    found = design_hinf(turned(P, 1e4), u=u, y=y)
+    assert found.gamma == pytest.approx(best, rel=1e-3, abs=0)
+    with pytest.raises(SolverError, match=r"badly conditioned: A is .*(one rounding|hang on)"):
+        design_hinf(turned(P, 1e5), u=u, y=y)
 
 
 def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():

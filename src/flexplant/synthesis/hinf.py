@@ -5,9 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
+
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
+from ..lti.interconnection import lft
+from ..lti.norms import hinf_norm
 from ..lti.preparation import Prepared, departure_from_normal, prepared
-from ..lti.statespace import System
+from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant, standard_plant
 from ..values import short
@@ -24,6 +28,8 @@ from .structured_lmi import StructuredLmi
 
 #: A beside its poles, from which on coordinates are blamed for a failure
 _MIXED = 1e3
+#: relative change of gamma by rounding of such a plant for which they are, over so many draws
+_SENSITIVE, _DRAWS = 2e-4, 3
 
 
 @one_thread()
@@ -127,7 +133,7 @@ def design_hinf(
             if progress is not None and isinstance(method, (Riccati, StructuredLmi, Lmi)):
                 method = method.replace(progress=progress)
             answer = answered(plant, problem, method)
-        _require_known(problem, answer)
+        _require_known(plant, problem, answer)
     except (AssumptionError, SolverError, CertificateError) as error:
         raise _blamed(problem, error) from error
     controller, found = answer.controller, answer.found
@@ -164,7 +170,7 @@ def _require_channels(plant: StandardPlant) -> None:
             )
 
 
-def _require_known(problem: Prepared, answer: Answer) -> None:
+def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> None:
     """Raise SolverError when rounding in the given coordinates may have made another plant."""
     if problem.departure < _MIXED:
         return
@@ -173,6 +179,25 @@ def _require_known(problem: Prepared, answer: Answer) -> None:
             f"a controller with gamma {answer.gamma:.4g} was found, the lower bound is "
             f"{answer.lower:.4g}, and both hang on rounding."
         )
+    change = _moved_by_rounding(plant.system, answer)
+    if change > _SENSITIVE:
+        raise SolverError(
+            f"a controller with gamma {answer.gamma:.4g} was found, but one rounding of each entry "
+            f"of A, B and C changes it by {100 * change:.2g} %."
+        )
+
+
+def _moved_by_rounding(P: StateSpace, answer: Answer) -> float:
+    """Return by how much the loop's norm changes, relative, with the last digits of the plant."""
+    rng, change = np.random.default_rng(0), 0.0
+    for _ in range(_DRAWS):
+        moved = {
+            name: part * (1.0 + np.finfo(float).eps * rng.choice([-1.0, 1.0], size=part.shape))
+            for name, part in (("A", P.A), ("B", P.B), ("C", P.C))
+        }
+        gain = hinf_norm(lft(P.replace(**moved, blocks=None), answer.controller))
+        change = max(change, abs(gain / answer.gamma - 1.0) if answer.gamma else 0.0)
+    return change
 
 
 def _blamed(problem: Prepared, error: FlexplantError) -> FlexplantError:
