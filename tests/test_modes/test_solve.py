@@ -9,6 +9,7 @@ from flexplant.errors import LabelError, ModelError, ShapeError, SolverError
 from flexplant.labels import DofSet
 from flexplant.modes import solve, solve_modes
 from flexplant.modes import sparse_modes as counted
+from flexplant.modes.mode_errors import rigid_residual
 from flexplant.structure import FEModel, ModalDamping, Rayleigh, Spring
 from plates import make_plate
 
@@ -147,8 +148,9 @@ def test_a_lost_partner_is_found_again(monkeypatch):
 
     def forgetful(*args):
         calls.append(args[3])
-        found = search(*args)
-        return np.delete(found, 4, axis=1) if len(calls) == 1 else found
+        squares, found = search(*args)
+        lost = [4] if len(calls) == 1 else []
+        return np.delete(squares, lost), np.delete(found, lost, axis=1)
 
     monkeypatch.setattr(counted, "_search", forgetful)
     modes = solve_modes(model, count=24)
@@ -294,7 +296,7 @@ def test_the_certificate_holds_the_rigid_body_residual(plate):
     spring = sp.csc_array(([1e-5], ([0], [0])), shape=plate.K.shape)
     held = FEModel(plate.M, plate.K, dofs=plate.dofs)
     object.__setattr__(held, "K", sp.csc_array(plate.K + spring))
-    assert solve._rigid_residual(held) > 1.5 * left.max()
+    assert rigid_residual(held) > 1.5 * left.max()
 
 
 def test_below_a_frequency_is_sparse_from_some_hundred_dofs_on(monkeypatch):

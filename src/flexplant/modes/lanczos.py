@@ -25,10 +25,16 @@ _STEPS = 12
 _RESTARTS = 60
 #: a block with directions this much shorter than others is orthonormalised again
 _LOST = 1e-3
+#: what one orthogonalisation may take away, relative, for rounding to leave nothing of it
+_SMALL = 1e-4
 #: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
 _STALE = 1e-11
-#: residuals of this part of the largest value are rounding: no step reduces them
+#: relative error of a Ritz pair below which its shape needs no tolerance of its own
+_SURE = 1e-12
+#: values below this part of the largest one, times FOUND, are not found beside it
 _ROUNDING = 1e-14
+#: residuals of this part of the largest value are rounding: no step reduces them
+REACHED = 1e-15
 #: entries of a vector worked on at a time
 _PIECE = 8192
 
@@ -81,20 +87,27 @@ class BlockLanczos:
         known = np.zeros((n, 0)) if start is None else start[:, : self._block // 2]
         first = np.hstack([known, self._random(self._block - known.shape[1])])
         self._next, self._loaded, _ = self._orthonormal(first)
+        self._over = np.zeros((self._next.shape[1], 0))
 
     def _reserve(self, want: int) -> None:
-        # after a restart want + block vectors are kept; as many again or _STEPS blocks follow
-        room = 2 * self._block + max(_STEPS * self._block, want + self._block)
+        # after a restart want + block vectors are kept; more than as many or _STEPS blocks follow
+        room = 2 * self._block + max(_STEPS * self._block, 5 * want // 4 + self._block)
         self._capacity = self._r + want + self._block + room
 
     def lowest(
-        self, count: int, tolerance: float = FOUND, *, extra: int = 0
+        self,
+        count: int,
+        tolerance: float = FOUND,
+        *,
+        extra: int = 0,
+        needed: Callable[[FloatArray], FloatArray] | None = None,
     ) -> tuple[FloatArray, FloatArray]:
         """Return the `count` largest theta found and their shapes (n, count).
 
-        The last `extra` of them need not be shapes yet, only values. Fewer than `count` are
-        returned where the others are so much smaller than the largest that its rounding hides
-        them: with those returned locked, another search finds the rest.
+        The last `extra` of them need not be shapes yet, only values. Of shapes (n, m) that are
+        found to `tolerance` but no further, `needed` says which tolerance (m,) each must reach.
+        Fewer than `count` are returned where the others are so much smaller than the largest that
+        its rounding hides them: with those returned locked, another search finds the rest.
 
         Raises
         ------
@@ -103,22 +116,33 @@ class BlockLanczos:
         """
         n = self._V.shape[1]
         count = min(count, n - self._r)
+        required = np.full(count, tolerance)
+        required[count - extra :] = max(tolerance, VALUE)
+        check_at = self.steps
         for _ in range(_RESTARTS * _STEPS):
             if self._m + self._r >= n or not self._next.shape[1]:
                 return self._ritz(count)
-            theta, mix, error = self._step()
+            self._step()
+            full = self._r + self._m + 2 * self._next.shape[1] > self._capacity
+            if self.steps < check_at and not full:
+                continue
+            theta, mix, error = self._pairs()
             # what rounding of the largest value lets be found in this search
             sure = int(np.count_nonzero(theta * FOUND >= _ROUNDING * theta[0]))
             limited = sure < min(count, theta.size)
             wanted = sure if limited else count
-            required = np.full(min(wanted, theta.size), tolerance)
-            if not limited:
-                required[count - extra :] = max(tolerance, VALUE)
-            limit = np.maximum(required * theta[: required.size], _ROUNDING * theta[0])
-            if theta.size >= wanted and np.all(error[: required.size] <= limit):
-                basis = self._V[self._r : self._r + self._m]
-                return theta[:wanted], basis.T @ mix[:, :wanted]
-            if self._r + self._m + 2 * self._next.shape[1] > self._capacity:
+            strict = np.minimum(required, tolerance) if limited else required
+            left = _unfinished(theta[:wanted], error, strict)
+            if theta.size >= wanted and not left and needed is not None:
+                shapes = wanted if limited else wanted - extra
+                close = np.flatnonzero(error[:shapes] > _SURE * theta[:shapes])
+                strict[close] = np.minimum(tolerance, needed(self._shapes(mix[:, close])))
+                left, needed = _unfinished(theta[:wanted], error, strict), None
+            if theta.size >= wanted and not left:
+                return theta[:wanted], self._shapes(mix[:, :wanted])
+            # a step brings no more than a block of new ones, usually half of it
+            check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
+            if full:
                 self._restart(theta, mix, min(count + self._block, theta.size))
         raise SolverError(
             f"Lanczos did not converge for {count} modes in {self.steps} steps: M and K are badly "
@@ -131,10 +155,13 @@ class BlockLanczos:
     def _ritz(self, count: int) -> tuple[FloatArray, FloatArray]:
         theta, mix = la.eigh(self._T)
         theta, mix = theta[::-1][:count], mix[:, ::-1][:, :count]
-        return theta, self._V[self._r : self._r + self._m].T @ mix
+        return theta, self._shapes(mix)
 
-    def _step(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Extend the basis by the next block; return Ritz values, vectors and residuals."""
+    def _shapes(self, mix: FloatArray) -> FloatArray:
+        return self._V[self._r : self._r + self._m].T @ mix
+
+    def _step(self) -> None:
+        """Extend the basis by the next block."""
         block, width = self._next, self._next.shape[1]
         moved = self._solve(self._loaded)
         at = self._r + self._m
@@ -144,7 +171,15 @@ class BlockLanczos:
             self._V, self._capacity = grown, grown.shape[0]
         self._V[at : at + width] = block.T
         self._m += width
-        self._next, self._loaded, (along, over) = self._orthonormal(moved)
+        # nearly all of it along the basis lies along the last block and those before it that T
+        # couples to it: what is left is small, and one orthogonalisation enough
+        main, coupling = self._loaded.T @ moved, self._over.T
+        before = slice(at - coupling.shape[0], at)
+        moved -= block @ main
+        moved -= self._V[before].T @ coupling
+        self._next, self._loaded, (along, self._over) = self._orthonormal(moved)
+        along[at:] += main
+        along[before] += coupling
         along = along[self._r :]
         grown_T = np.zeros((self._m, self._m))
         grown_T[:-width, :-width] = self._T
@@ -154,9 +189,13 @@ class BlockLanczos:
         self._T = grown_T
         self.steps += 1
         tick(STEPS)
+
+    def _pairs(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return Ritz values, vectors in terms of the basis, and residuals."""
         theta, mix = la.eigh(self._T)
         theta, mix = theta[::-1], mix[:, ::-1]
-        return theta, mix, np.linalg.norm(over @ mix[-width:], axis=0)
+        over = self._over
+        return theta, mix, np.linalg.norm(over @ mix[-over.shape[1] :], axis=0)
 
     def _restart(self, theta: FloatArray, mix: FloatArray, keep: int) -> None:
         """Keep the best Ritz vectors only; the next block holds the residuals of all of them."""
@@ -166,29 +205,33 @@ class BlockLanczos:
             columns = slice(begin, min(begin + 65536, n))
             basis[:keep, columns] = mix[:, :keep].T @ basis[:, columns]
         self._m, self._T = keep, np.diag(theta[:keep])
+        self._over = self._over @ mix[-self._over.shape[1] :, :keep]
 
     def _orthonormal(
         self, W: FloatArray
     ) -> tuple[FloatArray, FloatArray, tuple[FloatArray, FloatArray]]:
         """Return the M-orthonormal part of W beyond the basis, M times it, and the coefficients.
 
-        Gram-Schmidt twice is enough [Giraud2005]_, and again where the block itself had next to
-        nothing new in some direction.
+        Gram-Schmidt until it takes next to nothing away, twice at most: that is enough
+        [Giraud2005]_; and again where the block itself had next to nothing new in some direction.
         """
         basis = self._V[: self._r + self._m]
         along = np.zeros((basis.shape[0], W.shape[1]))
         over = np.eye(W.shape[1])
         W = np.ascontiguousarray(W)
-        loaded, before = self._M @ W, 0.0
+        loaded = self._M @ W
         for _ in range(3):
-            for again in (False, True):
+            for _ in range(2):
                 part = _along(basis, loaded)
                 _subtract(W, basis, part)
                 along += part @ over
-                # the second time next to nothing is taken away: M W stays what it is
-                if not again or np.abs(part).max(initial=0.0) > _STALE * before:
-                    loaded = self._M @ W
                 before = float(np.sqrt(np.abs(np.sum(W * loaded, axis=0)).min()))
+                taken = np.abs(part).max(initial=0.0)
+                # where next to nothing is taken away, M W stays what it is
+                if taken > _STALE * before:
+                    loaded = self._M @ W
+                if taken <= _SMALL * before:
+                    break
             poor = False
             # twice: the first turn is exact only to the condition of the block
             for _ in range(2):
@@ -205,6 +248,12 @@ class BlockLanczos:
                 break
             loaded = self._M @ W
         return W, loaded, (along, over)
+
+
+def _unfinished(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
+    """Return how many Ritz pairs have not reached their tolerance."""
+    limit = np.maximum(required[: theta.size] * theta, REACHED * theta[0])
+    return int(np.count_nonzero(error[: theta.size] > limit))
 
 
 def _along(basis: FloatArray, loaded: FloatArray) -> FloatArray:

@@ -9,12 +9,12 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError, warn
+from ..errors import ModelError, warn
 from ..labels import Place
 from ..progress import Progress
-from ..sparse.factor import DENSE_LIMIT, by_rows, dense, diagonal
+from ..sparse.factor import DENSE_LIMIT, dense, diagonal
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import absolute, rounding_of
+from ..sparse.rayleigh_ritz import column_groups, rounding_of
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
 from ..structure.eigen import elastic_modes, signed
 from ..structure.negative_stiffness import signed_root, signed_square
@@ -22,17 +22,12 @@ from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .damped_modes import damped_modes, is_rayleigh, leaving_overdamped, wider
 from .lanczos import STEPS
+from .mode_errors import checked, rigid_residual
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form
 from .shifted import modes_below, stiffness_factor
 from .sparse_modes import counted_modes
 
-#: M-orthonormality that every result must have
-_ORTHONORMAL = 1e-12
-#: residual ||K phi - omega^2 M phi||, of omega^2 ||M phi|| and of || |K| |phi| ||
-_RESIDUAL = (1e-8, 1e-12)
-#: the part of the largest entry of a shape that counts for the rounding of each
-_ENTRY = 1e-3
 #: elastic modes that responses are made of at least
 _FEW = 6
 #: relative error of a loss factor that is worth a warning
@@ -142,16 +137,17 @@ def solve_modes(
         # one factor for the modes and for the attachment vectors, while it is held here
         factored = stiffness_factor(model, factor) if at and _is_large(model) else None
         omega, phi, certificate = _undamped(model, *more, factor)
-    orthonormality, residual = _check(model, omega, phi)
+    orthonormality, residual, rounding = checked(model, omega, phi)
     certificate["orthonormality"] = orthonormality
     if model.rigid_body.shape[1]:
-        certificate["rigid_residual"] = _rigid_residual(model)
+        certificate["rigid_residual"] = rigid_residual(model)
         held = float(rounding_of(model.K, model.rigid_body).max())
         certificate["rigid_rounding"] = float(np.sqrt(held) / (2 * np.pi))
     if damping is None and model.D is not None and not _is_proportional(model, omega, phi):
         return _complex_modes(model, phi, kept, top, names, factor)
     inside = np.flatnonzero(signed_square(omega) <= top)[:kept]
-    omega, phi, residual = omega[inside], phi[:, inside], residual[inside]
+    if inside.size < omega.size:
+        omega, phi, residual = omega[inside], phi[:, inside], residual[inside]
     vectors, vector_omega = np.zeros((model.n_dof, 0)), np.zeros(0)
     if at:
         vectors, vector_omega = attachment_vectors(model, phi, at)
@@ -174,7 +170,7 @@ def solve_modes(
         vector_zeta=_vector_zeta(model, vectors, vector_omega, damping, compliance_damping),
         vector_dofs=names,
         residual=residual,
-        rounding=_rounding(model, omega, phi),
+        rounding=rounding[inside],
         certificate=certificate,
     )
     _solved[model] = weakref.ref(found)
@@ -284,72 +280,19 @@ def _undamped(
         )
     elif count > r:
         squares, phi, certificate = counted_modes(model, count - r, top, method)
-        omega, phi = signed_root(squares), signed(phi) if squares.size else phi
+        omega = signed_root(squares)
     else:
         omega, phi = np.zeros(0), np.zeros((n, 0))
-    keep = signed_square(omega) <= top
-    return (
-        np.concatenate([np.zeros(r), omega[keep]]),
-        np.hstack([rigid, phi[:, keep]]),
-        certificate,
-    )
+    omega = omega[signed_square(omega) <= top]
+    shapes = np.empty((n, r + omega.size))
+    shapes[:, :r] = rigid
+    for at in column_groups(omega.size):
+        shapes[:, r + at.start : r + at.stop] = signed(phi[:, at])
+    return np.concatenate([np.zeros(r), omega]), shapes, certificate
 
 
 def _is_large(model: FEModel) -> bool:
     return model.n_dof > DENSE_LIMIT and sp.issparse(model.K) and sp.issparse(model.M)
-
-
-def _check(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[float, FloatArray]:
-    """Raise SolverError unless shapes are M-orthonormal and fulfil the eigenvalue problem."""
-    mass = by_rows(model.M) @ phi
-    error = float(np.abs(phi.T @ mass - np.eye(omega.size)).max(initial=0.0))
-    if not error <= _ORTHONORMAL:
-        raise SolverError(
-            f"modes are M-orthonormal only to {error:.2g} (limit {_ORTHONORMAL:g}): M is too badly "
-            "conditioned. Look for DOFs with next to no mass."
-        )
-    force = by_rows(model.K) @ phi
-    residual = force - mass * signed_square(omega)
-    # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more
-    stiff = diagonal(model.K)
-    weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
-    size = np.linalg.norm(weight * residual, axis=0)
-    # an entry of a shape is known to a rounding of its largest ones, which stiff springs multiply
-    moved = np.abs(phi)
-    whole = absolute(by_rows(model.K)) @ (moved + _ENTRY * moved.max(axis=0))
-    inertia = np.linalg.norm(weight * mass, axis=0) * omega**2
-    limit = _RESIDUAL[0] * inertia + _RESIDUAL[1] * np.linalg.norm(weight * whole, axis=0)
-    if not np.all(size <= limit):
-        i = int(np.argmax(size / limit))
-        if omega[i] == 0:
-            raise SolverError(
-                f"rigid-body motion {i + 1} leaves a force (of {size[i]:.2g}, limit "
-                f"{limit[i]:.2g}): the entries of K carry too few digits. check(model) says how "
-                "many; export in double precision, or take "
-                "FEMatrices(K, M, dofs=dofs).model(free=True)."
-            )
-        raise SolverError(
-            f"mode {i + 1} at {omega[i] / (2 * np.pi):.5g} Hz leaves a residual of {size[i]:.2g} "
-            f"(limit {limit[i]:.2g}) in the eigenvalue problem: not a mode of this model."
-        )
-    elastic = omega != 0
-    scale = np.where(elastic, np.linalg.norm(force, axis=0), 1.0)
-    return error, np.where(elastic, np.linalg.norm(residual, axis=0), 0.0) / scale
-
-
-def _rounding(model: FEModel, omega: FloatArray, phi: FloatArray) -> FloatArray:
-    """Return the relative error of each frequency that rounding of K's entries may make."""
-    elastic = omega != 0
-    found = np.zeros(omega.size)
-    found[elastic] = rounding_of(model.K, phi[:, elastic]) / (2 * omega[elastic] ** 2)
-    return found
-
-
-def _rigid_residual(model: FEModel) -> float:
-    """Return ``||K R||``, in terms of what would be there if nothing cancelled."""
-    K, R = by_rows(model.K), model.rigid_body
-    whole = np.linalg.norm(abs(K) @ np.abs(R), axis=0)
-    return float(np.max(np.linalg.norm(K @ R, axis=0) / np.where(whole > 0, whole, 1.0)))
 
 
 def _is_proportional(model: FEModel, omega: FloatArray, phi: FloatArray) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -10,12 +11,12 @@ from ..errors import ModelError, SolverError
 from ..parallel import one_thread
 from ..sparse.factor import by_rows
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import absolute, rayleigh_ritz, rounding_of
+from ..sparse.rayleigh_ritz import absolute, column_groups, rayleigh_ritz, rounding_of
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
 from ..structure.negative_stiffness import are_rigid
 from ..values import FloatArray, Rng
-from .lanczos import FOUND, BlockLanczos
+from .lanczos import REACHED, BlockLanczos
 from .shifted import StiffnessFactor, modes_below, stiffness_factor
 
 #: modes beyond the last wanted one among which a gap is searched
@@ -30,6 +31,8 @@ _SEARCHES = 8
 _RESIDUAL = 1e-11
 #: residuals below this many roundings of K phi are not reduced by more steps
 _ROUNDINGS = 10.0
+#: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at
+_PARTS = (1.0, 0.03)
 
 
 def counted_modes(
@@ -93,15 +96,14 @@ def _counted(
     for search in range(_SEARCHES):
         factor = factor or stiffness_factor(model, method)
         locked = np.hstack([model.rigid_body, phi])
-        more = _search(model, factor, locked, missing, search)
-        squares, phi = rayleigh_ritz(model.K, model.M, np.hstack([phi, more]))
+        squares, phi = _beside(model, phi, *_search(model, factor, locked, missing, search))
         rounding = rounding_of(model.K, phi)
         # a motion of the geometry that is not free has springs, which rounding does not hide
         suspended = are_rigid(model.M, model.body_motions, phi)
         least = np.where(suspended, 0.0, rounding)
         check_stiffness(squares, phi, least, model.rigid_body, model.dofs, suspended)
         # the count needs the memory
-        factor, more = None, np.zeros((n, 0))
+        factor = None
         if below == count and _apart(squares, count, top, rounding):
             counted, sure, shift = count, count, top
         else:
@@ -131,23 +133,32 @@ def _certificate(shift: float, counted: int, found: int) -> dict[str, float]:
     }
 
 
+def _beside(
+    model: FEModel, known: FloatArray, squares: FloatArray, phi: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return omega^2 and shapes of modes known before and of those found beside them."""
+    if not known.shape[1]:
+        return squares, phi
+    return rayleigh_ritz(model.K, model.M, np.hstack([known, phi]))
+
+
 def _search(
     model: FEModel, factor: StiffnessFactor, locked: FloatArray, want: int, rng: Rng
-) -> FloatArray:
-    """Return shapes (n, want) beside the locked ones, residuals down to rounding.
+) -> tuple[FloatArray, FloatArray]:
+    """Return omega^2 and shapes (n, want) beside the locked ones, residuals down to rounding.
 
     Soft modes first: they are locked, and a new search finds those that their rounding hides.
     """
     held = model.body_motions
     start = None if locked.shape[1] >= held.shape[1] else held
-    found = _searched(model, factor, locked, want, rng, start)
+    squares, found = _searched(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
         beside = np.hstack([locked, found])
         more = _searched(model, factor, beside, want - found.shape[1], rng, None)
-        if not more.shape[1]:
+        if not more[0].size:
             break
-        found = np.hstack([found, more])
-    return found
+        squares, found = _beside(model, found, *more)
+    return squares, found
 
 
 def _searched(
@@ -157,43 +168,53 @@ def _searched(
     want: int,
     rng: Rng,
     start: FloatArray | None,
-) -> FloatArray:
-    """Return up to `want` shapes of one search."""
+) -> tuple[FloatArray, FloatArray]:
+    """Return omega^2 and shapes, up to `want`, of one search."""
     lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, rng=rng, start=start)
     extra = min(_EXTRA, want - 1)
     mass, stiffness = by_rows(model.M), by_rows(model.K)
-    deflated = np.asarray(mass @ locked)
-    best, found = np.inf, np.zeros((locked.shape[0], 0))
-    for tolerance in FOUND * np.array([1, 2e-3, 1e-5]):
-        _, phi = lanczos.lowest(want, tolerance, extra=extra)
+    size, deflated = absolute(stiffness), np.asarray(mass @ locked)
+    best, squares, found = np.inf, np.zeros(0), np.zeros((locked.shape[0], 0))
+    for part in _PARTS:
+        steps = lanczos.steps
+        needed = partial(_tolerance, stiffness, size, part)
+        _, phi = lanczos.lowest(want, extra=extra, needed=needed)
+        if steps == lanczos.steps:
+            break
         # one inverse iteration: what is left in phi of high modes, most of its residual, is gone
-        force = mass @ phi
-        force -= deflated @ (locked.T @ force)
-        phi = factor.solve(force)
-        phi -= locked @ (deflated.T @ phi)
-        squares, phi = rayleigh_ritz(stiffness, mass, phi)
-        kept = squares.size - extra if squares.size == want else squares.size
-        left = _residual(stiffness, mass, squares[:kept], phi[:, :kept])
+        for at in column_groups(phi.shape[1]):
+            force = mass @ phi[:, at]
+            force -= deflated @ (locked.T @ force)
+            moved = factor.solve(force)
+            moved -= locked @ (deflated.T @ moved)
+            phi[:, at] = moved
+        values, phi = rayleigh_ritz(stiffness, mass, phi)
+        # what the rounding of the largest 1 / (omega^2 - sigma) lets be reached
+        reached = 2 * REACHED * (values - factor.sigma) / (values[0] - factor.sigma)
+        kept = values.size - extra if values.size == want else values.size
+        left = 0.0
+        for at in column_groups(kept):
+            force, limit = _let_pass(stiffness, size, phi[:, at])
+            limit = np.maximum(limit, reached[at]) * np.linalg.norm(force, axis=0)
+            force -= (mass @ phi[:, at]) * values[at]
+            left = max(left, float(np.max(np.linalg.norm(force, axis=0) / limit)))
         if left < best:
-            best, found = left, phi
+            best, squares, found = left, values, phi
         if left <= 1:
             break
-    return found
+    return squares, found
 
 
-def _residual(K: Any, M: Any, squares: FloatArray, phi: FloatArray) -> float:
-    """Return the worst residual of some modes, ``||K phi - omega^2 M phi|| / ||K phi||``.
+def _tolerance(K: Any, size_of_K: Any, part: float, phi: FloatArray) -> FloatArray:
+    """Return the relative error of each shape at which `part` of its residual is let pass."""
+    return part * _let_pass(K, size_of_K, phi)[1]
 
-    In units of what is let pass.
-    """
-    force, mass = K @ phi, M @ phi
-    size = np.linalg.norm(force, axis=0)
-    mass *= squares
-    force -= mass
-    left = np.linalg.norm(force, axis=0)
-    del force, mass
-    rounding = np.finfo(np.float64).eps * np.linalg.norm(absolute(K) @ np.abs(phi), axis=0)
-    return float(np.max(left / np.maximum(_RESIDUAL * size, _ROUNDINGS * rounding)))
+
+def _let_pass(K: Any, size_of_K: Any, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return forces ``K phi`` and, relative to each, the residual that is let pass."""
+    force = np.asarray(K @ phi)
+    rounding = np.finfo(np.float64).eps * np.linalg.norm(size_of_K @ np.abs(phi), axis=0)
+    return force, np.maximum(_RESIDUAL, _ROUNDINGS * rounding / np.linalg.norm(force, axis=0))
 
 
 def _apart(squares: FloatArray, count: int, top: float, rounding: FloatArray) -> bool:

@@ -38,6 +38,8 @@ def by_rows(matrix: Any) -> Any:
     if not sp.issparse(matrix):
         return np.asarray(matrix, dtype=np.float64)
     given: Any = matrix
+    if given.format == "csr":
+        return given
     stored: Any = sp.csc_array(given)
     return sp.csr_array((stored.data, stored.indices, stored.indptr), shape=stored.shape)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -17,6 +18,8 @@ SPREAD = 1e-6
 _END = 1e-3
 #: rows that are mixed at a time
 _ROWS = 65536
+#: shapes that are multiplied at a time: a product of all at once is memory at its peak
+_COLUMNS = 32
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -54,8 +57,17 @@ def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
     By so much the eigenvalue of a shape may change when the entries of K are rounded to double
     precision: no method finds it closer to that of the structure.
     """
-    size = np.abs(phi)
-    return np.asarray(_EPS * np.einsum("ij,ij->j", size, np.asarray(absolute(by_rows(K)) @ size)))
+    size_of_K, found = absolute(by_rows(K)), np.zeros(phi.shape[1])
+    for at in column_groups(phi.shape[1]):
+        size = np.abs(phi[:, at])
+        found[at] = _EPS * np.einsum("ij,ij->j", size, np.asarray(size_of_K @ size))
+    return found
+
+
+def column_groups(count: int) -> Iterator[slice]:
+    """Yield the columns of a wide array in groups: what is made of a group fits the cache."""
+    for begin in range(0, count, _COLUMNS):
+        yield slice(begin, min(begin + _COLUMNS, count))
 
 
 def absolute(K: Any) -> Any:
@@ -75,6 +87,11 @@ def mixed(X: FloatArray, mix: FloatArray) -> FloatArray:
 
 
 def _eigh(K: Any, M: Any, X: FloatArray) -> tuple[FloatArray, FloatArray]:
-    stiffness, mass = X.T @ (K @ X), X.T @ (M @ X)
-    squares, mix = la.eigh(0.5 * (stiffness + stiffness.T), 0.5 * (mass + mass.T))
+    stiffness, mass = np.zeros((2, X.shape[1], X.shape[1]))
+    for at in column_groups(X.shape[1]):
+        part, later = np.ascontiguousarray(X[:, at]), X[:, at.start :].T
+        # lower triangles
+        stiffness[at.start :, at] = later @ (K @ part)
+        mass[at.start :, at] = later @ (M @ part)
+    squares, mix = la.eigh(stiffness, mass)
     return np.asarray(squares), np.asarray(mix)

@@ -40,7 +40,7 @@ def rigid_shares(M: Any, motions: FloatArray, phi: FloatArray) -> FloatArray:
     phi : (n, k) array
         Shapes.
     """
-    part = motions.T @ (by_rows(M) @ phi)
+    part = np.asarray(by_rows(M) @ motions).T @ phi
     return np.asarray(np.sum(part**2, axis=0))
 
 
