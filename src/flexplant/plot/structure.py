@@ -83,6 +83,7 @@ def layout(
         point = _point(dofs, place) / factor
         ax.plot(point[0], point[1], "s", color=BLACK, fillstyle="none", markersize=11)
         ax.annotate(text, (point[0], point[1]), (8, -14), textcoords="offset points")
+    ax.margins(0.08)  # for the names of what is at an edge
     legend_below(ax)
     return ax
 

@@ -97,7 +97,8 @@ class MachinePipeline(Value):
     duration : float [s]
         Of that run.
     larger : int
-        Modes of the updated full structure that are known beyond the reduced model's.
+        Modes of the updated full structure that are known, those of the reduced model included; at
+        most all.
     folder : path, optional
         Where the report of each machine is written, a text file; the table names it.
 
@@ -201,7 +202,8 @@ class MachinePipeline(Value):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             measured, places, fit = self._fitted(self._measured(machine, of_measurement))
-            many = solve_modes(fit.applied_to(self.full), count=self.larger)
+            updated = fit.applied_to(self.full)
+            many = solve_modes(updated, count=min(self.larger, updated.n_dof))
             plant = assemble_plant(fit.model, self.ports).discretized(self.rate, delay=self.delay)
             observer = design_kalman(plant, larger=many)
             if self.blocks is None:
