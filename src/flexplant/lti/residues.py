@@ -137,6 +137,8 @@ def _of_eigenvectors(g: StateSpace) -> _Found:
         inverse = np.linalg.inv(V)
     except np.linalg.LinAlgError:
         return poles, None, poles
-    if not np.linalg.norm(V) * np.linalg.norm(inverse) < POOR:
+    with np.errstate(over="ignore"):  # of defective poles
+        condition = np.linalg.norm(V) * np.linalg.norm(inverse)
+    if not condition < POOR:
         return poles, None, poles
     return poles, (C @ V).T[:, :, None] * (inverse @ B)[:, None, :], poles
