@@ -12,6 +12,7 @@ from .numbering import numbered as numbered
 from .output_only import identify_output_only as identify_output_only
 from .periodic import Periodic as Periodic
 from .periodic import multisine as multisine
+from .shape_deviations import shape_deviations as shape_deviations
 from .spectra import H1Estimator as H1Estimator
 from .spectra import H2Estimator as H2Estimator
 from .spectra import HvEstimator as HvEstimator

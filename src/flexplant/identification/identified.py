@@ -51,10 +51,10 @@ class IdentifiedModes(MeasuredModes):
         Cost per degree of freedom; 1 when only noise of the stated variance is left.
     diagram : StabilisationDiagram, optional
         The poles were chosen from.
-    shape_covariance : (m, n_out, n_out) complex array, optional
-        E[n n^H] of the error n of each shape at its scale, from the FRF's variance and the
-        correlation of its outputs' errors (where not known, they are taken for independent); not
-        known where there are fewer outputs than inputs.
+    channel_covariance : (m, n_out + n_in, n_out + n_in) complex array, optional
+        E[n n^H] of the error n of each mode's [shape; participation], that of their scale
+        included, from the FRF's variance and the correlation of its outputs' errors (where not
+        known, they are taken for independent).
 
     Examples
     --------
@@ -80,7 +80,7 @@ class IdentifiedModes(MeasuredModes):
     mass_normalised: bool = field(default=False, kw_only=True)
     misfit: float = field(kw_only=True)
     diagram: StabilisationDiagram | None = field(default=None, kw_only=True)
-    shape_covariance: ComplexArray | None = field(default=None, kw_only=True)
+    channel_covariance: ComplexArray | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -90,8 +90,14 @@ class IdentifiedModes(MeasuredModes):
             input_dofs=tuple(self.input_dofs) or tuple(self.inputs),
             participation=self.participation,
             terms=self.terms,
-            shape_covariance=self.shape_covariance,
+            channel_covariance=self.channel_covariance,
         )
+
+    @property
+    def shape_covariance(self) -> ComplexArray | None:
+        """E[n n^H] (m, n_out, n_out) of the error n of each shape, None where not known."""
+        count, spread = len(self.outputs), self.channel_covariance
+        return None if spread is None else spread[:, :count, :count]
 
     def frf(self, freq: FloatArray, *, as_measured: bool = False) -> Frf:
         """Return the identified response (displacement per input), to compare or to extend.
@@ -131,8 +137,8 @@ class IdentifiedModes(MeasuredModes):
         return Frf(freq, data, inputs=self.inputs, outputs=self.outputs, quantity="displacement")
 
     def _picked(self, places: list[int]) -> dict[str, Any]:
-        spread = self.shape_covariance
+        spread = self.channel_covariance
         return super()._picked(places) | {
             "participation": self.participation[:, places],
-            "shape_covariance": None if spread is None else spread[places],
+            "channel_covariance": None if spread is None else spread[places],
         }

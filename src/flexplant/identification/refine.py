@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import SolverError
-from ..values import ComplexArray, FloatArray
+from ..values import ComplexArray, FloatArray, IntArray
 from .basis import axis, residual_terms, seen_terms
 
 #: largest entry of a participation vector beside the one held at 1
@@ -79,6 +79,7 @@ class Fit:
     cost: float
     N: FloatArray  # normal matrix of the nonlinear parameters
     jacobian: list[ComplexArray]  # per output (n_in, n_freq, n_parameters)
+    pivots: IntArray  # the entry of each column of the participation that is held at 1
     model: ComplexArray  # the fitted responses
     settled: bool = True
     shape_maps: tuple[tuple[FloatArray, ComplexArray], ...] = ()  # see _Projected.normal
@@ -169,6 +170,7 @@ def refined(
         now.cost,
         N,
         jacobian,
+        pivots,
         now.model,
         settled,
         maps,

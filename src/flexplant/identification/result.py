@@ -37,8 +37,14 @@ def answer(
     outputs = tuple(labels.get(name, name) for name in frf.outputs)
     inputs = tuple(labels.get(name, name) for name in frf.inputs)
     shared = [(outputs.index(dof), i) for i, dof in enumerate(inputs) if dof in outputs]
-    raw = shapes
+    raw, unscaled = shapes, part
     shapes, part, normalised = _scaled(fit.poles, shapes, part, shared if labels else [])
+    spread = _channel_covariance(fit, ready) * max(1.0, misfit)
+    if ready.swapped:
+        turned = np.roll(np.arange(spread.shape[1]), -len(fit.shape_maps))
+        spread = spread[:, turned][:, :, turned]
+    T = _scale_errors((raw, unscaled), (shapes, part), shared if normalised else [])
+    spread = T @ spread @ T.conj().transpose(0, 2, 1)
     freq = np.abs(fit.poles) / (2 * np.pi)
     order = np.argsort(freq, kind="stable")
     inside = np.array([k for k in order if band[0] <= freq[k] <= band[1]], dtype=np.int64)
@@ -49,13 +55,6 @@ def answer(
         )
         raise no_pole(frf, lost)
     both = np.concatenate([inside, inside + fit.poles.size])
-    spread = None
-    if not ready.swapped:
-        large = np.argmax(np.abs(raw), axis=0)
-        columns = np.arange(fit.poles.size)
-        factor = np.abs(shapes[large, columns] / raw[large, columns]) ** 2
-        spread = _shape_covariance(fit, ready) * factor[:, None, None] * max(1.0, misfit)
-        spread = spread[inside]
     return IdentifiedModes(
         fit.poles[inside],
         covariance=covariance[np.ix_(both, both)],
@@ -74,7 +73,7 @@ def answer(
         mass_normalised=normalised,
         misfit=misfit,
         diagram=diagram,
-        shape_covariance=spread,
+        channel_covariance=spread[inside],
     )
 
 
@@ -95,15 +94,15 @@ def _covariance(fit: Fit, ready: PreparedLines) -> FloatArray:
     return np.asarray((chosen + chosen.T) / 2)
 
 
-def _shape_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
-    r"""Return E[n n^H] (m, n_out, n_out) of the errors n of each shape.
+def _channel_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
+    r"""Return E[n n^H] of the errors n (n_out + n_in,) of each mode's shape and participation.
 
     With poles and participation theta, the error of the shape at output a is
     ``S_a d theta + D_a^T e_a``, ``d theta = N^{-1} sum_b J_b^T e_b``; D_a and J_a are orthogonal,
     so that the two are independent unless outputs share errors. Noise that acts on the machine
     is shared: near a resonance it moves all outputs along the shape, which is scale.
     """
-    m, n_out = fit.poles.size, len(fit.shape_maps)
+    m, n_out, n_in = fit.poles.size, len(fit.shape_maps), fit.participation.shape[0]
     size = np.sqrt(np.maximum(np.diag(fit.N), 1e-300))
     inverse = la.pinvh(fit.N / np.outer(size, size), rtol=1e-13) / np.outer(size, size)
     slopes = np.array([slope for slope, _ in fit.shape_maps]).reshape(n_out, 2, m, -1)
@@ -122,17 +121,62 @@ def _shape_covariance(fit: Fit, ready: PreparedLines) -> ComplexArray:
                 common = common + _inner(gains[a], ready.spread(a, b, gains[b]))
                 mixed[b] += _inner(gains[a], other)
                 held[a, b] = _inner(direct[a], other)
+    slopes = np.concatenate([slopes, _free_entries(fit)])
     mixed = mixed.reshape(n_out, -1, 2, m)
     held = held.reshape(n_out, n_out, 2, m, 2, m)
-    found = np.zeros((m, n_out, n_out), dtype=np.complex128)
+    found = np.zeros((m, n_out + n_in, n_out + n_in), dtype=np.complex128)
     for k in range(m):
         slope = slopes[:, :, k]
         S = np.einsum("oap,pq,ebq->oaeb", slope, common, slope, optimize=True)
         cross = np.einsum("oap,epb->oaeb", slope, mixed[..., k])
-        S += cross + cross.transpose(2, 3, 0, 1)
-        S += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
+        S[:, :, :n_out] += cross
+        S[:n_out] += cross.transpose(2, 3, 0, 1)
+        S[:n_out, :, :n_out] += held[:, :, :, k, :, k].transpose(0, 2, 1, 3)
         found[k] = S[:, 0, :, 0] + S[:, 1, :, 1] + 1j * (S[:, 1, :, 0] - S[:, 0, :, 1])
     return np.asarray((found + found.conj().transpose(0, 2, 1)) / 2)
+
+
+def _free_entries(fit: Fit) -> FloatArray:
+    """Return the derivatives (n_in, 2, m, n_parameters) of Re and Im of the participation."""
+    n_in, m = fit.participation.shape
+    found = np.zeros((n_in, 2, m, 2 * m * n_in))
+    for k, pivot in enumerate(fit.pivots.tolist()):
+        free = [i for i in range(n_in) if i != pivot]
+        for j, i in enumerate(free):
+            found[i, 0, k, (2 + 2 * j) * m + k] = found[i, 1, k, (3 + 2 * j) * m + k] = 1.0
+    return found
+
+
+def _scale_errors(
+    raw: tuple[ComplexArray, ComplexArray],
+    scaled: tuple[ComplexArray, ComplexArray],
+    shared: list[tuple[int, int]],
+) -> ComplexArray:
+    r"""Return T (m, n_out + n_in, n_out + n_in) from errors of raw channels to those scaled.
+
+    With ``phi = f psi`` and ``p = l / f``: ``d phi = f d psi + phi df/f`` and
+    ``d p = d l / f - p df/f``. Of `shared` channels s, ``f^2 ~ psi_s^H l_s / |psi_s|^2`` and l_s is
+    a multiple r of psi_s but for noise, so that ``2 df/f = psi_s^H (d l_s / r - d psi_s) /
+    |psi_s|^2``; else ``f = 1 / psi_max``.
+    """
+    psi, part = raw
+    n_out, m = psi.shape
+    large, columns = np.argmax(np.abs(psi), axis=0), np.arange(m)
+    factor = scaled[0][large, columns] / psi[large, columns]
+    g = np.zeros((m, n_out + part.shape[0]), dtype=np.complex128)
+    if shared:
+        rows, places = (list(side) for side in zip(*shared, strict=True))
+        driven = psi[rows].conj() / np.sum(np.abs(psi[rows]) ** 2, axis=0)
+        ratio = np.sum(driven * part[places], axis=0)
+        for row, place, weight in zip(rows, places, driven, strict=True):
+            g[:, row] -= 0.5 * weight
+            g[:, n_out + place] += 0.5 * weight / ratio
+    else:
+        g[columns, large] = -1.0 / psi[large, columns]
+    T = np.concatenate([scaled[0], -scaled[1]]).T[:, :, None] * g[:, None, :]
+    diagonal = np.arange(g.shape[1])
+    T[:, diagonal, diagonal] += np.where(diagonal < n_out, factor[:, None], 1 / factor[:, None])
+    return np.asarray(T)
 
 
 def _inner(left: ComplexArray, right: ComplexArray | None) -> Any:

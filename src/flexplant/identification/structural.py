@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -13,7 +13,7 @@ from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
 from ..structure.rigid import rigid_motions
-from ..values import ComplexArray, FloatArray, flag, instance
+from ..values import ComplexArray, FloatArray, IntArray, flag, instance
 from .identified import IdentifiedModes
 
 #: part of the largest eigenvalue of an inertia or a flexibility below which one is noise, and by
@@ -21,6 +21,8 @@ from .identified import IdentifiedModes
 NOISE, NEGATIVE = 1e-3, 0.05
 #: relative imaginary part of a shape, and part of one that a model's modes do not make, to warn of
 COMPLEX, MISSED = 0.1, 0.1
+#: relative error of its real shapes below which a pole outside the band is a mode
+ALIKE = 0.3
 #: frequencies of residual vectors that are tried, in parts of the band's end
 NEAREST, FARTHEST = 1.03, 10.0
 
@@ -43,7 +45,9 @@ def structural_modes(
     - what is left, nearest to :math:`A/s^2 + G\,\omega_v^2/(s^2 + \omega_v^2)` in the band:
       rigid-body modes :math:`\Phi_r \Phi_r^T = A` in the span of the rigid-body motions of the
       geometry, and residual vectors :math:`v v^T/\omega_v^2 = G`, completed from the places that
-      are both: :math:`G_{oc} G_{cc}^{-1} G_{co}`.
+      are both: :math:`G_{oc} G_{cc}^{-1} G_{co}`;
+    - modes that were found just outside the band are residual vectors too, with their own
+      frequency and damping, where they are modes of a structure: real shapes, driven as they move.
 
     Parameters
     ----------
@@ -65,7 +69,7 @@ def structural_modes(
         Rigid-body modes first. `certificate` says how large the imaginary parts left out are
         ("imaginary") and, with `over`, what part of a measured shape the model's modes do not make
         ("expansion"). ``plant.uncertain(numbered(measured, modes))`` gives the covariance of the
-        poles to the plant.
+        poles to the plant, with ``shapes=shape_deviations(measured, dofs)`` that of shapes too.
 
     Warns
     -----
@@ -98,33 +102,16 @@ def structural_modes(
     >>> found.freq.round(1)
     array([ 34.5, 147. ])
     """
-    instance(measured, IdentifiedModes, "measured", "Pass the answer of identify_modes(frf).")
-    instance(dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz), or model.dofs.")
-    if over is not None:
-        instance(over, Modes, "over", "Pass solve_modes(model, count=...).")
-        dofs = over.dofs
-    if not measured.mass_normalised:
-        raise ModelError(
-            "the scale of these shapes is not known: no input and output are at one DOF. Drive "
-            "and measure one place, and name it in identify_modes(frf, dofs={channel: label})."
-        )
-    free = flag(rigid, "rigid")
-    labels = tuple(dict.fromkeys([*(measured.dofs or ()), *measured.input_dofs]))
-    absent = [label for label in labels if label not in dofs.labels]
-    if absent:
-        raise LabelError(
-            f"{', '.join(absent[:4])} are channels at no DOF of {dofs!r}. Say where they are: "
-            "identify_modes(frf, dofs={channel: label})."
-        )
-    at = _Places(measured, labels)
+    at, dofs, rows = places_of(measured, dofs, over)
+    free, labels = flag(rigid, "rigid"), at.labels
     shapes = at.shapes()
-    imaginary = float(np.max(np.linalg.norm(shapes.imag, axis=0) / np.linalg.norm(shapes, axis=0)))
-    rows = dofs.indices(labels)
-    A, G, fast = at.smooth()
+    imaginary = float(np.max(_imaginary(shapes)))
+    beside = at.beside()
+    A, G, fast = at.smooth(beside)
     body = at.rigid(A, dofs, rows) if free else np.zeros((len(labels), 0))
-    vectors = at.residual(G, fast)
+    residual = at.residual(G, fast)
     certificate = {"imaginary": imaginary}
-    columns = [body, shapes.real, vectors]
+    columns = [body, shapes.real, np.hstack([beside.shapes.real, residual])]
     place = dofs
     if over is not None:
         columns, certificate["expansion"] = _expanded(over, rows, columns)
@@ -136,7 +123,8 @@ def structural_modes(
             place = interpolated(place, margin=margin)
     _warn(certificate)
     body, phi, vectors = columns
-    m = vectors.shape[1]
+    m = residual.shape[1]
+    near = beside.poles
     zeta = np.concatenate([np.zeros(body.shape[1]), measured.zeta])
     return Modes(
         np.concatenate([np.zeros(body.shape[1]), np.abs(measured.poles)]),
@@ -145,38 +133,104 @@ def structural_modes(
         place,
         n_rigid=body.shape[1],
         vectors=vectors,
-        vector_omega=np.full(m, fast),
-        vector_zeta=np.full(m, float(np.median(measured.zeta))),
-        vector_dofs=[f"residual {i + 1}" for i in range(m)],
+        vector_omega=np.append(np.abs(near), np.full(m, fast)),
+        vector_zeta=np.append(
+            -near.real / np.abs(near), np.full(m, float(np.median(measured.zeta)))
+        ),
+        vector_dofs=[
+            *(f"mode beside the band at {abs(pole) / (2 * np.pi):.5g} Hz" for pole in near),
+            *(f"residual {i + 1}" for i in range(m)),
+        ],
         certificate=certificate,
     )
 
 
-class _Places:
+def places_of(measured: Any, dofs: Any, over: Modes | None) -> tuple[Places, DofSet, IntArray]:
+    """Return the places of an identification's channels, the DOFs and their rows among these.
+
+    Raises
+    ------
+    ModelError
+        When the scale of the shapes is not known.
+    LabelError
+        When a channel is not one of `dofs`.
+    """
+    instance(measured, IdentifiedModes, "measured", "Pass the answer of identify_modes(frf).")
+    instance(dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz), or model.dofs.")
+    if over is not None:
+        instance(over, Modes, "over", "Pass solve_modes(model, count=...).")
+        dofs = over.dofs
+    if not measured.mass_normalised:
+        raise ModelError(
+            "the scale of these shapes is not known: no input and output are at one DOF. Drive "
+            "and measure one place, and name it in identify_modes(frf, dofs={channel: label})."
+        )
+    labels = tuple(dict.fromkeys([*(measured.dofs or ()), *measured.input_dofs]))
+    absent = [label for label in labels if label not in dofs.labels]
+    if absent:
+        raise LabelError(
+            f"{', '.join(absent[:4])} are channels at no DOF of {dofs!r}. Say where they are: "
+            "identify_modes(frf, dofs={channel: label})."
+        )
+    return Places(measured, labels), dofs, dofs.indices(labels)
+
+
+class Beside(NamedTuple):
+    """Modes just outside the band, as the fit has them and by places."""
+
+    poles: ComplexArray
+    residues: ComplexArray
+    shapes: ComplexArray
+
+
+class Places:
     """The channels of an identification by the places they are at."""
 
     def __init__(self, measured: IdentifiedModes, labels: tuple[str, ...]) -> None:
-        self.measured, self.count = measured, len(labels)
+        self.measured, self.labels, self.count = measured, labels, len(labels)
         #: positions among the places
         self.outputs = [labels.index(label) for label in measured.dofs or ()]
         self.inputs = [labels.index(label) for label in measured.input_dofs]
         self.top = 2 * np.pi * measured.top
 
-    def shapes(self) -> ComplexArray:
-        """Return the shapes (places, m), the mean of both where there are two."""
-        total = np.zeros((self.count, len(self.measured)), dtype=np.complex128)
-        times = np.zeros((self.count, 1))
-        driven = 2j * self.measured.poles.imag * self.measured.participation
-        for at, part in ((self.outputs, np.asarray(self.measured.shapes)), (self.inputs, driven)):
-            np.add.at(total, at, part)
-            np.add.at(times, at, 1.0)
-        return total / times
+    def maps(self, poles: ComplexArray) -> ComplexArray:
+        """Return the maps (m, places, n_out + n_in) from [shape; participation] to a shape.
 
-    def smooth(self) -> tuple[FloatArray, FloatArray, float]:
+        The mean of both where a place was driven and measured.
+        """
+        found = np.zeros((poles.size, self.count, len(self.outputs) + len(self.inputs)), complex)
+        for channel, place in enumerate([*self.outputs, *self.inputs]):
+            found[:, place, channel] = 1.0 if channel < len(self.outputs) else 2j * poles.imag
+        times = np.bincount([*self.outputs, *self.inputs], minlength=self.count)
+        return np.asarray(found / times[:, None])
+
+    def shapes(self) -> ComplexArray:
+        """Return the shapes (places, m)."""
+        measured = self.measured
+        return self._at(measured.poles, np.asarray(measured.shapes), measured.participation)
+
+    def _at(self, poles: ComplexArray, shapes: Any, part: Any) -> ComplexArray:
+        channels = np.concatenate([shapes, part]).T[:, :, None]
+        found = np.matmul(self.maps(poles), channels)[:, :, 0].T
+        return np.asarray(found, dtype=np.complex128)
+
+    def beside(self) -> Beside:
+        """Return the poles outside the band that are modes of a structure."""
+        poles, shapes, part = self.measured.unreported
+        phi = self._at(poles, shapes, part)
+        made = phi[self.outputs][:, None] * phi[self.inputs] / (2j * poles.imag)
+        known = shapes[:, None] * part
+        off = np.linalg.norm(made.real - known.real, axis=(0, 1))
+        off = np.hypot(off, np.linalg.norm(made.imag - known.imag, axis=(0, 1)))
+        like = off < ALIKE * np.linalg.norm(known, axis=(0, 1))
+        keep = np.flatnonzero(like & (_imaginary(phi) < ALIKE))
+        return Beside(poles[keep], known[:, :, keep], phi[:, keep])
+
+    def smooth(self, beside: Beside) -> tuple[FloatArray, FloatArray, float]:
         """Return A, G and w of ``A/s^2 + G w^2/(s^2 + w^2)``, nearest to all but the modes.
 
-        The residual terms, and the poles beside the band, on 200 frequencies of the band, relative
-        to the whole response; w is searched.
+        The residual terms, and what poles outside the band are no modes of a structure, on 200
+        frequencies of the band, relative to the whole response; w is searched.
         """
         measured, top = self.measured, self.top
         freq = np.geomspace(0.5 * float(measured.freq.min()), measured.top, 200)
@@ -184,8 +238,9 @@ class _Places:
         whole = measured.replace(hold=None).frf(freq).data
         s = 2j * np.pi * freq
         part: ComplexArray = np.asarray(measured.shapes)[:, None, :] * measured.participation
-        modal = part @ (1 / (s - measured.poles[:, None]))
-        modal = modal + part.conj() @ (1 / (s - measured.poles.conj()[:, None]))
+        poles = np.concatenate([measured.poles, beside.poles])[:, None]
+        part = np.concatenate([part, beside.residues], axis=2)
+        modal = part @ (1 / (s - poles)) + part.conj() @ (1 / (s - poles.conj()))
         rest = np.real(whole - modal).reshape(-1, freq.size)
         weight = 1 / np.sqrt(np.mean(np.abs(whole) ** 2, axis=(0, 1)))
         best = None
@@ -238,6 +293,12 @@ class _Places:
         return vectors * fast
 
 
+def _imaginary(shapes: ComplexArray) -> FloatArray:
+    """Return the relative size (m,) of the shapes' imaginary parts."""
+    size = np.linalg.norm(shapes, axis=0)
+    return np.asarray(np.linalg.norm(shapes.imag, axis=0) / np.where(size > 0, size, 1.0))
+
+
 def _root(S: FloatArray, trouble: str) -> FloatArray:
     """Return L with ``S = L L^T`` but for noise."""
     values, vectors = la.eigh(S)
@@ -249,6 +310,20 @@ def _root(S: FloatArray, trouble: str) -> FloatArray:
 
 def _expanded(over: Modes, rows: Any, columns: list[FloatArray]) -> tuple[list[FloatArray], float]:
     """Return shapes over all DOFs of a model, and the part of elastic ones it does not make."""
+    E = expansion(over, rows)
+    left = columns[1] - E[rows] @ columns[1]
+    part = np.linalg.norm(left, axis=0) / np.linalg.norm(columns[1], axis=0)
+    return [E @ one for one in columns], float(np.max(part))
+
+
+def expansion(over: Modes, rows: Any) -> FloatArray:
+    """Return ``Phi Phi_a^+`` (n, places) of a model's modes and the rows of measured places.
+
+    Raises
+    ------
+    ModelError
+        When there are more modes than places.
+    """
     Phi = np.real(over.phi)
     seen = Phi[rows]
     count, places = over.n_modes, len(rows)
@@ -257,10 +332,7 @@ def _expanded(over: Modes, rows: Any, columns: list[FloatArray]) -> tuple[list[F
             f"{places} measured places do not determine {count} modes of the model: expand over "
             "fewer, solve_modes(model, count=...), or measure at more places."
         )
-    found = [np.linalg.lstsq(seen, part)[0] for part in columns]
-    left = columns[1] - seen @ found[1]
-    part = np.linalg.norm(left, axis=0) / np.linalg.norm(columns[1], axis=0)
-    return [Phi @ one for one in found], float(np.max(part))
+    return np.asarray(np.linalg.lstsq(seen.T, Phi.T)[0].T)
 
 
 def _warn(certificate: dict[str, float]) -> None:

@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..labels import Place
 from ..lti.statespace import System
+from ..values import FloatArray
 from .assumptions import AssumptionReport
 from .building import rebuilt, sampled
 from .moving import Along, along, moved
@@ -216,6 +217,7 @@ class StandardPlant(Partition):
         modes: Sequence[int] | None = None,
         deviations: float = 2.0,
         neglected: Any = None,
+        shapes: FloatArray | None = None,
     ) -> UncertainPlant[StandardPlant]:
         """Return the plant with the uncertainty of a fit as real Deltas on its modes.
 
@@ -240,6 +242,10 @@ class StandardPlant(Partition):
         neglected : StandardPlant, FEModel, Modes, ReducedModel or NeglectedModes, optional
             A larger model with the same channels: the difference from w and u to z and y is
             bounded by additive weights (see `NeglectedModes`).
+        shapes : (m, n, r) array, optional
+            Of measured modes: directions over the n DOFs of the plant's modes, each a standard
+            deviation of the shape, independent (`flexplant.identification.shape_deviations`). Each
+            becomes a Delta `mode6:shape1` on what drives the mode and what is seen of it.
 
         Returns
         -------
@@ -251,8 +257,8 @@ class StandardPlant(Partition):
         LabelError
             When parameters are not those of the fit, or a mode is unknown.
         ModelError
-            When there is no covariance, the fit is of another model, or the uncertainty covers
-            negative stiffness or damping.
+            When there is no covariance, the fit is of another model, the uncertainty covers
+            negative stiffness or damping, or shapes are given that are not real.
         """
         return uncertain(
             self,
@@ -261,6 +267,7 @@ class StandardPlant(Partition):
             modes=modes,
             deviations=deviations,
             neglected=neglected,
+            shapes=shapes,
         )
 
     @cached_property

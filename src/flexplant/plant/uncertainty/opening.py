@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+import scipy.linalg as la
 
 from ...errors import LabelError, ModelError, unknown_label
 from ...identification import MeasuredModes
@@ -18,6 +19,7 @@ from ..partition import Partition
 from ..realisation import ModalRealisation
 from .neglected import NeglectedModes, neglected_modes, opened
 from .parametric import by_parameters
+from .shape_channels import shape_deltas, with_shape_channels
 from .uncertain_plant import Delta, UncertainPlant, modal_realisation, with_changes
 
 #: relative standard deviations below this open no channel
@@ -36,9 +38,15 @@ def uncertain(
     modes: Sequence[int] | None = None,
     deviations: float = 2.0,
     neglected: Any = None,
+    shapes: Any = None,
 ) -> UncertainPlant[P]:
     """Return a plant with channels for Deltas; see `StandardPlant.uncertain`."""
     many = positive(deviations, "deviations")
+    if shapes is not None and not isinstance(source, MeasuredModes):
+        raise ModelError(
+            "deviations of shapes go with measured modes; those of a fit follow from its "
+            "parameters, in sample. Leave shapes= out."
+        )
     if (
         isinstance(source, UpdateResult)
         and not plant.is_weighted
@@ -72,6 +80,13 @@ def uncertain(
     deltas = tuple(every[i] for i in keep)
     _check_range(deltas, many)
     system = _opened(plant.continuous, deltas)
+    own = covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep])
+    if shapes is not None and isinstance(source, MeasuredModes):
+        more = shape_deltas(plant, shapes, source.modes or (), numbers, many)
+        if more:
+            system = with_shape_channels(plant.continuous, system, deltas, more)
+        deltas = (*deltas, *more)
+        own = la.block_diag(own, np.eye(len(more)) / many**2)
     weight = None
     if neglected is not None:
         known = isinstance(neglected, NeglectedModes)
@@ -81,7 +96,7 @@ def uncertain(
         plant,
         system,
         deltas,
-        covariance[np.ix_(keep, keep)] / np.outer(scale[keep], scale[keep]),
+        own,
         many,
         weight,
         source if isinstance(source, UpdateResult) else None,

@@ -34,11 +34,14 @@ class Delta(Value):
         Of the channels: `mode6:freq` has the input `mode6:freq:w` and the output `mode6:freq:z`.
     mode : int
         Number of the mode, from 1, rigid-body modes included; 0 of a parameter.
-    kind : {"freq", "damping", "parameter"}
-        Stiffness ``omega^2 (1 + scale delta)`` or damping ``2 zeta omega (1 + scale delta)`` of a
-        mode; or a parameter of the fit, its value plus scale delta.
+    kind : {"freq", "damping", "shape", "parameter"}
+        Stiffness ``omega^2 (1 + scale delta)``, damping ``2 zeta omega (1 + scale delta)`` or shape
+        ``phi + scale delta along`` of a mode; or a parameter of the fit, its value plus scale
+        delta.
     scale : float
         Change at delta = 1: relative, of a parameter in its own unit.
+    along : (n,) array, optional
+        Of a shape: as long as the shape, over the DOFs of the plant's modes.
 
     Examples
     --------
@@ -55,8 +58,12 @@ class Delta(Value):
 
     name: str
     mode: int
-    kind: Literal["freq", "damping", "parameter"]
+    kind: Literal["freq", "damping", "shape", "parameter"]
     scale: float
+    along: FloatArray | None = None
+
+    def __post_init__(self) -> None:
+        self._set(along=self.along)
 
 
 def modal_realisation(plant: Partition) -> ModalRealisation:
@@ -82,7 +89,7 @@ def modal_realisation(plant: Partition) -> ModalRealisation:
 
 
 def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
-    """Return the plant with modes' stiffness or damping changed by some relative amounts.
+    """Return the plant with modes' stiffness, damping or shape changed by some relative amounts.
 
     Rows [1, 0] and [a00 / s, 1] of a block [[a00, s], [a10, a11]] are a mode's displacement and
     its rate over s; only the second row of the block changes, whatever its form.
@@ -90,6 +97,9 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
     realisation = modal_realisation(plant)
     pairs = np.array(realisation.pairs)
     for delta, amount in changes:
+        if delta.kind == "shape":
+            realisation = reshaped(realisation, delta, amount)
+            continue
         if not amount > -1:
             raise ModelError(
                 f"{delta.name} = {amount / delta.scale:.4g} leaves mode {delta.mode} with negative "
@@ -105,6 +115,36 @@ def with_changes(plant: P, changes: Sequence[tuple[Delta, float]]) -> P:
     return rebuilt(plant, realisation=realisation.replace(pairs=pairs))
 
 
+def reshaped(
+    realisation: ModalRealisation,
+    delta: Delta,
+    amount: float,
+    *,
+    inputs: bool = True,
+    outputs: bool = True,
+) -> ModalRealisation:
+    """Return a realisation with ``phi + amount along`` where forces act, motions show, or both.
+
+    Raises
+    ------
+    ModelError
+        When the mode is complex.
+    """
+    first = 2 * delta.mode - 2
+    if np.any(realisation.inputs[:, first]) or np.any(realisation.outputs[:, first + 1]):
+        raise ModelError(
+            f"mode {delta.mode} has a complex shape: deviations of shapes are of real ones. Leave "
+            "it out of modes=."
+        )
+    pushed, shown = np.array(realisation.inputs), np.array(realisation.outputs)
+    moved = amount * np.asarray(delta.along)
+    if inputs:
+        pushed[:, first + 1] += moved
+    if outputs:
+        shown[:, first] += moved / realisation.pairs[delta.mode - 1, 0, 1]
+    return realisation.replace(inputs=pushed, outputs=shown)
+
+
 @dataclass(frozen=True, eq=False, repr=False)
 class UncertainPlant(Value, Generic[P]):
     """A plant whose modes are known up to real Deltas, and its neglected modes up to a weight.
@@ -115,8 +155,9 @@ class UncertainPlant(Value, Generic[P]):
                 z <---|  P  |<--- w
                 y <---|     |<--- u
 
-    A mode of frequency omega and damping ratio zeta keeps its shape and obeys
+    A mode of frequency omega and damping ratio zeta obeys
     ``q'' + 2 zeta omega (1 + b d_b) q' + omega^2 (1 + a d_a) q = f``: each Delta is one channel.
+    Where deviations of shapes are given, it is driven and seen by ``phi + c d_c v``.
 
     Made by `StandardPlant.uncertain`.
 
@@ -238,7 +279,8 @@ class UncertainPlant(Value, Generic[P]):
 
         From a fit: its parameters are drawn from their covariance and each machine's matrices are
         rebuilt, so shapes and all modes differ too. From measured modes: stiffness and damping of
-        the measured modes are drawn, correlated as measured.
+        the measured modes are drawn, correlated as measured, and their shapes where deviations
+        were given.
 
         Parameters
         ----------

@@ -1,0 +1,197 @@
+"""Deltas on the shapes of modes: how a mode is driven, and what is seen of it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ...errors import ModelError
+from ...lti.statespace import StateSpace
+from ...values import FloatArray, real_array
+from ..building import rebuilt
+from ..partition import Partition
+from .uncertain_plant import Delta, modal_realisation, reshaped, with_changes
+
+#: relative: a dependence below this is rounding
+_ROUNDING = 1e-9
+#: values of the Deltas at which the channels are compared with a plant assembled anew
+_PROBE = 0.5
+
+
+class _Channel(NamedTuple):
+    """One channel of a Delta: what it moves, what it reads, of which mode's velocity."""
+
+    left: FloatArray
+    right: FloatArray
+    state: int
+    #: whether it reads the rate of that state
+    of_rate: bool = False
+    name: str = ""
+    #: factor of `right` that makes both sides of one size
+    even: float = 1.0
+
+
+def shape_deltas(
+    plant: Partition,
+    shapes: FloatArray,
+    measured: Sequence[int],
+    chosen: Sequence[int],
+    deviations: float,
+) -> list[Delta]:
+    """Return a Delta for each direction (n,) of `shapes` (m, n, r) of the chosen modes.
+
+    Raises
+    ------
+    ShapeError
+        When there is not one row for each DOF of the plant's modes.
+    """
+    realisation = modal_realisation(plant)
+    n = realisation.outputs.shape[0]
+    given = real_array(shapes, "shapes", (len(measured), n, None))
+    found = []
+    for number in chosen:
+        phi = realisation.inputs[:, 2 * number - 1]
+        for j, direction in enumerate(given[list(measured).index(number)].T, 1):
+            size = float(np.linalg.norm(direction) / np.linalg.norm(phi))
+            if size > 0:
+                along = direction / size
+                found.append(
+                    Delta(f"mode{number}:shape{j}", number, "shape", deviations * size, along)
+                )
+    return found
+
+
+def with_shape_channels(
+    plant: Partition, system: StateSpace, others: Sequence[Delta], deltas: Sequence[Delta]
+) -> StateSpace:
+    r"""Return a plant's system with channels for Deltas on shapes beside those it has.
+
+    ``phi + d v`` drives the mode by ``d v^T f`` more and shows ``d v q``, ``d v q'`` or
+    ``d v q''`` of its motion more: four channels at most, of which q'' feels what the first one
+    drives. Their columns are read off the plant assembled with forces or motions changed alone, so
+    that they hold for any port and filter.
+
+    Parameters
+    ----------
+    plant : StandardPlant
+        Continuous.
+    system : StateSpace
+        Its system with the channels of `others`.
+    others, deltas : sequences of Delta
+        On frequencies and damping; on shapes.
+    """
+    base, g = _matrix(plant.system), plant.system
+    n, m, p = g.n_states, len(g.inputs), len(g.outputs)
+    before = len(system.inputs) - m
+    first: list[_Channel] = []
+    further: list[_Channel] = []
+    for delta in deltas:
+        states = [int(plant.modal_states[2 * delta.mode - i]) for i in (2, 1)]
+        own = _factors(plant, delta, base, *states)
+        if not own:
+            raise ModelError(f"{delta.name} moves no port of the plant: leave that mode out.")
+        for i, one in enumerate(own):
+            row = np.concatenate([one.right[:n], np.zeros(before), one.right[n:]])
+            if one.of_rate:  # with what the other Deltas make of it
+                row = np.concatenate([system.A[one.state], system.B[one.state]])
+            even = np.sqrt(delta.scale * np.linalg.norm(one.left) / np.linalg.norm(one.right))
+            part = one._replace(
+                name=f"{delta.name}:{i + 1}" if i else delta.name,
+                left=one.left * (delta.scale / even),
+                right=row * even,
+                even=float(even),
+            )
+            (further if i else first).append(part)
+    parts = [*first, *further]
+    names = [one.name for one in parts]
+    left = np.array([one.left for one in parts]).T
+    right = np.array([one.right for one in parts])
+    feed = np.array([one.of_rate * one.even * left[one.state] for one in parts])
+    within = np.hstack([system.D[:before, :before], np.zeros((before, len(parts)))])
+    D = np.block(
+        [
+            [within, system.D[:before, before:]],
+            [right[:, n : n + before], feed, right[:, n + before :]],
+            [system.D[before:, :before], left[n:], system.D[before:, before:]],
+        ]
+    )
+    found = StateSpace(
+        system.A,
+        np.hstack([system.B[:, :before], left[:n], system.B[:, before:]]),
+        np.vstack([system.C[:before], right[:, :n], system.C[before:]]),
+        D,
+        inputs=[*system.inputs[:before], *(f"{name}:w" for name in names), *g.inputs],
+        outputs=[*system.outputs[:before], *(f"{name}:z" for name in names), *g.outputs],
+        states=system.states,
+        name=system.name,
+        blocks=system.blocks,
+    )
+    _check(plant, found, [*others, *deltas], p)
+    return found
+
+
+def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -> list[_Channel]:
+    """Return columns and rows of what a unit change of a shape does, of states q and v."""
+    realisation = modal_realisation(plant)
+    driven, seen = (
+        _matrix(rebuilt(plant, realisation=reshaped(realisation, delta, 1.0, **part)).system) - base
+        for part in ({"outputs": False}, {"inputs": False})
+    )
+    found = []
+    row = driven[v]
+    if np.any(row):
+        found.append(_Channel(driven @ row / (row @ row), row, v))
+    # displacements and velocities read the states, accelerations what else their rate holds
+    size, rest, beyond = np.linalg.norm(seen, axis=1), seen.copy(), base[v].copy()
+    rest[:, [q, v]], beyond[[q, v]] = 0.0, 0.0
+    amount = rest @ beyond / max(float(beyond @ beyond), 1e-300)
+    amount[np.linalg.norm(rest, axis=1) <= _ROUNDING * size] = 0.0
+    plain = seen - np.outer(amount, base[v])
+    motion, speed = (np.eye(base.shape[1])[i] for i in (q, v))
+    for column, right, of_rate in (
+        (plain[:, q], motion, False),
+        (plain[:, v], speed, False),
+        (amount, base[v], True),
+    ):
+        small = np.abs(column) * np.linalg.norm(right) <= _ROUNDING * size
+        left = np.where(small, 0.0, column)
+        if np.any(left):
+            found.append(_Channel(left, right, v, of_rate))
+    return found
+
+
+def _check(plant: Partition, system: StateSpace, deltas: Sequence[Delta], p: int) -> None:
+    """Raise ModelError unless the channels give the plant with all modes changed at once."""
+    values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(deltas)}
+    changes = [(d, values[d.name] * d.scale) for d in deltas]
+    wanted = _matrix(with_changes(plant, changes).system)
+    n, count = system.n_states, len(system.inputs) - len(plant.system.inputs)
+    owner = [name.removesuffix(":w") for name in system.inputs[:count]]
+    amounts = np.diag([next(v for k, v in values.items() if _is_of(one, k)) for one in owner])
+    whole = np.block([[system.A, system.B], [system.C, system.D]])
+    inner, outer = np.arange(n, n + count), np.r_[0:n, n + count : n + count + p]
+    columns = np.r_[0:n, n + count : whole.shape[1]]
+    closed = np.linalg.solve(
+        np.eye(count) - whole[np.ix_(inner, inner)] @ amounts, whole[np.ix_(inner, columns)]
+    )
+    made = whole[np.ix_(outer, columns)] + whole[np.ix_(outer, inner)] @ amounts @ closed
+    base = _matrix(plant.system)
+    size = np.abs(wanted - base).max(axis=1)
+    bad = np.abs(made - wanted).max(axis=1) > 1e-6 * size + 1e-12 * np.abs(wanted).max(axis=1)
+    if np.any(bad):
+        i = int(np.flatnonzero(bad)[0]) - n
+        name = plant.system.outputs[i] if i >= 0 else plant.system.states[i + n]
+        raise ModelError(
+            f"{name!r} does not depend on the shapes of modes as displacements, velocities and "
+            "accelerations do, so that no Deltas express it. Leave shapes= out."
+        )
+
+
+def _is_of(channel: str, name: str) -> bool:
+    return channel == name or channel.startswith(f"{name}:")
+
+
+def _matrix(g: StateSpace) -> FloatArray:
+    return np.block([[g.A, g.B], [g.C, g.D]])
