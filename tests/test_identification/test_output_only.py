@@ -52,7 +52,9 @@ def test_poles_and_their_uncertainty():
             assert (found.std.imag / np.abs(TRUE)).max() < 5e-3
             assert 0.05 < (found.std.real / np.abs(TRUE.real)).max() < 0.5
     scores = np.array(scores)
-    assert 0.75 < np.sqrt(np.mean(scores**2)) < 1.3
+    # squares of 192 scores of Student's distribution with 19 degrees, of variance 1: 3.5 deviations
+    assert np.mean(scores**2) == pytest.approx(1.0, abs=3.5 * np.sqrt((2 + 6 / 15) / scores.size))
+    assert np.mean(np.abs(scores) < 2) > 0.9
     assert np.abs(scores.mean(axis=0)).max() < 4 / np.sqrt(24)
 
 

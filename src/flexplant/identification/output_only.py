@@ -57,8 +57,10 @@ def identify_output_only(
     :math:`R_0` only, which is not used.
 
     The record is cut into blocks; H without each of them (a jackknife) gives the covariance of
-    each pole, to first order in the errors of H. Poles whose frequency varies by more than 2 %, or
-    whose damping by more than 60 %, are noise and left out.
+    each pole, to first order in the errors of H, made larger by (b - 1)/(b - 3) of b blocks: errors
+    over estimated deviations are of Student's distribution, and their squares then 1 in the mean.
+    Poles whose frequency varies by more than 2 %, or whose damping by more than 60 %, are noise and
+    left out.
 
     Parameters
     ----------
@@ -157,10 +159,11 @@ def identify_output_only(
             "Measure longer, or narrow the band to where resonances stand out of the noise."
         )
     found, spread, kept = best
-    covariance = np.zeros((2 * kept.size,) * 2)
+    covariance, count = np.zeros((2 * kept.size,) * 2), spread.shape[1]
+    fair = (count - 1) / (count - 3)
     for i, k in enumerate(kept.tolist()):
         both = [i, i + kept.size]
-        covariance[np.ix_(both, both)] = spread[:, :, k] @ spread[:, :, k].T
+        covariance[np.ix_(both, both)] = fair * spread[:, :, k] @ spread[:, :, k].T
     shapes = found.shapes[:, kept]
     shapes = shapes / shapes[np.argmax(np.abs(shapes), axis=0), np.arange(kept.size)]
     return MeasuredModes(found.poles[kept], covariance=covariance, shapes=shapes, dofs=names)

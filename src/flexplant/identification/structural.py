@@ -145,7 +145,9 @@ def structural_modes(
     )
 
 
-def places_of(measured: Any, dofs: Any, over: Modes | None) -> tuple[Places, DofSet, IntArray]:
+def places_of(
+    measured: Any, dofs: Any, over: Modes | None
+) -> tuple[MeasuredPlaces, DofSet, IntArray]:
     """Return the places of an identification's channels, the DOFs and their rows among these.
 
     Raises
@@ -172,7 +174,7 @@ def places_of(measured: Any, dofs: Any, over: Modes | None) -> tuple[Places, Dof
             f"{', '.join(absent[:4])} are channels at no DOF of {dofs!r}. Say where they are: "
             "identify_modes(frf, dofs={channel: label})."
         )
-    return Places(measured, labels), dofs, dofs.indices(labels)
+    return MeasuredPlaces(measured, labels), dofs, dofs.indices(labels)
 
 
 class Beside(NamedTuple):
@@ -183,7 +185,7 @@ class Beside(NamedTuple):
     shapes: ComplexArray
 
 
-class Places:
+class MeasuredPlaces:
     """The channels of an identification by the places they are at."""
 
     def __init__(self, measured: IdentifiedModes, labels: tuple[str, ...]) -> None:
