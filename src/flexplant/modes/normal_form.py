@@ -101,7 +101,9 @@ class NormalForm(Value):
         listed = ", ".join(f"{pole:.4g}" for pole in slow[:3]) + (", ..." if slow.size > 3 else "")
         return (
             f"{counted(slow.size, 'real pole')} of overdamped motions ({listed} 1/s) left out: "
-            f"modes cannot express them. {PLANT}"
+            "modes cannot express them, and a plant of these modes lacks them. "
+            "assemble_plant(model, ports) keeps them, in dense form: reduce a large model first, by "
+            "CraigBampton at the dampers."
         )
 
     @property

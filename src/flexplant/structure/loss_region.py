@@ -25,7 +25,8 @@ class LossRegion(Value):
     loss_factor : float [-]
         eta, in [0, 2).
     stiffness : (n, n) array or sparse matrix [N/m, ...], Spring or sequence of Spring
-        K_i, part of the structure's K and over the same DOFs; or springs that K has already.
+        K_i, part of the structure's K and over the same DOFs; or springs that K has already. Of
+        joints, what they add: the machine's K less that of one joined with ``stiffness=0`` there.
 
     Raises
     ------
