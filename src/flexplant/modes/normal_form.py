@@ -102,7 +102,7 @@ class NormalForm(Value):
         return (
             f"{counted(slow.size, 'real pole')} of overdamped motions ({listed} 1/s) left out: "
             "modes cannot express them, and a plant of these modes lacks them. "
-            "assemble_plant(model, ports) keeps them, in dense form: reduce a large model first, by "
+            "assemble_plant(model, ports) keeps them, in dense form: reduce large models first, by "
             "CraigBampton at the dampers."
         )
 
