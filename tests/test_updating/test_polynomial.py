@@ -6,8 +6,9 @@ import pytest
 import oracles_updating as oracle
 from flexplant.errors import ModelError, ShapeError
 from flexplant.identification import MeasuredModes
+from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Poi, Ports, Sensor, assemble_plant
-from flexplant.structure import ModalDamping
+from flexplant.structure import ModalDamping, chain
 from flexplant.updating import (
     Eigenvalues,
     FrfResidual,
@@ -97,6 +98,31 @@ def test_gradients_of_all_residuals(thickness, plate):
         up, down = (objective.values(objective.at(p + s * h)) for s in (1, -1))
         slope = (up - down) / (2 * step)
         np.testing.assert_allclose(J[:, column], slope, atol=3e-5 * np.abs(slope).max())
+
+
+def stretched(length):
+    """A rod's spring goes with 1/length, its mass with the length."""
+    masses = [1.0, 2.0 * length, 1.5]
+    return chain(masses=masses, stiffnesses=[4e5 / length, 3e5], ground=[1e5, 0.0, 0.0])
+
+
+def test_matrices_that_are_no_polynomials_are_followed():
+    """15 % longer: found to 1e-7, with gradients of the model built anew; bounds where compared."""
+    length = PolynomialParameter.from_build("length", stretched, value=1.0, unit="m")
+    assert "good to" in repr(length)
+    assert 1e-9 < length.missed < 1e-6
+    assert (len(length.dM), length.bounds) == (1, (-0.2, 0.2))
+    model, longer = stretched(1.0), stretched(1.15)
+    poles = solve_modes(longer, count=3).poles
+    data = [Eigenvalues(MeasuredModes(poles, modes=[1, 2, 3]))]
+    fit = update(model, [length], data)
+    assert fit.values[0] == pytest.approx(0.15, rel=1e-6)
+    objective = Objective(model, [length], data)
+    slope = objective.slopes(objective.begin(np.array([0.1])))
+    up, down = (solve_modes(stretched(1.1 + h), count=3).omega for h in (1e-5, -1e-5))
+    np.testing.assert_allclose(slope[3:, 0], -(up - down) / 2e-5, rtol=1e-5)
+    with pytest.raises(ModelError, match=r"K of length is no polynomial of degree 12"):
+        PolynomialParameter.from_build("length", stretched, value=1.0, width=0.99)
 
 
 def test_what_is_no_polynomial_is_refused():

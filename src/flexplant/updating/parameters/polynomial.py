@@ -1,4 +1,4 @@
-"""Parameters on which matrices depend as polynomials: thicknesses, lengths, widths."""
+"""Parameters on which matrices depend as polynomials, or nearly: thicknesses, lengths, angles."""
 
 from __future__ import annotations
 
@@ -15,8 +15,13 @@ from ...values import FloatArray, Matrix, positive, real_array, whole
 from .added import MAKES, Derivatives, Parameter, checked_bounds, checked_prior, checked_text
 from .matrix_parameters import checked_matrix, projected
 
-#: relative to the change of a matrix: what its polynomial may miss between the points of it
-EXACT = 1e-6
+#: relative to the change of a matrix: what its polynomial may miss between the points of it, and
+#: what rounding makes it miss where the matrix is one
+CLOSE, EXACT = 1e-6, 1e-9
+#: degrees that are tried where none is given
+DEGREES = (3, 6, 12)
+#: where polynomials are compared with the matrices, in parts of the width
+CHECKS = (-0.97, -0.77, 0.31)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,6 +44,8 @@ class PolynomialParameter(Parameter):
         The parameter is kept between them.
     prior : (mean, standard deviation), optional
         What is known beforehand, a normal distribution.
+    missed : float
+        Part of the largest change of a matrix that the polynomials were seen to miss.
 
     Raises
     ------
@@ -62,6 +69,7 @@ class PolynomialParameter(Parameter):
     unit: str = field(default="", kw_only=True)
     bounds: tuple[float, float] | None = field(default=None, kw_only=True)
     prior: tuple[float, float] | None = field(default=None, kw_only=True)
+    missed: float = field(default=0.0, kw_only=True)
 
     def __post_init__(self) -> None:
         if not checked_text(self.name, "name"):
@@ -89,7 +97,8 @@ class PolynomialParameter(Parameter):
             if getattr(self, label)
         ]
         unit = f" [{self.unit}]" if self.unit else ""
-        return f"<PolynomialParameter: {self.name}{unit}, {', '.join(parts)}>"
+        about = f", good to {self.missed:.1g}" if self.missed > EXACT else ""
+        return f"<PolynomialParameter: {self.name}{unit}, {', '.join(parts)}{about}>"
 
     @classmethod
     def from_build(
@@ -98,7 +107,7 @@ class PolynomialParameter(Parameter):
         build: Callable[[float], Any],
         *,
         value: float,
-        degree: int = 3,
+        degree: int | None = None,
         width: float | None = None,
         unit: str = "",
         bounds: tuple[float, float] | None = None,
@@ -106,9 +115,10 @@ class PolynomialParameter(Parameter):
     ) -> PolynomialParameter:
         """Return the parameter p = v - value of a full model `build(v)`, by interpolation.
 
-        The matrices at degree + 1 Chebyshev points make the polynomials, two points more check
-        them. Exact where the matrices are polynomials of this degree (3 for a plate's thickness),
-        and as good as the check says where they are not.
+        The matrices at degree + 1 Chebyshev points make the polynomials, three points more check
+        them. Exact where the matrices are polynomials of this degree (3 for a plate's thickness).
+        Where they are smooth functions of another kind (a length, an angle), `missed` says how good
+        the polynomials are, and bounds keep the parameter where they were compared.
 
         Parameters
         ----------
@@ -118,8 +128,8 @@ class PolynomialParameter(Parameter):
             From the value to an FEModel; the same DOFs at every value.
         value : float
             Of the model that is updated.
-        degree : int
-            Highest power.
+        degree : int, optional
+            Highest power. None: the first of 3, 6 and 12 that is good enough.
         width : float, optional
             Of the interval on either side of the value; a fifth of it when not given.
         unit, bounds, prior
@@ -136,39 +146,22 @@ class PolynomialParameter(Parameter):
         function(build, "build", MAKES)
         middle = float(real_array(value, "value", ()))
         half = positive(0.2 * abs(middle) if width is None else width, "width")
-        powers = whole(degree, "degree")
-        nodes = np.cos(np.pi * (np.arange(powers + 1) + 0.5) / (powers + 1))
-        between = np.array([-0.77, 0.31])
-        start, models = build(middle), [build(middle + half * x) for x in nodes]
-        checks = [build(middle + half * x) for x in between]
-        if any(tuple(one.dofs) != tuple(start.dofs) for one in [*models, *checks]):
-            raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
-        # without a constant: p = 0 is the model itself
-        weights = np.linalg.lstsq(nodes[:, None] ** np.arange(1, powers + 1), np.eye(powers + 1))[0]
-        found: dict[str, list[Matrix | None]] = {}
-        for label in "MDK":
-            base = getattr(start, label)
-            if base is None:
-                continue
-            changes = [getattr(one, label) - base for one in models]
-            terms = [_sum(row, changes) for row in weights]
-            size = max(float(abs(part).max()) for part in changes)
-            for x, one in zip(between.tolist(), checks, strict=True):
-                made = _sum([x ** (k + 1) for k in range(powers)], terms)
-                missed = float(abs(made - (getattr(one, label) - base)).max())
-                if missed > EXACT * size:
-                    raise ModelError(
-                        f"{label} of {name} is no polynomial of degree {powers}: it misses by "
-                        f"{missed / size:.2g} of the change at {middle + half * x:.6g}. Raise "
-                        "degree=, or make width= smaller."
-                    )
-            kept = [part / half ** (k + 1) for k, part in enumerate(terms)]
-            least = 1e-9 * size
-            found["d" + label] = [
-                part if float(abs(part).max()) * half ** (k + 1) > least else None
-                for k, part in enumerate(kept)
-            ]
-        return cls(name, **found, unit=unit, bounds=bounds, prior=prior)
+        points = {float(x): build(middle + half * x) for x in (0.0, *CHECKS)}
+        for powers in DEGREES if degree is None else (whole(degree, "degree"),):
+            found, missed = _interpolated(build, points, middle, half, powers, name)
+            worst = max(missed, key=lambda label: missed[label][0])
+            if missed[worst][0] <= CLOSE:
+                break
+        else:
+            part, at = missed[worst]
+            raise ModelError(
+                f"{worst} of {name} is no polynomial of degree {powers}: it misses by {part:.2g} "
+                f"of the change at {middle + half * at:.6g}. Raise degree=, or make width= smaller."
+            )
+        if missed[worst][0] > EXACT:
+            low, high = checked_bounds(bounds, name) or (-np.inf, np.inf)
+            bounds = max(low, -half), min(high, half)
+        return cls(name, **found, unit=unit, bounds=bounds, prior=prior, missed=missed[worst][0])
 
     def terms(self, model: Any) -> list[Derivatives]:
         """Return the matrices of all powers in the model's DOFs."""
@@ -206,6 +199,51 @@ class PolynomialParameter(Parameter):
     @property
     def _degree(self) -> int:
         return max(len(self.dM), len(self.dD), len(self.dK))
+
+
+def _interpolated(
+    build: Callable[[float], Any],
+    points: dict[float, Any],
+    middle: float,
+    half: float,
+    powers: int,
+    name: str,
+) -> tuple[dict[str, list[Matrix | None]], dict[str, tuple[float, float]]]:
+    """Return the matrices of all powers, and what they miss at most and where, of M, D and K.
+
+    `points` holds the models at the middle and where the polynomials are checked; those at the
+    nodes join them.
+    """
+    nodes = np.cos(np.pi * (np.arange(powers + 1) + 0.5) / (powers + 1)).tolist()
+    for x in nodes:
+        if x not in points:
+            points[x] = build(middle + half * x)
+    start = points[0.0]
+    if any(tuple(one.dofs) != tuple(start.dofs) for one in points.values()):
+        raise ShapeError(f"build of {name} changes the DOFs: the matrices cannot be compared.")
+    # without a constant: p = 0 is the model itself
+    table = np.array(nodes)[:, None] ** np.arange(1, powers + 1)
+    weights = np.linalg.lstsq(table, np.eye(powers + 1))[0]
+    found: dict[str, list[Matrix | None]] = {}
+    missed: dict[str, tuple[float, float]] = {}
+    for label in "MDK":
+        base = getattr(start, label)
+        if base is None:
+            continue
+        changes = [getattr(points[x], label) - base for x in nodes]
+        terms = [_sum(row, changes) for row in weights]
+        size = max(float(abs(part).max()) for part in changes)
+        missed[label] = (0.0, 0.0)
+        for x in CHECKS:
+            made = _sum([x ** (k + 1) for k in range(powers)], terms)
+            off = float(abs(made - (getattr(points[x], label) - base)).max())
+            missed[label] = max(missed[label], (off / size if size else 0.0, x))
+        kept = [part / half ** (k + 1) for k, part in enumerate(terms)]
+        found["d" + label] = [
+            part if float(abs(part).max()) * half ** (k + 1) > EXACT * size else None
+            for k, part in enumerate(kept)
+        ]
+    return found, missed
 
 
 def _at(parts: Sequence[Matrix | None], k: int) -> Matrix | None:
