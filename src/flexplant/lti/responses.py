@@ -18,8 +18,8 @@ from .statespace import StateSpace
 CHUNK = 400_000
 #: rows of a back substitution that are solved together
 ROWS = 32
-#: functions of frequency at a time in block form: in cache, and in memory that is used again
-MODAL_CHUNK = 19_200
+#: functions of frequency at a time in block form
+MODAL_CHUNK, PARTS = 19_200, 7
 
 #: the responses (p, m, n_freq) at frequencies [Hz]
 Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
@@ -52,12 +52,12 @@ def responder(g: StateSpace) -> Responder:
     """Return the function of frequency [Hz] that gives the responses, prepared once."""
     if not g.n_states or not g.D.size:
         return lambda freq: np.repeat(g.D[:, :, None], freq.size, axis=2).astype(np.complex128)
-    solve, entries = _solver(g)
-    step = max(64, entries // g.n_states)
+    solve, entries, parts = _solver(g)
 
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
         s, tame = points(g, freq), True
+        step = max(128, min(entries // g.n_states, freq.size // parts))
         out = np.empty((*g.D.shape, freq.size), dtype=np.complex128)
         out[:] = g.D[:, :, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -113,22 +113,25 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
     return np.asarray(logs[np.isfinite(logs)] / g.dt)
 
 
-def _solver(g: StateSpace | Part) -> tuple[Solver, int]:
-    """Return what solves, and for how many frequencies at a time, times states."""
+def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
+    """Return what solves, how many frequencies at a time, times states, and least parts of a grid.
+
+    The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
+    """
     n, m = g.B.shape
-    entries = CHUNK // (m + 2)
+    whole = CHUNK // (m + 2), 1
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
         owner = _components(g.A)
-        return _side_by_side(g, owner) if np.any(owner) else _schur(g), entries
+        return _side_by_side(g, owner) if np.any(owner) else _schur(g), *whole
     pairs, slots, coupling = _paired(g)
     tied = np.flatnonzero(np.any(coupling, axis=0))
     head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
     if head == n:
-        return _modal(g, pairs, slots), MODAL_CHUNK
+        return _modal(g, pairs, slots), MODAL_CHUNK, PARTS
     if head and 4 * (n - head) <= n:
         cut = int(np.searchsorted(slots[:, 0], head))
-        return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), MODAL_CHUNK
-    return _substitution(g, pairs, slots, coupling), entries
+        return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), MODAL_CHUNK, PARTS
+    return _substitution(g, pairs, slots, coupling), *whole
 
 
 def _components(A: FloatArray) -> IntArray:
@@ -276,7 +279,7 @@ def _fed_by_lines(g: StateSpace | Part, head: int, pairs: FloatArray, slots: Int
     driven = _modal(Part(g.A[:head, :head], inputs, g.C[:, :head], g.dt), pairs, slots)
     rest = list(g.blocks or ())[len(slots) :]
     lines = Part(g.A[head:, head:], g.B[head:], np.eye(n - head), g.dt, rest)
-    (tail, _), reached = _solver(lines), _reached(lines.A, lines.B)
+    (tail, *_), reached = _solver(lines), _reached(lines.A, lines.B)
     seen = np.flatnonzero(np.any(g.C[:, head:], axis=0))
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
