@@ -236,7 +236,8 @@ def highest(
     freq, size = grid[ends], values[ends]  # (k, 3): left, top and right of each
     for n in range(1, rounds + 1):
         left, top, right = freq[:, :1], freq[:, 1:2], freq[:, 2:]
-        fresh = np.hstack([left + (top - left) * _EIGHTHS, top + (right - top) * _EIGHTHS])
+        parts = left + (top - left) * _EIGHTHS, top + (right - top) * _EIGHTHS
+        fresh = np.hstack([*parts, _vertex(freq, size)[0][:, None]])
         freq = np.hstack([freq, fresh])
         size = np.hstack([size, find(fresh.ravel()).reshape(fresh.shape)])
         order = np.argsort(freq, axis=1)
@@ -246,19 +247,21 @@ def highest(
         # a top seen at half its height is seen at 1 - 0.5 / 8^n of it by now
         left_in = size[:, 1] >= (1.0 - (1.0 - _HIGH) / 8.0**n) * size[:, 1].max()
         freq, size = freq[left_in], size[left_in]
-        if not np.any(_rise(freq, size) > _GAIN * size[:, 1]):
+        if not np.any(_vertex(freq, size)[1] > _GAIN * size[:, 1]):
             break
     best = int(np.argmax(size[:, 1]))
     return float(size[best, 1]), float(freq[best, 1])
 
 
-def _rise(x: FloatArray, y: FloatArray) -> FloatArray:
-    """Return how far the vertex of a parabola lies above its middle point, x and y (k, 3)."""
+def _vertex(x: FloatArray, y: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return where the vertex of a parabola lies, and how far above its middle point; (k, 3)."""
+    width = x[:, 2] - x[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):  # at an end of the grid there is no side
         slopes = np.diff(y, axis=1) / np.diff(x, axis=1)
-        width = x[:, 2] - x[:, 0]
         slope = (slopes[:, 0] * (x[:, 2] - x[:, 1]) + slopes[:, 1] * (x[:, 1] - x[:, 0])) / width
-        return np.asarray(slope**2 * width / (4.0 * (slopes[:, 0] - slopes[:, 1])))
+        way = 0.5 * slope * width / (slopes[:, 0] - slopes[:, 1])
+    inside = np.clip(np.where(np.isfinite(way), x[:, 1] + way, x[:, 1]), x[:, 0], x[:, 2])
+    return inside, np.asarray(0.5 * slope * way)
 
 
 def checked_freq(freq: npt.ArrayLike) -> FloatArray:

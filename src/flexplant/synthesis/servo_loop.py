@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, LabelError
+from ..errors import AssumptionError, FlexplantError, LabelError
 from ..loop.broken import sensitivity_size
 from ..lti.grid import resonance_grid
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..plant import Foreign, Poi, StandardPlant
-from ..values import ComplexArray, FloatArray
+from ..plant.rigid.rigid_motion import rigid_gain
+from ..values import ComplexArray, FloatArray, frozen
 from .servo_axis import Axis
 
 #: |S| at u that a notch is to bring the loop below: 6 dB
 TARGET = 2.0
 #: notches that are placed at most, modes that are tried for each, and what one has to gain
 _NOTCHES, _TRIED, _GAIN = 6, 4, 0.97
+#: loops of so many plants are kept: their designs at other bandwidths begin with them
+_KEPT = 8
 #: loop gain at a resonance below which a notch there serves nothing
 _QUIET = 0.3
 
@@ -84,10 +87,35 @@ class ServoLoop:
         return axis
 
 
+@lru_cache(maxsize=_KEPT)
+def decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
+    """Return T_u (m, r): accelerations of the POI's axes to actuator forces, of least norm.
+
+    Raises
+    ------
+    AssumptionError
+        When the axes or actuators do not span the rigid-body motions.
+    """
+    axes, r = poi.axes, plant.rigid_motions.modes.size
+    plant.continuous.check().require(("stabilisable",), "a servo of the rigid body")
+    gain = rigid_gain(plant, plant.rigid_motions, [poi.channel(a) for a in axes], plant.u)
+    size = np.linalg.norm(gain, axis=1, keepdims=True)
+    if len(axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
+        raise AssumptionError(
+            f"POI {poi.name!r} has axes {axes}, the plant {r} rigid-body modes: the servo needs "
+            "axes that span them, one each (for a plate z, rx, ry). Give the POI these."
+        )
+    return np.asarray(frozen(np.linalg.pinv(gain)))
+
+
+@lru_cache(maxsize=_KEPT)
 def servo_loop(
-    plant: StandardPlant, observer: StateSpace | None, poi: Poi, decoupling: FloatArray
+    plant: StandardPlant, observer: StateSpace | None, poi: Poi, known: StandardPlant
 ) -> ServoLoop:
-    """Return the loop of a plant with an observer, or with the POI itself as its estimate."""
+    """Return the loop of a plant with an observer, or with the POI itself as its estimate.
+
+    It is decoupled, and has notches, by what is known to the design: a plant of fewer modes.
+    """
     hats = [poi.derived(axis, "hat") for axis in poi.axes]
     rate = 1.0 / plant.dt
     poles = plant.system.poles()
@@ -107,7 +135,7 @@ def servo_loop(
         G = estimate[:, :, places] @ P
         columns = [plant.u.index(name) for name in given]
         G[:, :, columns] += estimate[:, :, [observer.inputs.index(name) for name in given]]
-    return ServoLoop(grid, decoupling @ G, elastic(plant))
+    return ServoLoop(grid, decoupling(known, poi) @ G, elastic(known))
 
 
 def _stacked(system: StateSpace, grid: FloatArray) -> ComplexArray:
@@ -124,6 +152,7 @@ def elastic(plant: StandardPlant) -> FloatArray:
     return np.asarray(freq[freq * plant.dt < 0.45])
 
 
+@lru_cache(maxsize=_KEPT)
 def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:
     """Return the plant whose y are the references and the POI itself, named as estimates."""
     g, nz = plant.system, len(plant.z)
@@ -170,7 +199,7 @@ def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace
         raise FlexplantError(
             f"the observer has dt {inner.dt:g} s, the plant {plant.dt:g} s: design both alike."
         )
-    return inner.replace(dt=plant.dt)
+    return inner if inner.dt == plant.dt else inner.replace(dt=plant.dt)
 
 
 def highest(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache, cached_property
 from typing import Any
 
@@ -15,12 +15,12 @@ from ..loop.blocks import drives, joined
 from ..lti.interconnection import loop_poles
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant
-from ..plant.rigid.rigid_motion import RigidModes, rigid_gain
+from ..plant.rigid.rigid_motion import RigidModes
 from ..values import FloatArray, positive, real_array
 from .servo_axis import Axis, rigid_body, rigid_peak
 from .servo_loop import (
     ServoLoop,
-    elastic,
+    decoupling,
     highest,
     observer_system,
     seeing,
@@ -43,8 +43,6 @@ class ServoTask:
         Sampled.
     poi : Poi
         What is moved.
-    motions : RigidModes
-        The plant's rigid-body motions, free or on springs.
     rolloff, integrator, notches
         As for `design_servo`.
     observer : StateSpace, optional
@@ -55,12 +53,16 @@ class ServoTask:
 
     plant: StandardPlant
     poi: Poi
-    motions: RigidModes
     rolloff: float | None
     integrator: float | None
     notches: tuple[float, ...] | None
     observer: StateSpace | None
     larger: StandardPlant | None
+
+    @property
+    def motions(self) -> RigidModes:
+        """The plant's rigid-body motions, free or on springs."""
+        return self.plant.rigid_motions
 
     @property
     def rate(self) -> float:
@@ -75,31 +77,10 @@ class ServoTask:
             _below_nyquist(freq, name, self.rate)
         return Axis(bandwidth, float(rolloff), float(slow), self.notches or (), self.rate)
 
-    @cached_property
-    def decoupling(self) -> FloatArray:
-        """T_u (m, r): accelerations of the POI's axes to actuator forces, of least norm.
-
-        Raises
-        ------
-        AssumptionError
-            When the axes or actuators do not span the rigid-body motions.
-        """
-        plant, axes, r = self.plant, self.poi.axes, self.motions.modes.size
-        plant.continuous.check().require(("stabilisable",), "a servo of the rigid body")
-        gain = rigid_gain(plant, self.motions, [self.poi.channel(a) for a in axes], plant.u)
-        size = np.linalg.norm(gain, axis=1, keepdims=True)
-        if len(axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
-            raise AssumptionError(
-                f"POI {self.poi.name!r} has axes {axes}, the plant {r} rigid-body modes: the servo "
-                "needs axes that span them, one each (for a plate z, rx, ry). Give the POI these."
-            )
-        return np.asarray(np.linalg.pinv(gain))
-
-    @cached_property
+    @property
     def loop(self) -> ServoLoop:
         """Over frequency, with the modes left out where they are known."""
-        found = servo_loop(self.larger or self.plant, self.observer, self.poi, self.decoupling)
-        return found if self.larger is None else replace(found, modes=elastic(self.plant))
+        return servo_loop(self.larger or self.plant, self.observer, self.poi, self.plant)
 
     def notched(self, axis: Axis) -> Axis:
         """Return the axis with notches where they serve, unless they were given."""
@@ -108,7 +89,8 @@ class ServoTask:
     @cached_property
     def controller(self) -> Callable[[Axis], StateSpace]:
         """The function of an axis that gives [ref, hats] -> u: errors, axes and decoupling."""
-        return cache(lambda axis: _joined(self.plant, self.poi, axis.system, self.decoupling))
+        T_u = decoupling(self.plant, self.poi)
+        return cache(lambda axis: _joined(self.plant, self.poi, axis.system, T_u))
 
     def is_stable(self, axis: Axis) -> bool:
         """Return whether the loop is stable with the modes that the plant has."""
@@ -226,11 +208,9 @@ def servo_task(
     centres = None if notches is None else real_array(notches, "notches", (None,)).tolist()
     for freq in centres or ():
         _below_nyquist(freq, "notch", 1.0 / plant.dt)
-    motions = plant.rigid_motions
     return ServoTask(
         plant,
         port,
-        motions,
         rolloff,
         integrator,
         None if centres is None else tuple(centres),
@@ -268,7 +248,7 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     return ports.poi(name if name is not None else ports.z[0].name)
 
 
-def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatArray) -> StateSpace:
+def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -> StateSpace:
     """Return [ref, hats] -> u: ``T_u (I x c) E``, E the errors, c the controller of an axis."""
     reference = poi.derived(poi.axes[0], "ref")
     inputs = [reference] if reference in plant.y else []
@@ -279,8 +259,8 @@ def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, decoupling: FloatA
     return StateSpace(
         np.kron(each, axis.A),
         np.kron(each, axis.B) @ errors,
-        decoupling @ np.kron(each, axis.C),
-        decoupling @ np.kron(each, axis.D) @ errors,
+        T_u @ np.kron(each, axis.C),
+        T_u @ np.kron(each, axis.D) @ errors,
         plant.dt,
         inputs=[*inputs, *hats],
         outputs=plant.u,
