@@ -41,8 +41,8 @@ def between(value: Any, name: str, low: float, high: float, hint: str, *, ends: 
     number = positive(value, name, zero=low == 0.0)
     above = number >= low if "[" in ends else number > low
     if not above or not (number <= high if "]" in ends else number < high):
-        where = f"above {low:g}" if np.isinf(high) else f"between {low:g} and {high:g}"
-        raise ModelError(f"{name} must lie {where}, got {number:g}. {hint}")
+        where = f"be above {low:g}" if np.isinf(high) else f"lie between {low:g} and {high:g}"
+        raise ModelError(f"{name} must {where}, got {number:g}. {hint}")
     return number
 
 
