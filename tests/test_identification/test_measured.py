@@ -113,3 +113,26 @@ def test_bad_covariance_is_refused(covariance, error, text):
 def test_places_that_are_none_are_refused(places):
     with pytest.raises((LabelError, ModelError), match="place"):
         MeasuredModes([-1 + 10j, -1 + 20j]).select(places)
+
+
+def test_frequencies_and_dampings_with_their_deviations():
+    """The covariance is that of many draws, and of differences; nonsense is refused."""
+    f, z = np.array([100.0, 250.0]), np.array([0.02, 0.3])
+    found = MeasuredModes.from_freq(f, z, modes=[4, 5], freq_std=[0.5, 1.0], zeta_std=0.004)
+    np.testing.assert_allclose(found.freq, f, rtol=1e-14)
+    np.testing.assert_allclose(found.zeta, z, rtol=1e-14)
+    assert found.modes == (4, 5)
+    rng = np.random.default_rng(0)
+    draws = np.array([
+        MeasuredModes.from_freq(f + [0.5, 1.0] * rng.standard_normal(2),
+                                z + 0.004 * rng.standard_normal(2)).poles
+        for _ in range(1500)
+    ])  # fmt: skip
+    wanted = np.cov(np.hstack([draws.real, draws.imag]).T)
+    size = np.sqrt(np.outer(np.diag(wanted), np.diag(wanted)))
+    assert np.abs((found.covariance - wanted) / size).max() < 0.12
+    assert MeasuredModes.from_freq(100.0, 0.01).covariance is None
+    with pytest.raises(ModelError, match=r"0\.01 is 1 %"):
+        MeasuredModes.from_freq(f, [1.0, 2.0])
+    with pytest.raises(ModelError, match="or neither"):
+        MeasuredModes.from_freq(f, z, freq_std=1.0)

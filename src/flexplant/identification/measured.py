@@ -81,6 +81,64 @@ class MeasuredModes(Value):
         poles = poles.real + 1j * np.abs(poles.imag)
         self._set(poles=poles, modes=numbers, covariance=covariance, shapes=shapes, dofs=dofs)
 
+    @staticmethod
+    def from_freq(
+        freq: npt.ArrayLike,
+        zeta: npt.ArrayLike,
+        *,
+        modes: Iterable[int] | None = None,
+        freq_std: npt.ArrayLike | None = None,
+        zeta_std: npt.ArrayLike | None = None,
+    ) -> MeasuredModes:
+        """Return modes of measured frequencies and dampings, ``lambda = omega (-zeta + i zeta_d)``.
+
+        Here ``zeta_d = sqrt(1 - zeta^2)``; standard deviations are carried over to first order.
+
+        Parameters
+        ----------
+        freq : (m,) array [Hz]
+            Undamped natural frequencies.
+        zeta : float or (m,) array
+            Damping ratios, 0 or more and below 1.
+        modes : sequence of m int, optional
+            Their numbers in the model.
+        freq_std, zeta_std : float or (m,) arrays [Hz, 1], optional
+            Standard deviations, independent of each other; both or none.
+
+        Raises
+        ------
+        ModelError
+            When a damping ratio is not in 0 .. 1, or one kind of deviation is given alone.
+
+        Examples
+        --------
+        >>> MeasuredModes.from_freq([456.8, 631.9], 0.01, modes=[6, 7]).poles.round(1)
+        array([-28.7+2870.j , -39.7+3970.1j])
+        """
+        f = np.atleast_1d(real_array(freq, "freq"))
+        z = np.broadcast_to(real_array(zeta, "zeta"), f.shape)
+        if np.any(z < 0) or np.any(z >= 1):
+            raise ModelError("zeta must be damping ratios of 0 or more, below 1: 0.01 is 1 %.")
+        turn = 2.0 * np.pi * f
+        damped = np.sqrt(1.0 - z**2)
+        poles = turn * (-z + 1j * damped)
+        if freq_std is None and zeta_std is None:
+            return MeasuredModes(poles, modes=modes)
+        if freq_std is None or zeta_std is None:
+            raise ModelError(
+                "give freq_std= and zeta_std=, or neither: one alone is no covariance."
+            )
+        spread = [
+            np.diag(np.broadcast_to(real_array(s, "a standard deviation"), f.shape) ** 2)
+            for s in (freq_std, zeta_std)
+        ]
+        slope = np.block([
+            [np.diag(-2.0 * np.pi * z), np.diag(-turn)],
+            [np.diag(2.0 * np.pi * damped), np.diag(-turn * z / damped)],
+        ])  # fmt: skip
+        covariance = slope @ la.block_diag(*spread) @ slope.T
+        return MeasuredModes(poles, modes=modes, covariance=covariance)
+
     def __len__(self) -> int:
         return int(self.poles.size)
 

@@ -16,6 +16,7 @@ from ...lti.frequency import Frf
 from ...lti.statespace import StateSpace
 from ...modes import Modes
 from ...placement import ParetoCurve, Placement, SensorMap
+from ...placement.criterion import in_words
 from ...plant import StandardPlant
 from ...reduction import ReducedModel
 from ...simulation import ErrorMap, ExposureErrors, Response, Verdict
@@ -227,5 +228,5 @@ def _verified(value: Any) -> Iterator[tuple[str, Any]]:
         yield "chi-square of the fit", value.chi2
         yield "its degrees of freedom", value.dof
     if isinstance(value, Placement):
-        yield "value", value.value
-        yield "no choice is below", value.bound
+        yield "value", in_words(value.value, value.unit)
+        yield "no choice is below", in_words(value.bound, value.unit)
