@@ -154,7 +154,7 @@ def picture(result: dict[str, Any], folder: Path = OUT) -> Path:
     what = "motion of the die" if run is None else "error of the estimate at the die"
     ax.plot(one.time[near], middle, color=blue, lw=0.8, label=what)
     ax.set(xlabel="time [s]", ylabel=f"{what} [nm]")
-    ax.legend(frameon=False, loc="upper left")
+    ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=3)
     folder.mkdir(exist_ok=True)
     figure.savefig(folder / "recorded_data.png", dpi=110)
     plt.close(figure)

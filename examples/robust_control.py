@@ -165,7 +165,8 @@ def picture(found: dict[str, Any], folder: Path = OUT) -> Path:
         (f"servo, {BANDWIDTH:g} Hz", robust, fx.plot.CYCLE[0]["color"]),
         (f"H-infinity, {MORE:g} Hz", found["sharp"], fx.plot.CYCLE[1]["color"]),
     ):
-        axs[0].loglog(one.frequencies, one.bounds, ".", ms=3, color=color)
+        dots = None if one is robust else "dots: at the frequencies of their scalings"
+        axs[0].loglog(one.frequencies, one.bounds, ".", ms=3, color=color, label=dots)
         axs[0].axhline(one.upper, color=color, label=f"{name}: proven at all frequencies")
     axs[0].axhline(1.0, label="uncertainty of the fit", **fx.plot.STYLES["bound"])
     axs[0].set(title="robust stability", xlabel="frequency [Hz]", ylabel="upper bound of mu [1]",

@@ -141,4 +141,4 @@ def parameters(
 def error_label(fit: UpdateResult) -> str:
     """Return the label of an update's error: in units of the noise where that is known."""
     unit = "SI units squared" if fit.chi2 is None else "-"
-    return f"sum of squares, model less measured [{unit}]"
+    return f"sum of squares,\nmodel less measured [{unit}]"
