@@ -207,6 +207,8 @@
 .. [Smith1968] Smith, Matrix equation XA + BX = C, SIAM J. Appl. Math. 16, 1968.
 .. [Stetter1978] Stetter, The defect correction principle and discretization methods, Numer. Math.
    29, 1978.
+.. [Stoorvogel1992] Stoorvogel, The H-infinity Control Problem: A State Space Approach, Prentice
+   Hall, 1992.
 .. [Tibshirani1996] Tibshirani, Regression shrinkage and selection via the lasso, J. R. Stat. Soc. B
    58, 1996.
 .. [TimoshenkoGoodier1970] Timoshenko, Goodier, Theory of Elasticity, 3rd ed., McGraw-Hill, 1970.

@@ -328,6 +328,15 @@ def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():
         design_hinf(P, u=u, y=y)
 
 
+def test_an_actuator_that_z_does_not_contain_at_all_does_the_work():
+    """u1 stabilises at no cost; z is the effort of u2 alone, which stays at rest."""
+    B, C = np.array([[1.0, 0.0, 1.0, 1.0]]), np.array([[0.0], [1.0]])
+    D = np.array([[0.0, 0.0, 0.0, 1.0], [0.0, 1.0, 0.0, 0.0]])
+    P, u, y = named([[1.0]], B, C, D, 2, 1)
+    with pytest.raises(InfeasibleError, match="the infimum is 0"):
+        design_hinf(P, u=u, y=y)
+
+
 @needs_data
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FULL_RANK)

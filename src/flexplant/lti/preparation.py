@@ -99,13 +99,13 @@ class Prepared(Value):
     def own_sizes(self) -> tuple[FloatArray, FloatArray]:
         """What the plant does on each channel: sizes of u in z (nu,) and of w in y (ny,).
 
-        Feedthrough included, at the plant's own speed and away from its resonances.
+        Feedthrough included, at the plant's own speed and away from its resonances. A channel that
+        does nothing has the size of the largest one.
         """
         s = self._point
-        return (
-            np.hypot(_answers(self.A, self.B2, self.C1, s), np.linalg.norm(self.D12, axis=0)),
-            np.hypot(_answers(self.A.T, self.C2.T, self.B1.T, s), np.linalg.norm(self.D21, axis=1)),
-        )
+        u = np.hypot(_answers(self.A, self.B2, self.C1, s), np.linalg.norm(self.D12, axis=0))
+        y = np.hypot(_answers(self.A.T, self.C2.T, self.B1.T, s), np.linalg.norm(self.D21, axis=1))
+        return _none_zero(u), _none_zero(y)
 
     @property
     def _point(self) -> complex:
@@ -270,6 +270,10 @@ def _answers(A: FloatArray, B: FloatArray, C: FloatArray, s: complex) -> FloatAr
         states = np.asarray(B, dtype=np.complex128)
     terms = np.linalg.norm(C) * np.linalg.norm(states, axis=0)
     return np.asarray(np.maximum(np.linalg.norm(C @ states, axis=0), _HIDDEN * terms))
+
+
+def _none_zero(sizes: FloatArray) -> FloatArray:
+    return np.asarray(np.where(sizes > 0.0, sizes, np.max(sizes, initial=0.0) or 1.0))
 
 
 def _matrices(g: StateSpace) -> tuple[FloatArray, FloatArray, FloatArray]:

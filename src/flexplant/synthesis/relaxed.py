@@ -112,6 +112,10 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
         What is reached.
     known : float
         A bound that was proved.
+
+    References
+    ----------
+    [Stoorvogel1992]_ (the two quadratic matrix inequalities of singular problems).
     """
     sides = (
         full_information(p.A, p.B1, p.B2, p.C1, p.D11, p.D12),
