@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..errors import ModelError, SolverError
 from ..structure.negative_stiffness import signed_square
-from ..values import ComplexArray, FloatArray
+from ..values import ComplexArray, FloatArray, IntArray
 
 #: eigenvalues closer than this (relative) have no eigenvectors of their own
 _CLUSTER = 1e-7
@@ -78,24 +78,18 @@ def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> Co
     SolverError
         When the modes fail their check.
     """
-    k = omega.size
+    k, u = omega.size, int(np.count_nonzero(omega < 0))
     values, vectors = _eigen(omega, C, low=lowest is not None)
-    real = np.abs(values.imag) <= 1e-9 * np.abs(values)
-    upper = np.flatnonzero((values.imag > 0) & ~real)
-    up, down = np.flatnonzero(real & (values.real > 0)), np.flatnonzero(real & (values.real < 0))
-    u = int(np.count_nonzero(omega < 0))
-    beside = np.zeros(0, dtype=np.int64)
-    if upper.size < k - u and lowest is not None and not u:
-        beside, down = down, beside
-    elif upper.size < k - u:
-        share = np.sum(np.abs(vectors[:, real]) ** 2, axis=1)
-        share = np.where(omega > 0, share[:k] + share[k:], -1.0)
-        check_oscillating(np.arange(k) != np.argmax(share), omega)
-    # growing and decaying, the fastest first as in `elastic_modes`, then oscillating
-    size_of = np.abs(values)
-    up, down = (part[np.argsort(-size_of[part], kind="stable")] for part in (up, down))
-    real_ones = beside[np.argsort(size_of[beside], kind="stable")]
-    upper = upper[np.argsort(size_of[upper], kind="stable")][:lowest]
+    up, down, upper = _kinds(values)
+    still = down[:0]
+    if upper.size < k - u:
+        if lowest is None or u:
+            real = np.concatenate([up, down])
+            share = np.sum(np.abs(vectors[:, real]) ** 2, axis=1)
+            share = np.where(omega > 0, share[:k] + share[k:], -1.0)
+            check_oscillating(np.arange(k) != np.argmax(share), omega)
+        still, down = down[::-1], still
+    upper = upper[:lowest]
     listed = np.concatenate([up, down, upper])
     poles, mix = values[listed], vectors[k:, listed] / values[listed]
     poles[: 2 * u] = poles[: 2 * u].real
@@ -117,22 +111,41 @@ def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> Co
             f"damping is close to critical for two modes at once. {PLANT} Else change D, or lower "
             "it."
         )
-    if not u:
-        still = vectors[k:, real_ones].real
-        still = still / np.linalg.norm(still, axis=0)
-        return ComplexModes(poles, mix, np.zeros(0), values[real_ones].real, still)
-    if np.abs(mix[:, : 2 * u].imag).max() > 1e-9 * np.abs(mix[:, : 2 * u]).max():
+    if u:
+        pairs = _unstable_pairs(mix[:, :u], mix[:, u : 2 * u])
+        mix = np.hstack([pairs, mix[:, 2 * u :]])
+    decaying, slow = poles[u : 2 * u].real, vectors[k:, still].real
+    poles = np.concatenate([poles[:u], poles[2 * u :]])
+    slow = slow / np.linalg.norm(slow, axis=0)
+    return ComplexModes(poles, mix, decaying, values[still].real, slow)
+
+
+def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Return which eigenvalues grow, decay, both the fastest first, or oscillate, the slowest."""
+    order = np.argsort(np.abs(values), kind="stable")
+    sorted_ = values[order]
+    real = np.abs(sorted_.imag) <= 1e-9 * np.abs(sorted_)
+    up, down = order[real & (sorted_.real > 0)][::-1], order[real & (sorted_.real < 0)][::-1]
+    return up, down, order[~real & (sorted_.imag > 0)]
+
+
+def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
+    """Return shapes (k, u) of which growing and decaying ones are ``Re +- Im``; both are real.
+
+    Raises
+    ------
+    SolverError
+        When they are not.
+    """
+    both = np.hstack([grow, decay])
+    if np.abs(both.imag).max() > 1e-9 * np.abs(both).max():
         raise SolverError(
             f"the real poles of an unstable mode cannot be paired: damping and negative stiffness "
             f"mix them with other motions. {PLANT} Else lower the damping."
         )
-    grow, decay = mix[:, :u].real, mix[:, u : 2 * u].real
-    decay = decay * np.where(np.sum(grow * decay, axis=0) < 0, -1.0, 1.0)
-    pairs = 0.5 * (grow + decay) + 0.5j * (grow - decay)
-    kept = np.concatenate([np.arange(u), np.arange(2 * u, poles.size)])
-    shapes = np.hstack([pairs, mix[:, 2 * u :]])
-    none = np.zeros(0)
-    return ComplexModes(poles[kept], shapes, poles[u : 2 * u].real, none, np.zeros((k, 0)))
+    up, down = grow.real, decay.real
+    down = down * np.where(np.sum(up * down, axis=0) < 0, -1.0, 1.0)
+    return np.asarray(0.5 * (up + down) + 0.5j * (up - down))
 
 
 def _eigen(omega: FloatArray, C: FloatArray, *, low: bool) -> tuple[ComplexArray, ComplexArray]:

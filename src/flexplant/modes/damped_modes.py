@@ -99,7 +99,7 @@ def damped_modes(
     for _ in range(_STEPS):
         form, keep = _ritz(model, V, r, count, top)
         shapes: Any = V @ form.phi[:, keep]
-        slow = np.abs(form.overdamped) <= np.abs(form.poles[keep]).max(initial=0.0)
+        slow = np.abs(form.overdamped) <= _range(form.poles[keep], top)
         still = V @ form.overdamped_phi[:, slow]
         poles, every = form.poles[keep], _growing(form, shapes, keep)
         rest, size, limit = _rest(
@@ -119,6 +119,7 @@ def damped_modes(
                     residual=_RESIDUAL[0] * part[: keep.size],
                     certificate={"basis": V.shape[1]},
                 ),
+                top,
             )
         step = factor.solve(np.hstack([rest[:, wrong].real, rest[:, wrong].imag]))
         more = beyond(by_rows(model.M), V, step, dependent=_NEW)
@@ -163,13 +164,18 @@ def _dampers(D: Any) -> FloatArray:
     return forces
 
 
-def leaving_overdamped(form: NormalForm, modes: Modes) -> Modes:
-    """Return modes with a note of the real poles among them, which are warned of."""
-    note = form.overdamped_below(float(np.abs(modes.poles).max(initial=0.0)))
+def leaving_overdamped(form: NormalForm, modes: Modes, top: float = np.inf) -> Modes:
+    """Return modes up to omega^2 with a note of the real poles there, which are warned of."""
+    note = form.overdamped_below(_range(modes.poles, top))
     if not note:
         return modes
     warn(note)
     return modes.replace(notes=(*modes.notes, note))
+
+
+def _range(poles: ComplexArray, top: float) -> float:
+    """Return up to which rate [1/s] poles are wanted: omega^2, or as far as these reach."""
+    return float(np.sqrt(top) if np.isfinite(top) else np.abs(poles).max(initial=0.0))
 
 
 def _growing(form: NormalForm, shapes: Any, keep: np.ndarray) -> Any:

@@ -335,4 +335,4 @@ def _complex_modes(
     omega = form.omega
     keep = np.flatnonzero(signed_square(omega) <= top)[:count]
     found = Modes(omega[keep], form.zeta[keep], form.phi[:, keep], model.dofs, form.n_rigid)
-    return leaving_overdamped(form, found)
+    return leaving_overdamped(form, found, top)

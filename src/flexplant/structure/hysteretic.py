@@ -47,7 +47,8 @@ class Hysteretic(Damping):
         all that is in no region.
     regions : mapping {str: LossRegion or (eta_j, K_j)}, optional
         Regions of other loss factors, each a part of K: a matrix, or Springs that K has; see
-        `LossRegion`. They must not overlap.
+        `LossRegion`. They must not overlap. An exported matrix of structural damping (Nastran's K4)
+        is one of loss factor 1, beside a `loss_factor` of 0.
 
     Raises
     ------
