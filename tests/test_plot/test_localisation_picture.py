@@ -56,3 +56,17 @@ def test_what_does_not_go_together_is_refused(case):
         plot.localisation(found, candidates=candidates)
     with pytest.raises(ModelError, match="in its order"):
         plot.localisation(found, candidates=candidates[:2], dofs=dofs)
+
+
+def test_what_was_chosen_is_shown_though_a_dozen_explain_more_alone(case):
+    """Two masses together: the second explains little by itself."""
+    names = tuple(f"m{i}" for i in range(20))
+    score = np.linspace(0.9, 0.1, 20)
+    found = case[0].replace(
+        candidates=names, values=score, score=score, bic=np.arange(20.0) * 10, chosen=("m0", "m17")
+    )
+    assert found.table.splitlines()[-2].startswith("m17")
+    assert found.table.splitlines()[-2].endswith("chosen")
+    assert found.table.splitlines()[-1] == "and 7 more"
+    ax = plot.localisation(found)
+    assert [text.get_text() for text in ax.get_yticklabels()][-1] == "m17"

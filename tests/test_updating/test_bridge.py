@@ -20,10 +20,10 @@ def test_the_truth_is_reached_from_stored_starts(bridge):
 
 @pytest.mark.slow
 def test_noise_leaves_the_published_error_and_an_honest_doubt(bridge):
-    error, score = noisy_fits(bridge, 20, bounds=(-1, 1))
+    error, score = noisy_fits(bridge, 8, bounds=(-1, 1))
     assert error < 0.11
     assert 0.8 < score < 1.25
     assert error < 0.5 * np.sqrt(np.mean(TRUTH**2))
     # the prior does it, on the same noise
-    plain, _ = noisy_fits(bridge, 20)
+    plain, _ = noisy_fits(bridge, 8)
     assert plain > 1.3 * error

@@ -15,8 +15,6 @@ from ..values import FloatArray, instance, with_unit
 from ._axes import axes, finish, legend_below, plan
 from ._style import BLUE, GREY, LIGHT, RED
 
-#: candidates in the bars
-SHOWN = 12
 #: colours of what was chosen, cannot be distinguished from it, hardly can, and of all others
 COLOURS = {"chosen": RED, "alike": BLUE, "rival": GREY, "other": LIGHT}
 
@@ -81,7 +79,7 @@ def _kind(found: Localisation, name: str) -> str:
 
 
 def _bars(found: Localisation, ax: Axes | None) -> Axes:
-    names = found.ranking[:SHOWN]
+    names = found.leading
     ax = axes(ax, figsize=(7.0, 0.8 + 0.33 * len(names)))
     rows = np.arange(len(names))
     kinds = [_kind(found, name) for name in names]

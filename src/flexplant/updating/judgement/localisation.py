@@ -105,6 +105,12 @@ class Localisation(Value):
         return tuple(self.candidates[i] for i in order)
 
     @property
+    def leading(self) -> tuple[str, ...]:
+        """The best dozen candidates alone, and those chosen that are not among them."""
+        best = self.ranking[:ROWS]
+        return (*best, *(name for name in self.chosen if name not in best))
+
+    @property
     def alike(self) -> tuple[str, ...]:
         """Single candidates that the data cannot distinguish from the best one (BIC within 2).
 
@@ -126,11 +132,11 @@ class Localisation(Value):
 
     @property
     def table(self) -> str:
-        """The best candidates in lines: value alone, share explained, BIC above the least one's."""
-        width = max(len("candidate"), *(len(name) for name in self.ranking[:ROWS]))
+        """The leading candidates in lines: value alone, share explained, BIC above the least."""
+        width = max(len("candidate"), *(len(name) for name in self.leading))
         lines = [f"{'candidate':{width}s}{'value alone':>13s}{'explained':>11s}{'BIC +':>10s}"]
         least = float(np.min(self.bic))
-        for name in self.ranking[:ROWS]:
+        for name in self.leading:
             i = self.candidates.index(name)
             known = np.isfinite(self.bic[i])
             more = f"{self.bic[i] - least:10.1f}" if known else f"{'-':>10s}"
