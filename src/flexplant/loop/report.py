@@ -69,11 +69,13 @@ class LoopMargins(Value):
         first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4])
         more = ", ..." if len(self.crossovers) > 4 else ""
         crosses = f"crosses 1 at {first}{more} Hz" if first else "does not cross 1"
-        decibel = f"{20.0 * np.log10(self.gain_margin):.1f}"
-        if self.gain_reduction:
-            decibel += f" and {20.0 * np.log10(self.gain_reduction):.1f}"
+        bounds = [gain for gain in (self.gain_margin, self.gain_reduction) if gain]
+        decibel = [
+            f"{20.0 * np.log10(gain):.1f} dB" if np.isfinite(gain) else "infinite"
+            for gain in bounds
+        ]
         return (
-            f"{self.name}: {crosses}, gain margin {decibel} dB, phase margin "
+            f"{self.name}: {crosses}, gain margin {' and '.join(decibel)}, phase margin "
             f"{self.phase_margin:.0f} deg, modulus margin {self.modulus_margin:.3f} "
             f"({self.freq:.4g} Hz)"
         )
