@@ -1,7 +1,8 @@
-"""Specifications of a stage as tests: ``pytest examples/test_specifications.py``.
+"""Specifications of a stage as tests: ``python -m pytest examples/test_specifications.py``.
 
-The design runs on a reduced model, the tests on the virtual machine with all its modes. When one
-fails, the message is the table of all requirements, reached and allowed.
+``python examples/test_specifications.py`` prints the tables that they check. The design runs on a
+reduced model, the tests on the virtual machine with all its modes. When one fails, the message is
+the table of all requirements, reached and allowed.
 """
 
 # %% The stage, its channels and what it must do
@@ -68,3 +69,9 @@ def test_the_loop() -> None:
 def test_the_exposure_after_a_move() -> None:
     verdict = EXPOSED.check(machine(), run(), exposures=MOVE.exposures)
     assert verdict.passed, str(verdict)
+
+
+# %% Run it
+if __name__ == "__main__":
+    print(LOOP.check(machine()))
+    print(EXPOSED.check(machine(), run(), exposures=MOVE.exposures))

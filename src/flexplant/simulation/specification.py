@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import AssumptionError, ModelError, unknown_label
 from ..loop import ClosedLoop, bandwidth
-from ..values import FloatArray, Value, instance, positive, short
+from ..values import FloatArray, Value, in_unit, instance, positive, short
 from .exposure import exposure_errors, settling_time
 from .response import Response
 
@@ -95,8 +95,9 @@ class Verdict(Value):
         )
         for name, unit, value, limit, least, met in rows:
             sign = ">=" if least else "<="
+            factor, shown = in_unit(float(limit), unit) if np.isfinite(limit) else (1.0, unit)
             lines.append(
-                f"{name:{width}s}{value:12.4g} {sign} {limit:<10.4g} {unit:5s}"
+                f"{name:{width}s}{value / factor:12.4g} {sign} {limit / factor:<10.4g} {shown:5s}"
                 f"{'' if met else ' FAILED'}"
             )
         return "\n".join(line.rstrip() for line in lines)
