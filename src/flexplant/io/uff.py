@@ -318,6 +318,6 @@ def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, floa
 
 UNIVERSAL = Elsewhere(
     (".unv", ".uff"),
-    "results, not matrices: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io, and "
+    "results: read_frf_uff, read_modes_uff, read_nodes_uff of flexplant.io, and "
     "read_modes for the modes of a model",
 )
