@@ -138,10 +138,15 @@ def test_the_check_sees_a_wrong_basis_and_mends_a_poor_one(plate, monkeypatch):
         wrong = fx.frequency_response(plate, PLAIN, FREQ, damping=law)
     assert wrong.error.max() > 0.1
     monkeypatch.undo()
-    # a damper as stiff as the plate, far from all loads: static shapes do not hold its motion
+    # a damper as stiff as the plate, far from all loads: their static shapes do not hold its motion
     damped = plate.with_parts([fx.Damper("49:z", 2e5, to="33:z"), fx.Damper("49:z", 1.0)])
     few = fx.solve_modes(damped, count=8, damping=fx.ModalDamping(0.0))
-    fine = fx.frequency_response(damped, PLAIN, np.linspace(30.0, 0.9 * few.freq[-1], 9))
+    grid = np.linspace(30.0, 0.9 * few.freq[-1], 9)
+    good = fx.frequency_response(damped, PLAIN, grid)
+    assert int(good.route.split()[3]) == 8  # of three places, and of the dampers at once
+    monkeypatch.setattr(dynamic_basis, "damper_forces", lambda model: np.zeros((model.n_dof, 0)))
+    fine = fx.frequency_response(damped, PLAIN, grid)
+    assert apart(good.data, fine.data) < 1e-4
     assert fine.error.max() < 1e-4
     assert int(fine.route.split()[3]) > 6  # more than the static responses at three places
     poor = fx.frequency_response(damped, PLAIN, fine.freq, checks=0)

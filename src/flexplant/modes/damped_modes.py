@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 
 from ..errors import SolverError, warn
 from ..sparse.factor import by_rows, diagonal
@@ -15,6 +14,7 @@ from ..sparse.rayleigh_ritz import absolute
 from ..structure import FEModel
 from ..structure.negative_stiffness import signed_square
 from ..values import ComplexArray, FloatArray
+from .damper_forces import damper_forces
 from .modes import Modes
 from .normal_form import NormalForm, normal_form
 from .shifted import stiffness_factor
@@ -27,10 +27,6 @@ _ENTRY = 1e-3
 _STEPS = 30
 #: part of a correction, beyond the basis, below which it is rounding
 _NEW = 1e-7
-#: DOFs at which dampers act, at most, and their forces, at most: more of them are a material's
-_TOUCHED, _FORCES = 600, 200
-#: relative: a damper below this is none
-_NONE = 1e-12
 #: more undamped modes than wanted, as a part and at least; and how far beyond a band
 _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 
@@ -38,16 +34,6 @@ _MORE, _LEAST, _BEYOND = 4, 8, 1.3
 def wider(count: int, top: float, n: int) -> tuple[int, float]:
     """Return how many undamped modes, and up to which omega^2, make a basis of complex ones."""
     return min(n, count + max(count // _MORE, _LEAST)), top * _BEYOND**2
-
-
-def is_rayleigh(model: FEModel) -> bool:
-    """Return whether ``D = alpha M + beta K``, seen on one vector."""
-    x = np.random.default_rng(0).standard_normal(model.n_dof) / np.sqrt(diagonal(model.K) + 1e-300)
-    sides: Any = [np.asarray(part @ x) for part in (model.M, model.K)]
-    basis = np.column_stack([side / np.linalg.norm(side) for side in sides])
-    damped = np.asarray(model.D @ x)  # type: ignore[operator]
-    left = damped - basis @ np.linalg.lstsq(basis, damped)[0]
-    return bool(np.linalg.norm(left) <= 1e-12 * np.linalg.norm(damped))
 
 
 def damped_modes(
@@ -95,7 +81,7 @@ def damped_modes(
     [Sleijpen1996]_.
     """
     factor, r = stiffness_factor(model, method), model.rigid_body.shape[1]
-    V = np.hstack([phi, beyond(model.M, phi, factor.solve(_dampers(model.D)))])
+    V = np.hstack([phi, beyond(model.M, phi, factor.solve(damper_forces(model)))])
     for _ in range(_STEPS):
         form, keep = _ritz(model, V, r, count, top)
         shapes: Any = V @ form.phi[:, keep]
@@ -147,21 +133,6 @@ def _ritz(
 def _projected(matrix: Any, V: FloatArray) -> FloatArray:
     product = V.T @ np.asarray(matrix @ V)
     return np.asarray(0.5 * (product + product.T))
-
-
-def _dampers(D: Any) -> FloatArray:
-    """Return the forces (n, m) that dampers make, orthonormal; none when they are at many DOFs."""
-    rows = by_rows(D)
-    touched = np.flatnonzero(np.diff(rows.indptr))
-    if touched.size > _TOUCHED:
-        return np.zeros((D.shape[0], 0))
-    values, vectors = la.eigh(rows[touched][:, touched].toarray())
-    kept = np.flatnonzero(values > _NONE * values.max(initial=0.0))
-    if kept.size > _FORCES:
-        return np.zeros((D.shape[0], 0))
-    forces = np.zeros((D.shape[0], kept.size))
-    forces[touched] = vectors[:, kept]
-    return forces
 
 
 def leaving_overdamped(form: NormalForm, modes: Modes, top: float = np.inf) -> Modes:

@@ -17,6 +17,7 @@ from ..structure import Damping, FEModel, Hysteretic, ModalDamping, Rayleigh
 from ..structure.negative_stiffness import signed_root, unstable_stiffness
 from ..values import ComplexArray, FloatArray
 from .attachment_vectors import static_response
+from .damper_forces import damper_forces
 from .modes import Modes
 from .shifted import dissection_of, stiffness_factor
 
@@ -50,9 +51,10 @@ class DampingTerms:
 class DynamicBasis:
     """``M q'' + D q' + K q = B f`` in q = V p: modes, and static responses to the loads.
 
-    V holds the modes, the static responses ``u = G f`` to the loads (inertia relief), and
-    ``G M u``, M-orthonormal and diagonal in K. Responses between loads then have an error of order
-    ``(f / f_cut)^8`` of what the modes left out give, f_cut being the last frequency of the modes.
+    V holds the modes, the static responses ``u = G f`` to the loads (inertia relief), ``G M u``,
+    and the static responses to the forces of dampers, M-orthonormal and diagonal in K. Responses
+    between loads then have an error of order ``(f / f_cut)^8`` of what the modes left out give,
+    f_cut being the last frequency of the modes.
 
     Parameters
     ----------
@@ -74,7 +76,9 @@ class DynamicBasis:
         self.model = model
         self.n_modes, self.n_rigid = modes.n_modes, modes.n_rigid
         phi = np.real(modes.phi)
-        shapes, squares = _diagonal(model, beyond(model.M, phi, static_shapes(model, loads)))
+        dampers = damper_forces(model) if damping is None else None
+        static = static_shapes(model, loads, dampers)
+        shapes, squares = _diagonal(model, beyond(model.M, phi, static))
         self.V = np.hstack([phi, shapes])
         self.squares = np.concatenate([modes.basis_squares[: modes.n_modes], squares])
         #: shapes that a damping law by modes is of
@@ -242,8 +246,13 @@ def _couples(C: FloatArray) -> bool:
     return bool(np.any(np.abs(C - np.diag(own)) > _COUPLED * size))
 
 
-def static_shapes(model: FEModel, loads: FloatArray) -> FloatArray:
-    """Return static responses ``u = G f`` to loads (n, m) and, of few loads, ``G M u``."""
+def static_shapes(
+    model: FEModel, loads: FloatArray, dampers: FloatArray | None = None
+) -> FloatArray:
+    """Return static responses ``u = G f`` to loads (n, m) and, of few loads, ``G M u``.
+
+    To the forces of dampers, (n, d), only the former.
+    """
     if not loads.shape[1]:
         return loads
     sparse = sp.issparse(model.K) and sp.issparse(model.M) and model.n_dof > DENSE_LIMIT
@@ -264,9 +273,10 @@ def static_shapes(model: FEModel, loads: FloatArray) -> FloatArray:
         return factor.static(forces)
 
     found = static(loads)
-    if loads.shape[1] > _MANY:
-        return found
-    return np.hstack([found, static(np.asarray(model.M @ found))])
+    shapes = [found] if loads.shape[1] > _MANY else [found, static(np.asarray(model.M @ found))]
+    if dampers is not None and dampers.shape[1]:
+        shapes.append(static(dampers))
+    return np.hstack(shapes)
 
 
 def _diagonal(model: FEModel, shapes: FloatArray) -> tuple[FloatArray, FloatArray]:

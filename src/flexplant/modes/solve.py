@@ -20,7 +20,8 @@ from ..structure.eigen import elastic_modes, signed
 from ..structure.negative_stiffness import signed_root, signed_square
 from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
-from .damped_modes import damped_modes, is_rayleigh, leaving_overdamped, wider
+from .damped_modes import damped_modes, leaving_overdamped, wider
+from .damper_forces import is_rayleigh
 from .lanczos import STEPS
 from .mode_errors import checked, rigid_residual
 from .modes import Modes
