@@ -20,6 +20,10 @@ NEAR = 0.6
 #: where it is cut when that does not suffice, from -1 to 1: finer towards its ends
 CUTS = np.array([-1.0, -0.9, -0.4, 0.4, 0.9, 1.0])
 MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
+#: relative: levels so close to the gain of the feedthrough are not examined
+CLEAR = 1e-6
+#: entries of the largest arrays: intervals at a time, times poles or channels
+CHUNK = 1_000_000
 #: radii tried around a peak, in distances to the nearest pole
 ZONES = np.array([0.4, 0.3, 0.2, 0.1, 0.03, 0.01])
 
@@ -136,20 +140,14 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
     None: undecided, at as much work as an eigenvalue problem.
     """
     through = float(np.linalg.norm(model.through, 2))
-    if not level > through * (1.0 + 1e-6):
+    if not level > through * (1.0 + CLEAR):
         return None
-    speed = float(np.abs(model.poles).max())
-    # beyond the end |G - D| <= sum 2 |R_i| / (omega - |p_i|)
-    end = 1.001 * speed + 2.0 * float(model.sizes.sum()) / (level - through)
-    beyond = 1.001 * speed * 4.0 ** np.arange(1 + int(np.log2(end / speed)) // 2)
-    low, high = peaks.omega - peaks.zone, peaks.omega + peaks.zone
-    edges = np.sort(np.concatenate([model.poles.imag, np.maximum(low, 0.0), high, beyond]))
-    edges = np.concatenate([[0.0], np.minimum(edges, end), [end]])
-    centre, radius = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
-    free = np.all((centre < low[:, None]) | (centre > high[:, None]), axis=0) & (radius > 0.0)
-    centre, radius = centre[free], radius[free]
+    centre, radius = _outside(model, level - through, peaks)
     left = 100 + model.poles.size**2 // 10
+    step = max(1, CHUNK // max(model.poles.size, model.through.size))
     while centre.size:
+        later, wide = centre[step:], radius[step:]
+        centre, radius = centre[:step], radius[:step]
         rough = through + model.rest(centre, radius, -1) > level
         centre, radius = centre[rough], radius[rough]
         fine = radius <= NEAR * model.nearest(centre)
@@ -162,9 +160,26 @@ def exceeding(model: Residues, level: float, peaks: Peaks) -> FloatArray | None:
         stay = np.ones(centre.size, dtype=bool)
         stay[np.flatnonzero(fine)[passed]] = False
         centre, radius = centre[stay, None], radius[stay, None]
-        centre = (centre + radius * MIDDLES).reshape(-1)
-        radius = (radius * HALVES).reshape(-1)
+        centre = np.concatenate([(centre + radius * MIDDLES).reshape(-1), later])
+        radius = np.concatenate([(radius * HALVES).reshape(-1), wide])
     return np.zeros(0)
+
+
+def _outside(model: Residues, room: float, peaks: Peaks) -> tuple[FloatArray, FloatArray]:
+    """Return centres and radii of intervals outside the peaks' zones, from zero to an end.
+
+    Beyond the end ``|G - D| <= sum 2 |R_i| / (omega - |p_i|)`` is less than what the level leaves
+    room for.
+    """
+    speed = float(np.abs(model.poles).max())
+    end = 1.001 * speed + 2.0 * float(model.sizes.sum()) / room
+    beyond = 1.001 * speed * 4.0 ** np.arange(1 + int(np.log2(end / speed)) // 2)
+    low, high = peaks.omega - peaks.zone, peaks.omega + peaks.zone
+    edges = np.sort(np.concatenate([model.poles.imag, np.maximum(low, 0.0), high, beyond]))
+    edges = np.concatenate([[0.0], np.minimum(edges, end), [end]])
+    centre, radius = 0.5 * (edges[1:] + edges[:-1]), 0.5 * np.diff(edges)
+    free = np.all((centre < low[:, None]) | (centre > high[:, None]), axis=0) & (radius > 0.0)
+    return centre[free], radius[free]
 
 
 def _examined(

@@ -15,6 +15,8 @@ from .statespace import StateSpace
 POOR = 1e5
 #: a distance that counts as none
 TINY = 1e-100
+#: entries of all residues from which on they are not formed
+LARGEST = 5_000_000
 
 
 class Residues(NamedTuple):
@@ -89,8 +91,11 @@ def residues(g: StateSpace) -> tuple[Residues | None, ComplexArray | None]:
     """Return poles and residues, a sampled system mapped by ``z = (1 + s) / (1 - s)``.
 
     Block by block where A is block diagonal, by the eigenvectors of A otherwise. None where these
-    are poor, or a pole lies at z = -1. Beside them the eigenvalues of A where they were computed.
+    are poor or too many, or a pole lies at z = -1. Beside them the eigenvalues of A where they were
+    computed.
     """
+    if g.n_states * g.D.size > LARGEST:
+        return None, None
     pairs = modal_pairs(g)
     poles, found, known = _of_blocks(pairs) if pairs is not None else _of_eigenvectors(g)
     if found is None or (g.dt and np.any(poles == -1.0)):
