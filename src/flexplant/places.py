@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -17,6 +18,7 @@ Place: TypeAlias = "str | Sequence[float] | FloatArray | Mapping[Any, float]"
 class Interpolation(Value):
     """How displacements between nodes follow from those at the nodes (element shape functions)."""
 
+    @abstractmethod
     def row(self, xyz: FloatArray, direction: str) -> FloatArray:
         """Return the weights (n,) with which all n DOFs give the motion `direction` at `xyz`.
 
@@ -25,7 +27,6 @@ class Interpolation(Value):
         LabelError
             When the point is off the structure or the direction is unknown to it.
         """
-        raise NotImplementedError
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n) at many points (p, 3); the same as `row` one by one.

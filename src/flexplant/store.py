@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import uuid
+from abc import ABC
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields, replace
@@ -21,7 +22,7 @@ from .notebook import as_html
 _HEADER = "__flexplant__"
 
 
-class Value:
+class Value(ABC):  # noqa: B024 - its kinds have abstract methods
     """A frozen dataclass whose arrays are read-only copies, also after pickling and loading."""
 
     registry: ClassVar[dict[str, type[Value]]] = {}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from typing import Any
 
 from ..errors import ModelError
@@ -20,9 +21,9 @@ class Constraint(Value):
     True
     """
 
+    @abstractmethod
     def rows(self, places: Places) -> LinearRows:
         """Return linear rows in x, which is 1 for chosen candidates and 0 for others."""
-        raise NotImplementedError
 
     def drawn(self, places: Places) -> tuple[Zone, ...]:
         """Return zones without candidates, seen from above, for pictures."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -102,9 +103,9 @@ class Criterion(Value):
     #: values are compared by differences of this size where they pass through zero
     scale: ClassVar[float] = 0.0
 
+    @abstractmethod
     def __call__(self, plant: StandardPlant) -> float:
         """Return the criterion on a plant."""
-        raise NotImplementedError
 
     def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
         """Raise AssumptionError for what no choice among the candidates can repair."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -73,8 +74,8 @@ class ModalGramian(Criterion):
         found = (back.conj().T @ W @ back).real
         return np.asarray(0.5 * (found + found.transpose(0, 2, 1)))
 
-    def _row(self, real: ModalRealisation, port: Any) -> FloatArray:
-        raise NotImplementedError
+    @abstractmethod
+    def _row(self, real: ModalRealisation, port: Any) -> FloatArray: ...
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -223,6 +224,7 @@ class Search(Value):
     True
     """
 
+    @abstractmethod
     def search(self, problem: Problem, work: Work) -> Found:
         """Return the best choice that was found.
 
@@ -234,7 +236,6 @@ class Search(Value):
             Its `mapped` and `rng`: the result is the same to the bit on any executor, and work
             that was stopped goes on from a file.
         """
-        raise NotImplementedError
 
 
 def _without(rows: FloatArray, row: FloatArray) -> FloatArray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -85,9 +86,9 @@ class ByShapes(Criterion):
     sides: ClassVar[str] = "y"
     scale: ClassVar[float] = 1.0
 
+    @abstractmethod
     def of(self, plant: StandardPlant, shapes: Shapes) -> Scorer:
         """Return the scores of choices among the ports that the shapes belong to."""
-        raise NotImplementedError
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the criterion of the plant's own ports."""

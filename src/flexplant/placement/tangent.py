@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -21,16 +22,17 @@ _TANGENTS, _HALVES = 20, (1.0, 0.5, 0.25, 0.125, 0.0625)
 _ROUNDING = 1e-9
 
 
-class Below:
+class Below(ABC):
     """A function of weights that is nowhere above a cost of choices."""
 
     #: effect of each candidate (N, r) on the cost; of like candidates alike
     rows: FloatArray
 
+    @abstractmethod
     def values(self, sets: Sequence[Sequence[int]]) -> FloatArray:
         """Return numbers (m,) below the cost of each choice."""
-        raise NotImplementedError
 
+    @abstractmethod
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
         """Return a number below the cost of every choice of a branch, and weights near the least.
 
@@ -41,7 +43,6 @@ class Below:
         start : (N,) array
             First weights.
         """
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)

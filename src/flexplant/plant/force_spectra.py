@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +19,14 @@ class _Spectrum(Value):
     """White noise through a stable filter: `asd` of the noise, and the filter as `shape`."""
 
     @property
+    @abstractmethod
     def asd(self) -> float:
         """One-sided amplitude spectral density of the white noise before the filter."""
-        raise NotImplementedError
 
     @property
+    @abstractmethod
     def shape(self) -> StateSpace:
         """The filter."""
-        raise NotImplementedError
 
     def force(self, name: str, at: Place, direction: str = "z") -> Disturbance:
         """Return the force of this spectrum at a place: a channel of w.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from typing import ClassVar, Literal, NamedTuple, TypeAlias
 
@@ -104,9 +105,9 @@ class ForcePort(Value):
         """The rigid-body motion (6,) of the ground about the origin whose acceleration it is."""
         return np.zeros(6)
 
+    @abstractmethod
     def push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) over the model's DOFs per unit behind the filter."""
-        raise NotImplementedError
 
     def static_push(self, realisation: ModalRealisation) -> FloatArray:
         """Return the load (n,) per unit of the channel at rest: the filter is its static gain."""
@@ -179,9 +180,9 @@ class SensorPort(Value):
         """Whether it measures absolute motion: no accelerometer measures against the ground."""
         return self.order == 2 if self.absolute is None else self.absolute
 
+    @abstractmethod
     def row(self, realisation: ModalRealisation) -> FloatArray:
         """Return the row (n,) over the model's DOFs of the displacement that it is about."""
-        raise NotImplementedError
 
     def carried(self, realisation: ModalRealisation) -> FloatArray:
         """Return its motion (6,) with each rigid-body motion about the origin."""

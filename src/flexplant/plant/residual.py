@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +16,9 @@ from .realisation import MODAL, ModalRealisation, Structure, realised
 class ResidualForm(Value):
     """How the residual compliance of a reduction appears in a plant."""
 
+    @abstractmethod
     def applied(self, realisation: ModalRealisation) -> ModalRealisation:
         """Return the realisation in this form."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
@@ -32,13 +33,13 @@ class SelectionCriterion(Value):
     def __repr__(self) -> str:
         return f"{type(self).__name__}()"
 
+    @abstractmethod
     def chosen(self, required: Rows, pool: Rows, count: int) -> list[int]:
         """Return which rows of the pool (p, k) to take beside the required ones (q, k)."""
-        raise NotImplementedError
 
+    @abstractmethod
     def values(self, rows: Rows) -> FloatArray:
         """Return the value of the criterion at each of the chosen rows, in their order."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, repr=False)

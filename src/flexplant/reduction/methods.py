@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from typing import Any
@@ -37,9 +38,9 @@ class ReductionMethod(Value):
     True
     """
 
+    @abstractmethod
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -23,6 +24,7 @@ class Damping(Value):
     True
     """
 
+    @abstractmethod
     def zeta(self, omega: FloatArray) -> FloatArray:
         """Return the damping ratios of modes; rigid-body modes (omega = 0) are undamped.
 
@@ -35,7 +37,6 @@ class Damping(Value):
         -------
         (k,) array [-]
         """
-        raise NotImplementedError
 
     def ratios(self, omega: FloatArray, shapes: FloatArray, K: Matrix, dofs: DofSet) -> FloatArray:
         """Return the damping ratios of shapes: those of their frequencies, for most laws.

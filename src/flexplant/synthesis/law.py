@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -84,9 +85,9 @@ class Element(Value):
     """A factor of a law: multiply elements, and numbers, to a `Law`."""
 
     @property
+    @abstractmethod
     def law(self) -> Law:
         """The law of this element alone."""
-        raise NotImplementedError
 
     @property
     def system(self) -> StateSpace:
@@ -156,9 +157,9 @@ class SingleElement(Element):
     """An element with one section."""
 
     @property
+    @abstractmethod
     def section(self) -> Section:
         """Its transfer function."""
-        raise NotImplementedError
 
     @property
     def law(self) -> Law:

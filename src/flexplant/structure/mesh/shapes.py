@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,8 +27,8 @@ class GridShape(Interpolation):
         there = np.ones(counts[::-1], dtype=bool) if present is None else np.asarray(present)
         return Grid(counts, per_node, there)
 
-    def _layout(self) -> tuple[tuple[int, ...], Any, int]:
-        raise NotImplementedError
+    @abstractmethod
+    def _layout(self) -> tuple[tuple[int, ...], Any, int]: ...
 
     def _row(self, element: Sequence[int], weights: FloatArray) -> FloatArray:
         """Return the row (n,) of an element's weights, its corners in the order of the grid."""

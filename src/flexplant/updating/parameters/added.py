@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, TypeAlias
@@ -37,6 +38,7 @@ class Parameter(Value):
     bounds: tuple[float, float] | None
     prior: tuple[float, float] | None
 
+    @abstractmethod
     def matrices(self, model: Any) -> Derivatives:
         """Return the derivatives (dM, dD, dK) of the model's matrices, None where zero.
 
@@ -45,7 +47,6 @@ class Parameter(Value):
         LabelError
             When the model has no such place.
         """
-        raise NotImplementedError
 
     def terms(self, model: Any) -> list[Derivatives]:
         """Return the matrices M_j of ``M(p) = M + sum_j g_j(p) M_j``, and of D and K."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -37,12 +38,12 @@ class Residual(Value):
         measured: Any = getattr(self, "measured", None)
         return float(np.max(np.abs(getattr(measured, "poles", [0.0]))))
 
+    @abstractmethod
     def bound(self, family: Family) -> Bound:
         """Return the residual tied to the rows of one family of models."""
-        raise NotImplementedError
 
 
-class Bound:
+class Bound(ABC):
     """Residuals of unit covariance (where the noise is known), and their exact gradients."""
 
     #: numbers of the modes that are followed for it
@@ -55,13 +56,13 @@ class Bound:
     size: FloatArray | float = 1.0
     name: str = ""
 
+    @abstractmethod
     def values(self, point: Point) -> FloatArray:
         """Return the real residuals (m,) at a point, measured minus model, whitened."""
-        raise NotImplementedError
 
+    @abstractmethod
     def slopes(self, point: Point) -> FloatArray:
         """Return their derivatives (m, q)."""
-        raise NotImplementedError
 
     def row_name(self, row: int) -> str:
         """Return what is measured in a row, for messages."""

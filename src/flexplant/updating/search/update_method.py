@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
@@ -83,6 +84,7 @@ class UpdateMethod(Value):
         """Whether the answer is drawn towards the start, so that its covariance is not known."""
         return False
 
+    @abstractmethod
     def search(
         self,
         objective: Objective,
@@ -109,7 +111,6 @@ class UpdateMethod(Value):
         ModelError, SolverError
             When no step from the start helps.
         """
-        raise NotImplementedError
 
 
 def units(objective: Objective, J: FloatArray) -> FloatArray:
