@@ -92,7 +92,7 @@ def test_any_numbers_and_names(tmp_path_factory, numbers, names):
         ("f,a,b\n1,2,3\n", "no header"),
         ("frequency [Hz],y real,y imag\n1,2,3\n", r"'y real' is not like 'y1 <- u1 real"),
         ("frequency [Hz],y <- u real,y <- u real\n1,2,3\n", r"lacks or doubles.*y <- u imag"),
-        ("# x\nfrequency [Hz],y <- u real,y <- u imag\n1,2,3\n4,5\n", r"line 4: 2 numbers, 3"),
+        ("# x\nfrequency [Hz],y <- u real,y <- u imag\n1,2,3\n4,5\n", r"2 numbers in line 4"),
         ("frequency [Hz],y <- u real,y <- u imag\n1,2,x\n", r"line 2: 'x' is no decimal number"),
     ],
 )

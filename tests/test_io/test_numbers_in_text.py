@@ -89,7 +89,7 @@ def test_a_number_is_read_whole_or_refused_with_its_line(tmp_path, make):
 def test_tables_name_the_line_of_what_is_no_number(tmp_path, word):
     path = tmp_path / "t.csv"
     path.write_text(f"# by hand\nnode;direction;x;y;z\n\n1;z;0;0;0\n2;z;{word};0;0\n")
-    with pytest.raises(FlexplantError, match=r"line 5: column 'x'"):
+    with pytest.raises(FlexplantError, match=r"line 5, column 'x'"):
         fx.io.read_dofs(path)
     path.write_text("node;direction;x;y;z\n1;z;7.5D-01;-2.5-3;0\n")
     assert fx.io.read_dofs(path).xyz.tolist() == [[0.75, -0.0025, 0.0]]

@@ -210,7 +210,7 @@ def test_missing_doubled_and_uneven_pairs_are_listed(tmp_path):
     with pytest.raises(FlexplantError, match="2:z <- u 2:z more than once"):
         read_frf_uff(written(tmp_path, [*sets, sets[0]]))
     other = sets[1] | {"x": 1.01 * FREQ}
-    with pytest.raises(FlexplantError, match=r"2:z <- u 7:x is at other frequencies"):
+    with pytest.raises(FlexplantError, match=r"2:z <- u 7:x .* at other frequencies"):
         read_frf_uff(written(tmp_path, [sets[0], other, *sets[2:]]))
     with pytest.raises(FlexplantError, match="not over frequency"):
         read_frf_uff(written(tmp_path, [sets[0] | {"abscissa_spec_data_type": 17}]))
@@ -359,7 +359,7 @@ def test_coordinate_systems_that_are_not_the_global_one_are_refused(tmp_path):
     moved = straight.copy()
     moved[3] = [0.1, 0.0, 0.0]
     for changes in ({"CS_types": [1]}, {"CS_matrices": [moved]}):
-        with pytest.raises(ModelError, match="system 1 as a turned, moved or curved one"):
+        with pytest.raises(ModelError, match="system 1, turned, moved or curved"):
             read_nodes_uff(written(tmp_path, [systems(**changes), nodes(2411)]))
 
 
@@ -415,7 +415,7 @@ def test_responses_that_a_finite_element_program_computed(tmp_path):
     np.testing.assert_allclose(fast.data, wanted * 1e3 * 2j * np.pi * found.freq, rtol=1e-5)
     with pytest.raises(FlexplantError, match="load set 2 at 20 Hz twice"):
         read_frf_uff(results(tmp_path, *sets, sets[3]))
-    with pytest.raises(FlexplantError, match="load set 2 is at other frequencies"):
+    with pytest.raises(FlexplantError, match="load set 2 at other frequencies"):
         read_frf_uff(results(tmp_path, *sets[:-1]))
     both = [*sets, *(analysis(5, data[0, 0], load=1, freq=f, result=12) for f in freq)]
     with pytest.raises(ModelError, match="in acceleration, displacement"):

@@ -15,7 +15,7 @@ from ..lti.frequency import Frf
 from ..store import written
 from ..values import FloatArray, instance
 from .numbers import decimal
-from .paths import file_path, text_of
+from .paths import file_path, refused, text_of
 
 _FREQ = "frequency [Hz]"
 _ARROW = " <- "
@@ -138,9 +138,7 @@ def read_frf_csv(path: str | Path) -> Frf:
         resolution = float(said["resolution"]) if "resolution" in said else None
         overlap = float(said.get("overlap", 0.0))
     except ValueError as error:
-        raise FlexplantError(
-            f"{str(path)!r}: resolution and overlap are numbers: {error}."
-        ) from None
+        raise refused(path, "has a resolution or overlap that is no number", f"{error}.") from None
     first = len(comments) + 1
     rows = list(csv.reader(line for line in lines if not line.startswith("#")))
     keys = _header(rows[0] if rows else [], str(path))
@@ -151,9 +149,8 @@ def read_frf_csv(path: str | Path) -> Frf:
         except ValueError as error:
             raise FlexplantError(f"{str(path)!r}, line {line}: {error}.") from None
         if len(row) != len(keys) + 1:
-            raise FlexplantError(
-                f"{str(path)!r}, line {line}: {len(row)} numbers, {len(keys) + 1} columns."
-            )
+            what = f"has {len(row)} numbers in line {line}, and {len(keys) + 1} columns"
+            raise refused(path, what, "Complete it.")
     table = np.array(values, dtype=np.float64).reshape(len(values), len(keys) + 1)
     outputs = list(dict.fromkeys(key[0] for key in keys))
     inputs = list(dict.fromkeys(key[1] for key in keys))

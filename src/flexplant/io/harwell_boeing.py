@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, ModelError
+from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import one_matrix_each, text_digits
 from .foreign import sound
 from .formats import Format
 from .numbers import fixed_numbers, spaced_numbers
-from .paths import check_size, check_whole, parsing
+from .paths import check_size, check_whole, parsing, refused, unread
 
 #: lines whose digits are counted
 _SAMPLE = 4000
@@ -89,16 +89,15 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
         if min(*counts, n_rows, n_columns, n_entries) < 0:
             raise ValueError("a count below 0")
     except (IndexError, ValueError, UnicodeDecodeError) as error:
-        raise FlexplantError(
-            f"{str(path)!r} is no Harwell-Boeing file: its header cannot be read ({error})."
-        ) from None
+        what = f"is no Harwell-Boeing file: its header cannot be read ({error})"
+        raise refused(path, what, "Write it again, or give its format another suffix.") from None
     check_size(max(n_rows, n_columns), sum(map(len, lines)), path)
     if kind[:1] not in ("R", "I") or kind[1:2] not in ("S", "U") or kind[2:] != "A":
-        raise ModelError(
-            f"{str(path)!r} is of kind {kind!r}: only real or integer (R, I), symmetric or "
-            "unsymmetric (S, U), assembled (A) matrices are a stiffness or mass. A skew-symmetric "
-            "one is gyroscopic, an elemental one must be assembled first."
+        do = (
+            "Only real or integer (R, I), symmetric or unsymmetric (S, U), assembled (A) matrices "
+            "are a stiffness or mass: assemble elemental ones, leave gyroscopic ones out."
         )
+        raise unread(path, f"is of kind {kind!r}", do)
     right_hand = 1 if len(lines[1]) >= 70 and lines[1][56:70].strip() not in (b"", b"0") else 0
     first = 4 + right_hand
     blocks = []

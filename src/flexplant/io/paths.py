@@ -11,6 +11,10 @@ from ..errors import FlexplantError, ModelError
 from ..values import short
 from .numbers import cut_short
 
+#: what to do with a file that says a thing twice, and one in axes of its own
+ONCE = "Export each once (one result set)."
+GLOBAL = "Only global coordinates and directions are read: export these."
+
 
 def file_path(path: Any, name: str = "path") -> Path:
     """Return the path of a file; its absence is left to what opens it.
@@ -45,9 +49,20 @@ def wrong_line_of(
     )
 
 
+def refused(path: object, what: str, do: str) -> FlexplantError:
+    """Return the error of a file that holds another thing than what is read of it."""
+    return FlexplantError(f"{str(path)!r} {what}. {do}")
+
+
 def unread(path: object, what: str, do: str) -> ModelError:
     """Return the error of a file that holds what is no M, D, K or shape of a structure."""
     return ModelError(f"{str(path)!r} {what}. {do}")
+
+
+def at_zero(path: object, kind: str, target: str) -> ModelError:
+    """Return the error of responses at 0 Hz that were to be integrated."""
+    what = f"holds {kind} at zero frequency, which cannot be integrated to {target}"
+    return unread(path, what, f"Read it as {kind}, or export from above zero.")
 
 
 def no_motion(path: object, kinds: object) -> ModelError:

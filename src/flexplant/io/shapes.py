@@ -14,7 +14,7 @@ from ..labels import DofSet
 from ..modes import Modes
 from ..structure.units import Units
 from ..values import FloatArray, positive, real_array
-from .paths import damaged
+from .paths import damaged, unread
 
 #: generalised masses nearer to 1 than this are those of mass-normalised shapes in few digits
 _ONE = 1e-5
@@ -98,9 +98,7 @@ def modes_of(
     shapes = _unit_mass(shapes, path)
     damping = shapes.zeta if zeta is None else zeta
     if damping is None:
-        raise ModelError(
-            f"{path!r} does not say how the modes are damped. Say it: zeta=0.01, or one a mode."
-        )
+        raise unread(path, "does not say how modes are damped", "Say it: zeta=0.01, or one a mode.")
     k = shapes.omega.size
     damping = real_array(damping, "zeta")
     if damping.shape not in ((), (k,)):
@@ -138,10 +136,8 @@ def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
         return replace(shapes, notes=(*shapes.notes, note))
     if np.any(~np.isfinite(masses)) or np.any(masses <= 0):
         mode = int(np.argmax(~(masses > 0))) + 1
-        raise ModelError(
-            f"{path!r}: mode {mode} has a generalised mass of {masses[mode - 1]:g}: it must be "
-            "above 0. Was the file written by a modal analysis?"
-        )
+        what = f"gives mode {mode} a generalised mass of {masses[mode - 1]:g}, not above 0"
+        raise unread(path, what, "Was it written by a modal analysis?")
     off = float(np.max(np.abs(masses - 1)))
     if off < _ONE:
         note = f"mass-normalised: generalised masses of the file are 1 within {off:.1g}"

@@ -16,7 +16,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..structure.units import units
 from ..values import FloatArray, IntArray
 from .numbers import decimal
-from .paths import file_path, text_of
+from .paths import file_path, refused, text_of
 
 #: what other programs call the six directions
 _DIRECTION = {
@@ -122,8 +122,8 @@ def read_dofs(
         rows = table.whole("row")
         if not np.array_equal(np.sort(rows), np.arange(1, rows.size + 1)):
             raise LabelError(
-                f"column 'row' of {str(path)!r} must count the {rows.size} rows of the matrices "
-                f"from 1, each once, got {rows.min()} to {rows.max()}. Add 1 if it counts from 0."
+                f"column 'row' of {str(path)!r} must count {rows.size} rows from 1, each once, got "
+                f"{rows.min()} to {rows.max()}. Add 1 if it counts from 0."
             )
         order = np.argsort(rows)
     return DofSet(numbers[order], tuple(kinds[i] for i in order), scale * xyz[order])
@@ -171,10 +171,9 @@ class _Table:
             try:
                 found.append(decimal(cell))
             except ValueError as error:
-                raise FlexplantError(
-                    f"{self.path!r}, line {line}: column {column!r} holds something that is no "
-                    f"number ({error}). Write it with a decimal point and no unit."
-                ) from None
+                what = f"has no number in line {line}, column {column!r} ({error})"
+                do = "Write it with a decimal point and no unit."
+                raise refused(self.path, what, do) from None
         return np.array(found)
 
     def whole(self, column: str) -> IntArray:
@@ -218,9 +217,8 @@ def _table(path: str | Path, plain: Sequence[str] = ()) -> _Table:
         raise FlexplantError(f"{str(path)!r} has a cell of several lines. Close its quotes.")
     for line, row in zip(lines, rows, strict=True):
         if len(row) != len(names):
-            raise FlexplantError(
-                f"{str(path)!r}, line {line}: {len(row)} columns, {len(names)} names. Complete it."
-            )
+            what = f"has {len(row)} columns in line {line}, and {len(names)} names"
+            raise refused(path, what, "Complete it.")
     columns = {name: [row[i] for row in rows] for i, name in enumerate(names)}
     return _Table(str(path), columns, lines)
 
@@ -229,8 +227,7 @@ def _direction(name: str, path: str | Path) -> str:
     direction = _DIRECTION.get(str(name).strip().lower())
     if direction is None:
         raise LabelError(
-            f"{str(path)!r}: {name!r} is no direction of motion. Known are "
-            f"{', '.join(DIRECTIONS)}, UX to ROTZ, T1 to R3 and 1 to 6; other DOFs (temperature, "
-            "pressure) have no place here."
+            f"{str(path)!r}: {name!r} is no direction of motion. Use {', '.join(DIRECTIONS)}, UX "
+            "to ROTZ, T1 to R3 or 1 to 6, and leave temperature, pressure and the like out."
         )
     return direction

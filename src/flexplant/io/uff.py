@@ -13,7 +13,7 @@ from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import Frf
 from ..values import FloatArray, IntArray, positive
 from .formats import Elsewhere
-from .paths import damaged, file_path
+from .paths import GLOBAL, ONCE, at_zero, damaged, file_path, refused, unread
 from .uff_analysis import AnalysisData, mode_records
 from .uff_records import (
     check_complete,
@@ -111,17 +111,14 @@ def read_frf_uff(
         if computed is not None:
             return computed
         kinds = sorted({whole_entry(part, "func_type") for part in records})
-        raise FlexplantError(
-            f"{str(path)!r} holds no frequency response function: {len(records)} records 58 of "
-            f"function types {kinds} (4 is a frequency response). Export these, or estimate them "
-            "from time records: estimate_frf."
-        )
+        what = f"{len(records)} records 58 of function types {kinds} (4 is a frequency response)"
+        do = "Export these, or estimate them from time records: estimate_frf."
+        raise refused(path, f"holds no frequency response function: {what}", do)
     found = {KINDS.get(whole_entry(part, "ordinate_spec_data_type")) for part in responses}
     if len(found) > 1 and quantity is None:
-        raise ModelError(
-            f"{str(path)!r} holds records of {sorted(str(kind or 'unknown') for kind in found)}: "
-            "one Frf is of one quantity. Say which to convert to: quantity='acceleration'."
-        )
+        said = sorted(str(kind or "unknown") for kind in found)
+        do = "One Frf is of one quantity: say which to convert to, quantity='acceleration'."
+        raise unread(path, f"holds records of {said}", do)
     target = quantity or found.pop()
     pairs = paired_records(responses, str(path))
     freq = common_frequencies(responses, str(path))
@@ -135,10 +132,7 @@ def read_frf_uff(
         if kind is not None and target is not None and kind != target:
             order = ORDERS[target] - ORDERS[kind]
             if order < 0 and freq[0] == 0:
-                raise ModelError(
-                    f"{str(path)!r} holds {kind} at zero frequency, which cannot be integrated to "
-                    f"{target}. Read it as {kind}, or export from above zero."
-                )
+                raise at_zero(path, kind, target)
             row = row * (2j * np.pi * freq) ** order
         data[outputs.index(output), inputs.index(name)] = row
     measured = (
@@ -205,15 +199,11 @@ def read_modes_uff(path: str | Path, *, modes: Iterable[int] | None = None) -> M
     parts: dict[int, AnalysisData] = {}
     for part in mode_records(file_path(path), measured=True):
         if part.mode in parts:
-            raise FlexplantError(
-                f"{str(path)!r} holds mode {part.mode} twice. Export each once (one result set)."
-            )
+            raise refused(path, f"holds mode {part.mode} twice", ONCE)
         parts[part.mode] = part
     if not parts:
-        raise FlexplantError(
-            f"{str(path)!r} holds no mode shapes: datasets 55, or 2414 of displacements at nodes, "
-            "of normal (2) or complex modes (3, 7). Export these."
-        )
+        what = "datasets 55, or 2414 of displacements at nodes, of modes (normal 2, complex 3, 7)"
+        raise refused(path, f"holds no mode shapes: {what}", "Export these.")
     chosen = list(parts) if modes is None else list(modes)
     for number in chosen:
         if number not in parts:
@@ -302,11 +292,8 @@ def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, floa
         # 0 and 1 both stand for the global system in files of test software
         for what, of in (("gives", system), ("moves", moved)):
             if np.any(of > 1):
-                raise ModelError(
-                    f"{str(path)!r} {what} node {int(numbers[np.argmax(of > 1)])} in coordinate "
-                    f"system {int(of.max())}: only global coordinates and directions are read. "
-                    "Export these."
-                )
+                where = f"{what} node {int(numbers[np.argmax(of > 1)])}"
+                raise unread(path, f"{where} in coordinate system {int(of.max())}", GLOBAL)
         nodes.append(numbers)
         axes = [np.atleast_1d(part[axis]) for axis in "xyz"]
         if any(axis.shape != numbers.shape for axis in axes):

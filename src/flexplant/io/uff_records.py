@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, ModelError
+from ..errors import FlexplantError
 from ..labels import DIRECTIONS
 from ..values import FloatArray, short
-from .paths import file_path
+from .paths import GLOBAL, file_path, refused, unread
 
 
 def check_systems(parts: list[dict[str, Any]], path: str) -> None:
@@ -23,11 +23,8 @@ def check_systems(parts: list[dict[str, Any]], path: str) -> None:
         listed = zip(part["CS_sys_labels"], part["CS_types"], part["CS_matrices"], strict=True)
         for label, kind, matrix in listed:
             if label in (0, 1) and (kind or np.abs(np.asarray(matrix) - straight).max() > 1e-9):
-                raise ModelError(
-                    f"{path!r} defines coordinate system {int(label)} as a turned, moved or curved "
-                    "one (dataset 2420), and nodes are given in it: only global coordinates are "
-                    "read. Export these."
-                )
+                what = f"gives nodes in coordinate system {int(label)}, turned, moved or curved"
+                raise unread(path, f"{what} by dataset 2420", GLOBAL)
 
 
 def dataset_types(path: str | Path) -> list[int]:
@@ -52,9 +49,8 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
             "universal files need pyuff. Install it: pip install 'flexplant[uff]'."
         ) from None
     if start.split()[:1] != [b"-1"]:
-        raise FlexplantError(
-            f"{str(path)!r} is no universal file: it begins with {start[:20]!r}, not with -1."
-        )
+        what = f"is no universal file: it begins with {start[:20]!r}, not with -1"
+        raise refused(path, what, "Export it as one, .uff or .unv.")
     found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy's of what pyuff calls
@@ -87,11 +83,12 @@ def _check_58(part: dict[str, Any], path: str | Path, place: int) -> None:
     data, x = np.asarray(part.get("data", ())), np.asarray(part.get("x", ()))
     points = whole_entry(part, "num_pts")
     if data.size != points or x.size != points or not points:
-        raise _damaged(
-            path, f"dataset {place + 1} (type 58)", f"{data.size} of {points} points are there"
-        )
-    if not (np.all(np.isfinite(data)) and np.all(np.isfinite(x))):
-        raise _damaged(path, f"dataset {place + 1} (type 58)", "NaN or infinite numbers")
+        wrong = f"{data.size} of {points} points are there"
+    elif not (np.all(np.isfinite(data)) and np.all(np.isfinite(x))):
+        wrong = "NaN or infinite numbers"
+    else:
+        return
+    raise _damaged(path, f"dataset {place + 1} (type 58)", wrong)
 
 
 def whole_entry(part: dict[str, Any], name: str) -> int:
@@ -127,10 +124,8 @@ def paired_records(
             doubled.append(" <- ".join(pair))
         pairs[pair] = (up * down, part)
     if doubled:
-        raise FlexplantError(
-            f"{path!r} holds {', '.join(doubled[:6])} more than once: repeated measurements are "
-            "averaged, not chosen from. Export each pair once (average_frfs joins files)."
-        )
+        do = "Repeated ones are averaged: export each pair once (average_frfs joins files)."
+        raise refused(path, f"holds {', '.join(doubled[:6])} more than once", do)
     return pairs
 
 
@@ -161,10 +156,9 @@ def check_complete(
     there = set(pairs)
     missing = [f"{a} <- {b}" for a in outputs for b in inputs if (a, b) not in there]
     if missing:
-        raise FlexplantError(
-            f"{path!r} lacks {len(missing)} of {len(outputs) * len(inputs)} {what}: "
-            f"{', '.join(missing[:8])}. Export every output for every input{remedy}."
-        )
+        few = f"lacks {len(missing)} of {len(outputs) * len(inputs)} {what}: "
+        do = f"Export every output for every input{remedy}."
+        raise refused(path, few + ", ".join(missing[:8]), do)
 
 
 def common_frequencies(records: list[dict[str, Any]], path: str) -> FloatArray:
@@ -172,20 +166,19 @@ def common_frequencies(records: list[dict[str, Any]], path: str) -> FloatArray:
     first = np.asarray(records[0]["x"], dtype=np.float64)
     for part in records:
         if whole_entry(part, "abscissa_spec_data_type") not in (0, 1, 18):
-            raise FlexplantError(
-                f"{path!r}: a response is not over frequency (abscissa type "
-                f"{whole_entry(part, 'abscissa_spec_data_type')}, 18 is frequency). Export "
-                "it in Hz."
-            )
+            kind = whole_entry(part, "abscissa_spec_data_type")
+            what = f"has a response not over frequency (abscissa type {kind}, 18 is frequency)"
+            raise refused(path, what, "Export it in Hz.")
         own = np.asarray(part["x"], dtype=np.float64)
         step = float(np.ptp(first)) / max(first.size - 1, 1)
         if own.size != first.size or np.max(np.abs(own - first)) > 1e-3 * step:
-            raise FlexplantError(
-                f"{path!r}: {_channel(part, 'rsp')[0]} <- u {_channel(part, 'ref')[0]} is at other "
-                f"frequencies ({own.size} from {own[0]:g} to {own[-1]:g} Hz) than "
-                f"{_channel(records[0], 'rsp')[0]} <- u {_channel(records[0], 'ref')[0]} "
-                f"({first.size} from {first[0]:g} to {first[-1]:g} Hz). Export all alike."
-            )
+            two = [
+                f"{_channel(one, 'rsp')[0]} <- u {_channel(one, 'ref')[0]} ({x.size} from "
+                f"{x[0]:g} to {x[-1]:g} Hz)"
+                for one, x in ((part, own), (records[0], first))
+            ]
+            what = f"has {two[0]} at other frequencies than {two[1]}"
+            raise refused(path, what, "Export all alike.")
     return first
 
 
@@ -204,10 +197,8 @@ def coherence_of(
     }
     check_complete(pairs, outputs, inputs, "coherences", path, ", or pass coherence=False")
     if any(np.size(part["data"]) != freq.size for _, part in pairs.values()):
-        raise FlexplantError(
-            f"{path!r}: coherences are at other frequencies than the responses. Export all alike, "
-            "or pass coherence=False."
-        )
+        what = "has coherences at other frequencies than the responses"
+        raise refused(path, what, "Export all alike, or pass coherence=False.")
     rows = [[np.real(pairs[a, b][1]["data"]) for b in inputs] for a in outputs]
     # single precision goes beyond 1 by its rounding
     return np.minimum(np.array(rows, dtype=np.float64), 1.0)

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS
 from ..lti.frequency import Frf
+from .paths import ONCE, at_zero, refused, unread
 from .uff_analysis import FREQUENCY_RESPONSE, AnalysisData, check_nodes, read_analysis
 from .uff_units import KINDS, ORDERS
 
@@ -46,10 +46,8 @@ def responses_of_model(
         return None
     found = sorted({KINDS[part.result] for part in parts})
     if len(found) > 1 and quantity not in found:
-        raise ModelError(
-            f"{str(path)!r} holds responses in {', '.join(found)}: one Frf is of one quantity. "
-            f"Choose: quantity={found[0]!r}."
-        )
+        do = f"One Frf is of one quantity: choose, quantity={found[0]!r}."
+        raise unread(path, f"holds responses in {', '.join(found)}", do)
     kind = quantity if quantity in found else found[0]
     parts = [part for part in parts if KINDS[part.result] == kind]
     check_nodes(parts, path)
@@ -62,10 +60,7 @@ def responses_of_model(
     data[:, motion < 3] *= length
     order = ORDERS[quantity or kind] - ORDERS[kind]
     if order < 0 and freq[0] == 0:
-        raise ModelError(
-            f"{str(path)!r} holds {kind} at zero frequency, which cannot be integrated to "
-            f"{quantity}. Read it as {kind}, or export from above zero."
-        )
+        raise at_zero(path, kind, str(quantity))
     data = data * ((2j * np.pi * freq) ** order)[:, None, None]
     seen = np.isin(motion, motion[np.any(data, axis=(0, 2))])
     names = [f"{node}:{axis}" for node in parts[0].nodes.tolist() for axis in DIRECTIONS]
@@ -84,16 +79,12 @@ def _by_load(parts: list[AnalysisData], path: Path) -> dict[int, dict[float, Ana
     for part in sorted(parts, key=lambda part: (part.load, part.freq)):
         lines = sets.setdefault(part.load, {})
         if part.freq in lines:
-            raise FlexplantError(
-                f"{str(path)!r} holds the response to load set {part.load} at {part.freq:g} Hz "
-                "twice. Export each once (one result set)."
-            )
+            what = f"holds the response to load set {part.load} at {part.freq:g} Hz twice"
+            raise refused(path, what, ONCE)
         lines[part.freq] = part
     first = next(iter(sets.values()))
     for number, lines in sets.items():
         if list(lines) != list(first):
-            raise FlexplantError(
-                f"{str(path)!r}: load set {number} is at other frequencies than load set "
-                f"{next(iter(sets))}. Export all alike."
-            )
+            other = f"has load set {number} at other frequencies than load set {next(iter(sets))}"
+            raise refused(path, other, "Export all alike.")
     return sets
