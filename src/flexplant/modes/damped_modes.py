@@ -124,6 +124,7 @@ def _ritz(
     model: FEModel, V: FloatArray, r: int, count: int, top: float
 ) -> tuple[NormalForm, np.ndarray]:
     M, D, K = (_projected(part, V) for part in (model.M, model.D, model.K))
+    K[:r], K[:, :r] = 0.0, 0.0  # rounding of stiff shapes would hold rigid-body motions
     rigid = np.eye(V.shape[1], r)
     body = V.T @ np.asarray(model.M @ model.body_motions) if model.n_unstable else rigid
     form = normal_form(M, D, K, rigid, lambda: body, lowest=max(count - r, 0))

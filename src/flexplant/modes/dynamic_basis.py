@@ -27,8 +27,8 @@ _MANY = 30
 _COUPLED = 1e-11
 #: relative: a rate of decay below this leaves a resonance without a finite response
 _UNDAMPED = 1e-9
-#: frequencies that are solved at once
-_CHUNK = 256
+#: frequencies that are solved at once, and entries of their matrices
+_CHUNK, _ENTRIES = 256, 4_000_000
 #: relative change of a direct solution by its last refinement, wanted and at most
 _SETTLED, _UNSETTLED = 1e-9, 1e-6
 
@@ -131,8 +131,11 @@ class DynamicBasis:
         """
         left, right = rows @ self.V, self.V.T @ loads
         found = np.zeros((freq.size, left.shape[0], right.shape[1]), dtype=np.complex128)
-        for begin in range(0, freq.size, _CHUNK):
-            part = slice(begin, begin + _CHUNK)
+        chunk = _CHUNK
+        if self._coupled:
+            chunk = max(1, min(chunk, _ENTRIES // self.squares.size**2))
+        for begin in range(0, freq.size, chunk):
+            part = slice(begin, begin + chunk)
             omega = 2 * np.pi * freq[part, None]
             main = self.squares + 1j * self._loss - omega**2 + 1j * omega * self._rates
             if np.any(main == 0):
