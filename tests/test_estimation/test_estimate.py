@@ -346,7 +346,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
     assert report.recovered("1 ms", "die") > 0.5
     assert np.isnan(report["static relation"]).all()
     assert "no static relation: this plant was not assembled" in repr(report)
-    with pytest.raises(ModelError, match="positive times"):
+    with pytest.raises(ModelError, match="lags must be positive"):
         kalman.report([0.0])
     with pytest.raises(LabelError, match="no row 'smooth'"):
         report["smooth"]
