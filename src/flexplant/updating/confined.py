@@ -9,14 +9,13 @@ import scipy.linalg as la
 
 from ..values import FloatArray
 from .family import Eigen, Family
+from .low_rank import ROUNDING, factors
 from .point_model import Point
 
 #: modes up to this part above the highest frequency that is compared are coordinates themselves
 BEYOND = 1.5
 #: frequencies at which the others follow a load, and part of all coordinates that pay
 SHIFTS, WORTHWHILE = 3, 0.7
-#: largest rank of one matrix of a parameter, and relative size below which one is rounding
-FEW, ROUNDING = 4, 1e-11
 #: part of the softest mode's stiffness by which rounding may leave K negative
 NEARLY = 1e-3
 
@@ -29,31 +28,13 @@ def load_vectors(family: Family, parameter: int) -> FloatArray | None:
     found: list[FloatArray] = []
     for stack in family.terms:
         for j in np.flatnonzero(np.array(family.owner) == parameter).tolist():
-            own = _factors(stack[j])
-            if own is None:
-                return None
-            found += own
+            across = np.abs(stack[j] - np.diag(np.diag(stack[j]))).max(initial=0.0)
+            if across > ROUNDING * np.abs(stack[j]).max(initial=0.0):
+                own = factors(stack[j])
+                if own is None:
+                    return None
+                found += [b for _, b in own]
     return np.array(found).reshape(-1, family.V.shape[1]).T
-
-
-def _factors(matrix: FloatArray) -> list[FloatArray] | None:
-    """Return b_i of ``A = sum_i s_i b_i b_i^T``, s = +-1, by pivots; None when there are many."""
-    size = float(np.abs(matrix).max(initial=0.0))
-    if np.abs(matrix - np.diag(np.diag(matrix))).max(initial=0.0) <= ROUNDING * size:
-        return []
-    found: list[FloatArray] = []
-    left = matrix.copy()
-    for _ in range(FEW):
-        i = int(np.argmax(np.abs(np.diag(left))))
-        pivot = float(left[i, i])
-        if abs(pivot) <= ROUNDING * size:
-            return None
-        b = left[:, i] / np.sqrt(abs(pivot))
-        left = left - np.sign(pivot) * np.outer(b, b)
-        found.append(b)
-        if np.abs(left).max() <= ROUNDING * size:
-            return found
-    return None
 
 
 def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | None:

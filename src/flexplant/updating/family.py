@@ -18,6 +18,7 @@ from ..structure.eigen import elastic_modes
 from ..structure.negative_stiffness import refuse_unstable
 from ..structure.rigid import orthonormalised
 from ..values import ComplexArray, FloatArray
+from .low_rank import turned
 from .parameters.added import Parameter
 
 #: modes whose eigenvalues differ by less than this, relatively, count as exactly repeated
@@ -107,9 +108,7 @@ class Family:
             self.massive, self.rigid = np.arange(k), np.eye(k)[:, : self.n_rigid]
             omega, self.V = _modal_basis(M, K, rigid)
             self.M, self.D, self.K = np.eye(k), self.V.T @ D @ self.V, np.diag(omega**2)
-            self.terms = [
-                self.V.T @ stack @ self.V if np.any(stack) else stack for stack in self.physical
-            ]
+            self.terms = [turned(stack, self.V) for stack in self.physical]
         self.condensed = self.massive.size < k
         self._derive(np.zeros(len(self.parameters)))
         self._weight: FloatArray | None = None
@@ -134,7 +133,7 @@ class Family:
         part.V, part.rigid = self.V @ B, B.T @ self.rigid
         part.massive = np.arange(B.shape[1])
         part.M, part.D, part.K = (B.T @ whole @ B for whole in (self.M, self.D, self.K))
-        part.terms = [np.matmul(B.T, stack @ B) for stack in self.terms]
+        part.terms = [turned(stack, B) for stack in self.terms]
         part._unchanged, part._weight = [], None
         part._derive(np.zeros(len(part.parameters)))
         return part

@@ -73,7 +73,7 @@ def localise(
     most : int
         Largest subset.
     screen : int
-        How many are fitted exactly, at most: those that explain, to first order, a quarter of what
+        How many are fitted, at most: those that explain, to first order, a quarter of what
         the best one does, and ten in any case.
     progress : bool, optional
         A bar: None shows one on a terminal for work of more than two seconds.

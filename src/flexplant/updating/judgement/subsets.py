@@ -38,7 +38,7 @@ Subset = tuple[int, ...]
 
 
 class SubsetFit(NamedTuple):
-    """The exact fit of a subset: its values (those of the nuisance last) and what it leaves."""
+    """The fit of a subset: its values (those of the nuisance last) and what it leaves."""
 
     p: FloatArray
     #: sum of squares of the residuals
