@@ -193,9 +193,9 @@ def design_feedforward(
     >>> forward = fx.design_feedforward(fx.testbeds.three_masses())
     >>> forward.gains.shape
     (1, 1, 5)
-    >>> forward
+    >>> forward.up_to("jerk")
     <Feedforward die:ref to 1 actuator>
-      x: acceleration 3  jerk 0.00225  snap 3.313e-06
+      x: acceleration 3  jerk 0.00225
     """
     loop = given if isinstance(given, ClosedLoop) else None
     plant, poi, name = tracked(given if loop is None else loop.plant, reference)
