@@ -225,7 +225,7 @@ def loaded(g):
     [
         (responses, "points", lambda g: flexplant.frequency_response(g, [1.0])),
         (responses, "points", lambda g: flexplant.frequency_response(g.replace(blocks=None), [1])),
-        (norms, "_searched", flexplant.hinf_norm),
+        (norms, "_proved", flexplant.hinf_norm),
         (h2_norms, "controllability_gramian", flexplant.h2_norm),
         (doubling, "_doubling", lambda g: control_care(g.A, g.B, Q=np.eye(2), R=np.eye(1))),
         (lyapunov, "symmetric", lambda g: solve_lyapunov(g.A, np.eye(2))),
