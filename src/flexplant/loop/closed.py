@@ -23,6 +23,7 @@ from .budget import ErrorBudget, error_budget, source_variances
 from .noise import Source, check_direct, sources, stationary_row
 from .spectrum import Spectrum, densities
 from .spill_over import SpillOver, growing_modes, high
+from .tapped import tapped
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -124,31 +125,8 @@ class ClosedLoop(Value):
     @cached_property
     def monitored(self) -> StateSpace:
         """The closed loop from w to z, y, the driven u and the monitored outputs of blocks."""
-        g, watched = self.plant.system, self.watched
-        shown = [*self.plant.z, *self.plant.y, *self.driven, *watched]
-        rows = g.output_index([*self.plant.z, *self.plant.y])
-        tapped = [*self.driven, *watched]  # inputs of the tapped plant, and outputs unchanged
-        columns = g.input_index([*self.plant.w, *self.driven])
-        extra = np.zeros((g.n_states, len(watched)))
-        fed = g.output_index(self.plant.y)
-        D = np.zeros((len(shown) + fed.size, columns.size + len(watched)))
-        D[: rows.size, : columns.size] = g.D[np.ix_(rows, columns)]
-        D[rows.size : len(shown), len(self.plant.w) :] = np.eye(len(tapped))
-        D[len(shown) :, : columns.size] = g.D[np.ix_(fed, columns)]
-        C = np.vstack([g.C[rows], np.zeros((len(tapped), g.n_states)), g.C[fed]])
-        back = [f"{name}|loop" for name in self.plant.y]
-        opened = StateSpace(
-            g.A,
-            np.hstack([g.B[:, columns], extra]),
-            C,
-            D,
-            g.dt,
-            inputs=[*self.plant.w, *tapped],
-            outputs=[*shown, *back],
-            states=g.states,
-            name=g.name,
-            units=self.units,
-        )
+        opened = tapped(self.plant, self.driven, self.watched, self.units)
+        back = opened.outputs[len(opened.outputs) - len(self.plant.y) :]
         loop = lft(opened, self.controller.replace(inputs=back))
         loop.__dict__["_poles"] = self._poles
         return loop

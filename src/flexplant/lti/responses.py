@@ -57,7 +57,7 @@ def responder(g: StateSpace) -> Responder:
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
         s, tame = points(g, freq), True
-        step = max(128, min(entries // g.n_states, freq.size // parts))
+        step = max(1, min(entries // g.n_states, max(128, freq.size // parts)))
         out = np.empty((*g.D.shape, freq.size), dtype=np.complex128)
         out[:] = g.D[:, :, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -126,11 +126,12 @@ def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
     pairs, slots, coupling = _paired(g)
     tied = np.flatnonzero(np.any(coupling, axis=0))
     head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
+    modal = max(MODAL_CHUNK, 64 * n), PARTS
     if head == n:
-        return _modal(g, pairs, slots), MODAL_CHUNK, PARTS
+        return _modal(g, pairs, slots), *modal
     if head and 4 * (n - head) <= n:
         cut = int(np.searchsorted(slots[:, 0], head))
-        return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), MODAL_CHUNK, PARTS
+        return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), *modal
     return _substitution(g, pairs, slots, coupling), *whole
 
 
