@@ -239,13 +239,21 @@ def test_the_proof_by_intervals_agrees_with_the_level_set(seed):
 
 
 def test_a_flat_gain_is_left_to_the_level_set():
-    """An all-pass beside a resonance just below it; repeated peaks in two directions."""
     lag = StateSpace([[-1.0]], [[1.0]], [[-2.0]], [[1.0]])
     assert norms._proved(lag, residues(lag)[0]) is None
-    twice = np.kron(np.eye(2), [[0, 1.0], [-1, -0.2]])
-    both = StateSpace(twice, np.eye(4)[:, 1::2], np.eye(4)[::2], np.zeros((2, 2)))
-    assert norms._proved(both, residues(both)[0]) is None
-    assert hinf_norm(both) == pytest.approx(1 / (0.2 * np.sqrt(1 - 0.01)), rel=1e-9, abs=0)
+
+
+def test_repeated_modes_share_their_peak():
+    """Two equal resonances in two directions of three, turned; a third one below them."""
+    blocks = [np.array([[0, w], [-w, -0.02 * w]]) for w in (1.0, 1.0, 5.0)]
+    turn, _ = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))
+    B, C = np.eye(6)[:, 1::2] @ turn, turn.T @ np.eye(6)[::2]
+    g = StateSpace(la.block_diag(*blocks), B, C, np.zeros((3, 3)), blocks=[2, 2, 2])
+    wanted = 1 / (0.02 * np.sqrt(1 - 1e-4))
+    for one in (g, g.replace(blocks=None)):
+        gain, freq = norms._proved(one, residues(one)[0])
+        assert gain == pytest.approx(wanted, rel=2e-9, abs=0)
+        assert freq == pytest.approx(np.sqrt(1 - 2e-4) / (2 * np.pi), rel=1e-5, abs=0)
 
 
 def test_units_scale_the_norm():

@@ -61,7 +61,7 @@ def peak_gain(sys: System, *, progress: bool | None = None) -> tuple[float, floa
 
     Newton's steps lead from the resonances to a peak. That no frequency exceeds it by 1e-9 is
     proved on intervals: by the series of ``D + sum R_i / (s - p_i)``, whose rest is bounded by the
-    distances to the poles. Where the eigenvectors of A are poor, peaks repeated or the gain flat, a
+    distances to the poles. Where the eigenvectors of A are poor or the gain is flat, a
     level set does it: the Hamiltonian matrix of that level has no eigenvalue on the imaginary axis.
     Sampled systems go through the bilinear map, which keeps gains.
 

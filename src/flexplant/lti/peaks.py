@@ -24,6 +24,8 @@ MIDDLES, HALVES = 0.5 * (CUTS[1:] + CUTS[:-1]), 0.5 * np.diff(CUTS)
 CLEAR = 1e-6
 #: entries of the largest arrays: intervals at a time, times poles or channels
 CHUNK = 1_000_000
+#: relative: eigenvalues so close to the largest are taken together with it
+TOGETHER = 1e-6
 #: radii tried around a peak, in distances to the nearest pole
 ZONES = np.array([0.4, 0.3, 0.2, 0.1, 0.03, 0.01])
 
@@ -67,6 +69,11 @@ class _Expansion(NamedTuple):
     T: list[ComplexArray]
 
     @property
+    def together(self) -> npt.NDArray[np.bool_]:
+        """Which eigenvalues (n_omega, m) count as the largest one: modes may be repeated."""
+        return np.asarray(self.values >= (1.0 - TOGETHER) * self.values[:, :1])
+
+    @property
     def slope(self) -> FloatArray:
         """First derivative of the largest eigenvalue."""
         return self.A1[:, 0, 0].real
@@ -74,8 +81,8 @@ class _Expansion(NamedTuple):
     @property
     def bend(self) -> FloatArray:
         """Half its second derivative."""
-        gaps = np.maximum(self.values[:, :1] - self.values[:, 1:], 1e-300)
-        pull = np.abs(self.A1[:, 1:, 0]) ** 2 / gaps
+        gaps = np.where(self.together, np.inf, self.values[:, :1] - self.values)
+        pull = np.abs(self.A1[:, :, 0]) ** 2 / gaps
         return np.asarray(self.A2[:, 0, 0].real + np.sum(pull, axis=1))
 
 
@@ -113,24 +120,28 @@ def _zones(
 ) -> FloatArray:
     """Return the radius around each frequency within which no gain is higher than there.
 
-    With G = T_0 + T_1 d + T_2 d^2 + O(d^3), in the singular vectors v of T_0: t - G*G is positive
-    when the Schur complement of its first entry is, for which bounds of the others suffice.
+    With G = T_0 + T_1 d + T_2 d^2 + O(d^3), in the singular vectors of T_0: t - G*G is positive
+    definite when the Schur complement of the block of its largest eigenvalue is, for which bounds
+    of the others suffice.
     """
     t0, t1, t2 = (np.linalg.norm(T, axis=(1, 2))[:, None] for T in one.T)
     r = near[:, None] * ZONES  # (n_omega, n_zones)
     beta = model.rest(np.repeat(omega, ZONES.size), r.reshape(-1), 2).reshape(r.shape)
     whole = t0 + t1 * r + t2 * r**2
     cubic = 2 * t1 * t2 + t2**2 * r + 2 * beta * whole + beta**2 * r**3
-    top = one.values[:, :1]
-    spread = np.linalg.norm(one.A1, axis=(1, 2))[:, None] * r
-    spread = spread + np.linalg.norm(one.A2, axis=(1, 2))[:, None] * r**2 + cubic * r**3
-    gaps = top[:, :, None] - one.values[:, None, 1:] - spread[:, :, None]
-    along = np.abs(one.A1[:, None, 1:, 0]) + np.abs(one.A2[:, None, 1:, 0]) * r[:, :, None]
-    along = along + (cubic * r**2)[:, :, None]
-    free = np.all(gaps > 0.0, axis=2)
+    top, first = one.values[:, :1], one.together
+    size1, size2 = (np.linalg.norm(A, axis=(1, 2))[:, None] for A in (one.A1, one.A2))
+    spread = size1 * r + size2 * r**2 + cubic * r**3
+    gaps = np.where(first[:, None], np.inf, (top - one.values)[:, None] - spread[:, :, None])
+    along1, along2 = (np.linalg.norm(A * first[:, None], axis=2)[:, None] for A in (one.A1, one.A2))
+    along = along1 + along2 * r[:, :, None] + (cubic * r**2)[:, :, None]
     pull = np.sum(along**2 / np.where(gaps > 0.0, gaps, 1.0), axis=2)
-    fall = -(one.A2[:, 0, 0].real[:, None] + cubic * r + pull)
-    fits = free & (fall > 0.0) & (one.slope[:, None] ** 2 <= 8.0 * tolerance * top * fall)
+    block = first[:, :, None] & first[:, None]
+    slope = np.linalg.norm(one.A1 * block, axis=(1, 2))[:, None]
+    others = np.eye(first.shape[1]) * np.where(first, 0.0, -2.0 * size2)[:, None]
+    bend = np.linalg.eigvalsh(one.A2 * block + others)[:, -1:]
+    fall = -(bend + cubic * r + pull)
+    fits = np.all(gaps > 0.0, axis=2) & (fall > 0.0) & (slope**2 <= 8.0 * tolerance * top * fall)
     return np.asarray(np.max(np.where(fits, r, 0.0), axis=1))
 
 
