@@ -35,7 +35,7 @@ def certified_norm(
     Returns
     -------
     dict
-        `norm` by level sets on a Hamiltonian, `swept norm` by a sweep refined at the resonances,
+        `norm` by `peak_gain`, with proof; `swept norm` by a sweep refined at the resonances,
         `spectral radius` when sampled, else `largest real part` [rad/s], and `claim`.
 
     Raises
@@ -58,7 +58,7 @@ def certified_norm(
     swept = swept_norm(loop, respond)
     if not abs(norm - swept) <= AGREEMENT * norm:
         raise CertificateError(
-            f"two routes to the norm disagree: {norm:.6g} by level sets, {swept:.6g} by a sweep. "
+            f"two routes to the norm disagree: {norm:.6g} with proof, {swept:.6g} by a sweep. "
             "The loop is too badly conditioned to trust; loosen the weights."
         )
     if norm > claim * (1.0 + AGREEMENT):

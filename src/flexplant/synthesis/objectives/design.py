@@ -49,7 +49,7 @@ def design_lmi(
     Mixed H2/H-infinity is ``minimize=H2(...), subject_to=[Hinf(..., below=...)]``. All objectives
     share one Lyapunov matrix, which makes the problem convex and its optimum an upper bound: a
     controller may exist that does better. What is reached is found anew from the closed loop:
-    H-infinity by level sets, H2 by Gramians, peaks by the impulse response, poles as eigenvalues.
+    H-infinity by `hinf_norm`, H2 by Gramians, peaks by the impulse response, poles as eigenvalues.
 
     Parameters
     ----------

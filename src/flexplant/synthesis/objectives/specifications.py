@@ -98,7 +98,7 @@ class Hinf(_ChannelNorm):
     """
 
     def measured(self, closed: StateSpace) -> float:
-        """Return the norm of a closed loop by level sets."""
+        """Return the norm of a closed loop."""
         return peak_gain(closed)[0]
 
 
