@@ -215,6 +215,6 @@ def _examined(
 
 def _largest(X: ComplexArray) -> FloatArray:
     """Return the largest singular value of each of a stack of matrices."""
-    if X.shape[-1] == 1:
+    if X.shape[-1] == 1 or not X.size:
         return np.asarray(np.linalg.norm(X, axis=(-2, -1)))
     return np.asarray(np.linalg.svd(X, compute_uv=False)[..., 0])
