@@ -65,7 +65,7 @@ def test_weights_near_half_the_rate_are_refused(filtered):
 def test_points_as_keys_are_drawn():
     pair = fx.Sensor("pair", at={CORNERS[0]: 0.5, CORNERS[3]: 0.5}, asd=NOISE)
     ax = fx.plot.layout(some_modes().dofs, ports=fx.Ports(y=[pair]))
-    drawn = [line.get_xydata() for line in ax.lines if line.get_label() == "sensors y"]
+    drawn = [line.get_xydata() for line in ax.lines if line.get_label() == "sensors"]
     np.testing.assert_allclose(drawn[0], [[300.0, 300.0]])
 
 
