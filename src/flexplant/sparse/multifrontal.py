@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import scipy.linalg as la
 import scipy.sparse as sp
 from scipy.linalg import blas, lapack
 
@@ -152,16 +151,15 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
                     b[front.rows] -= below @ y
                     blas.dsyrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
                 continue
-            # A = G S G^T, signs in S
             y, moved, signs = _signed(kept, y, below)
             negative += int(np.count_nonzero(signs < 0))
             energy += np.sum(signs[:, None] * y**2, axis=0)
             if front.rows.size:
-                b[front.rows] -= moved.T @ (signs[:, None] * y)
-                for sign in (1.0, -1.0):
-                    some = np.asfortranarray(moved[signs == sign].T)
-                    if some.shape[1]:
-                        blas.dsyrk(-sign, some, beta=1.0, c=rest, lower=1, overwrite_c=1)
+                b[front.rows] -= moved @ (signs[:, None] * y)
+                blas.dsyrk(-1.0, moved, beta=1.0, c=rest, lower=1, overwrite_c=1)
+                # the few with a negative sign are added, not taken away
+                few = np.asfortranarray(moved[:, signs < 0])
+                blas.dsyrk(2.0, few, beta=1.0, c=rest, lower=1, overwrite_c=1)
     if not np.all(np.abs(energy - wanted) <= _ENERGY * size):
         raise SolverError(
             f"a count of eigenvalues by L D L^T is not accurate (energies differ by "
@@ -174,31 +172,48 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
 def _signed(
     block: FloatArray, y: FloatArray, below: FloatArray
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return G^-1 y, G^-1 below^T and s of +1 and -1, ``A = G diag(s) G^T`` (Bunch-Kaufman)."""
-    block = np.tril(block) + np.tril(block, -1).T
-    factor, middle, order = la.ldl(block, lower=True, check_finite=False)
-    main, off = np.diag(middle).copy(), np.diag(middle, -1).copy()
-    pairs = np.flatnonzero(off)
+    """Return G^-1 y, below G^-T and s of +1 and -1, ``A = G diag(s) G^T`` (Bunch-Kaufman).
+
+    The lower triangle of A is overwritten.
+    """
+    work, _ = lapack.dsytrf_lwork(block.shape[0], lower=1)
+    block, exchanges, _ = lapack.dsytrf(block, lower=1, lwork=int(work), overwrite_a=1)
+    factor, off, _ = lapack.dsyconv(block, exchanges, lower=1, overwrite_a=1)
+    order = _exchanged(exchanges)
+    y = blas.dtrsm(1.0, factor, y[order], lower=1, diag=1)
+    below = below.T[order].T
+    if below.size:
+        below = blas.dtrsm(1.0, factor, below, side=1, lower=1, trans_a=1, diag=1, overwrite_b=1)
+    main = np.diag(factor).copy()
     # 2 x 2 pivots by a rotation each
-    cosine, sine = np.ones(main.size), np.zeros(main.size)
-    for i in pairs:
-        values, vectors = la.eigh(middle[i : i + 2, i : i + 2])
-        main[i : i + 2] = values
-        cosine[i], sine[i] = vectors[0, 0], vectors[1, 0]
-        cosine[i + 1], sine[i + 1] = vectors[1, 1], vectors[0, 1]
+    one = np.flatnonzero(off)
+    two = one + 1
+    pivots = np.array([[main[one], off[one]], [off[one], main[two]]]).transpose(2, 0, 1)
+    values, turn = np.linalg.eigh(pivots)
+    main[one], main[two] = values.T
+    for part in (y, below.T):
+        part[one], part[two] = (
+            turn[:, 0, j, None] * part[one] + turn[:, 1, j, None] * part[two] for j in (0, 1)
+        )
     if np.any(main == 0):
         raise SolverError(
             "a count of eigenvalues by L D L^T met a zero pivot: the shift hits an eigenvalue. "
             "Count at another frequency."
         )
-    right = np.asfortranarray(np.hstack([y, below.T])[order])
-    right = blas.dtrsm(1.0, factor[order], right, lower=1, diag=1, overwrite_b=1)
-    turned = cosine[:, None] * right
-    turned[pairs] += sine[pairs, None] * right[pairs + 1]
-    turned[pairs + 1] += sine[pairs + 1, None] * right[pairs]
-    turned /= np.sqrt(np.abs(main))[:, None]
-    width = y.shape[1]
-    return turned[:, :width], turned[:, width:], np.sign(main)
+    scale = np.sqrt(np.abs(main))
+    return y / scale[:, None], below / scale, np.sign(main)
+
+
+def _exchanged(exchanges: IntArray) -> IntArray:
+    """Return the order of the rows after LAPACK's exchanges by Bunch-Kaufman, lower triangle."""
+    order = np.arange(exchanges.size)
+    k = 0
+    while k < order.size:
+        pair = exchanges[k] < 0
+        last, other = k + int(pair), abs(int(exchanges[k])) - 1
+        order[[last, other]] = order[[other, last]]
+        k = last + 1
+    return order
 
 
 def assembled(
