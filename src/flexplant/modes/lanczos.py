@@ -9,7 +9,7 @@ import scipy.linalg as la
 
 from ..errors import SolverError
 from ..progress import tick
-from ..sparse.factor import by_rows
+from ..sparse.factor import by_rows, without_zeros
 from ..values import FloatArray, Matrix, Rng
 
 #: vectors that are solved for at a time
@@ -73,7 +73,7 @@ class BlockLanczos:
         start: FloatArray | None = None,
     ) -> None:
         self._solve = solve
-        self._M = by_rows(M)
+        self._M = without_zeros(by_rows(M))
         n, self._r = locked.shape
         self._block = min(block, n - self._r)
         self._rng = np.random.default_rng(rng)

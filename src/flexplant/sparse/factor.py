@@ -16,6 +16,8 @@ from .ordering import dissect
 
 #: up to this many DOFs dense LAPACK is as fast as a sparse factorisation, and safer
 DENSE_LIMIT = 1500
+#: stored zeros are left out for products where fewer entries than this part are none
+_FULL = 0.8
 #: from here on a bound by Lanczos is cheaper than a factorisation
 _BOUND_LIMIT = 10_000
 #: steps of that bound, and the chance that it is wrong
@@ -42,6 +44,16 @@ def by_rows(matrix: Any) -> Any:
         return given
     stored: Any = sp.csc_array(given)
     return sp.csr_array((stored.data, stored.indices, stored.indptr), shape=stored.shape)
+
+
+def without_zeros(matrix: Any) -> Any:
+    """Return a sparse matrix without stored zeros, a copy where there are many."""
+    given: Any = matrix
+    if not sp.issparse(matrix) or np.count_nonzero(given.data) > _FULL * given.nnz:
+        return given
+    kept = given.copy()
+    kept.eliminate_zeros()
+    return kept
 
 
 def diagonal(matrix: Matrix) -> FloatArray:
