@@ -17,6 +17,7 @@ from flexplant.labels import DofSet
 from flexplant.lti import Frf, frequency_response
 from flexplant.modes import Modes, solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
+from flexplant.plant.uncertainty.delta_channels import delta_channels
 from flexplant.structure import ModalDamping, chain
 
 DOFS = DofSet([1, 2, 3], ["z"] * 3, [[0.0, 0, 0], [1.0, 0, 0], [2.0, 0, 0]])
@@ -71,9 +72,12 @@ def test_a_value_of_delta_is_the_plant_with_that_shape():
     drawn = [m.assembled.realisation.inputs[:, 3] - phi[:, 1] for m in uncertain.sample(1, 400)]
     wanted = shapes[0] @ shapes[0].T
     np.testing.assert_allclose(np.cov(np.array(drawn).T), wanted, atol=0.2 * np.trace(wanted))
-    # channels are side by side for a sampled plant too
-    sampled = plant.discretized(2e3).uncertain(measured, shapes=shapes, deviations=1.0)
-    assert sampled.lft({"mode3:shape1": 1.0}).dt == pytest.approx(5e-4)
+    # sampled: of positions as good as affine, with the channels of each Delta side by side
+    seen = plant.with_ports(PORTS.replace(y=[Sensor("y1", at="1:z")])).discretized(2e3)
+    sampled = seen.uncertain(measured, shapes=shapes, deviations=1.0)
+    found = delta_channels(sampled)
+    assert found.distance < 1e-4
+    assert dict(found.deltas)["mode3:shape1"] == 2
     with pytest.raises(ShapeError, match="shapes"):
         plant.uncertain(measured, shapes=shapes[:, :2])
     silent = np.zeros((2, 3, 1))
