@@ -183,6 +183,7 @@ def test_the_stationary_filter_in_blocks_is_the_plain_loop():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "method",
     [
@@ -352,6 +353,7 @@ def test_the_report_by_lag_is_that_of_the_estimates():
         report["smooth"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("truncated", [False, pytest.param(True, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("method", [Predictor(), Filter(), FixedLag(4), Smoother()])
 def test_a_moving_poi_is_at_each_sample_a_poi_that_stands_there(method, truncated):

@@ -170,6 +170,7 @@ def test_one_machine_alone_is_its_kalman_filter():
     assert found.certificate.lower == pytest.approx(1.0, rel=1e-6, abs=0)
 
 
+@pytest.mark.slow
 def test_refusals():
     with pytest.raises(ModelError, match="at least one StandardPlant"):
         design_minimax_filter(plate(), [])

@@ -51,6 +51,7 @@ def test_an_frf_of_the_model_gives_what_the_model_gives(quantity):
         np.testing.assert_allclose(at_y.data, wanted.data, rtol=1e-6, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_channels_of_the_frf_in_any_order_and_more_of_them():
     loop, freq = loop_of(), np.geomspace(5.0, 500.0, 20)
     frf = frf_of(loop, freq)

@@ -60,6 +60,7 @@ def test_leadlag(zero, pole, gain):
     assert turn >= -1e-12 if zero <= pole else turn <= 1e-12
 
 
+@pytest.mark.slow
 @given(FREQS, st.floats(1.05, 10.0), st.floats(1e-6, 0.5), st.sampled_from([1, 2]))
 def test_inverse_sensitivity_crosses_at_the_bandwidth(bandwidth, peak, floor, slope):
     sys = inverse_sensitivity(bandwidth, peak=peak, floor=floor, slope=slope)

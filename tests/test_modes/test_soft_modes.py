@@ -62,6 +62,7 @@ def test_a_fine_clamped_beam(elements):
     assert modes.certificate["orthonormality"] < 1e-13
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "elements", [50, 400, pytest.param(700, marks=pytest.mark.slow), 751, 2000]
 )
@@ -104,6 +105,7 @@ def test_soft_springs_beside_extended_precision(stiffness, route, monkeypatch):
     assert ("counted" in modes.certificate) == (route == "sparse")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "stiffness", [1e-3, *(pytest.param(k, marks=pytest.mark.slow) for k in (0.1, 10.0, 1e3)), 1e5]
 )
@@ -161,6 +163,7 @@ def test_a_soft_suspension_of_a_small_plate_is_found_down_to_a_hundredth_of_a_he
         assert np.abs(error).max() < 5e-5 * hertz**2 + 1e-7 + modes.rounding[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("elements", "inertia"), [((10, 10), 1e-12), ((24, 24), 1e-12)])
 def test_lumped_masses_with_next_to_no_rotary_inertia(elements, inertia):
     """As condensing the rotations does, exact for none: dense, by another route."""

@@ -66,6 +66,7 @@ def test_frequencies_are_the_oracle_s(plate):
     np.testing.assert_allclose(solve_modes(plate).omega[3:], omega[3:], rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_rectangular_refined_plates():
     freq = solve_modes(make_plate(elements=(16, 16)), count=7).freq[3:]
     np.testing.assert_allclose(freq, [245.50, 358.98, 462.33, 640.01], atol=0.006)

@@ -135,6 +135,7 @@ def test_optima_are_proven_and_no_bound_is_above_any_truth(case, side):
             assert tangent.least(part, at)[0] <= least * (1 + 1e-7)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("side", [pytest.param("y", marks=pytest.mark.slow), "u"])
 def test_branches_find_what_every_subset_shows(make, monkeypatch, side):
     """With branches of a few choices only; required candidates stay, a gap is kept to."""

@@ -88,6 +88,7 @@ def machine(make):
     return plant, *on_grid
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", CASES)
 @pytest.mark.parametrize("side", ["y", pytest.param("u", marks=pytest.mark.slow)])
 def test_every_search_finds_the_best_that_satisfies(machine, monkeypatch, kind, side):

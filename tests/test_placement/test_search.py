@@ -45,6 +45,7 @@ def test_sensors_equal_every_subset_and_the_bound_bounds(make, seed, total, coun
     assert found.value == pytest.approx(criterion(found.on(plant)), rel=1e-9, abs=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("seed", "total", "count"), CASES[:3])
 @pytest.mark.parametrize("delay", [1.0, 0.4])
 def test_actuators_equal_every_subset_and_the_bound_bounds(make, seed, total, count, delay):
@@ -60,6 +61,7 @@ def test_actuators_equal_every_subset_and_the_bound_bounds(make, seed, total, co
     assert found.value == pytest.approx(criterion(found.on(plant)), rel=1e-6, abs=0.0)
 
 
+@pytest.mark.slow
 def test_exchanges_score_only_what_a_bound_leaves(make, monkeypatch):
     """The tangent at a choice excludes most of the exchanges; the answer is the same."""
     plant, sensors, _ = make(5, count=36)

@@ -27,6 +27,7 @@ def machine(*, doubled, latency=0.0, dynamics=AMP):
     return base.replace(w=w if doubled else [], u=u, y=y, references=())
 
 
+@pytest.mark.slow
 def test_noise_of_amplifiers_is_that_of_doubled_ones_without_their_states():
     model = reduced()
     plants = [

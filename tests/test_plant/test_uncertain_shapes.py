@@ -39,6 +39,7 @@ def three_modes(phi):
     return Modes(omega, np.array([0.0, 0.01, 0.02]), phi, DOFS, n_rigid=1)
 
 
+@pytest.mark.slow
 def test_a_value_of_delta_is_the_plant_with_that_shape():
     """Displacement, velocity, acceleration and POI; frequency and two shapes at once."""
     rng = np.random.default_rng(0)

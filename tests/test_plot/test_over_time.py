@@ -114,6 +114,7 @@ def estimate_of(white):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_innovations_beside_their_bounds():
     """White innovations stay inside; larger ones leave the first panel, coloured ones the rest."""
     white = np.random.default_rng(5).standard_normal((6000, 2))

@@ -76,6 +76,7 @@ def covered(ax):
     return sum(box.contains(*p) for p in seen)
 
 
+@pytest.mark.slow
 def test_legends_cover_no_line():
     """New axes have theirs beside them, wherever the lines go; given ones in an empty corner."""
     noise = np.random.default_rng(1).standard_normal((2, 50))
@@ -303,6 +304,7 @@ def test_predictions_beside_what_was_found():
         fx.plot.predictions({"none": [(0.0, 1.0, 0.9, 1.1)]})
 
 
+@pytest.mark.slow
 def test_an_estimate_with_its_band_and_what_waiting_brings():
     observer = fx.design_kalman(sampled(some_modes()))
     report = observer.report()

@@ -105,6 +105,7 @@ def test_the_asked_bandwidth_is_reached_on_model_and_machine(on):
     assert S[0] < 0.1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("channel", range(4))
 @pytest.mark.parametrize("side", ["u", "y"])
 def test_one_flipped_sign_is_refused(side, channel):
@@ -128,6 +129,7 @@ def test_delay_costs():
     assert slow.system.n_states == stage()[3].system.n_states + 16
 
 
+@pytest.mark.slow
 def test_python_control_systems_serve_and_give_the_same():
     _, _, problem, found = stage()
     other = design_hinf(problem.to_control(), u=problem.u, y=problem.y)

@@ -128,6 +128,7 @@ def test_scalar_output_feedback_equals_the_root_of_its_riccati_equations(a):
     check(scalar(a, 1.0), output_feedback_gamma(a), bound=1e-5)
 
 
+@pytest.mark.slow
 # AC4 and HE1: the smallest gamma is only approached as the Lyapunov matrices grow without bound
 @pytest.mark.parametrize(
     "name", [*SMALL[:5], *(pytest.param(name, marks=pytest.mark.slow) for name in SMALL[5:])]

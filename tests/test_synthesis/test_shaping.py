@@ -160,6 +160,7 @@ def test_the_stage_follows_its_reference():
         shape_loop(sampled(small(12), ports()), bandwidth=120.0, model=100.0, larger=many())
 
 
+@pytest.mark.slow
 def test_what_does_not_go_together_is_refused():
     G = mechanism(2e4)
     with pytest.raises(ModelError, match="needs a model"):

@@ -105,6 +105,7 @@ def test_a_design_on_24_modes_that_the_others_make_unstable_is_warned_of():
     assert "unstable" in repr(found) and "modes left out" in repr(found)
 
 
+@pytest.mark.slow
 def test_the_named_modes_are_the_cause():
     """Without them, and with all others, the loop is stable."""
     errors, _, found, _ = design()
@@ -172,6 +173,7 @@ def test_the_reduced_model_knows_its_modes_by_itself():
     assert "with the modes left out: stable" in repr(loop)
 
 
+@pytest.mark.slow
 def test_where_none_are_known_the_answer_says_so():
     errors, problem, _, _ = design()
     found = design_hinf(problem)
@@ -270,6 +272,7 @@ def test_every_design_is_warned_of_modes_left_out_that_bring_the_peak_above_8_db
         assert f"dB without them: mode {number} (" in said
 
 
+@pytest.mark.slow
 def test_a_continuous_design_is_checked_in_continuous_time():
     plant = assemble_plant(small(), ports())
     _, problem = weighted(plant, 50.0)
@@ -280,6 +283,7 @@ def test_a_continuous_design_is_checked_in_continuous_time():
         _ = found.left_out.spectral_radius
 
 
+@pytest.mark.slow
 def test_what_does_not_go_with_the_plant_is_refused():
     _, problem, found, _ = design()
     with pytest.raises(LabelError, match="other channels"):

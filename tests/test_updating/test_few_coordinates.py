@@ -60,6 +60,7 @@ def test_few_coordinates_give_the_modes_of_all(family):
         assert np.linalg.norm(rest) < 1e-6 * np.linalg.norm(b)
 
 
+@pytest.mark.slow
 def test_localisation_is_that_in_all_coordinates(plate, monkeypatch):
     """Poles and shapes; candidates that do not couple by few forces beside those that do."""
     rom = plate.reduced(0.01, True)

@@ -312,6 +312,7 @@ def test_losses_have_the_derivatives_they_state(name):
     np.testing.assert_allclose(rho(np.full(5, 1e-6))[:2], [[1e-6] * 5, [1.0] * 5], rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_lasso_finds_the_one_changed_spring(chain):
     pytest.importorskip("cvxpy")
     parts = changed(chain, stiffness=[(2, 12.0)])

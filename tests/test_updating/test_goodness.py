@@ -134,6 +134,7 @@ def changed_plate(plate, zeta, mass, stiffer):
     return M, D, (1 + stiffer) * K
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("zeta", "mass", "stiffer"),
     [(0.01, 0.7, -0.09), pytest.param(0.002, 0.6, 0.05, marks=pytest.mark.slow)],
@@ -172,6 +173,7 @@ def test_responses_are_fitted_from_far_away(plate, zeta, mass, stiffer):
     assert abs(near.values[0] - mass) > 0.2 * mass
 
 
+@pytest.mark.slow
 def test_poles_come_before_shapes(plate):
     """Two masses and a modulus: shapes from far away lead astray, poles do not."""
     near = plate.model.dofs.nearest((0.15, 0.45, 0.0), "z")
