@@ -7,6 +7,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from scipy.sparse import csgraph
 
 from ..errors import ModelError
 from ..parallel import one_thread
@@ -121,8 +122,8 @@ def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
     n, m = g.B.shape
     whole = CHUNK // (m + 2), 1
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
-        owner = _components(g.A)
-        return _side_by_side(g, owner) if np.any(owner) else _schur(g), *whole
+        count, owner = csgraph.connected_components(g.A != 0, directed=False)
+        return _side_by_side(g, owner) if count > 1 else _schur(g), *whole
     pairs, slots, coupling = _paired(g)
     tied = np.flatnonzero(np.any(coupling, axis=0))
     head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
@@ -135,23 +136,10 @@ def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
     return _substitution(g, pairs, slots, coupling), *whole
 
 
-def _components(A: FloatArray) -> IntArray:
-    """Return the first state that each state is tied to, by any path."""
-    tied = (A != 0) | (A.T != 0)
-    np.fill_diagonal(tied, True)
-    owner = np.arange(len(A))
-    while True:
-        before = owner
-        owner = np.where(tied, owner, len(A)).min(axis=1)
-        owner = owner[owner]
-        if np.array_equal(owner, before):
-            return np.asarray(owner)
-
-
-def _side_by_side(g: StateSpace | Part, owner: IntArray) -> Solver:
+def _side_by_side(g: StateSpace | Part, owner: npt.NDArray[np.int32]) -> Solver:
     """Systems that share no state, such as the axes of a servo: each with its own channels."""
     solvers = []
-    for own in (np.flatnonzero(owner == i) for i in np.unique(owner)):
+    for own in (np.flatnonzero(owner == i) for i in range(owner.max() + 1)):
         fed, seen = np.flatnonzero(g.B[own].any(axis=0)), np.flatnonzero(g.C[:, own].any(axis=1))
         if not fed.size * seen.size:
             continue
