@@ -31,6 +31,10 @@ class Value(ABC):  # noqa: B024 - its kinds have abstract methods
         super().__init_subclass__(**kwargs)
         Value.registry[cls.__name__] = cls
 
+    def __post_init__(self) -> None:
+        """Make what is given read-only; a kind that checks it does both in a method of its own."""
+        self._set(**self._fields())
+
     def _set(self, **values: Any) -> None:
         """Set fields during construction; arrays become read-only copies."""
         for name, value in values.items():

@@ -76,9 +76,6 @@ class KalmanEstimator(Value):
     variances: FloatArray
     left_out: LeftOut | None = None
 
-    def __post_init__(self) -> None:
-        self._set(gain=self.gain, covariance=self.covariance, variances=self.variances)
-
     def __repr__(self) -> str:
         channels = poi_channels(self.plant)
         rms = sizes_of({name: self.rms(name) for name in channels[:4]}, self.plant.units)

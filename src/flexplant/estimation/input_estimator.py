@@ -86,9 +86,6 @@ class InputEstimator(Value):
     invertibility: Invertibility
     certificate: InputCertificate
 
-    def __post_init__(self) -> None:
-        self._set(variances=self.variances, input_variances=self.input_variances)
-
     def __repr__(self) -> str:
         names = [*poi_channels(self.plant), *self.inputs]
         rms = sizes_of({name: self.rms(name) for name in names[:6]}, self.plant.units)

@@ -70,9 +70,6 @@ class Invertibility(Value):
     zeros: ComplexArray
     dt: float
 
-    def __post_init__(self) -> None:
-        self._set(zeros=self.zeros)
-
     def __repr__(self) -> str:
         holds = "holds" if self.holds else "does not hold"
         return f"<Invertibility {holds}: {self.text}>"

@@ -63,9 +63,6 @@ class LeftOut(Value):
     plant: StandardPlant
     larger: StandardPlant | None = None
 
-    def __post_init__(self) -> None:
-        self._set(modes=self.modes, sensors=self.sensors, pois=self.pois, cross=self.cross)
-
     def __repr__(self) -> str:
         return f"<LeftOut: {counted(self.modes.size, 'mode')} as noise and static compliance>"
 

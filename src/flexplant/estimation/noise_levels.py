@@ -60,9 +60,6 @@ class NoiseLevels(Value):
     nis: float
     samples: int
 
-    def __post_init__(self) -> None:
-        self._set(ratios=self.ratios, covariance=self.covariance, start=self.start)
-
     def __repr__(self) -> str:
         shown = [
             f"  {name} {ratio:.4g} times the given density, +- {100 * self.relative[name]:.2g} %"

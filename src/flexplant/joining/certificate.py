@@ -76,9 +76,6 @@ class JoiningCertificate(Value):
     rigid_force: float
     patches: Mapping[str, float]
 
-    def __post_init__(self) -> None:
-        self._set(rigid=self.rigid, pieces=self.pieces, patches=self.patches)
-
     def __repr__(self) -> str:
         before = ", ".join(f"{name} {count}" for name, count in self.rigid.items())
         pieces = "one piece"

@@ -46,9 +46,6 @@ class PlacedShape(Interpolation):
     pose: Pose
     C: sp.csc_array
 
-    def __post_init__(self) -> None:
-        self._set(C=self.C)
-
     def __repr__(self) -> str:
         return f"<PlacedShape of {self.own!r}>"
 

@@ -55,9 +55,6 @@ class BalancedReduction(Value):
     error_freq: float
     n_kept: int
 
-    def __post_init__(self) -> None:
-        self._set(hankel=self.hankel)
-
     def __repr__(self) -> str:
         full = self.hankel.size + self.n_kept
         promised = f"bound {self.bound:.3g}" if np.isfinite(self.bound) else "no bound (weighted)"

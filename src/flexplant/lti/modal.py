@@ -49,9 +49,6 @@ class ModalForm(Value):
     residual: float
     reason: str = ""
 
-    def __post_init__(self) -> None:
-        self._set(transformation=self.transformation)
-
     def __repr__(self) -> str:
         found = self.reason or f"{len(self.system.blocks or ())} blocks"
         return f"<ModalForm: {found}, condition {self.condition:.1e}>"

@@ -53,9 +53,6 @@ class RiccatiSolution(Value):
     residual: float
     iterations: int
 
-    def __post_init__(self) -> None:
-        self._set(P=self.P, gain=self.gain, poles=self.poles)
-
     def __repr__(self) -> str:
         return (
             f"<RiccatiSolution: {counted(self.P.shape[0], 'state')}, residual {self.residual:.1e}, "

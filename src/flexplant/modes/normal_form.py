@@ -61,10 +61,6 @@ class NormalForm(Value):
     overdamped: FloatArray = field(default_factory=lambda: np.zeros(0))
     overdamped_phi: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
 
-    def __post_init__(self) -> None:
-        self._set(poles=self.poles, phi=self.phi, decaying=self.decaying)
-        self._set(overdamped=self.overdamped, overdamped_phi=self.overdamped_phi)
-
     def __repr__(self) -> str:
         kind = "real" if self.is_real else "complex"
         more = f", {counted(self.overdamped.size, 'real pole')}" if self.overdamped.size else ""

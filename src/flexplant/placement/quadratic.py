@@ -57,9 +57,6 @@ class Quadratic(Value, Convex):
     owned: IntArray
     constant: float
 
-    def __post_init__(self) -> None:
-        self._set(A=self.A, H=self.H, S=self.S, items=self.items, owned=self.owned)
-
     def value(self, chosen: Sequence[int]) -> float:
         """Return J with some candidates.
 

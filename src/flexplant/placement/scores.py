@@ -61,9 +61,6 @@ class Scores(Value):
     side: Side
     unit: str = ""
 
-    def __post_init__(self) -> None:
-        self._set(values=self.values, order=self.order)
-
     def __len__(self) -> int:
         return len(self.layouts)
 

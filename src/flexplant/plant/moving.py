@@ -52,9 +52,6 @@ class Along(Value):
     D: FloatArray
     B: FloatArray
 
-    def __post_init__(self) -> None:
-        self._set(points=self.points, C=self.C, D=self.D, B=self.B)
-
     def __repr__(self) -> str:
         return f"<Along {counted(self.points.shape[0], 'point')}: {', '.join(self.channels)}>"
 

@@ -59,9 +59,6 @@ class Assembled(_Unknown, Value):
     delay: float = 0.0
     continuous: Any = None
 
-    def __post_init__(self) -> None:
-        self._set(noise_factor=self.noise_factor)
-
     def __repr__(self) -> str:
         return f"<Assembled: {type(self.realisation.model).__name__}, {self.ports!r}>"
 
@@ -97,9 +94,6 @@ class Foreign(_Unknown, Value):
     noise_factor: FloatArray | None = None
     delay: float = 0.0
     continuous: Any = None
-
-    def __post_init__(self) -> None:
-        self._set(noise_factor=self.noise_factor)
 
 
 @dataclass(frozen=True, eq=False)

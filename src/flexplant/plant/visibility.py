@@ -53,9 +53,6 @@ class ModeVisibility(Value):
     shares: dict[str, float]
     channels: dict[str, str]
 
-    def __post_init__(self) -> None:
-        self._set(shares=self.shares, channels=self.channels)
-
     @property
     def weak(self) -> tuple[str, ...]:
         """What is below one percent, in words."""

@@ -50,9 +50,6 @@ class ErrorMap(Value):
     msd: FloatArray
     window: float
 
-    def __post_init__(self) -> None:
-        self._set(points=self.points, ma=self.ma, msd=self.msd)
-
     def __repr__(self) -> str:
         window = f"windows of {1e3 * self.window:g} ms"
         lines = [f"<ErrorMap {counted(len(self.points), 'point')} along {self.axis}, {window}>"]

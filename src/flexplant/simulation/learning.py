@@ -48,9 +48,6 @@ class LearnedFeedforward(Value):
     errors: FloatArray
     gains: FloatArray
 
-    def __post_init__(self) -> None:
-        self._set(errors=self.errors, gains=self.gains)
-
     def __repr__(self) -> str:
         lines = [f"<LearnedFeedforward {counted(self.errors.size, 'move')}>"]
         lines += [f"  move {i}: rms {with_unit(e, 'm')}" for i, e in enumerate(self.errors[:5], 1)]

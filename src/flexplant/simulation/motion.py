@@ -86,15 +86,6 @@ class SetPoint(Value):
     gridded: bool
     exposures: FloatArray
 
-    def __post_init__(self) -> None:
-        self._set(
-            edges=self.edges,
-            lengths=self.lengths,
-            from_end=self.from_end,
-            states=self.states,
-            exposures=self.exposures,
-        )
-
     def __repr__(self) -> str:
         peak = self.peaks
         windows = f", {counted(len(self.exposures), 'exposure')}" if len(self.exposures) else ""

@@ -49,14 +49,6 @@ class History(Value):
     error: FloatArray
     fraction: FloatArray
 
-    def __post_init__(self) -> None:
-        self._set(
-            parameters=self.parameters,
-            eigenvalues=self.eigenvalues,
-            error=self.error,
-            fraction=self.fraction,
-        )
-
     def __len__(self) -> int:
         return int(self.error.size) - 1
 
@@ -94,9 +86,6 @@ class Starts(Value):
     begin: FloatArray
     end: FloatArray
     cost: FloatArray
-
-    def __post_init__(self) -> None:
-        self._set(begin=self.begin, end=self.end, cost=self.cost)
 
     def __len__(self) -> int:
         return int(self.cost.size)
@@ -182,10 +171,6 @@ class UpdateResult(Value):
     chi2: float | None = None
     dof: int = 0
     rounds: FloatArray | None = None
-
-    def __post_init__(self) -> None:
-        self._set(values=self.values, covariance=self.covariance, correlation=self.correlation)
-        self._set(rounds=self.rounds)
 
     def __getitem__(self, name: str) -> float:
         if name not in self.parameters:

@@ -61,9 +61,6 @@ class Decoupling(Value):
     centre: FloatArray
     axes: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        self._set(mass=self.mass, centre=self.centre)
-
     def __repr__(self) -> str:
         at = ", ".join(f"{c:.4g}" for c in self.centre)
         return (

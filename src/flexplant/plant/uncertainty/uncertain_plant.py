@@ -62,9 +62,6 @@ class Delta(Value):
     scale: float
     along: FloatArray | None = None
 
-    def __post_init__(self) -> None:
-        self._set(along=self.along)
-
 
 def modal_realisation(plant: Partition) -> ModalRealisation:
     """Return the modes of a plant, each of which has its own frequency and damping.
@@ -204,9 +201,6 @@ class UncertainPlant(Value, Generic[P]):
     neglected: NeglectedModes | None = None
     fit: UpdateResult | None = None
     parameters: tuple[Parameter, ...] = ()
-
-    def __post_init__(self) -> None:
-        self._set(covariance=self.covariance)
 
     @property
     def channels(self) -> dict[str, str]:

@@ -73,9 +73,6 @@ class ModelCheck(Value):
     first_freq: float
     source: str | None = None
 
-    def __post_init__(self) -> None:
-        self._set(mass=self.mass, center=self.center, inertia=self.inertia)
-
     @property
     def ok(self) -> bool:
         """Whether nothing failed; notes may be there."""

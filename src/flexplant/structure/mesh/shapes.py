@@ -96,9 +96,6 @@ class PlateShape(GridShape):
     elements: tuple[int, int]
     present: Any = None
 
-    def __post_init__(self) -> None:
-        self._set(thickness=self.thickness, present=self.present)
-
     def __repr__(self) -> str:
         (lx, ly), (nx, ny) = self.size, self.elements
         holes = "" if self.present is None else f", {np.count_nonzero(~self.present)} missing"
@@ -255,9 +252,6 @@ class BlockShape(GridShape):
     size: tuple[float, float, float]
     elements: tuple[int, int, int]
     present: Any = None
-
-    def __post_init__(self) -> None:
-        self._set(present=self.present)
 
     def __repr__(self) -> str:
         size, counts = (" x ".join(f"{n:g}" for n in part) for part in (self.size, self.elements))

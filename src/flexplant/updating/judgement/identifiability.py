@@ -74,15 +74,6 @@ class Identifiability(Value):
     mixed: tuple[tuple[str, ...], ...]
     missing: dict[str, tuple[int, ...]]
 
-    def __post_init__(self) -> None:
-        self._set(
-            singular_values=self.singular_values,
-            combinations=self.combinations,
-            std=self.std,
-            correlation=self.correlation,
-            missing=self.missing,
-        )
-
     @property
     def rank(self) -> int:
         """Number of combinations of parameters that can be determined."""

@@ -78,15 +78,6 @@ class Localisation(Value):
     dof: int = 0
     units: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        self._set(
-            values=self.values,
-            score=self.score,
-            bic=self.bic,
-            chosen_values=self.chosen_values,
-            nuisance_values=self.nuisance_values,
-        )
-
     def __getitem__(self, name: str) -> float:
         """Return the score of a candidate."""
         if name not in self.candidates:

@@ -55,9 +55,6 @@ class Posterior(Value):
     acceptance: float
     walkers: int
 
-    def __post_init__(self) -> None:
-        self._set(draws=self.draws)
-
     @property
     def mean(self) -> FloatArray:
         """Means (q,) of the parameters."""

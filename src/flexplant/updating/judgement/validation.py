@@ -69,9 +69,6 @@ class Validation(Value):
     after: Correlation
     p_value: float | None = None
 
-    def __post_init__(self) -> None:
-        self._set(fitted=self.fitted, unused=self.unused)
-
     @property
     def helped(self) -> bool:
         """Whether the updated model predicts data that were not fitted.
