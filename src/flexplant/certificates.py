@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from .store import Value
+from .values import ComplexArray
 
 
 class Certificate(Value):
@@ -20,6 +21,12 @@ class Certificate(Value):
 def stability_name(sampled: Any) -> str:
     """Return what stability is measured by: the spectral radius, or the largest real part."""
     return "spectral radius" if sampled else "largest real part"
+
+
+def stability(poles: ComplexArray, sampled: Any) -> float:
+    """Return that number of poles: a loop is stable below 1 (sampled) or 0."""
+    size = np.abs(poles) if sampled else poles.real
+    return float(np.max(size, initial=0.0 if sampled else -np.inf))
 
 
 def in_words(found: Mapping[str, Any]) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ..certificates import stability_name
+from ..certificates import stability, stability_name
 from ..errors import CertificateError
 from ..lti.norms import peak_gain
 from ..lti.responses import Responder, responder
@@ -43,14 +43,10 @@ def certified_norm(
     CertificateError
         When the loop is unstable, the norms differ by more than 1e-3, or exceed the claim.
     """
-    poles = loop.poles()
-    if not poles.size:  # a static loop
-        stability = 0.0 if loop.dt else -np.inf
-    else:
-        stability = float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real))
-    if not stability < (1.0 if loop.dt else 0.0):
+    least = stability(loop.poles(), loop.dt)
+    if not least < (1.0 if loop.dt else 0.0):
         raise CertificateError(
-            f"the closed loop is not stable ({stability_name(loop.dt)} {stability:.6g}): the "
+            f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}): the "
             "controller is refused. "
             "Is the sign of the feedback u = K y right, and is it the plant that it was made for?"
         )
@@ -66,7 +62,7 @@ def certified_norm(
             f"the closed loop has the norm {norm:.6g}, but {claim:.6g} was claimed: "
             "the controller is refused."
         )
-    return {"norm": norm, "swept norm": swept, stability_name(loop.dt): stability, "claim": claim}
+    return {"norm": norm, "swept norm": swept, stability_name(loop.dt): least, "claim": claim}
 
 
 def reached_norms(P: StandardPlant, loop: StateSpace, respond: Responder) -> dict[str, float]:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..certificates import stability_name
+from ..certificates import stability, stability_name
 from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
 from ..lti.h2_norms import h2_norm
 from ..lti.interconnection import lft
@@ -15,12 +15,12 @@ from ..lti.preparation import Prepared, prepared
 from ..lti.riccati import control_care, control_dare, solve_care, solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant, standard_plant
+from ..plant import StandardPlant
 from .controller import Controller
 from .method import SolvedController
-from .reach import require_reach
+from .reach import posed, require_reach
 from .singular import made_regular, missing_ranks
-from .spill_over import spill_over, unchecked
+from .spill_over import with_left_out
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
 AGREEMENT = 1e-5
@@ -106,16 +106,7 @@ def design_h2(
     >>> controller.certificate["H2 norm"] == controller.gamma
     True
     """
-    if u is None and y is None:
-        plant = standard_plant(plant)
-    elif isinstance(plant, StandardPlant):
-        raise ModelError("a StandardPlant names its u and y: leave them out.")
-    else:
-        plant = StandardPlant.from_statespace(plant, u=u, y=y)
-    if not plant.w or not plant.z or not plant.u or not plant.y:
-        raise AssumptionError(f"H2 synthesis needs channels w, z, u and y, got {plant!r}.")
-    if plant.is_assembled:  # it can name the rigid-body motion that is missed
-        plant.check().require(("stabilisable", "detectable"), "H2 synthesis")
+    plant = posed(plant, u, y, "H2 synthesis")
     _require_finite(plant)
     problem = prepared(plant.system, plant.u, plant.y, direct=True)
     try:
@@ -126,18 +117,15 @@ def design_h2(
     K = problem.restored(found.A, found.B, found.C, found.D).replace(name="h2", units=plant.units)
     # a norm of the scaled problem, in the user's unit of time
     certificate = _certified(plant.system, K, float(np.sqrt(problem.speed)) * found.gamma)
-    left_out = spill_over(plant, [K], larger)
-    return Controller(
+    answer = Controller(
         K,
         "H2 by two Riccati equations",
         gamma=certificate["H2 norm"],
         lower=None if found.notes else min(certificate["claim"], certificate["H2 norm"]),
-        certificate=certificate
-        | dict(found.certificate)
-        | (left_out.certificate if left_out is not None else {}),
-        left_out=left_out,
-        notes=(*found.notes, *(() if left_out is not None else unchecked(plant))),
+        certificate=certificate | dict(found.certificate),
+        notes=found.notes,
     )
+    return with_left_out(answer, plant, larger)
 
 
 def _require_finite(plant: StandardPlant) -> None:
@@ -210,13 +198,10 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
         When the loop is unstable or its norm is not the claim (the least cost).
     """
     loop = lft(P, K)
-    poles = loop.poles()
-    growth = np.abs(poles) if loop.dt else poles.real
-    stability = float(np.max(growth, initial=0.0 if loop.dt else -np.inf))
-    norm = h2_norm(loop)
-    if not (stability < (1.0 if loop.dt else 0.0) and np.isfinite(norm)):
+    least, norm = stability(loop.poles(), loop.dt), h2_norm(loop)
+    if not (least < (1.0 if loop.dt else 0.0) and np.isfinite(norm)):
         raise CertificateError(
-            f"the closed loop is not stable ({stability_name(loop.dt)} {stability:.6g}) or its H2 "
+            f"the closed loop is not stable ({stability_name(loop.dt)} {least:.6g}) or its H2 "
             "norm is infinite: the controller is refused. The plant is too badly conditioned, or a "
             "mode that neither z nor w contains stays undamped: weight its motion and disturb it."
         )
@@ -226,4 +211,4 @@ def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
             "synthesis: the problem is too badly conditioned to trust. Bring the "
             "sizes of the weights closer together."
         )
-    return {"H2 norm": norm, stability_name(loop.dt): stability, "claim": claim}
+    return {"H2 norm": norm, stability_name(loop.dt): least, "claim": claim}

@@ -13,7 +13,7 @@ from ..lti.norms import hinf_norm
 from ..lti.preparation import Prepared, departure_from_normal, prepared
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
-from ..plant import StandardPlant, standard_plant
+from ..plant import StandardPlant
 from ..values import short
 from .attempts import Answer, answered, best_answer
 from .central import require_shown
@@ -21,9 +21,9 @@ from .certificate import reached_norms
 from .controller import Controller
 from .lmi import Lmi
 from .method import SynthesisMethod
-from .reach import require_reach
+from .reach import posed, require_reach
 from .riccati import Riccati
-from .spill_over import spill_over, unchecked
+from .spill_over import with_left_out
 from .structured_lmi import StructuredLmi
 
 #: A beside its poles, from which on coordinates are blamed for a failure
@@ -108,20 +108,12 @@ def design_hinf(
     >>> fx.close_loop(plant, errors, controller).is_stable
     True
     """
-    if u is None and y is None:
-        plant = standard_plant(plant)
-    elif isinstance(plant, StandardPlant):
-        raise ModelError("a StandardPlant names its u and y: leave them out.")
-    else:
-        plant = StandardPlant.from_statespace(plant, u=u, y=y)
     if method is not None and not hasattr(method, "solve"):
         raise ModelError(
             f"method must be Riccati(...), StructuredLmi(...) or Lmi(...), got {short(method)}. "
             "Pass one, or none."
         )
-    _require_channels(plant)
-    if plant.is_assembled:  # it can name the rigid-body motion that is missed
-        plant.check().require(("stabilisable", "detectable"), "H-infinity synthesis")
+    plant = posed(plant, u, y, "H-infinity synthesis")
     problem = prepared(plant.system, plant.u, plant.y)
     try:
         require_reach(problem)
@@ -136,38 +128,17 @@ def design_hinf(
         _require_known(plant, problem, answer)
     except (AssumptionError, SolverError, CertificateError) as error:
         raise _blamed(problem, error) from error
-    controller, found = answer.controller, answer.found
-    reached = reached_norms(plant, answer.loop, answer.respond)
-    left_out = spill_over(plant, [controller], larger)
-    return Controller(
-        controller,
+    found = answer.found
+    one = Controller(
+        answer.controller,
         f"H-infinity by {type(answer.method).__name__}",
         gamma=answer.gamma,
         lower=answer.lower,
-        certificate=answer.certificate
-        | dict(found.certificate)
-        | (left_out.certificate if left_out is not None else {}),
-        reached=reached,
-        left_out=left_out,
-        notes=(*found.notes, *(() if left_out is not None else unchecked(plant))),
+        certificate=answer.certificate | dict(found.certificate),
+        reached=reached_norms(plant, answer.loop, answer.respond),
+        notes=found.notes,
     )
-
-
-def _require_channels(plant: StandardPlant) -> None:
-    """Raise AssumptionError when there is no w, z, u or y."""
-    roles = {
-        "w": "disturbance or noise",
-        "z": "output to be kept small",
-        "u": "actuator",
-        "y": "sensor",
-    }
-    for name, role in roles.items():
-        if not getattr(plant, name):
-            others = ", ".join(f"{len(getattr(plant, one))} {one}" for one in roles if one != name)
-            raise AssumptionError(
-                f"H-infinity synthesis needs channels w, z, u and y, got a plant without {name} "
-                f"({others}). Add a channel {name} ({role})."
-            )
+    return with_left_out(one, plant, larger)
 
 
 def _require_known(plant: StandardPlant, problem: Prepared, answer: Answer) -> None:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..certificates import stability_name
+from ..certificates import stability, stability_name
 from ..errors import AssumptionError, CertificateError, ModelError, SolverError
 from ..loop import modulus_margin
 from ..lti.discretisation import bilinear, tustin
@@ -22,7 +22,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, positive
 from .controller import Controller
-from .spill_over import spill_over, unchecked
+from .spill_over import with_left_out
 
 #: corner of the integral action of the recipe, beside the bandwidth
 _INTEGRAL = 0.1
@@ -117,19 +117,14 @@ def design_ncf(
     )
     if not loop_margin(G, whole)[0]:
         raise hidden_mode(G, whole)
-    left_out = spill_over(plant, [whole], larger) if isinstance(plant, StandardPlant) else None
-    lacking = unchecked(plant) if isinstance(plant, StandardPlant) and left_out is None else ()
-    return Controller(
+    answer = Controller(
         whole,
         "loop shaping by normalised coprime factors",
         gamma=1.0 / certificate["margin"],
         lower=least,
-        certificate=certificate
-        | {"modulus margin": modulus_margin((G, whole))}
-        | (left_out.certificate if left_out is not None else {}),
-        left_out=left_out,
-        notes=lacking,
+        certificate=certificate | {"modulus margin": modulus_margin((G, whole))},
     )
+    return with_left_out(answer, plant, larger) if isinstance(plant, StandardPlant) else answer
 
 
 def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -> float:
@@ -170,12 +165,10 @@ def ncf_margin(plant: StandardPlant | System, controller: Controller | System) -
 def loop_margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
     """Return 1 / the norm of the loop, 0 when unstable, and its stability."""
     loop = _four_block(G, K)
-    poles = loop.poles()
-    growth = np.abs(poles) if loop.dt else poles.real
-    stability = float(np.max(growth, initial=0.0 if loop.dt else -np.inf))
-    if not stability < (1.0 if loop.dt else 0.0):
-        return 0.0, stability
-    return 1.0 / peak_gain(loop)[0], stability
+    found = stability(loop.poles(), loop.dt)
+    if not found < (1.0 if loop.dt else 0.0):
+        return 0.0, found
+    return 1.0 / peak_gain(loop)[0], found
 
 
 def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
@@ -227,7 +220,7 @@ def verified_controller(
     """
     part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
     K, gamma, least = _robust(part, back_off)
-    margin, stability = loop_margin(shaped, K)
+    margin, least_stable = loop_margin(shaped, K)
     other = _least_by_factors(part)
     if not margin:
         raise hidden_mode(shaped, K)
@@ -247,7 +240,7 @@ def verified_controller(
     found = {
         "margin": margin,
         "smallest gamma by the Hankel norm": other,
-        stability_name(shaped.dt): stability,
+        stability_name(shaped.dt): least_stable,
     }
     return K, least, found
 

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
-from ..errors import AssumptionError
+from ..errors import AssumptionError, ModelError
 from ..lti.preparation import Prepared
-from ..plant import StandardPlant
+from ..lti.statespace import System
+from ..plant import StandardPlant, standard_plant
 
 #: relative: poles so small are zero, real parts above this are not stable
 _ZERO, _STABLE = 1e-6, -1e-10
@@ -16,10 +19,52 @@ _MISSED = 1e-12
 _NILPOTENT, _TOO_LONG = 0.5, 15.0
 
 
-def require_stabilisable(plant: StandardPlant, problem: Prepared, what: str) -> None:
-    """Raise AssumptionError, naming mode and channels, when no controller stabilises a plant."""
+#: what the channels of each side are
+_ROLES = {
+    "w": "disturbance or noise",
+    "z": "output to be kept small",
+    "u": "actuator",
+    "y": "sensor",
+}
+
+
+def posed(
+    given: StandardPlant | System, u: Sequence[str] | None, y: Sequence[str] | None, what: str
+) -> StandardPlant:
+    """Return the plant of a synthesis: u and y named where it has no names of its own.
+
+    Raises
+    ------
+    ModelError
+        When a StandardPlant, which names them, is given with names.
+    AssumptionError
+        When a side has no channel, or u or y misses a rigid-body motion.
+    """
+    if u is None and y is None:
+        plant = standard_plant(given)
+    elif isinstance(given, StandardPlant):
+        raise ModelError("a StandardPlant names its u and y: leave them out.")
+    else:
+        plant = StandardPlant.from_statespace(given, u=u, y=y)
+    for name, role in _ROLES.items():
+        if not getattr(plant, name):
+            others = ", ".join(f"{len(getattr(plant, one))} {one}" for one in _ROLES if one != name)
+            raise AssumptionError(
+                f"{what} needs channels w, z, u and y, got a plant without {name} "
+                f"({others}). Add a channel {name} ({role})."
+            )
+    _require_body(plant, what)
+    return plant
+
+
+def _require_body(plant: StandardPlant, what: str) -> None:
     if plant.is_assembled:  # it can name the rigid-body motion that is missed
         plant.check().require(("stabilisable", "detectable"), what)
+
+
+def require_stabilisable(plant: StandardPlant, problem: Prepared, what: str) -> None:
+    """Raise AssumptionError, naming mode and channels, when no controller stabilises a plant."""
+    _require_body(plant, what)
     require_reach(problem)
 
 

@@ -24,7 +24,7 @@ from .controller import Controller
 from .loop_design import Axes, axes_of, connected
 from .ncf import below_half_rate, integral_action, loop_margin, require_model, verified_controller
 from .ncf_following import following
-from .spill_over import spill_over, unchecked
+from .spill_over import with_left_out
 
 #: how near the crossover comes to the bandwidth, and the steps that it may take
 _NEAR, _STEPS = 0.02, 8
@@ -191,17 +191,15 @@ def shape_loop(
             "Move the zeros of `before` and `after`."
         )
     feedback = system.select(inputs=axes.after.inputs)  # references take no part in the loop
-    left_out = None if axes.given is None else spill_over(axes.given, [feedback], larger)
-    lacking = axes.given is not None and left_out is None
     controller = Controller(
         system,
         f"loop shaping to {target:g} Hz{'' if T_ref is None else ', two degrees of freedom'}",
         gamma=found.gamma,
         lower=found.least,
-        certificate=found.certificate | (left_out.certificate if left_out is not None else {}),
-        left_out=left_out,
-        notes=unchecked(axes.given) if lacking and axes.given else (),
+        certificate=found.certificate,
     )
+    if axes.given is not None:
+        controller = with_left_out(controller, axes.given, larger, feedback)
     return ShapedLoop(shaped, controller, report)
 
 

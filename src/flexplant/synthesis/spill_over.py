@@ -8,8 +8,10 @@ from typing import Any
 
 from ..errors import FlexplantWarning
 from ..loop import SpillOver, close_loop
+from ..lti.statespace import StateSpace
 from ..plant import StandardPlant, larger_plant
 from ..structure import FEModel
+from .controller import Controller
 
 #: what a high peak means
 CLOSE = ", and one that differs a little from the model may be unstable"
@@ -47,9 +49,23 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
             f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
             "the plant, or weight the efforts (or roll the controller off) before them.",
             FlexplantWarning,
-            stacklevel=4,
+            stacklevel=5,
         )
     return found
+
+
+def with_left_out(
+    answer: Controller, plant: StandardPlant, larger: Any, block: StateSpace | None = None
+) -> Controller:
+    """Return an answer with its check on the modes left out, or the note that none are known.
+
+    The block is its part from the plant's y to u, unless all of its system is.
+    """
+    found = spill_over(plant, [answer.system if block is None else block], larger)
+    if found is None:
+        return answer.replace(notes=(*answer.notes, *unchecked(plant)))
+    certificate = dict(answer.certificate or {}) | found.certificate
+    return answer.replace(certificate=certificate, left_out=found)
 
 
 def unchecked(plant: StandardPlant) -> tuple[str, ...]:

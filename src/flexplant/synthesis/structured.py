@@ -20,7 +20,7 @@ from .certificate import certified_norm, reached_norms
 from .controller import Controller
 from .nonsmooth import Minimum, bfgs, sampled_minimum
 from .reach import require_stabilisable
-from .spill_over import spill_over, unchecked
+from .spill_over import with_left_out
 from .structured_loop import DECAY, Matrices, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
@@ -161,17 +161,16 @@ def design_structured(
     notes = search.notes
     if found.decrease > _SHORT:
         notes += ("not yet a local minimum (decrease left): more starts, time or another order",)
-    left_out = spill_over(plants[0], [K], larger)
-    return Controller(
+    answer = Controller(
         K,
         f"H-infinity of structure {(structure if final is None else final)!r}",
         gamma=each[worst]["norm"],
-        certificate=certificate | (left_out.certificate if left_out is not None else {}),
+        certificate=certificate,
         reached=reached_norms(plants[worst], closed[worst], responder(closed[worst])),
-        left_out=left_out,
-        notes=(*notes, *(() if left_out is not None else unchecked(plants[0]))),
+        notes=notes,
         structure=final,
     )
+    return with_left_out(answer, plants[0], larger)
 
 
 def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[StandardPlant]:

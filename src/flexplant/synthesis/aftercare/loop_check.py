@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...certificates import stability_name
+from ...certificates import stability, stability_name
 from ...errors import CertificateError, FlexplantWarning
 from ...loop import close_loop
 from ...lti.interconnection import lft
@@ -53,9 +53,7 @@ def loop_facts(plant: StandardPlant, controller: StateSpace) -> LoopFacts:
         gamma = peak_gain(lft(plant.system, controller))[0]
     stable = loop.obstacle is None
     margin = loop.modulus_margin if stable else 0.0
-    return LoopFacts(
-        bool(dt), float(np.max(size, initial=-np.inf)), float(freq), stable, margin, gamma
-    )
+    return LoopFacts(bool(dt), stability(poles, dt), float(freq), stable, margin, gamma)
 
 
 def kept(before: LoopFacts, after: LoopFacts, loss: float) -> str:

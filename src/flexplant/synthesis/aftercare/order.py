@@ -19,7 +19,7 @@ from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
 from ...values import FloatArray, positive, whole
 from ..controller import Controller
-from ..spill_over import spill_over, unchecked
+from ..spill_over import with_left_out
 from .loop_check import LoopFacts, kept, loop_facts, required, stable_before
 
 
@@ -155,20 +155,14 @@ def reduce_controller(
         required(before, after, allowed, "Choose a higher order, leave order out, or raise loss.")
     else:
         found, error, after = _smallest(given, problem, before, allowed)
-    left_out = spill_over(given, [found], larger)
     was = {f"{name} before": value for name, value in before.certificate.items()}
-    gamma = None if np.isnan(after.gamma) else after.gamma
-    return Controller(
+    answer = Controller(
         found,
         f"reduced from {K.n_states} states, coprime factors weighted by the loop",
-        gamma=gamma,
-        certificate=after.certificate
-        | was
-        | {"weighted error": error}
-        | (left_out.certificate if left_out is not None else {}),
-        left_out=left_out,
-        notes=() if left_out is not None else unchecked(given),
+        gamma=None if np.isnan(after.gamma) else after.gamma,
+        certificate=after.certificate | was | {"weighted error": error},
     )
+    return with_left_out(answer, given, larger)
 
 
 def _smallest(

@@ -10,7 +10,7 @@ from ...lti.statespace import as_statespace
 from ...plant import StandardPlant
 from ...values import instance, positive
 from ..controller import Controller
-from ..spill_over import spill_over, unchecked
+from ..spill_over import with_left_out
 from .loop_check import loop_facts, required, stable_before
 
 
@@ -84,15 +84,11 @@ def discretise_controller(
         before, after, positive(loss, "loss", zero=True),
         "Raise the rate, shorten the delay, lower the bandwidth, or design on the sampled plant.",
     )  # fmt: skip
-    left_out = spill_over(given, [found], larger)
     continuous = {f"{name} continuous": v for name, v in before.certificate.items()}
-    return Controller(
+    answer = Controller(
         found,
         f"discretised at {1.0 / given.dt:g} Hz by the bilinear map"
         + ("" if prewarp is None else f", exact at {prewarp:g} Hz"),
-        certificate=after.certificate
-        | continuous
-        | (left_out.certificate if left_out is not None else {}),
-        left_out=left_out,
-        notes=() if left_out is not None else unchecked(given),
+        certificate=after.certificate | continuous,
     )
+    return with_left_out(answer, given, larger)

@@ -19,7 +19,7 @@ from ...values import positive, short, whole
 from ..controller import Controller
 from ..lmi_plant import Plant
 from ..reach import require_stabilisable
-from ..spill_over import spill_over, unchecked
+from ..spill_over import with_left_out
 from .least import require_reachable
 from .programs import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion
@@ -139,18 +139,14 @@ def design_lmi(
         except (SolverError, CertificateError, InfeasibleError, np.linalg.LinAlgError) as error:
             failures.append(error)
             continue
-        left_out = spill_over(given, [K], larger)
-        own = repr(minimize)
-        return Controller(
+        answer = Controller(
             K,
             "several objectives by LMIs",
-            gamma=reached[own],
-            certificate={"LMI optimum": claim, "LMI bound": bound, **reached}
-            | (left_out.certificate if left_out is not None else {}),
+            gamma=reached[repr(minimize)],
+            certificate={"LMI optimum": claim, "LMI bound": bound, **reached},
             reached=reached,
-            left_out=left_out,
-            notes=() if left_out is not None else unchecked(given),
         )
+        return with_left_out(answer, given, larger)
     raise CertificateError(
         f"the LMIs promise {claim:.6g}, but no controller kept all bounds: {failures[-1]} Loosen "
         "bounds, add a little noise to each sensor, or raise back_off."

@@ -19,7 +19,7 @@ from ...values import FloatArray, whole
 from ..controller import Controller
 from ..hinf import design_hinf
 from ..method import SynthesisMethod
-from ..spill_over import spill_over, unchecked
+from ..spill_over import with_left_out
 from .blocks import FullBlock, Scalings, osborne, places
 from .magnitude import fitted_magnitude, inverse
 from .sweep import covered
@@ -129,18 +129,14 @@ def design_mu(
             scales = _scales_of(plant, step.loop, states)
     if best is None:
         raise failure or SolverError("no step of the D-K iteration gave a controller. Report it.")
-    left_out = spill_over(uncertain.plant, [best.controller], larger)
     steps = {f"mu of step {i}": value for i, value in enumerate(found)}
-    return Controller(
+    answer = Controller(
         best.controller,
         f"D-K iteration, {len(found)} steps",
         gamma=best.mu,
-        certificate={"mu": best.mu, "at Hz": best.freq}
-        | steps
-        | (left_out.certificate if left_out is not None else {}),
-        left_out=left_out,
-        notes=() if left_out is not None else unchecked(uncertain.plant),
+        certificate={"mu": best.mu, "at Hz": best.freq} | steps,
     )
+    return with_left_out(answer, uncertain.plant, larger)
 
 
 class _DFilters(NamedTuple):

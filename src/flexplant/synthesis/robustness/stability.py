@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...certificates import stability
 from ...errors import CertificateError, FlexplantError
 from ...loop import ClosedLoop, SpillOver
 from ...parallel import one_thread
@@ -280,8 +281,7 @@ def _tried(
             zip(names, (size * rng.choice([-1.0, 1.0], len(names))).tolist(), strict=True)
         )
         made = loop.uncertain.lft(corner)
-        poles = close_loop_poles(loop, made)
-        worst = max(worst, float(np.max(np.abs(poles)) if loop.dt else np.max(poles.real)))
+        worst = max(worst, stability(close_loop_poles(loop, made), loop.dt))
     if not worst < (1.0 if loop.dt else 0.0):
         raise CertificateError(
             f"a machine with Deltas of {size:.3g} is unstable ({worst:.9g}), but mu <= "
