@@ -110,6 +110,12 @@ class FilterModel(Value):
         return np.asarray(0.5 * (added + added.T))
 
 
+def weighed(part: FloatArray, spread: FloatArray) -> FloatArray:
+    """Return ``part S^-1`` of a covariance S, its channels of unit size inside."""
+    size = np.sqrt(spread.diagonal())
+    return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
+
+
 _ARRAYS = ("A", "B", "C1", "D1", "C2", "D2", "Q", "R", "V", "N", "S")
 
 

@@ -15,7 +15,7 @@ from ..lti.statespace import System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray
-from .filter_model import FilterModel
+from .filter_model import FilterModel, weighed
 from .filter_system import error_system, filter_system, own_variances
 from .kalman import design_kalman
 from .robust import HinfFilterCertificate, RobustFilter
@@ -136,9 +136,7 @@ def _at(m: FilterModel, gamma: float) -> _HinfGains | None:
     if np.min(np.linalg.eigvalsh(P / unit / unit[:, None])) < -1e-9:
         return None
     innovation = m.innovation(P)
-    size = np.sqrt(innovation.diagonal())
-    unit = innovation / size / size[:, None]
-    gain, shift = (np.linalg.solve(unit, (part / size).T).T / size for part in (P @ m.C2.T, m.S))
+    gain, shift = (weighed(part, innovation) for part in (P @ m.C2.T, m.S))
     left = m.C1 @ (P - gain @ m.C2 @ P) @ m.C1.T
     if np.max(np.linalg.eigvalsh(0.5 * (left + left.T))) >= gamma**2:
         return None

@@ -17,7 +17,7 @@ from .certificate import KalmanCertificate, error_of
 from .channels import checked_plant, read_alike
 from .error import error_variances
 from .estimator import KalmanEstimator
-from .filter_model import FilterModel, check_noises, check_precision, filter_model
+from .filter_model import FilterModel, check_noises, check_precision, filter_model, weighed
 from .filter_system import filter_system
 from .left_out import left_out
 from .mesh import unresolved_share
@@ -149,15 +149,9 @@ def _designed(model: FilterModel) -> _Design:
     solution = solve_dare(model.A, model.C2, Q=model.Q, R=model.R, S=model.S)
     P = solution.P
     innovation = model.innovation(P)
-    scale = np.sqrt(innovation.diagonal())
-    unit = innovation / scale / scale[:, None]
-
-    def weighed(covariance: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.solve(unit, covariance.T / scale[:, None]).T / scale)
-
-    gain = weighed(P @ model.C2.T)
-    predictor = model.A @ gain + weighed(model.S)
-    poi_gain = weighed(model.C1 @ P @ model.C2.T + model.N)
+    gain = weighed(P @ model.C2.T, innovation)
+    predictor = model.A @ gain + weighed(model.S, innovation)
+    poi_gain = weighed(model.C1 @ P @ model.C2.T + model.N, innovation)
     covariance = model.updated(P, gain)
     variances = np.einsum("ij,jk,ik->i", model.C1, covariance, model.C1)
     radius, difference = error_of(model, gain, predictor, covariance)

@@ -18,7 +18,8 @@ from ..plant import StandardPlant
 from ..values import FloatArray, Value, instance, real_array, short, sizes_of, whole
 from .certificate import AGREEMENT
 from .channels import checked_plant, estimates, poi_channels, row_of, sensors
-from .filter_model import FilterModel, check_noises, filter_model
+from .filter_model import FilterModel, check_noises, filter_model, weighed
+from .filter_system import filter_system
 from .records import recorded
 
 #: longest period [samples], and most measurements in one
@@ -144,17 +145,9 @@ class PeriodicEstimator(Value):
             When there is no such sample in a period.
         """
         k = whole(phase, "phase", minimum=0, maximum=self.period - 1)
-        m, K = filter_model(self.plant), self.predictor_gains[k]
-        L_z = m.C1 @ self.gains[k]
-        return StateSpace(
-            m.A - K @ m.C2,
-            np.hstack([K, m.B - K @ m.D2]),
-            m.C1 - L_z @ m.C2,
-            np.hstack([L_z, m.D1 - L_z @ m.D2]),
-            m.dt,
-            inputs=[*m.sensors, *m.commands],
-            outputs=estimates(m.channels),
-        )
+        model = filter_model(self.plant)
+        gains = self.predictor_gains[k], model.C1 @ self.gains[k]
+        return filter_system(self.plant, model, *gains, f"sample {k} of a period")
 
     def estimate(self, records: Any, *, start: Any = None) -> dict[str, FloatArray]:
         """Return the estimates over a record whose first sample is the first one of a period.
@@ -348,11 +341,8 @@ def _step(
     if rows.size:
         C, R = m.C2[rows], m.R[np.ix_(rows, rows)]
         innovation = C @ P @ C.T + R
-        size = np.sqrt(innovation.diagonal())
-        unit = innovation / size / size[:, None]
-        gain[:, rows] = np.linalg.solve(unit, (P @ C.T / size).T).T / size
-        late = np.linalg.solve(unit, (m.S[:, rows] / size).T).T / size
-        predictor[:, rows] = m.A @ gain[:, rows] + late
+        gain[:, rows] = weighed(P @ C.T, innovation)
+        predictor[:, rows] = m.A @ gain[:, rows] + weighed(m.S[:, rows], innovation)
     closed = m.A - predictor @ m.C2
     ahead = closed @ P @ closed.T + m.driven(predictor)
     return gain, predictor, m.updated(P, gain), 0.5 * (ahead + ahead.T)

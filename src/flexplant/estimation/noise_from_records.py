@@ -15,7 +15,7 @@ from ..values import ComplexArray, FloatArray
 from .channels import checked_plant, sensors
 from .estimator import KalmanEstimator
 from .kalman import design_kalman
-from .noise_levels import PROCESS, NoiseLevels
+from .noise_levels import PROCESS, NoiseLevels, with_densities
 from .whiteness import level_test
 
 #: designs of the filter whose innovations are used, and the change of all ratios that ends them
@@ -162,24 +162,12 @@ def _sources(plant: StandardPlant, channels: tuple[str, ...]) -> list[_Source]:
             R[rows.index(at), rows.index(at)] = plant.sensor_noise[at, at]
             found.append(_Source(np.zeros((n, n)), np.zeros((n, ny)), R))
             continue
-        alone = plant if name == PROCESS else _alone(plant, name)
+        forces = [other for other in channels if other.removesuffix(":noise") not in plant.y]
+        still = {other: 0.0 for other in forces if other != name}
+        alone = plant if name == PROCESS else with_densities(plant, still)
         G, H = alone.noise_factor, alone.noise_direct[rows]
         found.append(_Source(G @ G.T, G @ H.T, H @ H.T))
     return found
-
-
-def _alone(plant: StandardPlant, name: str) -> StandardPlant:
-    """Return the plant with the noise of one force only."""
-    ports = plant.assembled.ports
-    return plant.with_ports(
-        ports.replace(
-            w=[p if p.name == name else p.replace(asd=0.0) for p in ports.w],
-            u=[
-                p if not p.asd or f"{p.name}:disturbance" == name else p.replace(asd=0.0)
-                for p in ports.u
-            ],
-        )
-    )
 
 
 def _steady(observer: KalmanEstimator, records: Any) -> FloatArray:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -92,14 +93,17 @@ class NoiseLevels(Value):
             factor = given.noise_factor * self.ratios[self.channels.index(PROCESS)]
             origin = given.origin.replace(noise_factor=factor)
             return given.replace(asd={**given.asd, **self.asd}, origin=origin)
-        ports, asd = given.assembled.ports, self.asd
-        return given.with_ports(
-            ports.replace(
-                w=[p.replace(asd=asd.get(p.name, p.asd)) for p in ports.w],
-                y=[s.replace(asd=asd.get(f"{s.name}:noise", s.asd)) for s in ports.y],
-                u=[
-                    p.replace(asd=asd.get(f"{p.name}:disturbance", p.asd)) if p.asd else p
-                    for p in ports.u
-                ],
-            )
-        )
+        return with_densities(given, self.asd)
+
+
+def with_densities(plant: StandardPlant, asd: Mapping[str, float]) -> StandardPlant:
+    """Return an assembled plant with other densities of some of the noises that it has."""
+
+    def changed(ports: Sequence[Any], ending: str = "") -> list[Any]:
+        given = [asd.get(f"{port.name}{ending}", port.asd) if port.asd else 0.0 for port in ports]
+        return [port.replace(asd=level) for port, level in zip(ports, given, strict=True)]
+
+    own = plant.assembled.ports
+    return plant.with_ports(
+        own.replace(w=changed(own.w), u=changed(own.u, ":disturbance"), y=changed(own.y, ":noise"))
+    )

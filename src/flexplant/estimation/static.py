@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -151,19 +152,6 @@ def design_static(
             f"rigid-body motion at {channels[int(np.argmax(bad))]!r}. Add or move sensors: three "
             "that are not on one line see z, rx and ry."
         )
-    n = np.zeros((0, 0))
-    return StaticEstimator(
-        StateSpace(
-            n,
-            np.zeros((0, len(used))),
-            np.zeros((len(channels), 0)),
-            gain,
-            plant.dt,
-            inputs=used,
-            outputs=estimates(channels),
-            name="static",
-            units=plant.units,
-        ),
-        plant,
-        None if larger is plant else larger_plant(plant, larger),
-    )
+    names: Any = {"inputs": used, "outputs": estimates(channels), "units": plant.units}
+    system = StateSpace([], [], [], gain, plant.dt, name="static", **names)
+    return StaticEstimator(system, plant, None if larger is plant else larger_plant(plant, larger))

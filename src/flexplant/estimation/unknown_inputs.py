@@ -18,9 +18,10 @@ from ..plant import StandardPlant
 from ..values import FloatArray, Value, instance, positive
 from .certificate import AGREEMENT
 from .channels import checked_plant, estimates
-from .filter_model import FilterModel, check_noises, filter_model
+from .filter_model import FilterModel, check_noises, filter_model, weighed
 from .input_estimator import InputCertificate, InputEstimator
 from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names
+from .noise_levels import with_densities
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve
 _LARGE = 1e6
@@ -240,9 +241,9 @@ def _direct_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     spread = m.innovation(P)
     M = _weighted(d.H, spread)
     rest = np.eye(len(spread)) - d.H @ M
-    L_x = _weighed(P @ m.C2.T, spread) @ rest
+    L_x = weighed(P @ m.C2.T, spread) @ rest
     # noise that reaches state and sensors together: what the innovation shows of it beside d
-    K = m.A @ L_x + d.G @ M + _weighed(m.S, spread) @ rest
+    K = m.A @ L_x + d.G @ M + weighed(m.S, spread) @ rest
     L = np.vstack([m.C1 @ L_x + d.at_pois @ M, M])
     C = np.vstack([m.C1, np.zeros((len(M), len(P)))])
     bias = max(_largest(M @ d.H - np.eye(len(M))), _largest((K @ d.H - d.G) / _size(d.G)))
@@ -253,7 +254,7 @@ def _late_gains(m: FilterModel, d: InputEntry, P: FloatArray) -> _InputGains:
     """Return the gains without feedthrough; P is that of x[k|k-1], the input left out."""
     spread, F = m.innovation(P), m.C2 @ d.G
     M = _weighted(F, spread)
-    plain = _weighed(P @ m.C2.T, spread)
+    plain = weighed(P @ m.C2.T, spread)
     L_x = plain + (d.G - plain @ F) @ M
     still = np.eye(len(P)) - L_x @ m.C2
     L = np.vstack([m.C1 @ L_x, M])
@@ -283,8 +284,8 @@ def _augmented(
             f"assumptions: {found.text}. Add a sensor, or give Augmented a corner above 0."
         ) from error
     spread = larger.innovation(P)
-    gain = _weighed(P @ C2.T, spread)
-    K = A @ gain + _weighed(larger.S, spread)
+    gain = weighed(P @ C2.T, spread)
+    K = A @ gain + weighed(larger.S, spread)
     gains = _InputGains(A, C, K, C @ gain, A - K @ C2, larger.driven(K), False, 0.0)
     return _judged(larger, gains, P, gains.covariance(larger))
 
@@ -350,10 +351,7 @@ def _without(plant: StandardPlant, names: Sequence[str]) -> StandardPlant:
             f"unknown inputs {', '.join(loud)} have a noise density, which is part of the given "
             "noise_factor. Give the plant a factor without them, and no asd of theirs."
         )
-    ports = plant.assembled.ports
-    return plant.with_ports(
-        ports.replace(w=[p.replace(asd=0.0) if p.name in loud else p for p in ports.w])
-    )
+    return with_densities(plant, dict.fromkeys(loud, 0.0))
 
 
 def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
@@ -365,12 +363,6 @@ def _weighted(F: FloatArray, spread: FloatArray) -> FloatArray:
     whitened = la.solve_triangular(root, scaled / columns, lower=True)
     inverse = np.linalg.pinv(whitened) @ la.solve_triangular(root, np.diag(1 / size), lower=True)
     return np.asarray(inverse / columns[:, None])
-
-
-def _weighed(part: FloatArray, spread: FloatArray) -> FloatArray:
-    """Return ``part S^-1``."""
-    size = np.sqrt(spread.diagonal())
-    return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
 
 
 def _size(G: FloatArray) -> FloatArray:

@@ -71,12 +71,8 @@ def sensitivity(
 
     Parameters
     ----------
-    loop : ClosedLoop, or (plant, controller)
+    loop, freq, at
         As for `loop_gain`.
-    freq : (n_freq,) array, optional [Hz]
-        As for `loop_gain`.
-    at : {"u", "y"}
-        Where the loop is broken.
 
     Returns
     -------
@@ -85,10 +81,8 @@ def sensitivity(
 
     Raises
     ------
-    LabelError
-        When channels of plant and controller do not match.
-    ModelError, ShapeError
-        When `freq` is not an array of positive frequencies.
+    LabelError, ModelError, ShapeError
+        As `loop_gain`.
 
     References
     ----------
@@ -115,12 +109,8 @@ def complementary_sensitivity(
 
     Parameters
     ----------
-    loop : ClosedLoop, or (plant, controller)
+    loop, freq, at
         As for `loop_gain`.
-    freq : (n_freq,) array, optional [Hz]
-        As for `loop_gain`.
-    at : {"u", "y"}
-        Where the loop is broken.
 
     Returns
     -------
@@ -129,10 +119,8 @@ def complementary_sensitivity(
 
     Raises
     ------
-    LabelError
-        When channels of plant and controller do not match.
-    ModelError, ShapeError
-        When `freq` is not an array of positive frequencies.
+    LabelError, ModelError, ShapeError
+        As `loop_gain`.
 
     References
     ----------
@@ -158,9 +146,7 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
 
     Parameters
     ----------
-    loop : ClosedLoop, or (plant, controller)
-        As for `loop_gain`.
-    freq : (n_freq,) array, optional [Hz]
+    loop, freq
         As for `loop_gain`.
 
     Returns
@@ -170,10 +156,8 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
 
     Raises
     ------
-    LabelError
-        When channels of plant and controller do not match.
-    ModelError, ShapeError
-        When `freq` is not an array of positive frequencies.
+    LabelError, ModelError, ShapeError
+        As `loop_gain`.
 
     References
     ----------
@@ -259,10 +243,7 @@ def _fed_back(gain: Any) -> tuple[Any, StateSpace]:
             "pass (plant, controller), the controller with the sign of the feedback in it."
         )
     n = len(inputs)
-    return gain, StateSpace(
-        np.zeros((0, 0)), np.zeros((0, n)), np.zeros((n, 0)), -np.eye(n),
-        inputs=outputs, outputs=inputs,
-    )  # fmt: skip
+    return gain, StateSpace([], [], [], -np.eye(n), inputs=outputs, outputs=inputs)
 
 
 def _modelled(

@@ -51,6 +51,16 @@ def append(*systems: System) -> StateSpace:
     )
 
 
+def side_by_side(systems: Iterable[System], names: Iterable[str], mark: str = "|") -> StateSpace:
+    """Return systems of one input and one output each as one, channel by channel of some names."""
+    return append(
+        *(
+            g.replace(inputs=[n], outputs=[n], states=[f"{n}{mark}{state}" for state in g.states])
+            for g, n in zip(map(as_statespace, systems), names, strict=True)
+        )
+    )
+
+
 def series(first: System, second: System) -> StateSpace:
     """Return second * first: the outputs of `first` drive the inputs of `second`, in order.
 
@@ -298,17 +308,9 @@ def connect(
     for name in [*needed, *outputs]:
         if name not in known:
             raise unknown_label("signal to connect", name, known)
-    route = np.array([[float(a == b) for b in produced] for a in needed]).reshape(
-        len(needed), len(produced)
-    )
-    enter = np.array([[float(a == b) for b in outer] for a in needed]).reshape(
-        len(needed), len(outer)
-    )
-    leave = np.array([[float(a == b) for b in produced] for a in outputs]).reshape(
-        len(outputs), len(produced)
-    )
-    through = np.array([[float(a == b) for b in outer] for a in outputs]).reshape(
-        len(outputs), len(outer)
+    route, enter, leave, through = (
+        np.array([[float(a == b) for b in fro] for a in to]).reshape(len(to), len(fro))
+        for to, fro in ((needed, produced), (needed, outer), (outputs, produced), (outputs, outer))
     )
     A, B, C, D = (stacked([getattr(p, part) for p in parts]) for part in "ABCD")
     # block outputs v = C x + D e with e = route v + enter w  =>  v = X (C x + D enter w)

@@ -58,9 +58,7 @@ def solve_stein(A: FloatArray, Q: FloatArray) -> FloatArray:
     >>> fx.lti.solve_stein([[0.5]], [[3.0]]).round(9)  # x = x / 4 + 3
     array([[4.]])
     """
-    A = real_array(A, "A", (None, None))
-    A = real_array(A, "A", (A.shape[0], A.shape[0]))
-    Q = symmetric(Q, "Q", A.shape[0])
+    A, Q = _square(A, Q)
     if not A.size:
         return Q
     d = scale_of(accumulated(A, Q))
@@ -95,12 +93,8 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
 
     Raises
     ------
-    ShapeError
-        When the sizes differ.
-    ModelError
-        When entries are not finite or Q is not symmetric.
-    SolverError
-        When A is not strictly stable or the residual is bad.
+    ShapeError, ModelError, SolverError
+        As `solve_stein`.
 
     Examples
     --------
@@ -108,9 +102,7 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     >>> fx.lti.solve_lyapunov([[-2.0]], [[4.0]]).round(9)  # -2 x - 2 x + 4 = 0
     array([[1.]])
     """
-    A = real_array(A, "A", (None, None))
-    A = real_array(A, "A", (A.shape[0], A.shape[0]))
-    Q = symmetric(Q, "Q", A.shape[0])
+    A, Q = _square(A, Q)
     if not A.size:
         return Q
     # A alone: a chain of lags is solved to 1e-16 in the units that make it even, to 1e-11 beside Q
@@ -120,6 +112,11 @@ def solve_lyapunov(A: FloatArray, Q: FloatArray) -> FloatArray:
     terms = 2 * float(np.linalg.norm(As) * np.linalg.norm(X))
     _check(float(np.linalg.norm(As @ X + X @ As.T + Qs)) / (terms or 1.0), "A X + X A' + Q = 0")
     return X * d * d[:, None]
+
+
+def _square(A: FloatArray, Q: FloatArray) -> tuple[FloatArray, FloatArray]:
+    A = real_array(A, "A", (None, None))
+    return real_array(A, "A", (A.shape[0], A.shape[0])), symmetric(Q, "Q", A.shape[0])
 
 
 def controllability_gramian(sys: System) -> FloatArray:

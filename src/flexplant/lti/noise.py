@@ -9,6 +9,7 @@ import scipy.linalg as la
 
 from ..values import FloatArray
 from .discretisation import block_diagonal, diagonal_pairs, pair_expm
+from .factors import compressed
 from .statespace import StateSpace
 
 #: nodes that integrate ``e^(A s) B B' e^(A' s)`` to rounding over a piece of |A| s <= 1
@@ -45,23 +46,14 @@ def accumulated_noise(
         count, doublings = _NODES, max(0, int(np.ceil(np.log2(max(rate * time, 1e-300)))))
     piece = time / 2**doublings
     nodes, weights = np.polynomial.legendre.leggauss(count)
-    G = _compressed(
-        [
-            np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
-            for node, weight in zip(nodes, weights, strict=True)
-        ]
-    )
+    parts = [
+        np.sqrt(0.5 * piece * weight) * (at(0.5 * piece * (node + 1.0)) @ force)
+        for node, weight in zip(nodes, weights, strict=True)
+    ]
+    G = compressed(np.hstack(parts))
     for k in range(doublings):
-        G = _compressed([G, at(piece * 2**k) @ G])
+        G = compressed(np.hstack([G, at(piece * 2**k) @ G]))
     return G
-
-
-def _compressed(parts: list[FloatArray]) -> FloatArray:
-    """Return a factor (n, r <= n) of the sum of ``part part'``."""
-    G = np.hstack(parts)
-    if G.shape[1] <= G.shape[0]:
-        return G
-    return np.asarray(la.qr(G.T, mode="r")[0][: G.shape[0]].T)
 
 
 def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:

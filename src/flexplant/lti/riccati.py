@@ -11,7 +11,9 @@ units (1e-9 m/N, 1e-10 m, rigid-body modes at 1) defeat solvers that do not scal
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -149,10 +151,8 @@ def solve_care(
 
     Raises
     ------
-    ShapeError, ModelError
-        For bad sizes, entries that are not finite, a singular R.
-    SolverError
-        When no strictly stabilising solution exists or the residual stays bad.
+    ShapeError, ModelError, SolverError
+        As `solve_dare`.
 
     References
     ----------
@@ -200,10 +200,8 @@ def control_dare(
 
     Raises
     ------
-    ShapeError, ModelError
-        For bad sizes, entries that are not finite, a singular R.
-    SolverError
-        When no strictly stabilising solution exists or the residual stays bad.
+    ShapeError, ModelError, SolverError
+        As `solve_dare`.
 
     References
     ----------
@@ -215,7 +213,7 @@ def control_dare(
     >>> fx.lti.control_dare([[1.0]], [[1.0]], Q=[[2.0]], R=[[1.0]]).P.round(9)  # p^2 = 2 p + 2
     array([[2.73205081]])
     """
-    return _dual(solve_dare(_transposed(A), _transposed(B), Q=Q, R=R, S=S))
+    return _dual(solve_dare, A, B, Q=Q, R=R, S=S)
 
 
 def control_care(
@@ -232,16 +230,8 @@ def control_care(
 
     Parameters
     ----------
-    A : (n, n) array
-        May have eigenvalues that are not stable.
-    B : (n, m) array
-        Inputs.
-    Q : (n, n) array
-        Symmetric; cost of x.
-    R : (m, m) array
-        Symmetric, non-singular, possibly indefinite; cost of u.
-    S : (n, m) array, optional
-        Cross term; zero when not given.
+    A, B, Q, R, S : arrays
+        As in `control_dare`.
 
     Returns
     -------
@@ -250,10 +240,8 @@ def control_care(
 
     Raises
     ------
-    ShapeError, ModelError
-        For bad sizes, entries that are not finite, a singular R.
-    SolverError
-        When no strictly stabilising solution exists or the residual stays bad.
+    ShapeError, ModelError, SolverError
+        As `solve_dare`.
 
     References
     ----------
@@ -265,14 +253,13 @@ def control_care(
     >>> fx.lti.control_care([[0.0]], [[1.0]], Q=[[4.0]], R=[[1.0]]).P.round(9)
     array([[2.]])
     """
-    return _dual(solve_care(_transposed(A), _transposed(B), Q=Q, R=R, S=S))
+    return _dual(solve_care, A, B, Q=Q, R=R, S=S)
 
 
-def _transposed(matrix: FloatArray) -> FloatArray:
-    return np.asarray(matrix).T
-
-
-def _dual(solution: RiccatiSolution) -> RiccatiSolution:
+def _dual(
+    solve: Callable[..., RiccatiSolution], A: FloatArray, B: FloatArray, **rest: Any
+) -> RiccatiSolution:
+    solution = solve(np.asarray(A).T, np.asarray(B).T, **rest)
     return solution.replace(gain=solution.gain.T)
 
 

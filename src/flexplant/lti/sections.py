@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..errors import ModelError
 from ..values import ComplexArray, FloatArray, real_array
-from .joining import stacked
+from .joining import cascaded, stacked
 
 
 def zpk_fields(
@@ -36,8 +36,7 @@ def zpk_fields(
             "input, which no state space does. Add poles beyond the band, such as a low-pass."
         )
     left = paired(z)
-    A, B, C = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0))
-    D = np.array([[1.0]])
+    chain = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
     blocks: list[int] = []
     factor = float(real_array(gain, "gain", ()))
     for pair in sorted(paired(p), key=lambda pole: _damping(pole[0], dt)):
@@ -48,10 +47,9 @@ def zpk_fields(
         size = float(np.abs(pair).max()) or 1.0
         lacking = size ** (pair.size - nearest.size)
         c, d, factor = c * lacking, d * lacking, factor / lacking
-        # the later section's states first: A stays block upper triangular
-        A = np.block([[a, b @ C], [np.zeros((A.shape[0], pair.size)), A]])
-        B, C, D = np.vstack([b @ D, B]), np.hstack([c, d @ C]), d @ D
+        chain = cascaded(chain, (a, b, c, d))
         blocks = [pair.size, *blocks]
+    A, B, C, D = chain
     return {"A": A, "B": B, "C": factor * C, "D": factor * D, "blocks": blocks}
 
 

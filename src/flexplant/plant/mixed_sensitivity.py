@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import ModelError
-from ..lti.interconnection import append, connect
+from ..lti.interconnection import connect, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from .standard import StandardPlant
 from .weighting import at_rate
@@ -89,15 +89,7 @@ def _weights(weight: System | float, key: str, names: Sequence[str], dt: float) 
     system = as_statespace(weight)
     count = len(names)
     if (len(system.inputs), len(system.outputs)) == (1, 1):
-        one = at_rate(system, key, dt)
-        return append(
-            *(
-                one.replace(
-                    inputs=[name], outputs=[name], states=[f"{name}|{x}" for x in one.states]
-                )
-                for name in names
-            )
-        )
+        return side_by_side([at_rate(system, key, dt)] * count, names)
     if (len(system.inputs), len(system.outputs)) != (count, count):
         raise ModelError(
             f"the weight {key} must be one by one or {count} by {count} (channels "

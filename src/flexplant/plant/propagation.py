@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..lti.discretisation import pair_expm
+from ..lti.discretisation import block_diagonal, pair_expm
 from ..lti.noise import accumulated_noise
 from ..values import FloatArray
 
@@ -73,9 +73,7 @@ class Flow:
             return np.asarray(E / self.size[:, None] * self.size)
         E = np.zeros((self.n, self.n))
         b, h = self.b, self.h
-        blocks = np.zeros((b, 2, b, 2))
-        blocks[np.arange(b), :, np.arange(b), :] = pair_expm(self.pairs, time)
-        E[self.modes, self.modes] = blocks.reshape(2 * b, 2 * b)
+        E[self.modes, self.modes] = block_diagonal(pair_expm(self.pairs, time))
         if not h + self.t:
             return E
         direct = la.expm(self.direct * time)

@@ -7,9 +7,9 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
 from ..errors import AssumptionError
+from ..lti.factors import compressed
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, IntArray
 from .propagation import Flow, HeldFlow
@@ -239,7 +239,4 @@ def _noise(
                 rows = [layout.line(j)[-1] for j in seen]
                 column[rows] = g.C[seen] @ flow.at(instant - end) @ G
         parts.append(column)
-    G = np.hstack(parts)
-    if G.shape[1] <= G.shape[0]:
-        return G
-    return np.asarray(la.qr(G.T, mode="r")[0][: G.shape[0]].T)
+    return compressed(np.hstack(parts))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 import scipy.linalg as la
@@ -124,17 +125,45 @@ class CraigBampton(ReductionMethod):
         return np.real(found.phi)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
 class _FreeInterface(ReductionMethod):
     """Free modes of the whole structure and its residual flexibility at the boundary."""
 
+    boundary: Iterable[str]
+    modes: int
+    damping: Damping | None = field(default=None, kw_only=True)
+    #: whether the residual flexibility has no inertia, and what it is called
+    _massless: ClassVar[bool]
+    _kind: ClassVar[str]
+
+    def __post_init__(self) -> None:
+        self._set(
+            boundary=labels_given(self.boundary, "boundary DOFs"),
+            modes=whole(self.modes, "modes"),
+            damping=checked_damping(self.damping),
+        )
+
+    def __repr__(self) -> str:
+        labels = tuple(self.boundary)
+        return (
+            f"<{type(self).__name__}: {counted(len(labels), 'DOF')} ({shown(labels)}), "
+            f"{counted(self.modes, 'free mode')}>"
+        )
+
+    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
+        """Return the reduced model; `reduce` is the public way."""
+        labels = tuple(self.boundary)
+        method = f"{self.modes} free modes and {self._kind} ({type(self).__name__})"
+        parts = self._parts(fe_model(structure, self), labels)
+        return _built(*parts, labels, self.damping, massless=self._massless, method=method)
+
     def _parts(
-        self, structure: FEModel | Modes, boundary: Iterable[str], count: int
+        self, model: FEModel, labels: tuple[str, ...]
     ) -> tuple[FEModel, Modes, FloatArray, FloatArray]:
         """Return the model, its modes with vectors, T, and the map from (u_b, p) to (p, g)."""
-        model, labels = fe_model(structure, self), tuple(boundary)
         b = len(labels)
         modes = solve_modes(
-            model, damping=ModalDamping(0.0), count=count, compliance_at=list(labels)
+            model, damping=ModalDamping(0.0), count=self.modes, compliance_at=list(labels)
         )
         rows = model.dofs.indices(labels)
         phi, vectors = np.real(modes.phi), modes.vectors
@@ -247,30 +276,8 @@ class Rubin(_FreeInterface):
     array([ 0.  , 77.04])
     """
 
-    boundary: Iterable[str]
-    modes: int
-    damping: Damping | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            boundary=labels_given(self.boundary, "boundary DOFs"),
-            modes=whole(self.modes, "modes"),
-            damping=checked_damping(self.damping),
-        )
-
-    def __repr__(self) -> str:
-        labels = tuple(self.boundary)
-        return (
-            f"<Rubin: {counted(len(labels), 'DOF')} ({shown(labels)}), "
-            f"{counted(self.modes, 'free mode')}>"
-        )
-
-    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the reduced model; `reduce` is the public way."""
-        labels = tuple(self.boundary)
-        parts = self._parts(structure, labels, self.modes)
-        method = f"{self.modes} free modes and residual flexibility (Rubin)"
-        return _built(*parts, labels, self.damping, massless=False, method=method)
+    _massless = False
+    _kind = "residual flexibility"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -284,10 +291,8 @@ class MacNeal(_FreeInterface):
 
     Parameters
     ----------
-    boundary : sequence of str, DofSet or DofSelection
-        DOFs that stay, where loads and other structures attach.
-    modes : int
-        Number of free modes, rigid-body modes included.
+    boundary, modes
+        As for `Rubin`.
     damping : ModalDamping or Rayleigh, optional
         Of the modes; None: their part of D.
 
@@ -308,27 +313,5 @@ class MacNeal(_FreeInterface):
     array([ 0.  , 77.04])
     """
 
-    boundary: Iterable[str]
-    modes: int
-    damping: Damping | None = field(default=None, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            boundary=labels_given(self.boundary, "boundary DOFs"),
-            modes=whole(self.modes, "modes"),
-            damping=checked_damping(self.damping),
-        )
-
-    def __repr__(self) -> str:
-        labels = tuple(self.boundary)
-        return (
-            f"<MacNeal: {counted(len(labels), 'DOF')} ({shown(labels)}), "
-            f"{counted(self.modes, 'free mode')}>"
-        )
-
-    def reduced(self, structure: FEModel | Modes) -> ReducedModel:
-        """Return the reduced model; `reduce` is the public way."""
-        labels = tuple(self.boundary)
-        parts = self._parts(structure, labels, self.modes)
-        method = f"{self.modes} free modes and static residual flexibility (MacNeal)"
-        return _built(*parts, labels, self.damping, massless=True, method=method)
+    _massless = True
+    _kind = "static residual flexibility"

@@ -13,7 +13,7 @@ from ..certificates import stability_name
 from ..errors import CertificateError, FlexplantWarning, SolverError
 from ..loop import LoopReport, report_loops
 from ..lti.discretisation import tustin
-from ..lti.interconnection import append, series
+from ..lti.interconnection import series, side_by_side
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..lti.weights import lowpass
@@ -269,12 +269,7 @@ def _model(given: float | System, axes: Axes) -> StateSpace:
         return as_statespace(given)
     one = lowpass(positive(given, "model"), order=2)
     names = [f"{name}:ref" for name in axes.names]
-    return append(
-        *(
-            one.replace(inputs=[r], outputs=[n], states=[f"{n}|{s}" for s in one.states])
-            for r, n in zip(names, axes.names, strict=True)
-        )
-    )
+    return side_by_side([one] * len(names), axes.names).replace(inputs=names)
 
 
 def _shaping(axes: Axes, freq: float, rolloff: float | None) -> StateSpace:
@@ -282,12 +277,6 @@ def _shaping(axes: Axes, freq: float, rolloff: float | None) -> StateSpace:
     if rolloff is None:
         return integral_action(axes.plant, freq)
     names = axes.before.inputs
-    one = lowpass(rolloff, order=2)
-    filters = append(
-        *(
-            one.replace(inputs=[f"{n}|in"], outputs=[n], states=[f"{n}|{s}" for s in one.states])
-            for n in names
-        )
-    )
+    filters = side_by_side([lowpass(rolloff, order=2)] * len(names), names)
     filters = tustin(filters, axes.rate) if axes.rate else filters
     return series(integral_action(series(filters, axes.plant), freq), filters)

@@ -14,6 +14,7 @@ from ...lti.interconnection import lft
 from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...values import FloatArray
+from .inserted import system_matrix, with_channels
 from .neglected import NeglectedModes, opened
 from .uncertain_plant import UncertainPlant
 
@@ -108,11 +109,8 @@ def _with_neglected(
 ) -> DeltaChannels:
     if neglected is None:
         return DeltaChannels(system, tuple(sizes), None, distance)
-    count = len(neglected.outputs)
-    plain = StateSpace(
-        np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)), np.eye(count),
-        inputs=neglected.outputs, outputs=neglected.outputs,
-    )  # fmt: skip
+    names = neglected.outputs
+    plain = StateSpace([], [], [], np.eye(len(names)), inputs=names, outputs=names)
     total = sum(size for _, size in sizes)
     whole = opened(system, neglected.replace(weights=plain), total)
     return DeltaChannels(whole, tuple(sizes), neglected, distance)
@@ -131,12 +129,14 @@ def sampled_machine(uncertain: UncertainPlant[Any], values: Mapping[str, float])
         )
     g, sizes = _grouped(uncertain)
     amounts = np.concatenate([[values.get(name, 0.0)] * size for name, size in sizes])
-    count = amounts.size
-    block = StateSpace(
-        np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)), np.diag(amounts),
-        inputs=g.outputs[:count], outputs=g.inputs[:count],
-    )  # fmt: skip
-    return discretized(lft(g, block), 1.0 / plant.dt, delay=plant.delay, delayed=plant.u)
+    return discretized(_closed(g, amounts), 1.0 / plant.dt, delay=plant.delay, delayed=plant.u)
+
+
+def _closed(g: StateSpace, amounts: FloatArray) -> StateSpace:
+    """Return the system at some values (k,) of the Deltas, its first k channels."""
+    k = amounts.size
+    block = StateSpace([], [], [], np.diag(amounts), inputs=g.outputs[:k], outputs=g.inputs[:k])
+    return lft(g, block)
 
 
 class _Change(NamedTuple):
@@ -195,8 +195,7 @@ class _EvenUnits(NamedTuple):
         return cls(np.concatenate([1.0 / d, size / out]), np.concatenate([d, size / into]))
 
     def scaled(self, g: StateSpace) -> FloatArray:
-        whole = np.block([[g.A, g.B], [g.C, g.D]])
-        return np.asarray(self.row[:, None] * whole * self.column)
+        return np.asarray(self.row[:, None] * system_matrix(g) * self.column)
 
     def change(self, base: StateSpace, plus: StateSpace, minus: StateSpace) -> _Change:
         up, down = self.scaled(plus) - self.scaled(base), self.scaled(minus) - self.scaled(base)
@@ -219,34 +218,12 @@ def _with_channels(
 ) -> StateSpace:
     """Return g with channels of Deltas before its own, after those that `opened` has already."""
     other = g if opened is None else opened
-    n = g.n_states
-    before = len(other.inputs) - len(g.inputs)
+    n, before = g.n_states, len(other.inputs) - len(g.inputs)
     names = [f"{name}:{i}" for name, _, right in parts for i in range(1, right.shape[0] + 1)]
-    m, p = len(g.inputs), len(g.outputs)
-    left = np.hstack([np.zeros((n + p, 0)), *(one for _, one, _ in parts)])
-    right = np.vstack([np.zeros((0, n + m)), *(one for _, _, one in parts)])
-    k = len(names)
-    D = np.zeros((before + k + p, before + k + m))
-    D[:before, :before], D[:before, before + k :] = (
-        other.D[:before, :before],
-        other.D[:before, before:],
-    )
-    D[before + k :, :before], D[before + k :, before + k :] = (
-        other.D[before:, :before],
-        other.D[before:, before:],
-    )
-    D[before : before + k, before + k :] = right[:, n:]
-    D[before + k :, before : before + k] = left[n:]
-    return StateSpace(
-        other.A,
-        np.hstack([other.B[:, :before], left[:n], other.B[:, before:]]),
-        np.vstack([other.C[:before], right[:, :n], other.C[before:]]),
-        D,
-        g.dt,
-        inputs=[*other.inputs[:before], *(f"{name}:w" for name in names), *g.inputs],
-        outputs=[*other.outputs[:before], *(f"{name}:z" for name in names), *g.outputs],
-        states=g.states,
-    )
+    left = np.hstack([np.zeros((n + len(g.outputs), 0)), *(one for _, one, _ in parts)])
+    right = np.vstack([np.zeros((0, n + len(g.inputs))), *(one for _, _, one in parts)])
+    right = np.insert(right, [n] * before, 0.0, axis=1)
+    return with_channels(other, before, names, left, right)
 
 
 def _distance(
@@ -258,16 +235,11 @@ def _distance(
     """
     base = sampled_machine(uncertain, {})
     units = _EvenUnits.of(base)
-    count = sum(size for _, size in sizes)
     found = 0.0
     for corner in np.random.default_rng(0).choice([-1.0, 1.0], (4, len(sizes))):
         values = dict(zip([name for name, _ in sizes], corner.tolist(), strict=True))
         exact = units.scaled(sampled_machine(uncertain, values))
-        block = StateSpace(
-            np.zeros((0, 0)), np.zeros((0, count)), np.zeros((count, 0)),
-            np.diag(np.repeat(corner, [size for _, size in sizes])),
-            inputs=system.outputs[:count], outputs=system.inputs[:count],
-        )  # fmt: skip
-        closed = units.scaled(tustin(lft(system, block), 1.0 / base.dt))
+        amounts = np.repeat(corner, [size for _, size in sizes])
+        closed = units.scaled(tustin(_closed(system, amounts), 1.0 / base.dt))
         found = max(found, float(la.norm(exact - closed) / la.norm(exact - units.scaled(base))))
     return found

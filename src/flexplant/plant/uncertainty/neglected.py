@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import CertificateError, ModelError, counted
 from ...lti.frequency import frequency_response
-from ...lti.interconnection import append
+from ...lti.interconnection import side_by_side
 from ...lti.statespace import StateSpace, System
 from ...values import ComplexArray, FloatArray, IntArray, Value, whole
 from ..building import sampled_like, with_modes_of
@@ -172,7 +172,7 @@ def _bounded(pair: Pair, follow: int) -> NeglectedModes:
     scales, gap = _evened(gap)
     tall = np.sqrt(gap.shape[0])  # all rows may be at their bound at once, at one resonance
     rows = [covering(grid, tall * np.linalg.norm(row, axis=0), poles, follow) for row in gap]
-    weights = _diagonal(rows, tuple(pair[0].outputs))
+    weights = side_by_side(rows, pair[0].outputs, ":neglected:")
     height = _height(weights, gap, grid)
     factor = _MARGIN * float(height.max())
     weights = weights.replace(C=factor * weights.C, D=factor * weights.D)
@@ -355,14 +355,6 @@ def _evened(gap: ComplexArray) -> tuple[FloatArray, ComplexArray]:
     most = np.abs(gap).max(axis=2)
     scales = 1.0 / np.max(most / most.max(axis=1, keepdims=True), axis=0)
     return scales, gap * scales[:, None]
-
-
-def _diagonal(rows: list[StateSpace], outputs: tuple[str, ...]) -> StateSpace:
-    names = [
-        g.replace(inputs=[name], outputs=[name], states=[f"{name}:neglected:{s}" for s in g.states])
-        for g, name in zip(rows, outputs, strict=True)
-    ]
-    return append(*names)
 
 
 def _height(weights: StateSpace, gap: ComplexArray, freq: FloatArray) -> FloatArray:

@@ -17,6 +17,7 @@ from ...values import ComplexArray, FloatArray, positive
 from ..building import P
 from ..partition import Partition
 from ..realisation import ModalRealisation
+from .inserted import require_exact, system_matrix, with_channels
 from .neglected import NeglectedModes, neglected_modes, opened
 from .parametric import by_parameters
 from .shape_channels import shape_deltas, with_shape_channels
@@ -188,15 +189,6 @@ class _Channels(NamedTuple):
         """Which Deltas (m,) have a second copy."""
         return np.asarray(np.any(self.again != 0, axis=0))
 
-    def at(self, amounts: FloatArray) -> FloatArray:
-        """Return M at some changes (m,) of the Deltas."""
-        once = amounts[:, None] * self.right
-        return np.asarray(
-            self.base
-            + self.left @ once
-            + (self.again * amounts) @ (self.rates + self.crossed @ once)
-        )
-
 
 def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
     """Return the continuous plant with a channel for each Delta, two where accelerations need it.
@@ -208,35 +200,26 @@ def _opened(plant: Partition, deltas: Sequence[Delta]) -> StateSpace:
     ``R_j x'`` makes it exact. The columns are read off the plant assembled with one mode changed,
     so that they hold for any port.
     """
-    own, g = _channels(plant, deltas), plant.system
-    _check(plant, deltas, own)
-    n, m, twice = own.n, len(g.inputs), np.flatnonzero(own.repeated)
-    again = own.again[:, twice]
-    left = np.hstack([own.left, again])
+    own = _channels(plant, deltas)
+    twice = np.flatnonzero(own.repeated)
+    left = np.hstack([own.left, own.again[:, twice]])
     right = np.vstack([own.right, own.rates[twice]])
     feed = np.zeros((right.shape[0], right.shape[0]))
     feed[len(deltas) :, : len(deltas)] = own.crossed[twice]
     names = [d.name for d in deltas] + [f"{deltas[j].name}:rate" for j in twice.tolist()]
-    return StateSpace(
-        g.A,
-        np.hstack([left[:n], g.B]),
-        np.vstack([right[:, :n], g.C]),
-        np.block([[feed, right[:, n : n + m]], [left[n:], g.D]]),
-        inputs=[*(f"{name}:w" for name in names), *g.inputs],
-        outputs=[*(f"{name}:z" for name in names), *g.outputs],
-        states=g.states,
-        name=g.name,
-        blocks=g.blocks,
-    )
+    system = with_channels(plant.system, 0, names, left, right, feed)
+    do = "Give the sensor a `row` and a quantity."
+    require_exact(plant, system, deltas, "the modes", do)
+    return system
 
 
 def _channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
     """Return how the plant depends on its Deltas, read off with one mode changed at a time."""
-    base, n = _matrix(plant.system), plant.system.n_states
+    base, n = system_matrix(plant.system), plant.system.n_states
     left, right = np.zeros((base.shape[0], len(deltas))), np.zeros((len(deltas), base.shape[1]))
     again = np.zeros_like(left)
     for j, delta in enumerate(deltas):
-        changed = _matrix(with_changes(plant, [(delta, _PROBE)]).system)
+        changed = system_matrix(with_changes(plant, [(delta, _PROBE)]).system)
         change = (changed - base) / _PROBE
         # of a mode's block the second row changes
         R = change[int(plant.modal_states[2 * delta.mode - 1])]
@@ -254,26 +237,6 @@ def _channels(plant: Partition, deltas: Sequence[Delta]) -> _Channels:
         left[:, j] *= delta.scale / even
         again[:, j] *= delta.scale / even
     return _Channels(base, left, right, again, n)
-
-
-def _check(plant: Partition, deltas: Sequence[Delta], own: _Channels) -> None:
-    """Raise ModelError unless the channels give the plant with all modes changed at once."""
-    amounts = [_PROBE * (1.0 if j % 2 else -0.5) for j in range(len(deltas))]
-    wanted = _matrix(with_changes(plant, list(zip(deltas, amounts, strict=True))).system)
-    off = np.abs(wanted - own.at(np.array(amounts) / np.array([delta.scale for delta in deltas])))
-    row = np.abs(wanted - own.base).max(axis=1)
-    bad = np.flatnonzero(off.max(axis=1) > 1e-6 * row + 1e-12 * np.abs(wanted).max(axis=1))
-    if bad.size:
-        i = int(bad[0]) - own.n
-        name = plant.system.outputs[i] if i >= 0 else plant.system.states[int(bad[0])]
-        raise ModelError(
-            f"{name!r} does not depend on the modes as displacements, velocities and accelerations "
-            "do, so that no Deltas express it. Give the sensor a `row` and a quantity."
-        )
-
-
-def _matrix(g: StateSpace) -> FloatArray:
-    return np.block([[g.A, g.B], [g.C, g.D]])
 
 
 def _fitted_poles(

@@ -12,12 +12,11 @@ from ...lti.statespace import StateSpace
 from ...values import FloatArray, real_array
 from ..building import rebuilt
 from ..partition import Partition
-from .uncertain_plant import Delta, modal_realisation, reshaped, with_changes
+from .inserted import require_exact, system_matrix, with_channels
+from .uncertain_plant import Delta, modal_realisation, reshaped
 
 #: relative: a dependence below this is rounding
 _ROUNDING = 1e-9
-#: values of the Deltas at which the channels are compared with a plant assembled anew
-_PROBE = 0.5
 
 
 class _Channel(NamedTuple):
@@ -82,8 +81,8 @@ def with_shape_channels(
     others, deltas : sequences of Delta
         On frequencies and damping; on shapes.
     """
-    base, g = _matrix(plant.system), plant.system
-    n, m, p = g.n_states, len(g.inputs), len(g.outputs)
+    base, g = system_matrix(plant.system), plant.system
+    n, m = g.n_states, len(g.inputs)
     before = len(system.inputs) - m
     first: list[_Channel] = []
     further: list[_Channel] = []
@@ -109,26 +108,8 @@ def with_shape_channels(
     left = np.array([one.left for one in parts]).T
     right = np.array([one.right for one in parts])
     feed = np.array([one.of_rate * one.even * left[one.state] for one in parts])
-    within = np.hstack([system.D[:before, :before], np.zeros((before, len(parts)))])
-    D = np.block(
-        [
-            [within, system.D[:before, before:]],
-            [right[:, n : n + before], feed, right[:, n + before :]],
-            [system.D[before:, :before], left[n:], system.D[before:, before:]],
-        ]
-    )
-    found = StateSpace(
-        system.A,
-        np.hstack([system.B[:, :before], left[:n], system.B[:, before:]]),
-        np.vstack([system.C[:before], right[:, :n], system.C[before:]]),
-        D,
-        inputs=[*system.inputs[:before], *(f"{name}:w" for name in names), *g.inputs],
-        outputs=[*system.outputs[:before], *(f"{name}:z" for name in names), *g.outputs],
-        states=system.states,
-        name=system.name,
-        blocks=system.blocks,
-    )
-    _check(plant, found, [*others, *deltas], p)
+    found = with_channels(system, before, names, left, right, feed)
+    require_exact(plant, found, [*others, *deltas], "the shapes of modes", "Leave shapes= out.")
     return found
 
 
@@ -136,8 +117,11 @@ def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -
     """Return columns and rows of what a unit change of a shape does, of states q and v."""
     realisation = modal_realisation(plant)
     driven, seen = (
-        _matrix(rebuilt(plant, realisation=reshaped(realisation, delta, 1.0, **part)).system) - base
-        for part in ({"outputs": False}, {"inputs": False})
+        system_matrix(rebuilt(plant, realisation=one).system) - base
+        for one in (
+            reshaped(realisation, delta, 1.0, outputs=False),
+            reshaped(realisation, delta, 1.0, inputs=False),
+        )
     )
     found = []
     row = driven[v]
@@ -160,38 +144,3 @@ def _factors(plant: Partition, delta: Delta, base: FloatArray, q: int, v: int) -
         if np.any(left):
             found.append(_Channel(left, right, v, of_rate))
     return found
-
-
-def _check(plant: Partition, system: StateSpace, deltas: Sequence[Delta], p: int) -> None:
-    """Raise ModelError unless the channels give the plant with all modes changed at once."""
-    values = {d.name: _PROBE * (1.0 if j % 2 else -0.5) for j, d in enumerate(deltas)}
-    changes = [(d, values[d.name] * d.scale) for d in deltas]
-    wanted = _matrix(with_changes(plant, changes).system)
-    n, count = system.n_states, len(system.inputs) - len(plant.system.inputs)
-    owner = [name.removesuffix(":w") for name in system.inputs[:count]]
-    amounts = np.diag([next(v for k, v in values.items() if _is_of(one, k)) for one in owner])
-    whole = np.block([[system.A, system.B], [system.C, system.D]])
-    inner, outer = np.arange(n, n + count), np.r_[0:n, n + count : n + count + p]
-    columns = np.r_[0:n, n + count : whole.shape[1]]
-    closed = np.linalg.solve(
-        np.eye(count) - whole[np.ix_(inner, inner)] @ amounts, whole[np.ix_(inner, columns)]
-    )
-    made = whole[np.ix_(outer, columns)] + whole[np.ix_(outer, inner)] @ amounts @ closed
-    base = _matrix(plant.system)
-    size = np.abs(wanted - base).max(axis=1)
-    bad = np.abs(made - wanted).max(axis=1) > 1e-6 * size + 1e-12 * np.abs(wanted).max(axis=1)
-    if np.any(bad):
-        i = int(np.flatnonzero(bad)[0]) - n
-        name = plant.system.outputs[i] if i >= 0 else plant.system.states[i + n]
-        raise ModelError(
-            f"{name!r} does not depend on the shapes of modes as displacements, velocities and "
-            "accelerations do, so that no Deltas express it. Leave shapes= out."
-        )
-
-
-def _is_of(channel: str, name: str) -> bool:
-    return channel == name or channel.startswith(f"{name}:")
-
-
-def _matrix(g: StateSpace) -> FloatArray:
-    return np.block([[g.A, g.B], [g.C, g.D]])

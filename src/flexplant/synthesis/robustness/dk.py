@@ -9,7 +9,7 @@ import numpy as np
 from ...errors import AssumptionError, FlexplantError, ModelError, SolverError
 from ...lti.discretisation import tustin
 from ...lti.grid import resonance_grid
-from ...lti.interconnection import append, series
+from ...lti.interconnection import series, side_by_side
 from ...lti.statespace import StateSpace
 from ...parallel import one_thread
 from ...plant import StandardPlant
@@ -175,18 +175,10 @@ def _designed(
         ones = [StateSpace([], [], [], [[1.0]])]
         into = [*scales.into, *ones * (len(g.inputs) - m)]
         out = [*scales.out, *ones * (len(g.outputs) - n)]
-        scaled = series(series(_side_by_side(into, g.inputs), g), _side_by_side(out, g.outputs))
+        scaled = series(series(side_by_side(into, g.inputs), g), side_by_side(out, g.outputs))
     standard = StandardPlant.from_statespace(scaled, u=plant.u, y=plant.y)
     K = design_hinf(standard, method).system
     return tustin(K, 1.0 / plant.dt) if plant.dt else K
-
-
-def _side_by_side(filters: list[StateSpace], names: Any) -> StateSpace:
-    named = []
-    for one, name in zip(filters, names, strict=True):
-        states = [f"{name}:D{i}" for i in range(one.n_states)]
-        named.append(one.replace(inputs=[name], outputs=[name], states=states))
-    return append(*named)
 
 
 def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _DkStep:

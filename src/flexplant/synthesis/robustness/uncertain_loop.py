@@ -12,7 +12,7 @@ import numpy as np
 from ...errors import AssumptionError, ModelError
 from ...loop import ClosedLoop, close_loop
 from ...lti.discretisation import bilinear
-from ...lti.interconnection import append, lft, series
+from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
@@ -260,9 +260,5 @@ def _with_weights(
 
 
 def _diagonal(names: Sequence[str], weights: Mapping[str, StateSpace], dt: float) -> StateSpace:
-    parts = []
-    for name in names:
-        one = as_statespace(weights.get(name, 1.0))
-        states = [f"{name}:weight:{i}" for i in range(one.n_states)]
-        parts.append(one.replace(inputs=[name], outputs=[name], dt=dt, states=states))
-    return append(*parts)
+    each = [as_statespace(weights.get(name, 1.0)).replace(dt=dt) for name in names]
+    return side_by_side(each, names, ":weight:")
