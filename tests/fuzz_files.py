@@ -27,7 +27,7 @@ import scipy.sparse as sp
 import flexplant as fx
 from flexplant import io
 from flexplant.errors import FlexplantError
-from flexplant.io import ansys, foreign, mat_variables
+from flexplant.io import ansys, foreign_parsers, mat_variables
 from flexplant.io.nastran import read_nodes
 
 sys.path.insert(0, str(Path(__file__).parent))
@@ -446,11 +446,11 @@ def forked(function, path, *, keep=False):
         process = os.fork()
         if not process:
             with contextlib.suppress(BaseException):
-                foreign.ALONE = True
+                foreign_parsers.ALONE = True
                 null = os.open(os.devnull, os.O_WRONLY)
                 os.dup2(null, 1)
                 os.dup2(null, 2)
-                answer.write(foreign.answered((sys.path, function, str(path))))
+                answer.write(foreign_parsers.answered((sys.path, function, str(path))))
                 answer.flush()
             os._exit(0)
         code = os.waitpid(process, 0)[1]
@@ -476,7 +476,7 @@ def tried(name, seconds, folder, seed, result):
             read(path)
     # the valid files were read as they always are
     children = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss // 1024
-    foreign.run("ansys_mesh" if "ansys" in name else "matlab", "none")
+    foreign_parsers.run("ansys_mesh" if "ansys" in name else "matlab", "none")
     mat_variables.in_child = ansys.in_child = forked
     rng, strange = np.random.default_rng(seed), {}
     start, base = used(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -299,6 +299,12 @@ def test_class_names_are_unique():
     assert not twice, f"one name for two classes: {twice}"
 
 
+def test_module_names_are_unique():
+    """Also where rooms differ; a picture's module is called as what it shows."""
+    names = [p.stem for p in MODULES if room_of(p) != "plot" and p.stem != "__init__"]
+    assert sorted({name for name in names if names.count(name) > 1}) == []
+
+
 def figures(source):
     """Return (line, word) of each figure of speech."""
     return [(source.count("\n", 0, m.start()) + 1, m[0]) for m in WORDS.finditer(source)]

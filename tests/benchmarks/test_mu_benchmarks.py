@@ -8,7 +8,7 @@ import pytest
 import flexplant as fx
 from flexplant.lti import StateSpace
 from flexplant.synthesis import H2, FullBlock, Hinf, RepeatedScalar, design_lmi, mu
-from flexplant.synthesis.robustness.blocks import Scalings
+from flexplant.synthesis.robustness.uncertainty_blocks import Scalings
 
 pytestmark = pytest.mark.benchmark
 

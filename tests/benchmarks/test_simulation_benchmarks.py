@@ -9,7 +9,7 @@ import scipy.signal
 from timing import best
 
 import flexplant as fx
-from flexplant.loop.noise import white_noise
+from flexplant.loop.noise_sources import white_noise
 from flexplant.parallel import one_thread
 from flexplant.simulation.drawn import Drawn
 from flexplant.simulation.runs import SampleBySample

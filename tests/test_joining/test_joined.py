@@ -11,8 +11,8 @@ import scipy.sparse as sp
 import flexplant as fx
 import oracles_joining as oracles
 from flexplant.errors import CertificateError, FlexplantWarning, LabelError, ModelError
-from flexplant.joining import certificate
 from flexplant.joining import join as join_module
+from flexplant.joining import joining_certificate
 from flexplant.joining.component import components_of
 
 PLATE = {"density": 2702, "youngs_modulus": 70e9, "poisson_ratio": 0.35}
@@ -488,6 +488,6 @@ def test_the_certificate_can_fail(monkeypatch):
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)
     monkeypatch.undo()
-    monkeypatch.setattr(certificate, "_force", lambda K, motions: 1.0)
+    monkeypatch.setattr(joining_certificate, "_force", lambda K, motions: 1.0)
     with pytest.raises(CertificateError, match="fails its check"):
         fx.joined({"left": half, "right": half}, seam(half), placed=RIGHT)

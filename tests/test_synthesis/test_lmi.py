@@ -17,9 +17,9 @@ from flexplant.store import load
 from flexplant.synthesis import lmi_programs
 from flexplant.synthesis.certificate import certified_norm
 from flexplant.synthesis.hinf import design_hinf
+from flexplant.synthesis.hinf_riccati import Riccati
 from flexplant.synthesis.lmi import Lmi
 from flexplant.synthesis.lmi_programs import Plant, dual_bound, smallest_gamma, symmetric_blocks
-from flexplant.synthesis.riccati import Riccati
 from oracles_lmi import closed_loop, output_feedback_gamma, state_feedback_gamma, swept_norm
 
 SETTINGS = {"tol_gap_abs": 1e-9, "tol_gap_rel": 1e-9, "tol_feas": 1e-9, "time_limit": 20.0}

@@ -209,15 +209,15 @@ def test_lower_is_never_undercut_by_another_controller():
 
 def test_lower_stays_where_nothing_was_refuted(monkeypatch):
     """A gamma that only fails in rounding does not raise the bound."""
-    from flexplant.synthesis import riccati
+    from flexplant.synthesis import hinf_riccati
 
-    plain = riccati._attempt
+    plain = hinf_riccati._attempt
 
     def fragile(problem, gamma):
         found = plain(problem, gamma)
-        return riccati._Attempt(None) if found.refuted else found
+        return hinf_riccati._Attempt(None) if found.refuted else found
 
-    monkeypatch.setattr(riccati, "_attempt", fragile)
+    monkeypatch.setattr(hinf_riccati, "_attempt", fragile)
     found = Riccati().solve(prepared(*scalar(1.0)))
     assert found.gamma <= 1.055 * scalar_optimum(1.0)
     assert found.lower == 0.0
@@ -225,15 +225,15 @@ def test_lower_stays_where_nothing_was_refuted(monkeypatch):
 
 def test_a_loop_above_its_gamma_is_not_accepted(monkeypatch):
     """Only the exact norm of the loop accepts: wrong formulas end at the quadratic controller."""
-    from flexplant.synthesis import riccati
+    from flexplant.synthesis import hinf_riccati
 
-    real = riccati.central
+    real = hinf_riccati.central
 
     def wrong(*args):
         K = real(*args)
         return K.replace(C=-K.C)
 
-    monkeypatch.setattr(riccati, "central", wrong)
+    monkeypatch.setattr(hinf_riccati, "central", wrong)
     found = checked(*scalar(1.0), Riccati())
     assert found.gamma > 1.1 * scalar_optimum(1.0)
     assert found.lower <= scalar_optimum(1.0)

@@ -1,8 +1,6 @@
 """Estimation: the motion at a point of interest from sensors elsewhere."""
 
 from .bias import check_bias as check_bias
-from .certificate import KalmanCertificate as KalmanCertificate
-from .certificate import check_gain as check_gain
 from .consistency import Consistency as Consistency
 from .consistency import consistency as consistency
 from .estimate import Estimate as Estimate
@@ -14,6 +12,8 @@ from .input_estimator import InputEstimator as InputEstimator
 from .invertibility import Invertibility as Invertibility
 from .invertibility import invertibility as invertibility
 from .kalman import design_kalman as design_kalman
+from .kalman_certificate import KalmanCertificate as KalmanCertificate
+from .kalman_certificate import check_gain as check_gain
 from .lag_report import LagReport as LagReport
 from .lags import Filter as Filter
 from .lags import FixedLag as FixedLag
@@ -28,9 +28,9 @@ from .multirate import PeriodicEstimator as PeriodicEstimator
 from .multirate import design_multirate as design_multirate
 from .noise_from_records import estimate_noise as estimate_noise
 from .noise_levels import NoiseLevels as NoiseLevels
-from .robust import HinfFilterCertificate as HinfFilterCertificate
-from .robust import MinimaxCertificate as MinimaxCertificate
-from .robust import RobustFilter as RobustFilter
+from .robust_filter import HinfFilterCertificate as HinfFilterCertificate
+from .robust_filter import MinimaxCertificate as MinimaxCertificate
+from .robust_filter import RobustFilter as RobustFilter
 from .static import StaticEstimator as StaticEstimator
 from .static import design_static as design_static
 from .unknown_inputs import Augmented as Augmented

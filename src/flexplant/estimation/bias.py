@@ -10,7 +10,7 @@ from ..errors import AssumptionError
 from ..lti.statespace import System
 from ..plant import StandardPlant
 from ..values import FloatArray
-from .channels import checked_plant
+from .estimator_channels import checked_plant
 from .filter_model import filter_model
 from .invertibility import entry, unknown_names
 

@@ -14,9 +14,9 @@ from ..lti.frequency import frequency_response
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, instance, real_array, short
-from .channels import poi_channels, row_of
 from .estimate import Estimate
 from .estimator import KalmanEstimator
+from .estimator_channels import poi_channels, row_of
 from .whiteness import (
     ExcessPeak,
     PooledSpectrum,

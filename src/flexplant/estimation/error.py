@@ -12,8 +12,8 @@ from ..lti.lyapunov import accumulated, doubled, scale_of, solve_stein
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, IntArray
-from .certificate import AGREEMENT
-from .channels import poi_channels
+from .estimator_channels import poi_channels
+from .kalman_certificate import AGREEMENT
 
 #: a rigid-body motion may enter the error by this part of the motion itself
 _SEEN = 1e-7

@@ -12,11 +12,11 @@ from ..errors import LabelError, counted, unknown_label
 from ..lti.lyapunov import scale_of
 from ..parallel import one_thread
 from ..values import FloatArray, Value, instance, known_units, real_array, sizes_of
-from .channels import estimates
+from .estimator_channels import estimates
 from .filter_model import FilterModel
 from .lags import Filter, FixedLag, Lag, Predictor, Smoother
 from .passage import Passage, passed
-from .records import recorded
+from .recorded import recorded
 from .sight import Sight
 from .smoothing import lagged, smoothed
 from .start import Start, stationary_start

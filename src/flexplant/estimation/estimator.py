@@ -15,11 +15,11 @@ from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, real_array, sizes_of
-from .certificate import KalmanCertificate
-from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
 from .estimate import Estimate, estimated, in_unit_states
+from .estimator_channels import poi_channels, row_of, same_pois, sensors
 from .filter_model import FilterModel, filter_model
+from .kalman_certificate import KalmanCertificate
 from .lag_report import LAGS, LagReport, lag_report
 from .lags import Filter, Lag
 from .left_out import LeftOut

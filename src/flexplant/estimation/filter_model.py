@@ -9,7 +9,7 @@ import numpy as np
 from ..errors import AssumptionError, ShapeError, SolverError, counted
 from ..plant import StandardPlant
 from ..values import FloatArray, Value
-from .channels import poi_channels, sensors
+from .estimator_channels import poi_channels, sensors
 from .left_out import LeftOut
 
 #: noise of a sensor beside its motion in one sample that rounding may hide: its square is 1e-12

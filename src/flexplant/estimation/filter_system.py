@@ -8,7 +8,7 @@ from ..lti.lyapunov import solve_stein
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray
-from .channels import estimates
+from .estimator_channels import estimates
 from .filter_model import FilterModel
 
 

@@ -18,7 +18,7 @@ from ..values import FloatArray
 from .filter_model import FilterModel, weighed
 from .filter_system import error_system, filter_system, own_variances
 from .kalman import design_kalman
-from .robust import HinfFilterCertificate, RobustFilter
+from .robust_filter import HinfFilterCertificate, RobustFilter
 
 #: the gain of the error's own system may exceed the level of the Riccati equation by this part
 _AGREEMENT = 1e-6

@@ -11,7 +11,7 @@ from ..errors import counted
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, sizes_of
-from .channels import poi_channels, row_of
+from .estimator_channels import poi_channels, row_of
 from .invertibility import Invertibility
 
 

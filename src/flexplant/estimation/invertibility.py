@@ -14,7 +14,7 @@ from ..lti.scaling import state_scale
 from ..lti.statespace import System
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, Value, check_names, name_list
-from .channels import checked_plant
+from .estimator_channels import checked_plant
 from .filter_model import FilterModel, filter_model
 
 #: singular values below this part of the largest one, inputs and sensors of unit size, are rounding

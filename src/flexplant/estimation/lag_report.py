@@ -14,7 +14,7 @@ from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, real_array
-from .channels import row_of
+from .estimator_channels import row_of
 from .sight import Sight
 from .static import design_static
 from .steady import Steady

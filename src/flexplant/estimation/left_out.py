@@ -17,7 +17,7 @@ from ..plant.realisation import ModalRealisation
 from ..reduction import ReducedModel
 from ..reduction.reduced import STATIC
 from ..values import ComplexArray, FloatArray, IntArray, Value
-from .channels import read_alike, sensors
+from .estimator_channels import read_alike, sensors
 
 #: a mode of the plant is one of the larger plant's within this part of its frequency
 _SAME = 0.15

@@ -7,11 +7,11 @@ import numpy as np
 from ..errors import ModelError
 from ..loop import ClosedLoop, close_loop
 from ..loop.budget import source_variances
-from ..loop.noise import check_stationary, sources
+from ..loop.noise_sources import check_stationary, sources
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import FloatArray
-from .channels import estimates, poi_channels, same_pois
+from .estimator_channels import estimates, poi_channels, same_pois
 
 
 def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop) -> FloatArray:

@@ -14,7 +14,7 @@ from ..errors import AssumptionError, FlexplantWarning, ModelError, unknown_labe
 from ..loop import close_loop
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, in_unit, short
-from .channels import poi_channels, row_of
+from .estimator_channels import poi_channels, row_of
 from .loop_error import loop_variances
 
 

@@ -12,8 +12,8 @@ from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..structure import FEModel
 from ..values import FloatArray, IntArray
-from .channels import poi_channels
 from .error import error_variances
+from .estimator_channels import poi_channels
 
 #: nodes per wavelength below which a mode is badly resolved: frequencies are off by some 5 %
 NODES = 4.0

@@ -15,12 +15,12 @@ from ..parallel import one_thread
 from ..plant import StandardPlant, UncertainPlant
 from ..progress import Progress, tick
 from ..values import FloatArray, whole
-from .channels import same_pois
 from .error import error_variances
+from .estimator_channels import same_pois
 from .filter_system import filter_system, own_variances
 from .kalman import design_kalman
 from .machine_error import FilterPart, Gains, MachineError, filter_part, machine_error
-from .robust import MinimaxCertificate, RobustFilter
+from .robust_filter import MinimaxCertificate, RobustFilter
 
 #: width of the smooth maximum relative to the largest value, from coarse to fine
 _WIDTHS = (0.1, 0.01, 0.001)

@@ -16,11 +16,11 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, instance, real_array, short, sizes_of, whole
-from .certificate import AGREEMENT
-from .channels import checked_plant, estimates, poi_channels, row_of, sensors
+from .estimator_channels import checked_plant, estimates, poi_channels, row_of, sensors
 from .filter_model import FilterModel, check_noises, filter_model, weighed
 from .filter_system import filter_system
-from .records import recorded
+from .kalman_certificate import AGREEMENT
+from .recorded import recorded
 
 #: longest period [samples], and most measurements in one
 _LONGEST, _MOST = 1000, 2000

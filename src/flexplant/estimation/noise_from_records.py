@@ -12,8 +12,8 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray
-from .channels import checked_plant, sensors
 from .estimator import KalmanEstimator
+from .estimator_channels import checked_plant, sensors
 from .kalman import design_kalman
 from .noise_levels import PROCESS, NoiseLevels, with_densities
 from .whiteness import level_test

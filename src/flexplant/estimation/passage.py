@@ -10,7 +10,7 @@ import numpy as np
 from ..lti.recursion import Recursion
 from ..values import FloatArray
 from . import fading
-from .records import Recorded
+from .recorded import Recorded
 from .sight import Sight
 from .start import Start
 from .steady import FilterGains, Steady, gains

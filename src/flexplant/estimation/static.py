@@ -13,8 +13,8 @@ from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from ..plant.rigid.rigid_motion import seen
 from ..values import FloatArray, Value
-from .channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 from .error import error_variances
+from .estimator_channels import checked_plant, estimates, poi_channels, row_of, same_pois, sensors
 
 #: a POI motion that the sensors miss by this relative part is not determined by them
 _MISSED = 1e-8

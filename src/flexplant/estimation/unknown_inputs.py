@@ -16,11 +16,11 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, instance, positive
-from .certificate import AGREEMENT
-from .channels import checked_plant, estimates
+from .estimator_channels import checked_plant, estimates
 from .filter_model import FilterModel, check_noises, filter_model, weighed
 from .input_estimator import InputCertificate, InputEstimator
 from .invertibility import InputEntry, Invertibility, entry, judged, unknown_names
+from .kalman_certificate import AGREEMENT
 from .noise_levels import with_densities
 
 #: variance of white inputs at the start of the search, beside what the sensors resolve

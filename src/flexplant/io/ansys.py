@@ -123,7 +123,7 @@ def cosines_of(angles: Any) -> FloatArray:
 
 
 def read_parsed(function: str, path: Path) -> dict[str, Any]:
-    """Return what a function of `foreign` finds in an ANSYS file.
+    """Return what a function of `foreign_parsers` finds in an ANSYS file.
 
     Raises
     ------

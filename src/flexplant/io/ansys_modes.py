@@ -9,8 +9,8 @@ import numpy as np
 from ..dof_columns import at_nodes
 from ..labels import DIRECTIONS, DofSet
 from .ansys import read_parsed
+from .file_shapes import FileShapes, ModesFormat
 from .paths import no_motion, unread
-from .shapes import FileShapes, ModesFormat
 
 _KINDS = dict(zip(("UX", "UY", "UZ", "ROTX", "ROTY", "ROTZ"), DIRECTIONS, strict=True))
 #: of the header: a modal analysis

@@ -11,7 +11,7 @@ from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
 from ..structure.precision import digits_of
-from .foreign import sound
+from .foreign_parsers import sound
 from .formats import USUAL
 from .numbers import printed_digits
 from .paths import file_path, parsing

@@ -10,7 +10,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from . import foreign
+from . import foreign_parsers
 from .paths import file_path
 
 #: children that wait for the next file, by the process that started them and the function
@@ -18,7 +18,7 @@ _WAITING: dict[tuple[int, str], subprocess.Popen[bytes]] = {}
 
 
 def in_child(function: str, path: str | Path, *, keep: bool = False) -> tuple[str, Any]:
-    """Return ("value", value) of a function of `foreign`, or the name and the text of its error.
+    """Return ("value", value) of one of `foreign_parsers`, or the name and the text of its error.
 
     A damaged file may make a parser crash, take all memory or never end: in a process of its own,
     with bounds, that is an error like any other. Where there is no Python to start (a frozen or
@@ -49,7 +49,7 @@ def in_child(function: str, path: str | Path, *, keep: bool = False) -> tuple[st
         child = None
     child = child or _started()
     if child is None:
-        return foreign.run(function, str(file))
+        return foreign_parsers.run(function, str(file))
     assert child.stdin is not None and child.stdout is not None  # noqa: S101 - both are pipes
     try:
         pickle.dump(([*sys.path], function, str(file.absolute())), child.stdin)
@@ -75,7 +75,7 @@ def _started() -> subprocess.Popen[bytes] | None:
     if "python" not in Path(sys.executable or "").name.lower():
         return None
     # -P: the folder of the script, whose modules have names of the standard library, stays out
-    command = [sys.executable, "-P", foreign.__file__]
+    command = [sys.executable, "-P", foreign_parsers.__file__]
     threads = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
     pipe, nothing = subprocess.PIPE, subprocess.DEVNULL
     environment = os.environ | threads

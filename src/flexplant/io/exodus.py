@@ -17,9 +17,9 @@ from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
 from ..values import FloatArray, Matrix, one_of, real_array
 from .assembled import missing_extra
+from .file_shapes import check_mass, frequencies
 from .formats import Elsewhere
 from .paths import damaged, file_path, parsing
-from .shapes import check_mass, frequencies
 
 _NAME = re.compile(r"(?:disp\w*?|displ\w*?|d|u|(rot\w*?|r))_?([xyz])", re.IGNORECASE)
 

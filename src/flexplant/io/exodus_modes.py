@@ -6,7 +6,7 @@ from pathlib import Path
 
 from ..errors import ModelError
 from .exodus import read_shapes
-from .shapes import FileShapes, ModesFormat
+from .file_shapes import FileShapes, ModesFormat
 
 
 def read_exodus_shapes(path: Path, nodes: Path | None) -> FileShapes:

@@ -13,7 +13,7 @@ from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from .assembled import one_matrix_each, text_digits
-from .foreign import sound
+from .foreign_parsers import sound
 from .formats import Format
 from .numbers import fixed_numbers, spaced_numbers
 from .paths import check_size, check_whole, parsing, refused, unread

@@ -11,8 +11,8 @@ from ..dof_columns import at_nodes
 from ..errors import LabelError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray
+from .file_shapes import FileShapes
 from .nastran import Nodes, read_nodes
-from .shapes import FileShapes
 from .tables import read_nodes_table
 
 _BULK = (".bdf", ".dat", ".nas", ".blk")

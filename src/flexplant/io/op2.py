@@ -9,11 +9,11 @@ import numpy as np
 
 from ..errors import FlexplantError, ModelError
 from ..values import FloatArray, IntArray
+from .file_shapes import FileShapes, ModesFormat
 from .nastran import Nodes, nodes_of
 from .nastran_shapes import shapes_at
 from .op2_records import Block, blocks
 from .paths import damaged
-from .shapes import FileShapes, ModesFormat
 
 #: approach (real eigenvalues) and table (eigenvectors, real numbers, mode by mode)
 _APPROACH, _TABLE = 2, 7

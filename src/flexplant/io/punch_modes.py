@@ -9,10 +9,10 @@ import numpy as np
 
 from ..errors import FlexplantError
 from ..values import FloatArray
+from .file_shapes import FileShapes, ModesFormat
 from .nastran_shapes import shapes_at
 from .numbers import decimal
 from .paths import damaged, wrong_line_of
-from .shapes import FileShapes, ModesFormat
 
 _EIGENVALUE = re.compile(rb"\$EIGENVALUE\s*=\s*(\S+)\s+MODE\s*=\s*(\d+)")
 

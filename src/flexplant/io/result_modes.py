@@ -13,9 +13,9 @@ from ..structure import FEMatrices, FEModel
 from ..structure.units import units as unit_system
 from ..values import FloatArray, instance
 from . import ansys_modes, exodus_modes, op2, punch_modes, uff_modes
+from .file_shapes import ModesFormat, check_mass, modes_of
 from .formats import HEAD, ends
 from .paths import file_path, three_units
-from .shapes import ModesFormat, check_mass, modes_of
 
 FORMATS: tuple[ModesFormat, ...] = (
     op2.OUTPUT2,

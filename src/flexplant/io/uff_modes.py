@@ -10,7 +10,7 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.units import Units
-from .shapes import FileShapes, ModesFormat
+from .file_shapes import FileShapes, ModesFormat
 from .tables import read_nodes_table
 from .uff import raw_nodes
 from .uff_analysis import NORMAL_MODE, mode_records

@@ -14,8 +14,8 @@ from ..labels import DofSet
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import FloatArray, instance
+from .joined_shapes import PlacedShape
 from .pose import Pose, turned
-from .shapes import PlacedShape
 
 #: either kind of model that can be joined
 Model = FEModel | ReducedModel

@@ -12,7 +12,6 @@ from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
 from ..values import ComplexArray, FloatArray, instance
-from .channels import channels_of, known_places, parts_of
 from .frf_joints import (
     FrfLink,
     channel_rows,
@@ -22,6 +21,7 @@ from .frf_joints import (
     warn_of_bending,
 )
 from .joint import Joint
+from .measured_channels import channels_of, known_places, parts_of
 
 #: condition of the interface beyond which errors of a measurement hide the answer
 _CONDITION = 1e8

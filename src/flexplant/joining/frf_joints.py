@@ -12,9 +12,9 @@ from ..errors import LabelError, ModelError, unknown_label, warn
 from ..lti import Frf
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, instance
-from .channels import Channels
 from .ends import JointEnd, joint_axes
 from .joint import Joint
+from .measured_channels import Channels
 from .patch import Patch
 
 #: time derivatives in the outputs of a measurement

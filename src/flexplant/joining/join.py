@@ -17,16 +17,16 @@ from ..sparse.factor import dense
 from ..structure import FEModel
 from ..structure.rigid import rigid_body_basis
 from ..values import FloatArray, frozen
-from .certificate import certified
 from .component import Component, Model, components_of
 from .elimination import Elimination, eliminated
 from .frf_coupling import joined_frfs
+from .joined_shapes import JoinedShape
+from .joining_certificate import certified
 from .joint import Joint
 from .links import Link, links_of, machine_size, rows_of, warn_of_missing_statics
 from .motions import groups_of, left_motions
 from .patch_error import patch_errors
 from .pose import Pose
-from .shapes import JoinedShape
 
 #: more coordinates of a machine with reduced components would not fit the memory comfortably
 _LARGEST = 5000

@@ -13,7 +13,7 @@ from ..errors import CertificateError, ModelError, unknown_label
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, in_unit, real_array, short
-from .noise import Source
+from .noise_sources import Source
 from .spectrum import densities, integrated, periodogram
 
 #: relative: the variance by the two Lyapunov equations, and by the integral of the spectrum

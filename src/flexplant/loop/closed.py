@@ -20,7 +20,7 @@ from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, Value
 from .broken import BrokenLoop, moved
 from .budget import ErrorBudget, error_budget, source_variances
-from .noise import Source, check_direct, sources, stationary_row
+from .noise_sources import Source, check_direct, sources, stationary_row
 from .spectrum import Spectrum, densities
 from .spill_over import SpillOver, growing_modes, high
 from .tapped import tapped

@@ -11,7 +11,7 @@ from ..lti.grid import resonance_grid
 from ..lti.responses import continuous_poles, responder
 from ..lti.statespace import StateSpace
 from ..values import FloatArray
-from .noise import Source
+from .noise_sources import Source
 
 #: densities (n_source, n_freq) at frequencies [Hz]
 Densities = Callable[[FloatArray], FloatArray]

@@ -2,13 +2,13 @@
 
 from .auto_mac import AutoMac as AutoMac
 from .branch_and_bound import BranchAndBound as BranchAndBound
-from .budget import Budget as Budget
 from .by_rows import ByRows as ByRows
 from .candidates import PlantChannel as PlantChannel
 from .closed_loop_h2 import ClosedLoopH2 as ClosedLoopH2
 from .constraint import Constraint as Constraint
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
+from .device_budget import Budget as Budget
 from .exchange import Exchange as Exchange
 from .exhaustive import Exhaustive as Exhaustive
 from .gramian import ModalControllability as ModalControllability
@@ -31,8 +31,8 @@ from .poi_variance import PoiVariance as PoiVariance
 from .problem import Found as Found
 from .problem import Problem as Problem
 from .problem import Search as Search
-from .robust import AfterLoss as AfterLoss
-from .robust import OverMachines as OverMachines
+from .robust_criteria import AfterLoss as AfterLoss
+from .robust_criteria import OverMachines as OverMachines
 from .scores import Scores as Scores
 from .scores import score_actuators as score_actuators
 from .scores import score_sensors as score_sensors

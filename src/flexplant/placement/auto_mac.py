@@ -9,8 +9,8 @@ import numpy as np
 
 from ..plant import StandardPlant
 from ..values import FloatArray
+from .candidate_shapes import ByShapes, Shapes
 from .criterion import Scorer
-from .shapes import ByShapes, Shapes
 from .summed import by_size
 
 

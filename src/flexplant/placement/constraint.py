@@ -7,7 +7,7 @@ from typing import Any
 
 from ..errors import ModelError
 from ..values import Value, whole
-from .places import Places, Zone
+from .candidate_places import Places, Zone
 from .rows import LinearRows
 
 

@@ -7,8 +7,8 @@ from typing import Any
 
 from ..errors import ModelError
 from ..values import short
+from .candidate_places import Places
 from .constraint import Constraint
-from .places import Places
 from .rows import LinearRows
 from .zones import OffPoi
 

@@ -13,8 +13,8 @@ from ..errors import ModelError
 from ..plant import StandardPlant
 from ..plant.realisation import ModalRealisation
 from ..values import FloatArray, one_of
+from .candidate_shapes import noise_sizes
 from .criterion import Criterion, Scorer
-from .shapes import noise_sizes
 from .summed import MEASURES, summed
 
 

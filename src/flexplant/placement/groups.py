@@ -9,8 +9,8 @@ import numpy as np
 
 from ..errors import LabelError, unknown_label
 from ..values import FloatArray, name_list, one_of, real_array, short
+from .candidate_places import Places
 from .constraint import Constraint, limits
-from .places import Places
 from .rows import LinearRows
 
 

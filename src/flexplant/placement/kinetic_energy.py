@@ -12,7 +12,7 @@ from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import short
-from .shapes import ByShapes, Shapes
+from .candidate_shapes import ByShapes, Shapes
 from .summed import SummedWorth
 
 

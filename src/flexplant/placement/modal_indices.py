@@ -9,7 +9,7 @@ import numpy as np
 
 from ..plant import StandardPlant
 from ..values import FloatArray, one_of
-from .shapes import ByShapes, Shapes, shapes_of
+from .candidate_shapes import ByShapes, Shapes, shapes_of
 from .summed import SummedWorth
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..plant import StandardPlant
 from ..values import FloatArray, flag
-from .shapes import ByShapes, Shapes
+from .candidate_shapes import ByShapes, Shapes
 from .summed import SummedMatrices
 
 

@@ -12,10 +12,10 @@ import numpy as np
 from ..errors import InfeasibleError, ModelError
 from ..plant import Actuator, StandardPlant
 from ..values import FloatArray, Rng, Value, positive, real_array, short
-from .budget import Budget
 from .candidates import checked_plant
 from .constraint import Constraint
 from .criterion import Criterion, in_words
+from .device_budget import Budget
 from .placement import Placement
 from .problem import Search
 from .search import place_actuators, place_sensors

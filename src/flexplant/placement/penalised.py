@@ -13,9 +13,9 @@ from ..arguments import function
 from ..errors import AssumptionError
 from ..plant import StandardPlant, larger_plant
 from ..values import FloatArray, one_of, positive
+from .candidate_shapes import Shapes, shapes_of
 from .candidates import side_of, sides_of
 from .criterion import Criterion, Scorer, as_criterion
-from .shapes import Shapes, shapes_of
 from .wrapping import Wrapping
 
 

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
-from ..estimation.channels import sensors
+from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
 from ..plant import Actuator, Disturbance, StandardPlant

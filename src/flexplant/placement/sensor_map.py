@@ -15,12 +15,12 @@ from ..plant.ports import Quantity
 from ..structure import Disc, Rectangle
 from ..values import FloatArray, Value, positive, real_array
 from ..work import Work
+from .candidate_places import places_of
 from .candidates import checked_plant
 from .constraint import Constraint
 from .constraints import all_of, rows_of
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
-from .places import places_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)

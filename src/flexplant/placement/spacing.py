@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..values import positive
+from .candidate_places import Places
 from .constraint import Constraint
-from .places import Places
 from .rows import LinearRows
 
 

@@ -11,11 +11,11 @@ import numpy as np
 from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
 from ..plant import StandardPlant
 from ..values import name_list, whole
+from .candidate_places import places_of
 from .candidates import Port, known_candidates, side_of
 from .constraint import Constraint
 from .constraints import rows_of
 from .layouts import layouts_of
-from .places import places_of
 from .problem import Problem
 from .rows import LinearRows
 from .separation import Separation

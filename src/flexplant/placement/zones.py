@@ -11,8 +11,8 @@ import numpy as np
 from ..errors import ModelError
 from ..structure import Disc
 from ..values import real_array, short
+from .candidate_places import Places, Zone
 from .constraint import Constraint, limits
-from .places import Places, Zone
 from .rows import LinearRows
 
 

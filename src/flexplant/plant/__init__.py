@@ -10,6 +10,7 @@ from .forces import Actuator as Actuator
 from .forces import BaseAcceleration as BaseAcceleration
 from .forces import Disturbance as Disturbance
 from .forces import OutputDisturbance as OutputDisturbance
+from .larger_plant import larger_plant as larger_plant
 from .mixed_sensitivity import mixed_sensitivity as mixed_sensitivity
 from .moving import Along as Along
 from .origin import Assembled as Assembled
@@ -20,8 +21,8 @@ from .port import Seen as Seen
 from .port import SensorPort as SensorPort
 from .ports import Ports as Ports
 from .ports import Reference as Reference
-from .residual import FastStates as FastStates
-from .residual import Feedthrough as Feedthrough
+from .residual_form import FastStates as FastStates
+from .residual_form import Feedthrough as Feedthrough
 from .rigid.decoupling import Decoupling as Decoupling
 from .rigid.decoupling import decouple as decouple
 from .rigid.stage import StageWeights as StageWeights
@@ -36,7 +37,6 @@ from .standard import StandardPlant as StandardPlant
 from .standard import standard_plant as standard_plant
 from .structure_frf import StructureFrf as StructureFrf
 from .structure_frf import frequency_response as frequency_response
-from .truncation import larger_plant as larger_plant
 from .uncertainty.neglected import NeglectedModes as NeglectedModes
 from .uncertainty.neglected import neglected_modes as neglected_modes
 from .uncertainty.uncertain_plant import Delta as Delta

@@ -5,7 +5,7 @@ from __future__ import annotations
 from .building import continuous_plant
 from .ports import Ports
 from .realisation import ModalRealisation, Structure
-from .residual import ResidualForm, modes_of
+from .residual_form import ResidualForm, modes_of
 from .standard import StandardPlant
 
 

@@ -20,7 +20,7 @@ from .origin import Assembled, Foreign
 from .partition import Partition
 from .ports import Ports
 from .realisation import ModalRealisation
-from .residual import modes_of
+from .residual_form import modes_of
 from .sampling import sampled_physical
 
 P = TypeVar("P", bound=Partition)

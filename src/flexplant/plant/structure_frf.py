@@ -26,7 +26,7 @@ from ..structure import Damping, FEModel
 from ..values import ComplexArray, FloatArray, instance, positive, real_array, whole
 from .ports import Ports
 from .realisation import Structure
-from .residual import modes_of
+from .residual_form import modes_of
 
 
 def _none() -> FloatArray:

@@ -11,7 +11,7 @@ from matplotlib.lines import Line2D
 
 from ..errors import ModelError, ShapeError
 from ..estimation import Estimate, LagReport
-from ..estimation.channels import row_of
+from ..estimation.estimator_channels import row_of
 from ..estimation.lag_report import PREDICTOR, SMOOTHER, STATIC
 from ..simulation import EstimatorComparison
 from ..values import FloatArray, instance, name_list, positive, real_array, short

@@ -12,8 +12,8 @@ from matplotlib.patches import Rectangle as Box
 
 from ..errors import ModelError
 from ..placement import ParetoCurve, SensorMap
-from ..placement.places import Zone, places_of
-from ..placement.shapes import shapes_of
+from ..placement.candidate_places import Zone, places_of
+from ..placement.candidate_shapes import shapes_of
 from ..plant import Ports, StandardPlant
 from ..structure import Disc
 from ..values import FloatArray, in_unit, instance, whole

@@ -1,9 +1,9 @@
 """Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality."""
 
 from .bounds import ErrorBound as ErrorBound
-from .component import CraigBampton as CraigBampton
-from .component import MacNeal as MacNeal
-from .component import Rubin as Rubin
+from .component_modes import CraigBampton as CraigBampton
+from .component_modes import MacNeal as MacNeal
+from .component_modes import Rubin as Rubin
 from .condensation import Guyan as Guyan
 from .condensation import Irs as Irs
 from .condensation import Serep as Serep

@@ -28,9 +28,9 @@ from ..values import (
 )
 from .bounds import ErrorBound
 from .judging import quality_of
-from .massless import static_followers
 from .quality import ReductionQuality
 from .spanned import Spanned
+from .static_followers import static_followers
 
 #: part of the largest eigenvalue of K* by which the lowest one is negative where K* is indefinite
 _DEFINITE = 1e-14

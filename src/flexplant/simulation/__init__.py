@@ -1,7 +1,5 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error."""
 
-from .elements import Quantiser as Quantiser
-from .elements import Saturation as Saturation
 from .error_map import ErrorMap as ErrorMap
 from .error_map import error_map as error_map
 from .estimator_comparison import EstimatorComparison as EstimatorComparison
@@ -20,6 +18,8 @@ from .machine_pipeline import MachinePipeline as MachinePipeline
 from .machine_report import MachineReport as MachineReport
 from .motion import Motion as Motion
 from .motion import SetPoint as SetPoint
+from .nonlinear_elements import Quantiser as Quantiser
+from .nonlinear_elements import Saturation as Saturation
 from .response import Response as Response
 from .setpoint import scan as scan
 from .setpoint import setpoint as setpoint

@@ -12,7 +12,7 @@ from ..loop import ClosedLoop
 from ..loop.known import with_known
 from ..plant import StandardPlant
 from ..values import FloatArray, instance, positive, real_array, whole
-from .elements import Element, split_elements
+from .nonlinear_elements import Element, split_elements
 
 
 class Conditions(NamedTuple):

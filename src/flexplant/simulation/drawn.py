@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..loop.noise import WhiteNoise
+from ..loop.noise_sources import WhiteNoise
 from ..plant import StandardPlant
 from ..values import FloatArray
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..estimation import KalmanEstimator, StaticEstimator
-from ..estimation.channels import estimates, poi_channels, row_of
+from ..estimation.estimator_channels import estimates, poi_channels, row_of
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, instance, short
 from .response import Response

@@ -8,14 +8,14 @@ from typing import Protocol
 import numpy as np
 
 from ..loop import ClosedLoop
-from ..loop.noise import WhiteNoise
+from ..loop.noise_sources import WhiteNoise
 from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, cheapest
 from ..values import FloatArray
 from .anti_windup import split_law
 from .conditions import Conditions, Moving
 from .drawn import Drawn
-from .elements import Acting
 from .lifting import lifted
+from .nonlinear_elements import Acting
 from .stepping import Buffers, Machine, machine, step_through
 
 #: samples per stretch and runs side by side: what fits the cache of one core

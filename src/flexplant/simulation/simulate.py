@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
 from ..loop import ClosedLoop
 from ..loop.known import DERIVATIVES, references
-from ..loop.noise import white_noise
+from ..loop.noise_sources import white_noise
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant
 from ..values import (
@@ -27,8 +27,8 @@ from ..values import (
     whole,
 )
 from .conditions import conditions, finer_loop
-from .elements import Element
 from .motion import SetPoint
+from .nonlinear_elements import Element
 from .response import Response
 from .runs import make_runner
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, IntArray
-from .elements import Acting
+from .nonlinear_elements import Acting
 
 
 class Machine(NamedTuple):

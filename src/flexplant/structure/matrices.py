@@ -20,7 +20,7 @@ from .completion import square
 from .condense import held_rows, no_mass
 from .definite import SEMIDEFINITE
 from .local_axes import cosines
-from .massless import inertial
+from .massless_motions import inertial
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding, shown_digits
 from .units import units

@@ -1,17 +1,18 @@
 """Controllers: the servo on the estimated point of interest, H2 and H-infinity."""
 
 from .aftercare.c_code import write_c as write_c
+from .aftercare.controller_sampling import discretise_controller as discretise_controller
+from .aftercare.filter_sections import second_order_sections as second_order_sections
 from .aftercare.order import reduce_controller as reduce_controller
-from .aftercare.sampling import discretise_controller as discretise_controller
-from .aftercare.sections import second_order_sections as second_order_sections
 from .aftercare.windup import anti_windup_form as anti_windup_form
 from .controller import Controller as Controller
-from .elements import Lead as Lead
-from .elements import LowPass as LowPass
-from .elements import Notch as Notch
-from .elements import Pid as Pid
+from .controller_elements import Lead as Lead
+from .controller_elements import LowPass as LowPass
+from .controller_elements import Notch as Notch
+from .controller_elements import Pid as Pid
 from .h2 import design_h2 as design_h2
 from .hinf import design_hinf as design_hinf
+from .hinf_riccati import Riccati as Riccati
 from .law import Law as Law
 from .lmi import Lmi as Lmi
 from .loop_design import LoopDesign as LoopDesign
@@ -23,16 +24,15 @@ from .objectives.specifications import H2 as H2
 from .objectives.specifications import Hinf as Hinf
 from .objectives.specifications import PeakGain as PeakGain
 from .objectives.specifications import PoleRegion as PoleRegion
-from .riccati import Riccati as Riccati
-from .robustness.blocks import FullBlock as FullBlock
-from .robustness.blocks import RepeatedScalar as RepeatedScalar
 from .robustness.dk import design_mu as design_mu
 from .robustness.gain import WorstCaseGain as WorstCaseGain
 from .robustness.gain import worst_case_gain as worst_case_gain
 from .robustness.mu import MuBounds as MuBounds
 from .robustness.mu import mu as mu
-from .robustness.stability import RobustStability as RobustStability
-from .robustness.stability import robust_stability as robust_stability
+from .robustness.robust_stability import RobustStability as RobustStability
+from .robustness.robust_stability import robust_stability as robust_stability
+from .robustness.uncertainty_blocks import FullBlock as FullBlock
+from .robustness.uncertainty_blocks import RepeatedScalar as RepeatedScalar
 from .servo import design_servo as design_servo
 from .servo import servo_bandwidth as servo_bandwidth
 from .shaping import ShapedLoop as ShapedLoop

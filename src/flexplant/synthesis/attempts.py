@@ -15,9 +15,9 @@ from ..lti.responses import Responder, remembered, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from .certificate import certified_norm
+from .hinf_riccati import Riccati
 from .lower_bound import lower_bound, pointwise_bound, raised_bound
 from .method import SolvedController, SynthesisMethod
-from .riccati import Riccati
 from .singular import ADDED
 from .structured_lmi import SmallestGamma, StructuredLmi
 

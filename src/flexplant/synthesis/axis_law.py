@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 
 from ..values import ComplexArray, FloatArray, IntArray
-from .elements import LowPass, Notch, Pid
+from .controller_elements import LowPass, Notch, Pid
 from .law import Law, Section
 from .measured_axis import MeasuredAxis
 

@@ -20,7 +20,7 @@ from .controller import Controller
 from .method import SolvedController
 from .reach import posed, require_reach
 from .singular import made_regular, missing_ranks
-from .spill_over import with_left_out
+from .spill_over_check import with_left_out
 
 #: the H2 norm by the closed loop's Gramians and by the formula of the least cost agree to this
 AGREEMENT = 1e-5

@@ -19,11 +19,11 @@ from .attempts import Answer, answered, best_answer
 from .central import require_shown
 from .certificate import reached_norms
 from .controller import Controller
+from .hinf_riccati import Riccati
 from .lmi import Lmi
 from .method import SynthesisMethod
 from .reach import posed, require_reach
-from .riccati import Riccati
-from .spill_over import with_left_out
+from .spill_over_check import with_left_out
 from .structured_lmi import StructuredLmi
 
 #: A beside its poles, from which on coordinates are blamed for a failure

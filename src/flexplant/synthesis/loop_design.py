@@ -20,7 +20,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant, decouple
 from ..values import FloatArray, Value, name_list, short
 from .law import Element, Law
-from .spill_over import spill_over, unchecked
+from .spill_over_check import spill_over, unchecked
 
 
 @dataclass(frozen=True, eq=False, repr=False)

@@ -22,7 +22,7 @@ from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import FloatArray, positive
 from .controller import Controller
-from .spill_over import with_left_out
+from .spill_over_check import with_left_out
 
 #: corner of the integral action of the recipe, beside the bandwidth
 _INTEGRAL = 0.1

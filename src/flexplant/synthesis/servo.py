@@ -18,7 +18,7 @@ from .controller import Controller
 from .servo_axis import Axis
 from .servo_loop import TARGET
 from .servo_task import ServoTask, servo_task
-from .spill_over import CLOSE, unchecked
+from .spill_over_check import CLOSE, unchecked
 
 
 @one_thread()

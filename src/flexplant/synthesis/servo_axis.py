@@ -11,7 +11,7 @@ from ..lti.discretisation import held_exactly
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray
-from .elements import LowPass, Notch, Pid
+from .controller_elements import LowPass, Notch, Pid
 from .law import Law
 
 #: the lead's zero lies this factor below the bandwidth, its pole above: |S| of the rigid body

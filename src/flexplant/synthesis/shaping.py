@@ -24,7 +24,7 @@ from .controller import Controller
 from .loop_design import Axes, axes_of, connected
 from .ncf import below_half_rate, integral_action, loop_margin, require_model, verified_controller
 from .ncf_following import following
-from .spill_over import with_left_out
+from .spill_over_check import with_left_out
 
 #: how near the crossover comes to the bandwidth, and the steps that it may take
 _NEAR, _STEPS = 0.02, 8

@@ -20,7 +20,7 @@ from .certificate import certified_norm, reached_norms
 from .controller import Controller
 from .nonsmooth import Minimum, bfgs, sampled_minimum
 from .reach import require_stabilisable
-from .spill_over import with_left_out
+from .spill_over_check import with_left_out
 from .structured_loop import DECAY, Matrices, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 

@@ -17,7 +17,7 @@ from ...structure.placed import SPANNED
 from ...structure.rigid import orthonormalised
 from ...values import FloatArray, Value, positive, real_array
 from ..port_checks import checked_direction, checked_place
-from .complex_modes import suspended
+from .complex_suspension import suspended
 
 Suspended = TypeVar("Suspended", FEModel, ReducedModel, Modes)
 #: relative: a rigid-body motion that stretches a spring by less than this does not

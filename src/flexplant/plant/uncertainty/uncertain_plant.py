@@ -20,7 +20,7 @@ from ...values import FloatArray, Value, generator, real_array, whole
 from ..building import P, rebuilt
 from ..partition import Partition
 from ..realisation import MODAL, ModalRealisation
-from ..residual import modes_of
+from ..residual_form import modes_of
 from .neglected import NeglectedModes
 
 

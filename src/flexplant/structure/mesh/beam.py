@@ -10,9 +10,9 @@ import numpy as np
 from ...errors import ModelError
 from ...values import one_of, positive, short
 from ..model import FEModel
-from .assembly import Grid
-from .elements import beam_mass, beam_stiffness
+from .element_matrices import beam_mass, beam_stiffness
 from .grid_fields import Field, counts_of, dofs_of, field_of
+from .grid_matrices import Grid
 from .shapes import BeamShape
 
 #: which motions an end does not have

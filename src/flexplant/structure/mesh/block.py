@@ -8,9 +8,9 @@ import numpy as np
 
 from ...values import FloatArray, real_array
 from ..model import FEModel
-from .assembly import Grid
-from .elements import brick_mass, brick_stiffness
+from .element_matrices import brick_mass, brick_stiffness
 from .grid_fields import Field, counts_of, dofs_of, field_of, lengths_of, poisson_of, present_of
+from .grid_matrices import Grid
 from .shapes import BlockShape
 
 

@@ -10,8 +10,7 @@ import numpy as np
 from ...arguments import members
 from ...values import FloatArray
 from ..model import FEModel
-from .assembly import Grid
-from .elements import plate_mass, plate_stiffness
+from .element_matrices import plate_mass, plate_stiffness
 from .grid_fields import (
     Field,
     Hole,
@@ -23,6 +22,7 @@ from .grid_fields import (
     present_of,
     share_of,
 )
+from .grid_matrices import Grid
 from .ribs import Rib, Skin, rib_matrices
 from .shapes import PlateShape as PlateShape
 

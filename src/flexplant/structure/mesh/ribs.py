@@ -11,8 +11,8 @@ import scipy.sparse as sp
 
 from ...errors import ModelError
 from ...values import FloatArray, IntArray, Value, positive, real_array
-from .assembly import Grid
-from .elements import beam_mass, beam_rotary, beam_stiffness
+from .element_matrices import beam_mass, beam_rotary, beam_stiffness
+from .grid_matrices import Grid
 
 #: of an element: a rib's ends are this close to nodes
 _ON_NODE = 1e-6

@@ -13,8 +13,8 @@ import numpy as np
 from ...errors import LabelError, counted
 from ...labels import Interpolation
 from ...values import FloatArray, real_array
-from .assembly import Grid
-from .elements import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
+from .element_matrices import brick_shape, brick_slopes, hermite, plate_coefficients, plate_terms
+from .grid_matrices import Grid
 
 
 @dataclass(frozen=True, eq=False, repr=False)

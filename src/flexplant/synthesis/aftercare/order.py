@@ -19,7 +19,7 @@ from ...parallel import one_thread
 from ...plant import StandardPlant, standard_plant
 from ...values import FloatArray, positive, whole
 from ..controller import Controller
-from ..spill_over import with_left_out
+from ..spill_over_check import with_left_out
 from .loop_check import LoopFacts, kept, loop_facts, required, stable_before
 
 

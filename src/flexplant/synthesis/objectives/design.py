@@ -19,7 +19,7 @@ from ...values import positive, short, whole
 from ..controller import Controller
 from ..lmi_plant import Plant
 from ..reach import require_stabilisable
-from ..spill_over import with_left_out
+from ..spill_over_check import with_left_out
 from .least import require_reachable
 from .programs import ObjectivePrograms
 from .specifications import H2, Hinf, PeakGain, PoleRegion

@@ -11,7 +11,7 @@ from ...lti.norms import peak_gain
 from ...plant import StandardPlant
 from ..h2 import design_h2
 from ..hinf import design_hinf
-from ..riccati import Riccati
+from ..hinf_riccati import Riccati
 from .specifications import H2, Hinf
 
 #: relative: bounds so close to the least value are left to the search

@@ -19,11 +19,11 @@ from ...values import FloatArray, whole
 from ..controller import Controller
 from ..hinf import design_hinf
 from ..method import SynthesisMethod
-from ..spill_over import with_left_out
-from .blocks import FullBlock, Scalings, osborne, places
+from ..spill_over_check import with_left_out
 from .magnitude import fitted_magnitude, inverse
 from .sweep import covered
 from .uncertain_loop import OpenPlant, UncertainLoop, open_plant, uncertain_loop
+from .uncertainty_blocks import FullBlock, Scalings, osborne, places
 from .upper import upper_level
 
 #: frequencies at which D is found

@@ -18,12 +18,12 @@ from ...plant import StandardPlant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...progress import Progress
 from ...values import ComplexArray, FloatArray, Value, generator
-from .blocks import FullBlock, places
 from .lower import power_iteration
 from .machine import machine, neglected_delta, values_of
 from .perturbation import Perturbation, matrix_of
 from .sweep import INTERVALS, Covered, covered
 from .uncertain_loop import UncertainLoop, uncertain_loop
+from .uncertainty_blocks import FullBlock, places
 
 #: frequencies that start a search, starts at each, rounds over all real Deltas
 _SOUGHT, _STARTS, _ROUNDS = 5, 3, 3

@@ -12,9 +12,9 @@ from ...lti.statespace import StateSpace
 from ...plant import StandardPlant
 from ...plant.uncertainty.neglected import opened
 from ...values import FloatArray
-from .blocks import FullBlock
 from .perturbation import Perturbation, realised
 from .uncertain_loop import UncertainLoop
+from .uncertainty_blocks import FullBlock
 
 
 def values_of(loop: UncertainLoop, found: Perturbation, size: float) -> dict[str, float]:

@@ -14,10 +14,10 @@ from ...lti.stability import obstacle
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
 from ...values import ComplexArray, Value, generator
-from .blocks import Block, RepeatedScalar, Scalings, checked_blocks, places
 from .lower import crossing_multiple, destabilising, power_iteration
 from .perturbation import Perturbation, matrix_of
 from .sweep import covered
+from .uncertainty_blocks import Block, RepeatedScalar, Scalings, checked_blocks, places
 from .upper import upper_level
 
 #: frequencies at which a perturbation is sought, starts at each

@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ...lti.statespace import StateSpace
 from ...values import ComplexArray, FloatArray
-from .blocks import Block, FullBlock, Place, places
+from .uncertainty_blocks import Block, FullBlock, Place, places
 
 
 class Perturbation(NamedTuple):

@@ -20,7 +20,7 @@ from ...lti.scaling import state_scale
 from ...lti.statespace import StateSpace
 from ...progress import tick
 from ...values import ComplexArray, FloatArray
-from .blocks import Block, Scalings, places
+from .uncertainty_blocks import Block, Scalings, places
 from .upper import centred, reached_level, simple_bound, upper_level
 
 #: relative distance of the level to the largest upper bound found at a frequency

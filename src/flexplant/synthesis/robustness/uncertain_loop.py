@@ -18,7 +18,7 @@ from ...lti.statespace import StateSpace, as_statespace
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...values import FloatArray, name_list, short
-from .blocks import Block, FullBlock, RepeatedScalar
+from .uncertainty_blocks import Block, FullBlock, RepeatedScalar
 
 #: heights are taken this much above the weights at the frequencies that sample an interval
 _SAFE = 1.002

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...values import ComplexArray, FloatArray, IntArray
-from .blocks import Place, Scalings, osborne
+from .uncertainty_blocks import Place, Scalings, osborne
 
 #: Newton decrement at which a centre is left; steps for one
 _CENTRED, _STEPS = 0.3, 40

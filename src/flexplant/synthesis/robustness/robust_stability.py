@@ -16,7 +16,6 @@ from ...plant import StandardPlant, larger_plant
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...progress import Progress
 from ...values import FloatArray, Value, generator, whole
-from .blocks import FullBlock, places
 from .lower import (
     Destabilising,
     destabilising,
@@ -27,6 +26,7 @@ from .machine import machine, neglected_delta, values_of
 from .mu import sought
 from .sweep import INTERVALS, covered
 from .uncertain_loop import UncertainLoop, uncertain_loop
+from .uncertainty_blocks import FullBlock, places
 
 #: mu below this is not resolved
 _RESOLVED = 0.05

@@ -9,8 +9,8 @@ import numpy as np
 
 from ..errors import ModelError, unknown_label
 from ..values import positive, short
+from .candidate_places import Places
 from .constraint import Constraint
-from .places import Places
 from .rows import LinearRows
 
 

@@ -11,7 +11,7 @@ from ..errors import CertificateError, SolverError
 from ..lti.lyapunov import solve_stein
 from ..plant import StandardPlant
 from ..values import FloatArray, real_array
-from .channels import sensors
+from .estimator_channels import sensors
 from .filter_model import FilterModel, filter_model
 
 #: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this

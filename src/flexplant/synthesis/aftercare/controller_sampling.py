@@ -10,7 +10,7 @@ from ...lti.statespace import as_statespace
 from ...plant import StandardPlant
 from ...values import instance, positive
 from ..controller import Controller
-from ..spill_over import with_left_out
+from ..spill_over_check import with_left_out
 from .loop_check import loop_facts, required, stable_before
 
 

@@ -11,8 +11,8 @@ from ..errors import counted
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, sizes_of
-from .channels import poi_channels, row_of, same_pois, sensors
 from .error import error_variances
+from .estimator_channels import poi_channels, row_of, same_pois, sensors
 
 
 @dataclass(frozen=True, eq=False, repr=False)
