@@ -166,6 +166,12 @@ def test_solids_at_any_angle():
     point = np.array([0.1, 0, 0]) + R @ [0.3, 0.1, 0.05]
     turned_row = machine.row(point, "x") @ machine.rigid_motions()
     np.testing.assert_allclose(turned_row[:3], [1, 0, 0], atol=1e-12)
+    outer = fx.joined({"m": machine}, placed={"m": fx.Pose((0, 1, 0), (-0.2, 0.5, 0.9))})
+    for axis in "xyz":  # the labels of nodes that follow, whose directions turn with them
+        left, right = f"m/left/3:{axis}", f"m/right/1:{axis}"
+        assert right not in outer.dofs.labels
+        np.testing.assert_allclose(outer.row(right), outer.row(left), atol=1e-14)
+        np.testing.assert_allclose(outer.dofs.location(right), outer.dofs.location(left))
 
 
 def test_matching_meshes_with_few_digits():

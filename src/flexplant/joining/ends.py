@@ -122,11 +122,11 @@ class JointEnd:
     def _at_point(self, point: Any) -> None:
         self.point, self._rows = np.asarray(point, dtype=np.float64), {}
         failed = ""
-        for axis in DIRECTIONS:
+        for axis in sorted(DIRECTIONS, key=lambda axis: axis not in self._dofs.directions):
             try:
                 self._rows[axis] = self._dofs.row(self.point, axis)
             except LabelError as error:
-                failed = str(error)
+                failed = failed or str(error)
         if not self._rows:
             raise LabelError(f"the joint at {self.text} is nowhere: {failed}")
 

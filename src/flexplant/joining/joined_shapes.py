@@ -61,26 +61,32 @@ class PlacedShape(Interpolation):
 
     def rows(self, points: FloatArray, direction: str) -> FloatArray:
         """Return the weights (p, n) at many points (p, 3), as `row` does one by one."""
-        axis, places = DIRECTIONS.index(direction), self.pose.own_points(points)
-        first = 3 * (axis // 3)
-        share = np.asarray(self.pose.rotation)[axis - first]
-        C: Any = self.C
-        found = sum(
-            share[k] * self.own.rows(places, DIRECTIONS[first + k])
-            for k in range(3)
-            if share[k] != 0
-        )
-        return np.asarray((C @ np.asarray(found).T).T)
+        places = self.pose.own_points(points)
+        found = sum(share * self.own.rows(places, own) for own, share in self._shares(direction))
+        return np.asarray((self.C @ np.asarray(found).T).T)
 
     def dependent(self, label: str) -> tuple[FloatArray, FloatArray] | None:
         """Return the row (n,) and the coordinates (3,) of a DOF that follows others, or None.
 
-        Only where the component is not turned: labels keep their directions then.
+        Turned, it is a mixture of the directions of its node, which must all be known.
         """
-        found = self.own.dependent(label)
-        if found is None or not np.array_equal(self.pose.rotation, np.eye(3)):
+        node, _, direction = label.rpartition(":")
+        if direction not in DIRECTIONS:
             return None
-        return found[0], self.pose.points(found[1][None])[0]
+        row = np.zeros(self.C.shape[1])
+        for own, share in self._shares(direction):
+            found = self.own.dependent(f"{node}:{own}")
+            if found is None:
+                return None
+            row += share * found[0]
+        return np.asarray(self.C @ row), self.pose.points(found[1][None])[0]
+
+    def _shares(self, direction: str) -> list[tuple[str, float]]:
+        """Return the own directions in one of the machine, and their shares."""
+        first, axis = divmod(DIRECTIONS.index(direction), 3)
+        shares = np.asarray(self.pose.rotation)[axis].tolist()
+        own = DIRECTIONS[3 * first : 3 * first + 3]
+        return [(name, share) for name, share in zip(own, shares, strict=True) if share]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
