@@ -73,13 +73,13 @@ class PlacedShape(Interpolation):
         node, _, direction = label.rpartition(":")
         if direction not in DIRECTIONS:
             return None
-        row = np.zeros(self.C.shape[1])
+        row, place = np.zeros(self.C.shape[1]), np.zeros(3)
         for own, share in self._shares(direction):
             found = self.own.dependent(f"{node}:{own}")
             if found is None:
                 return None
-            row += share * found[0]
-        return np.asarray(self.C @ row), self.pose.points(found[1][None])[0]
+            row, place = row + share * found[0], found[1]
+        return np.asarray(self.C @ row), self.pose.points(place[None])[0]
 
     def _shares(self, direction: str) -> list[tuple[str, float]]:
         """Return the own directions in one of the machine, and their shares."""
