@@ -49,12 +49,20 @@ def test_names_that_it_gives_exist():
             value = getattr(value, part)
 
 
+LISTS = """
+two = fx.FEModel([[1, 0], [0, 2]], [[5, -5], [-5, 5]], [[0, 0], [0, 0]],
+                 dofs=fx.DofSet([1, 2], ["x", "x"], [[0, 0, 0], [1, 0, 0]]))
+pair = fx.solve_modes(two, count=2, damping=fx.ModalDamping([0.0, 0.01]))
+tip = fx.Poi("tip", at=[1.0, 0, 0], axes=["x"])
+"""
+
+
 @pytest.mark.slow
 def test_its_scripts_pass_strict_type_checks(tmp_path):
     """Lists where arrays are held, one name or several; dask's own functions have no types."""
     pytest.importorskip("mypy")
     script = tmp_path / "readme.py"
-    script.write_text("\n".join(BLOCKS), encoding="utf-8")
+    script.write_text("\n".join([*BLOCKS, LISTS]), encoding="utf-8")
     options = ["--strict", "--allow-untyped-calls", f"--config-file={ROOT / 'pyproject.toml'}"]
     command = [sys.executable, "-m", "mypy", *options, f"--cache-dir={ROOT / '.mypy_cache'}"]
     env = os.environ | {"MYPYPATH": str(ROOT / "src")}

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
 from .dof_columns import LARGEST_NODE
-from .errors import LabelError, unknown_label
+from .errors import LabelError, ShapeError, unknown_label
 from .places import DIRECTIONS
-from .values import IntArray
+from .values import FloatArray, IntArray
 
 #: of so many labels the closest are found by comparing each with the one that is unknown
 _COMPARABLE = 2000
@@ -89,3 +90,18 @@ def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) 
     return LabelError(
         f"no DOF {label!r} ({nodes.size} known). At the nodes next to it there are: {listed}."
     )
+
+
+def in_box(xyz: FloatArray, box: Any) -> Any:
+    """Return which points (n, 3) are between the lowest and the highest corner of a box (n,)."""
+    try:
+        corners = np.array(box, dtype=np.float64)
+    except (TypeError, ValueError):
+        corners = np.full((1,), np.nan)
+    if corners.shape != (2, 3) or not np.all(corners[0] <= corners[1]):
+        raise ShapeError(
+            f"box must be its lowest and its highest corner, [(x, y, z), (x, y, z)] in metres, "
+            f"got {box!r:.120}. Use -inf and inf for open sides."
+        )
+    slack = 1e-9 * float(np.ptp(xyz, axis=0).max(initial=0.0))
+    return np.all((xyz >= corners[0] - slack) & (xyz <= corners[1] + slack), axis=1)

@@ -6,23 +6,18 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
-from .dof_columns import (
-    columns_of,
-    component_columns,
-    direction_names,
-    listed,
-    node_numbers,
-)
-from .dof_index import DofIndex, unknown_dof
+from .dof_columns import columns_of, component_columns, direction_names, listed, node_numbers
+from .dof_index import DofIndex, in_box, unknown_dof
 from .errors import LabelError, ShapeError, counted, unknown_label
 from .places import DIRECTIONS as DIRECTIONS
 from .places import Interpolation as Interpolation
 from .places import Place as Place
-from .values import FloatArray, IntArray, Value, instance, real_array
+from .values import FloatArray, IntArray, Value, frozen, instance, real_array
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -65,6 +60,18 @@ class DofSet(Value):
     interpolation: Interpolation | None = None
     components: tuple[str, ...] = ()
     component_of: IntArray | None = None
+
+    if TYPE_CHECKING:  # what comes in is anything array-like
+
+        def __init__(
+            self,
+            nodes: npt.ArrayLike,
+            directions: Iterable[str],
+            xyz: npt.ArrayLike,
+            interpolation: Interpolation | None = None,
+            components: Iterable[str] = (),
+            component_of: npt.ArrayLike | None = None,
+        ) -> None: ...
 
     def __post_init__(self) -> None:
         nodes = node_numbers(self.nodes)
@@ -109,8 +116,7 @@ class DofSet(Value):
         kinds = np.zeros(listed.size, dtype=np.int64)
         for kind, direction in enumerate(DIRECTIONS):
             kinds[listed == direction] = kind
-        kinds.flags.writeable = False
-        return kinds
+        return np.asarray(frozen(kinds))
 
     @cached_property
     def labels(self) -> tuple[str, ...]:
@@ -130,8 +136,7 @@ class DofSet(Value):
         if self.component_of is not None:
             pairs = index * len(self.components) + self.component_of
             index = np.unique(pairs, return_inverse=True)[1]
-        index.flags.writeable = False
-        return np.asarray(index)
+        return np.asarray(frozen(index))
 
     @cached_property
     def _index(self) -> DofIndex:
@@ -268,7 +273,7 @@ class DofSet(Value):
                 )
             keep &= np.isin(self.kinds, [DIRECTIONS.index(direction) for direction in named])
         if box is not None:
-            keep &= self._inside(box)
+            keep &= in_box(self.xyz, box)
             if not keep.any():
                 low, high = self.xyz.min(axis=0).tolist(), self.xyz.max(axis=0).tolist()
                 raise LabelError(
@@ -276,19 +281,6 @@ class DofSet(Value):
                     f"from {low} to {high} m. Coordinates are in metres; make the box larger."
                 )
         return self._taken(np.flatnonzero(keep))
-
-    def _inside(self, box: Any) -> Any:
-        try:
-            corners = np.array(box, dtype=np.float64)
-        except (TypeError, ValueError):
-            corners = np.full((1,), np.nan)
-        if corners.shape != (2, 3) or not np.all(corners[0] <= corners[1]):
-            raise ShapeError(
-                f"box must be its lowest and its highest corner, [(x, y, z), (x, y, z)] in metres, "
-                f"got {box!r:.120}. Use -inf and inf for open sides."
-            )
-        slack = 1e-9 * float(np.ptp(self.xyz, axis=0).max(initial=0.0))
-        return np.all((self.xyz >= corners[0] - slack) & (self.xyz <= corners[1] + slack), axis=1)
 
     def nearest(
         self,

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..dof_index import in_box
 from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray, positive
@@ -93,7 +94,7 @@ def _joints(one: Component, other: Component, box: Any, reach: float) -> list[Jo
 
 def _nodes(dofs: DofSet, box: Any) -> Any:
     """Return one row for each node in a box."""
-    inside = np.ones(len(dofs), dtype=bool) if box is None else dofs._inside(box)
+    inside = np.ones(len(dofs), dtype=bool) if box is None else in_box(dofs.xyz, box)
     first = np.unique(dofs.node_index, return_index=True)[1]
     return first[inside[first]]
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -116,7 +116,7 @@ class Poi(Value):
     home: ClassVar = "z"
     name: str
     at: Place
-    axes: tuple[str, ...] = ("z",)
+    axes: Sequence[str] = ("z",)
     absolute: bool = False
 
     def __post_init__(self) -> None:

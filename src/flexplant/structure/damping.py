@@ -89,7 +89,7 @@ class ModalDamping(Damping):
     array([0.  , 0.02, 0.01])
     """
 
-    ratio: float | FloatArray
+    ratio: float | Sequence[float] | FloatArray
     others: float | None = field(default=None, kw_only=True)
     rigid: float = field(default=0.0, kw_only=True)
 

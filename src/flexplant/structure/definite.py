@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, cast
+from typing import Any, TypeAlias, cast
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..sparse.factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
 from ..values import Matrix, real_array
 
+#: what becomes a matrix of a structure
+MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"
 #: relative to the diagonal: entries of a symmetric matrix differ by less from their mirror images
 _SYMMETRY_TOLERANCE = 1e-9
 #: relative to the diagonal: K and D may have eigenvalues this far below zero

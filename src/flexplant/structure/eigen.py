@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError
 from ..labels import DofSet
-from ..sparse.factor import dense, unit_diagonal
+from ..sparse.factor import DENSE_LIMIT, dense, unit_diagonal
 from ..sparse.rayleigh_ritz import rayleigh_ritz, rounding_of, soft_group
 from ..values import FloatArray
 from .negative_stiffness import are_rigid, signed_root
@@ -92,6 +93,19 @@ def elastic_modes(
         unstable[:] = False
     check_stiffness(squares, phi, rounding_of(K, phi), rigid, dofs, unstable)
     return signed_root(squares), signed(phi)
+
+
+def has_negative_springs(model: Any) -> bool:
+    """Return whether an FEModel's K has negative eigenvalues, all of them of rigid-body motion."""
+    count = model.n_unstable
+    if not count or model.n_dof > DENSE_LIMIT:
+        return False
+    M, K = dense(model.M), dense(model.K)
+    try:
+        elastic_modes(M, K, model.rigid_body, count + 1, motions=lambda: model.body_motions)
+    except ModelError:
+        return False
+    return True
 
 
 def _improved(

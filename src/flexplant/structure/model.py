@@ -5,20 +5,21 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
+import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
-from ..sparse.factor import DENSE_LIMIT, dense, is_positive_definite
+from ..sparse.factor import is_positive_definite
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, sum_of
 from .damping import Damping, Rayleigh
 from .damping_matrix import damping_matrix
-from .definite import check_semidefinite, slow, symmetric, without_inertia
-from .eigen import elastic_modes
+from .definite import MatrixLike, check_semidefinite, slow, symmetric, without_inertia
+from .eigen import has_negative_springs
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
 from .precision import digits_of, endangered, held_by_rounding
@@ -88,6 +89,21 @@ class FEModel(Placed, Value):
     joint_motions: FloatArray | None = field(default=None, kw_only=True)
     joining: Value | None = field(default=None, kw_only=True)
 
+    if TYPE_CHECKING:  # what comes in is anything array-like
+
+        def __init__(
+            self,
+            M: MatrixLike,
+            K: MatrixLike,
+            D: MatrixLike | None = None,
+            *,
+            dofs: DofSet,
+            name: str | None = None,
+            held_inertia: npt.ArrayLike | None = None,
+            joint_motions: npt.ArrayLike | None = None,
+            joining: Value | None = None,
+        ) -> None: ...
+
     def __post_init__(self) -> None:
         n = len(instance(self.dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz)."))
         if not n:
@@ -104,7 +120,7 @@ class FEModel(Placed, Value):
             held = None if digits is None else held_by_rounding(K, M, self.dofs, digits)
             if held:
                 raise ModelError(f"{error} {held[0].upper()}{held[1:]}") from None
-            if not self._has_negative_springs():
+            if not has_negative_springs(self):
                 raise
         if D is not None:
             check_semidefinite(D, "D")
@@ -145,20 +161,17 @@ class FEModel(Placed, Value):
         have few digits (down to four), rotations are the null vectors of K next to theirs; what a
         spring holds, however softly, has none.
         """
-        basis = rigid_body_basis(self.M, self.K, self.body_motions)
-        basis.flags.writeable = False
-        return basis
+        return np.asarray(frozen(rigid_body_basis(self.M, self.K, self.body_motions)))
 
     @cached_property
     def body_motions(self) -> FloatArray:
         """The M-orthonormal rigid-body motions (n, r) of every piece, whether held or not."""
-        if self.joint_motions is not None:
+        if self.joint_motions is None:
+            motions = body_motions(self.M, self.K, self.dofs)
+        else:
             # a mass or held DOFs may have been added since the machine was joined
             motions = orthonormalised(self.M, self.joint_motions, dependent="drop")
-        else:
-            motions = body_motions(self.M, self.K, self.dofs)
-        motions.flags.writeable = False
-        return motions
+        return np.asarray(frozen(motions))
 
     @cached_property
     def n_unstable(self) -> int:
@@ -166,19 +179,6 @@ class FEModel(Placed, Value):
         if self.rigid_body.shape[1] == self.body_motions.shape[1]:
             return 0
         return int(unstable_stiffness(self.K, self.body_motions).size)
-
-    def _has_negative_springs(self) -> bool:
-        """Return whether all negative eigenvalues of K belong to rigid-body motion."""
-        count = self.n_unstable
-        if not count or self.n_dof > DENSE_LIMIT:
-            return False
-        more = min(self.n_dof, count + 1)
-        try:
-            M, K = dense(self.M), dense(self.K)
-            elastic_modes(M, K, self.rigid_body, more, motions=lambda: self.body_motions)
-        except ModelError:
-            return False
-        return True
 
     def inertia(self, motions: FloatArray) -> FloatArray:
         """Return the loads (n, r) ``M motions`` of motions (n, r)."""
@@ -221,7 +221,7 @@ class FEModel(Placed, Value):
             "rotation^T M rotation instead, an inertia."
         )
 
-    def with_damping(self, damping: Damping | Matrix) -> FEModel:
+    def with_damping(self, damping: Damping | MatrixLike) -> FEModel:
         """Return the model with the matrix D of a damping law, or with a measured D.
 
         Modal damping is ``D = M Phi 2 Z Omega Phi^T M`` over all n modes: a full matrix; so is the
