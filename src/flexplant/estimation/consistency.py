@@ -85,9 +85,6 @@ class Consistency(Value):
     text: str
     level: float = field(default=0.95)
 
-    def __post_init__(self) -> None:
-        self._set(sensor_ratios=dict(self.sensor_ratios), nees=dict(self.nees))
-
     def __repr__(self) -> str:
         nees = "".join(f", NEES {name} {m:.3g}" for name, (m, _, _) in self.nees.items())
         return (

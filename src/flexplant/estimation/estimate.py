@@ -84,17 +84,6 @@ class Estimate(Value, Mapping[str, FloatArray]):
     __eq__ = object.__eq__
     __hash__ = object.__hash__
 
-    def __post_init__(self) -> None:
-        arrays = ("time", "data", "deviations", "innovations", "innovation_deviations")
-        self._set(
-            **{name: np.asarray(getattr(self, name), dtype=np.float64) for name in arrays},
-            whitened=np.asarray(self.whitened, dtype=np.float64),
-            state=np.asarray(self.state, dtype=np.float64),
-            names=tuple(self.names),
-            sensors=tuple(self.sensors),
-            units=dict(self.units),
-        )
-
     def __repr__(self) -> str:
         missing = int(np.count_nonzero(np.isnan(self.innovations)))
         gaps = f", {missing} of {self.innovations.size} innovations missing" if missing else ""

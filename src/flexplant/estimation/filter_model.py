@@ -69,9 +69,6 @@ class FilterModel(Value):
     sensors: tuple[str, ...]
     commands: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        self._set(**{name: getattr(self, name) for name in _ARRAYS})
-
     def __repr__(self) -> str:
         n, ny = self.C2.T.shape
         return (
@@ -114,9 +111,6 @@ def weighed(part: FloatArray, spread: FloatArray) -> FloatArray:
     """Return ``part S^-1`` of a covariance S, its channels of unit size inside."""
     size = np.sqrt(spread.diagonal())
     return np.asarray(np.linalg.solve(spread / size / size[:, None], (part / size).T).T / size)
-
-
-_ARRAYS = ("A", "B", "C1", "D1", "C2", "D2", "Q", "R", "V", "N", "S")
 
 
 def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterModel:

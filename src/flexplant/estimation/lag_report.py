@@ -13,7 +13,7 @@ from ..errors import FlexplantError, unknown_label
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, real_array
+from ..values import FloatArray, Value
 from .estimator_channels import row_of
 from .sight import Sight
 from .static import design_static
@@ -69,17 +69,6 @@ class LagReport(Value):
     on_whole: FloatArray
     note: str = ""
     units: Mapping[str, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self._set(
-            channels=tuple(self.channels),
-            names=tuple(self.names),
-            rms=np.asarray(self.rms, dtype=np.float64),
-            lag=real_array(self.lag, "lag", (None,)),
-            curve=real_array(self.curve, "curve", (None, len(self.channels))),
-            on_whole=real_array(self.on_whole, "on_whole", (len(self.channels),)),
-            units=dict(self.units),
-        )
 
     def __getitem__(self, row: str) -> FloatArray:
         """Return the rms errors (nz,) of one row, such as "smoother" or "1 ms"."""

@@ -51,13 +51,6 @@ class MachineTable(Value):
     values: FloatArray
     unit: str = ""
 
-    def __post_init__(self) -> None:
-        self._set(
-            names=tuple(self.names),
-            nominal=np.asarray(self.nominal, dtype=np.float64),
-            values=np.asarray(self.values, dtype=np.float64),
-        )
-
     def __getitem__(self, name: str) -> FloatArray:
         """Return the rms errors (n,) of one estimator."""
         if name not in self.names:

@@ -90,10 +90,6 @@ class PeriodicEstimator(Value):
     variances: FloatArray
     certificate: PeriodicCertificate
 
-    def __post_init__(self) -> None:
-        names = ("measured", "gains", "predictor_gains", "variances")
-        self._set(**{name: getattr(self, name) for name in names})
-
     def __repr__(self) -> str:
         names = poi_channels(self.plant)[:4]
         rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)

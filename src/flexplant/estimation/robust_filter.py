@@ -124,9 +124,6 @@ class RobustFilter(Value):
     variances: FloatArray
     certificate: HinfFilterCertificate | MinimaxCertificate
 
-    def __post_init__(self) -> None:
-        self._set(**{n: getattr(self, n) for n in ("gain", "poi_gain", "sizes", "variances")})
-
     def __repr__(self) -> str:
         names = poi_channels(self.plant)[:4]
         rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)

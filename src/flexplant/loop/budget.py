@@ -66,15 +66,6 @@ class ErrorBudget(Value):
     left_out: float
     certificate: Mapping[str, float]
 
-    def __post_init__(self) -> None:
-        self._set(
-            names=tuple(self.names),
-            variances=self.variances,
-            freq=self.freq,
-            cumulative=self.cumulative,
-            certificate=dict(self.certificate),
-        )
-
     def __getitem__(self, source: str) -> float:
         """Return the rms that one source causes."""
         if source not in self.names:

@@ -86,9 +86,6 @@ class LoopComparison(Value):
     channel: str
     sampled: bool = True
 
-    def __post_init__(self) -> None:
-        self._set(rows=dict(self.rows))
-
     def __getitem__(self, name: str) -> LoopFigures:
         if name not in self.rows:
             raise unknown_label("loop", name, self.rows)

@@ -62,9 +62,6 @@ class LoopMargins(Value):
     modulus_margin: float
     freq: float
 
-    def __post_init__(self) -> None:
-        self._set(crossovers=tuple(float(f) for f in self.crossovers))
-
     def __repr__(self) -> str:
         first = ", ".join(f"{f:.4g}" for f in self.crossovers[:4])
         more = ", ..." if len(self.crossovers) > 4 else ""
@@ -111,9 +108,6 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     modulus_margin: float
     unstable: int | None
     reason: str = ""
-
-    def __post_init__(self) -> None:
-        self._set(loops=tuple(self.loops))
 
     @property
     def is_stable(self) -> bool | None:

@@ -69,9 +69,6 @@ class SpillOver(Value):
     modes: tuple[int, ...] = ()
     freq: tuple[float, ...] = ()
 
-    def __post_init__(self) -> None:
-        self._set(modes=tuple(self.modes), freq=tuple(self.freq))
-
     @property
     def is_stable(self) -> bool:
         """Whether the loop is stable there."""

@@ -75,11 +75,11 @@ class ModalRealisation(Value):
     form: str = MODAL
 
     def __post_init__(self) -> None:
-        self._set(pairs=self.pairs, inputs=self.inputs, outputs=self.outputs)
         n = self.inputs.shape[0]
-        self._set(static_outputs=self.static_outputs.reshape(n, -1))
-        self._set(static_inputs=self.static_inputs.reshape(n, -1))
-        self._set(coupling=self.coupling)
+        outputs, inputs = (
+            part.reshape(n, -1) for part in (self.static_outputs, self.static_inputs)
+        )
+        self._set(**self._fields() | {"static_outputs": outputs, "static_inputs": inputs})
 
     @property
     def n_modes(self) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import counted
-from ..values import FloatArray, IntArray, Value, name_list
+from ..values import FloatArray, IntArray, Value
 from .bounds import ErrorBound
 
 
@@ -88,21 +88,6 @@ class ReductionQuality(Value):
     route: str
     full_error: float = np.nan
     bound: ErrorBound | None = None
-
-    def __post_init__(self) -> None:
-        self._set(
-            modes=np.asarray(self.modes, dtype=np.int64),
-            group=np.asarray(self.group, dtype=np.int64),
-            inputs=name_list(self.inputs, "inputs"),
-            outputs=name_list(self.outputs, "outputs"),
-            **{
-                name: np.asarray(getattr(self, name), dtype=np.float64)
-                for name in (
-                    "full_freq", "freq", "freq_error", "mac", "check_freq",
-                    "frf_error", "resonance_error", "antiresonance_error", "static_error",
-                )
-            },
-        )  # fmt: skip
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:

@@ -15,7 +15,7 @@ from ..lti.statespace import StateSpace
 from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
 from ..structure.negative_stiffness import refuse_unstable
-from ..values import FloatArray, IntArray, Value, name_list, real_array
+from ..values import FloatArray, IntArray, Value
 
 
 def peak_gains(omega: FloatArray, zeta: FloatArray) -> FloatArray:
@@ -66,21 +66,6 @@ class ModeRanking(Value):
     exact: FloatArray
     inputs: tuple[str, ...]
     outputs: tuple[str, ...]
-
-    def __post_init__(self) -> None:
-        inputs = name_list(self.inputs, "inputs")
-        outputs = name_list(self.outputs, "outputs")
-        m = np.size(self.modes)
-        self._set(
-            modes=np.asarray(self.modes, dtype=np.int64),
-            freq=real_array(self.freq, "freq", (m,)),
-            values=real_array(self.values, "values", (m, len(outputs), len(inputs))),
-            total=real_array(self.total, "total", (m,)),
-            peak=real_array(self.peak, "peak", (m,)),
-            exact=real_array(self.exact, "exact", (2 * m,)),
-            inputs=inputs,
-            outputs=outputs,
-        )
 
     @property
     def order(self) -> IntArray:

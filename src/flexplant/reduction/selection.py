@@ -10,7 +10,7 @@ import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, ShapeError, counted
 from ..modes.modes import Modes
-from ..values import FloatArray, Value, instance, name_list, positive, real_array, whole
+from ..values import FloatArray, Value, instance, name_list, positive, whole
 from .criteria import PivotedQr, SelectionCriterion
 
 
@@ -41,9 +41,6 @@ class DofSelection(Value):
     condition: float
     values: FloatArray = field(default_factory=lambda: np.zeros(0))
     criterion: SelectionCriterion = field(default_factory=PivotedQr)
-
-    def __post_init__(self) -> None:
-        self._set(values=real_array(self.values, "values", (None,)))
 
     def __repr__(self) -> str:
         more = f", ... {self.labels[-1]}" if len(self.labels) > 3 else ""

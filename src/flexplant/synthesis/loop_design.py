@@ -54,9 +54,6 @@ class LoopDesign(Value):
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        self._set(laws=dict(self.laws), notes=tuple(self.notes))
-
     def __repr__(self) -> str:
         axes = ", ".join(self.laws)
         lines = [f"<LoopDesign of {axes}: {counted(self.system.n_states, 'state')}>"]

@@ -44,9 +44,6 @@ class RigidBody(Value):
     centre: FloatArray
     lost: Mapping[str, float] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        self._set(motions=self.motions, mass=self.mass, centre=self.centre, lost=dict(self.lost))
-
 
 def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:
     """Return the load (n,) ``-M r`` of a unit base acceleration.

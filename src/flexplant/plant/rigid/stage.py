@@ -130,9 +130,6 @@ class StageWeights(Value):
     w: Mapping[str, Any]
     text: str
 
-    def __post_init__(self) -> None:
-        self._set(z=dict(self.z), w=dict(self.w))
-
     def __repr__(self) -> str:
         return f"<StageWeights {self.text}>"
 

@@ -77,10 +77,6 @@ class NeglectedModes(Value):
     looseness: float
     sampled: NeglectedModes | None = None
 
-    def __post_init__(self) -> None:
-        outputs, inputs = tuple(self.outputs), tuple(self.inputs)
-        self._set(scales=self.scales, mirrored=dict(self.mirrored), inputs=inputs, outputs=outputs)
-
     def narrowed(self, outputs: Sequence[str]) -> NeglectedModes:
         """Return the bound on some of the outputs, with the states of their weights alone."""
         W = self.weights

@@ -70,9 +70,6 @@ class WorstCaseGain(Value):
     frequencies: FloatArray
     bounds: FloatArray
 
-    def __post_init__(self) -> None:
-        self._set(values=dict(self.values), frequencies=self.frequencies, bounds=self.bounds)
-
     def __repr__(self) -> str:
         most = sorted(self.values.items(), key=lambda one: -abs(one[1]))[:4]
         shown = ", ".join(f"{name} {value:+.3g}" for name, value in most)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,7 +13,7 @@ from ...lti.discretisation import bilinear
 from ...lti.stability import obstacle
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
-from ...values import ComplexArray, Value, generator
+from ...values import ComplexArray, FloatArray, Value, generator
 from .lower import crossing_multiple, destabilising, power_iteration
 from .perturbation import Perturbation, matrix_of
 from .sweep import covered
@@ -57,16 +57,9 @@ class MuBounds(Value):
     lower: float
     freq: float
     perturbation: ComplexArray
-    frequencies: Any = ()
-    bounds: Any = ()
+    frequencies: FloatArray = field(default_factory=lambda: np.zeros(0))
+    bounds: FloatArray = field(default_factory=lambda: np.zeros(0))
     intervals: int = 0
-
-    def __post_init__(self) -> None:
-        self._set(
-            perturbation=np.asarray(self.perturbation, dtype=np.complex128),
-            frequencies=np.asarray(self.frequencies, dtype=np.float64),
-            bounds=np.asarray(self.bounds, dtype=np.float64),
-        )
 
     def __repr__(self) -> str:
         where = f", largest at {self.freq:.5g} Hz" if np.isfinite(self.freq) else ""

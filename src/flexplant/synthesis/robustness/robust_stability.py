@@ -83,14 +83,6 @@ class RobustStability(Value):
     certificate: Mapping[str, float]
     left_out: SpillOver | None = None
 
-    def __post_init__(self) -> None:
-        self._set(
-            values=dict(self.values),
-            certificate=dict(self.certificate),
-            frequencies=self.frequencies,
-            bounds=self.bounds,
-        )
-
     @property
     def is_robust(self) -> bool:
         """Whether every machine of the uncertainty is proven stable."""
