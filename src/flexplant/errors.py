@@ -111,3 +111,13 @@ def unknown_label(kind: str, name: object, known: Iterable[str], owner: str = ""
     lead = "Close matches" if close else "Known are"
     where = f" in {owner}" if owner else ""
     return LabelError(f"no {kind} {name!r}{where} ({len(known)} known). {lead}: {listed}.")
+
+
+def require_known(
+    kind: str, names: Iterable[object], known: Iterable[str], owner: str = ""
+) -> None:
+    """Raise the LabelError of `unknown_label` for the first of some names that is not known."""
+    listed = list(known)
+    for name in names:
+        if name not in listed:
+            raise unknown_label(kind, name, listed, owner)

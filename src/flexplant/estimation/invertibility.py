@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import AssumptionError, unknown_label
+from ..errors import AssumptionError, require_known
 from ..lti.scaling import state_scale
 from ..lti.statespace import System
 from ..plant import StandardPlant
@@ -168,9 +168,7 @@ def unknown_names(plant: StandardPlant, inputs: Sequence[str]) -> tuple[str, ...
     names = name_list(inputs, "unknown inputs")
     check_names(names, "unknown inputs")
     forces = [w for w in plant.w if w not in plant.y and not w.endswith(":noise")]
-    for name in names:
-        if name not in forces:
-            raise unknown_label("disturbance of w", name, forces)
+    require_known("disturbance of w", names, forces)
     if not names:
         raise AssumptionError(
             f"no unknown input is named: pass some of {', '.join(forces) or 'none'}."

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arguments import positive_array
-from ..errors import FlexplantError, unknown_label
+from ..errors import FlexplantError, require_known
 from ..lti.lyapunov import solve_stein
 from ..parallel import one_thread
 from ..plant import StandardPlant
@@ -72,8 +72,7 @@ class LagReport(Value):
 
     def __getitem__(self, row: str) -> FloatArray:
         """Return the rms errors (nz,) of one row, such as "smoother" or "1 ms"."""
-        if row not in self.names:
-            raise unknown_label("row", row, self.names)
+        require_known("row", [row], self.names)
         return np.asarray(self.rms[list(self.names).index(row)])
 
     def recovered(self, row: str, channel: str) -> float:

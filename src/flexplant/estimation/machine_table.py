@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import members
-from ..errors import AssumptionError, FlexplantWarning, ModelError, unknown_label
+from ..errors import AssumptionError, FlexplantWarning, ModelError, require_known
 from ..loop import close_loop
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, in_unit, short
@@ -53,8 +53,7 @@ class MachineTable(Value):
 
     def __getitem__(self, name: str) -> FloatArray:
         """Return the rms errors (n,) of one estimator."""
-        if name not in self.names:
-            raise unknown_label("estimator", name, self.names)
+        require_known("estimator", [name], self.names)
         return np.asarray(self.values[list(self.names).index(name)])
 
     def __repr__(self) -> str:

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, ShapeError, unknown_label
+from ..errors import LabelError, ShapeError, require_known
 from ..plant import StandardPlant
 from ..values import FloatArray, real_array, short
 from .filter_model import FilterModel, filter_model
@@ -62,8 +62,7 @@ def moving_sight(
     D1 = np.repeat(model.D1[None], count, axis=0)
     V = np.repeat(np.diagonal(model.V)[None], count, axis=0)
     for name, points in path.items():
-        if name not in pois:
-            raise unknown_label("POI", name, pois)
+        require_known("POI", [name], pois)
         points = real_array(points, f"the path of {name!r}", (None, 3))
         if len(points) != count:
             raise ShapeError(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..certificates import Certificate
-from ..errors import CertificateError, LabelError, ModelError, ShapeError, counted, unknown_label
+from ..errors import CertificateError, LabelError, ModelError, ShapeError, counted, require_known
 from ..lti.riccati import solve_dare
 from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
@@ -283,8 +283,7 @@ def _measured(names: tuple[str, ...], every: Any) -> FloatArray:
     instance(every, Mapping, "every", "Pass {sensor: samples}, such as {'y3': 10}.")
     intervals, offsets = dict.fromkeys(names, 1), dict.fromkeys(names, 0)
     for name, given in every.items():
-        if name not in names:
-            raise unknown_label("sensor", name, names)
+        require_known("sensor", [name], names)
         pair = given if isinstance(given, tuple) else (given, 0)
         if len(pair) != 2:
             raise ShapeError(

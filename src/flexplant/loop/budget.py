@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import CertificateError, ModelError, unknown_label
+from ..errors import CertificateError, ModelError, require_known, unknown_label
 from ..lti.lyapunov import solve_lyapunov, solve_stein
 from ..lti.statespace import StateSpace
 from ..values import FloatArray, Value, in_unit, real_array, short
@@ -68,8 +68,7 @@ class ErrorBudget(Value):
 
     def __getitem__(self, source: str) -> float:
         """Return the rms that one source causes."""
-        if source not in self.names:
-            raise unknown_label("source", source, self.names)
+        require_known("source", [source], self.names)
         return float(np.sqrt(self.variances[self.names.index(source)]))
 
     @property

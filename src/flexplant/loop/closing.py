@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Iterable
 from typing import Any
 
-from ..errors import FlexplantWarning, ModelError, unknown_label
+from ..errors import FlexplantWarning, ModelError, require_known
 from ..lti.statespace import System
 from ..plant import StandardPlant, larger_plant, standard_plant
 from ..values import name_list
@@ -84,9 +84,7 @@ def close_loop(
             "a Controller, or an observer and a servo."
         )
     resting = name_list(idle, "idle actuators")
-    for name in resting:
-        if name not in plant.u:
-            raise unknown_label("actuator to leave idle", name, plant.u)
+    require_known("actuator to leave idle", resting, plant.u)
     larger = _completed(plant, larger)
     plant = with_known(plant, systems)
     driven, watched = drives(plant, systems, resting)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..lti.grid import climbed
 from ..values import FloatArray, Value, short
 from .closed import ClosedLoop
@@ -87,8 +87,7 @@ class LoopComparison(Value):
     sampled: bool = True
 
     def __getitem__(self, name: str) -> LoopFigures:
-        if name not in self.rows:
-            raise unknown_label("loop", name, self.rows)
+        require_known("loop", [name], self.rows)
         return self.rows[name]
 
     def __repr__(self) -> str:

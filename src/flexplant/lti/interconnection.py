@@ -8,7 +8,7 @@ import numpy as np
 import scipy.linalg as la
 from scipy.sparse import csgraph
 
-from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..errors import LabelError, ModelError, ShapeError, require_known
 from ..values import ComplexArray, FloatArray, name_list
 from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
@@ -305,9 +305,7 @@ def connect(
             f"{name!r} is driven {known.count(name)} times: two blocks (or a block and an outer "
             "input) produce it. Rename one, or add them in a block of their own."
         )
-    for name in [*needed, *outputs]:
-        if name not in known:
-            raise unknown_label("signal to connect", name, known)
+    require_known("signal to connect", [*needed, *outputs], known)
     route, enter, leave, through = (
         np.array([[float(a == b) for b in fro] for a in to]).reshape(len(to), len(fro))
         for to, fro in ((needed, produced), (needed, outer), (outputs, produced), (outputs, outer))

@@ -8,7 +8,7 @@ from typing import Any, Self, TypeGuard
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, counted, unknown_label
+from ..errors import LabelError, ModelError, counted, require_known, unknown_label
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import FloatArray, IntArray, Value, name_list, positive, short
 from .channel_sides import TYPE_THIS, sides
@@ -44,9 +44,7 @@ class Partition(Value):
             raise LabelError(f"inputs {self.system.inputs} are not [w; u] = {self.w + self.u}.")
         if (*self.z, *self.y) != tuple(self.system.outputs):
             raise LabelError(f"outputs {self.system.outputs} are not [z; y] = {self.z + self.y}.")
-        for name in self.asd:
-            if name not in self.w:
-                raise unknown_label("w channel with an asd", name, self.w)
+        require_known("w channel with an asd", self.asd, self.w)
         asd = {name: positive(a, f"asd of {name!r}", zero=True) for name, a in self.asd.items()}
         self._set(asd=asd)
 

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
 
-from ..errors import LabelError, unknown_label
+from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, Place
 from ..lti.statespace import StateSpace
 from ..structure.rigid import place_motion
@@ -126,9 +126,7 @@ class Poi(Value):
                 " Name them."
             )
         axes = (self.axes,) if isinstance(self.axes, str) else tuple(self.axes)
-        for axis in axes:
-            if axis not in DIRECTIONS:
-                raise unknown_label(f"axis of POI {self.name!r}", axis, DIRECTIONS)
+        require_known(f"axis of POI {self.name!r}", axes, DIRECTIONS)
         if not axes:
             raise LabelError(f"POI {self.name!r} has no axes: name at least one, such as ('z',).")
         check_names(axes, f"axes of POI {self.name!r}")

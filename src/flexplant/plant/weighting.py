@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..lti.discretisation import tustin
 from ..lti.interconnection import append, series
 from ..lti.statespace import StateSpace, System, as_statespace
@@ -21,9 +21,7 @@ def weighted(plant: P, z: Any, w: Any) -> P:
     """Return ``W_z P W_w``; a weight None drops its channel."""
     z, w = _mapping(z, "z"), _mapping(w, "w")
     for side, weights in (("z", z), ("w", w)):
-        for name in weights:
-            if name not in getattr(plant, side):
-                raise unknown_label(f"channel of {side}", name, getattr(plant, side))
+        require_known(f"channel of {side}", weights, getattr(plant, side))
     keep_z = [name for name in plant.z if name not in z or z[name] is not None]
     keep_w = [name for name in plant.w if name not in w or w[name] is not None]
     if not keep_z or not keep_w:
@@ -70,9 +68,7 @@ def measured_through(plant: P, block: System) -> P:
 
 
 def _columns(plant: Partition, g: StateSpace) -> list[int]:
-    for name in g.inputs:
-        if name not in plant.y:
-            raise unknown_label("channel of y", name, plant.y)
+    require_known("channel of y", g.inputs, plant.y)
     return [plant.y.index(name) for name in g.inputs]
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, LabelError, ModelError, counted, unknown_label
+from ..errors import FlexplantWarning, LabelError, ModelError, counted, require_known
 from ..loop import LoopReport, SpillOver, in_axes, report_loops
 from ..loop.axes import static_map
 from ..loop.sensitivity import taken_apart
@@ -289,9 +289,7 @@ def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> S
     LabelError
         When an axis is unknown.
     """
-    for name in references:
-        if name not in axes.names:
-            raise unknown_label("axis", name, axes.names)
+    require_known("axis", references, axes.names)
     names = name_list(references.values(), "references")
     chosen = np.zeros((len(axes.names), len(names)))
     for column, name in enumerate(references):
@@ -321,9 +319,7 @@ def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str,
             f"laws must be a law or a mapping {{axis: law}}, got {type(laws).__name__}. Pass a "
             "product of Pid, Lead, Notch and LowPass; a gain alone is Pid(gain)."
         )
-    for name in each:
-        if name not in axes.names:
-            raise unknown_label("axis", name, axes.names)
+    require_known("axis", each, axes.names)
     found = {}
     for name in axes.names:
         if name not in each:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..lti.preparation import Prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant
@@ -65,9 +65,8 @@ class TunedLaws(Value):
     free: Sequence[str] = _FREE
 
     def __post_init__(self) -> None:
-        for name in (free := name_list(self.free, "free numbers")):
-            if name not in _NUMBERS:
-                raise unknown_label("number of an element", name, _NUMBERS)
+        free = name_list(self.free, "free numbers")
+        require_known("number of an element", free, _NUMBERS)
         laws = dict(self.laws) if isinstance(self.laws, Mapping) else self.laws
         self._set(free=free, laws=laws)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...errors import AssumptionError, unknown_label
+from ...errors import AssumptionError, require_known
 from ...lti.statespace import StateSpace
 from ...values import FloatArray, Value, name_list
 from ..standard import StandardPlant, standard_plant
@@ -125,9 +125,7 @@ def decouple(plant: StandardPlant, *, axes: Sequence[str] | None = None) -> Deco
         rows += [port.static_push(realisation) for port in ports.u]
         refuse_lost(body, realisation, rows, np.inf, "; or name the axes that count, axes=[...]")
     wanted = body.axes if axes is None else name_list(axes, "axes")
-    for axis in wanted:
-        if axis not in body.axes:
-            raise unknown_label("rigid-body axis", axis, body.axes)
+    require_known("rigid-body axis", wanted, body.axes)
     pick = np.eye(len(body.axes))[[body.axes.index(axis) for axis in wanted]]
     sensors = [s for s in ports.y if s.order == 0]
     see = projected([s.static_row(realisation) for s in sensors], body.motions)

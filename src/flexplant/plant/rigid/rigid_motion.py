@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...errors import AssumptionError, FlexplantError, unknown_label
+from ...errors import AssumptionError, FlexplantError, require_known
 from ...structure.negative_stiffness import signed_root
 from ...values import FloatArray, IntArray
 from ..partition import Partition
@@ -148,9 +148,7 @@ def seen(plant: Partition, motions: RigidModes, channels: Sequence[str]) -> Floa
         if poi.channel(axis) in channels
     }
     places |= {s.name: s.static_row(realisation) for s in ports.y if s.name in channels}
-    for name in channels:
-        if name not in places:
-            raise unknown_label("motion of a POI or a sensor", name, list(places))
+    require_known("motion of a POI or a sensor", channels, places)
     return projected([places[name] for name in channels], motions.shapes)
 
 
@@ -187,8 +185,6 @@ def rigid_gain(
     """
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     forces = {port.name: port for port in ports.forces}
-    for name in inputs:
-        if name not in forces:
-            raise unknown_label("force", name, list(forces))
+    require_known("force", inputs, forces)
     push = projected([forces[name].static_push(realisation) for name in inputs], motions.shapes)
     return np.asarray(seen(plant, motions, outputs) @ push.T)

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import AssumptionError, LabelError, ModelError, unknown_label
+from ...errors import AssumptionError, LabelError, ModelError, require_known
 from ...lti.discretisation import tustin
 from ...lti.interconnection import series
 from ...lti.statespace import StateSpace
@@ -102,8 +102,7 @@ def _chosen(names: list[str], poi: str | None, kind: str) -> str:
                 f"meant: poi={names[0]!r}."
             )
         return names[0]
-    if poi not in names:
-        raise unknown_label(kind, poi, names)
+    require_known(kind, [poi], names)
     return poi
 
 

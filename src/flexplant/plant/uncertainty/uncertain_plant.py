@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import FlexplantWarning, ModelError, unknown_label
+from ...errors import FlexplantWarning, ModelError, require_known
 from ...lti.statespace import StateSpace
 from ...sparse.factor import dense
 from ...structure.rigid import orthonormalised
@@ -259,8 +259,7 @@ class UncertainPlant(Value, Generic[P]):
         known = {delta.name: delta for delta in self.deltas}
         changes = []
         for name, value in given.items():
-            if name not in known:
-                raise unknown_label("Delta", name, known)
+            require_known("Delta", [name], known)
             amount = float(real_array(value, f"the value of {name!r}", ()))
             changes.append((known[name], known[name].scale * amount))
         if self.deltas[0].kind != "parameter":

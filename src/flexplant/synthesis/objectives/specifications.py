@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import ModelError, unknown_label
+from ...errors import ModelError, require_known
 from ...lti.h2_norms import h2_norm
 from ...lti.norms import peak_gain
 from ...lti.responses import continuous_poles
@@ -49,9 +49,7 @@ class _ChannelNorm(Value):
             When the plant has no such channel.
         """
         for side in "wz":
-            for name in getattr(self, side) or ():
-                if name not in getattr(plant, side):
-                    raise unknown_label(f"channel of {side}", name, getattr(plant, side))
+            require_known(f"channel of {side}", getattr(self, side) or (), getattr(plant, side))
         return self.w or plant.w, self.z or plant.z
 
 
