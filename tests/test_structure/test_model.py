@@ -159,6 +159,14 @@ def test_rounding_is_no_asymmetry():
     FEModel(M3, K, dofs=CHAIN)
 
 
+def test_given_sparse_matrices_stay_as_they_are():
+    rows = np.tile([2, 1, 0], 3)  # out of order
+    K = sp.csc_array((K3[::-1].T.ravel(), rows, np.arange(0, 10, 3)), shape=(3, 3))
+    assert np.array_equal(FEModel(sp.csc_array(M3), K, dofs=CHAIN).K.toarray(), K3)
+    assert np.array_equal(K.indices, rows)
+    assert np.array_equal(K.toarray(), K3)
+
+
 def test_values_are_frozen_and_travel(plate, tmp_path):
     model = plate.with_damping(ModalDamping(0.01))
     with pytest.raises(ValueError, match="read-only"):
