@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, unknown_label
 from ..plant import StandardPlant
 from ..structure import Disc, Rectangle
 from ..values import FloatArray
@@ -36,6 +36,13 @@ class Places:
         """Points closer than this [m] are the same."""
         every = np.vstack([*self.points, *self.pois])
         return _SAME * float(np.max(np.ptp(every, axis=0), initial=0.0))
+
+    def index(self, names: Sequence[str], what: str) -> list[int]:
+        """Return the places of candidates by name."""
+        for name in names:
+            if name not in self.names:
+                raise unknown_label(what, name, self.names)
+        return [self.names.index(name) for name in names]
 
     def inside(self, zones: Sequence[Zone]) -> FloatArray:
         """Return 1 for candidates with any point in any zone, seen from above, else 0."""

@@ -37,6 +37,8 @@ Port: TypeAlias = "SensorPort | Actuator | PlantChannel"
 #: what is chosen: sensors, actuators, or both
 Side: TypeAlias = Literal["y", "u", "yu"]
 
+#: what users call them
+SIDES = {"sensors": "y", "actuators": "u"}
 _NAME = {"y": "Sensor", "u": "Actuator"}
 _KIND: dict[str, type[Any]] = {"y": SensorPort, "u": Actuator}
 

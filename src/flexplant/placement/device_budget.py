@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError
 from ..values import positive, short
 from .candidate_places import Places
 from .constraint import Constraint
@@ -62,8 +62,6 @@ class Budget(Constraint):
 
     def rows(self, places: Places) -> LinearRows:
         """Return the sum of costs, at most the total."""
-        for name in self.costs:
-            if name not in places.names:
-                raise unknown_label("candidate with a cost", name, places.names)
+        places.index(list(self.costs), "candidate with a cost")
         costs = np.array([self.costs.get(name, self.default) for name in places.names])
         return LinearRows(costs[None], np.array([0.0]), np.array([self.total]))

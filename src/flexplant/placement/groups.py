@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..errors import LabelError, unknown_label
+from ..errors import LabelError
 from ..values import FloatArray, name_list, one_of, real_array, short
 from .candidate_places import Places
 from .constraint import Constraint, limits
@@ -55,10 +55,7 @@ class Together(Constraint):
         """Return x_i - x_j = 0 within each group."""
         pairs = []
         for group in self.groups:
-            for name in group:
-                if name not in places.names:
-                    raise unknown_label("candidate of a group", name, places.names)
-            at = [places.names.index(name) for name in group]
+            at = places.index(group, "candidate of a group")
             pairs += [(at[0], other) for other in at[1:]]
         return LinearRows.equal(pairs, places.total)
 
@@ -151,12 +148,9 @@ class Among(Constraint):
 
     def rows(self, places: Places) -> LinearRows:
         """Return the count of them between its limits."""
-        for name in self.names:
-            if name not in places.names:
-                raise unknown_label("candidate among others", name, places.names)
-        row = np.array([[name in self.names for name in places.names]], dtype=np.float64)
-        high = np.inf if self.at_most is None else float(self.at_most)
-        return LinearRows(row, np.array([float(self.at_least or 0)]), np.array([high]))
+        row = np.zeros(places.total)
+        row[places.index(self.names, "candidate among others")] = 1.0
+        return LinearRows.counted(row, self.at_least, self.at_most)
 
 
 def _apart(points: FloatArray, others: FloatArray) -> float:

@@ -14,7 +14,7 @@ from ..errors import AssumptionError
 from ..plant import StandardPlant, larger_plant
 from ..values import FloatArray, one_of, positive
 from .candidate_shapes import Shapes, shapes_of
-from .candidates import side_of, sides_of
+from .candidates import SIDES, side_of, sides_of
 from .criterion import Criterion, Scorer, as_criterion
 from .wrapping import Wrapping
 
@@ -70,7 +70,7 @@ class LeftOutModes(Criterion):
     of: str = field(default="sensors", kw_only=True)
 
     def __post_init__(self) -> None:
-        one_of(self.of, "of", ("sensors", "actuators"))
+        one_of(self.of, "of", SIDES)
 
     def __repr__(self) -> str:
         given = ["larger=..."] if self.larger is not None else []
@@ -78,14 +78,13 @@ class LeftOutModes(Criterion):
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the share of the plant's own sensors or actuators."""
-        ports = plant.assembled.ports
-        own = ports.y if self.of == "sensors" else ports.u
+        own = getattr(plant.assembled.ports, SIDES[self.of])
         return float(self.scorer(plant, own).value(range(len(own))))
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
         """Return the share of choices among candidates of this kind; others do not count."""
-        side = "y" if self.of == "sensors" else "u"
-        counted = np.array([side_of(port) == side for port in candidates], dtype=np.float64)
+        own = [side_of(port) == SIDES[self.of] for port in candidates]
+        counted = np.array(own, dtype=np.float64)
         whole = larger_plant(plant, self.larger)
         kept = shapes_of(plant, candidates)
         more = None if whole is None else shapes_of(whole, candidates)

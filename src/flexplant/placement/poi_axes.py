@@ -127,17 +127,20 @@ def structure_part(
     plant: StandardPlant, factors: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return A, the noise factor and the rows of the POI on the structure's own states."""
-    n = plant.system.n_states
-    if plant.is_assembled:
-        n = plant.assembled.realisation.outputs.shape[1]
+    n = _own_states(plant)
     return plant.system.A[:n, :n], plant.noise_factor[:n], poi_rows(plant, factors)[:, :n]
+
+
+def _own_states(plant: StandardPlant) -> int:
+    """Return how many states are those of the structure: all of a plant made elsewhere."""
+    if plant.is_assembled:
+        return int(plant.assembled.realisation.outputs.shape[1])
+    return plant.system.n_states
 
 
 def measured_rows(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
     """Return what sensors see of the structure's states, over the deviation of one sample."""
-    n, rows = plant.system.n_states, []
-    if plant.is_assembled:
-        n = plant.assembled.realisation.outputs.shape[1]
+    rows = []
     for port in candidates:
         if isinstance(port, PlantChannel):
             i = plant.y.index(port.name)
@@ -145,7 +148,7 @@ def measured_rows(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray
         else:
             row = port.see(plant.assembled.realisation).row
             rows.append(row / np.sqrt(0.5 * port.asd**2 / plant.dt))
-    return np.array(rows, dtype=np.float64).reshape(-1, n)
+    return np.array(rows, dtype=np.float64).reshape(-1, _own_states(plant))
 
 
 def sensor_rows(plant: StandardPlant) -> list[int]:
@@ -157,12 +160,15 @@ def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArra
     """Return what a unit of each actuator, held over one sample, does to the structure's states."""
     if not plant.is_assembled:
         return np.asarray(plant.B2[:, [plant.u.index(port.name) for port in candidates]])
+    silent = np.zeros((0, _own_states(plant)))
+    return held_exactly(pushed(plant, candidates, silent), 1.0 / plant.dt).B
+
+
+def pushed(plant: StandardPlant, candidates: Sequence[Any], rows: FloatArray) -> StateSpace:
+    """Return the structure between forces of actuators and some rows of its states, continuous."""
     real = plant.assembled.realisation
-    n = real.outputs.shape[1]
     B = np.array([real.force(port.push(real)) for port in candidates]).T
-    D = np.zeros((0, len(candidates)))
-    slow = StateSpace(real.A, B, np.zeros((0, n)), D, blocks=real.blocks)
-    return held_exactly(slow, 1.0 / plant.dt).B
+    return StateSpace(real.A, B, rows, np.zeros((len(rows), B.shape[1])), blocks=real.blocks)
 
 
 def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:

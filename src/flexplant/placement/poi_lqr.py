@@ -22,6 +22,7 @@ from .poi_axes import (
     factors_of,
     plain,
     poi_rows,
+    pushed,
     pushed_columns,
     shown,
     structure_part,
@@ -31,7 +32,55 @@ from .quadratic import quadratic
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class PoiLqr(Criterion):
+class MotionAndEffort(Criterion):
+    """A mean square of the motion of POIs and of the effort; the base of such criteria."""
+
+    poi: Named = None
+    axes: Named = field(default=None)
+    effort: float = field(default=1e-9, kw_only=True)
+
+    def __post_init__(self) -> None:
+        self._set(
+            poi=checked_names(self.poi, "POI"),
+            axes=checked_names(self.axes, "axis"),
+            effort=positive(self.effort, "effort"),
+        )
+
+    def __repr__(self) -> str:
+        given = [*shown(self.poi, self.axes), f"effort={self.effort:g}"]
+        return f"{type(self).__name__}({', '.join(given)})"
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
+        _require_control(plant, self.factors(plant), repr(self))
+
+    def unit(self, plant: StandardPlant) -> str:
+        """Return the unit of the square root."""
+        return unit_of(plant, self.factors(plant))
+
+    def factors(self, plant: StandardPlant) -> dict[str, float]:
+        """Return {z channel: factor}."""
+        return factors_of(plant, self.poi, self.axes, every=True)
+
+
+def confirmed(cost: float, found: float) -> float:
+    """Return the cost by Riccati equations, which that of the loop's stationary covariance confirms.
+
+    Raises
+    ------
+    CertificateError
+        When they differ.
+    """
+    if not abs(found - cost) <= 1e-6 * abs(cost):
+        raise CertificateError(
+            f"the loop costs {found:.9g}, its Riccati equations say {cost:.9g}: the problem is "
+            "too badly conditioned. Give a larger effort."
+        )
+    return cost
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class PoiLqr(MotionAndEffort):
     """Smallest mean square of POI motion and effort by state feedback (LQR): for actuators.
 
     ``min E[sum_a (f_a z_a)^2 + effort^2 |u|^2]`` over all stabilising state
@@ -65,19 +114,6 @@ class PoiLqr(Criterion):
     """
 
     sides = "u"
-    poi: Named = None
-    axes: Named = field(default=None)
-    effort: float = field(default=1e-9, kw_only=True)
-
-    def __post_init__(self) -> None:
-        self._set(
-            poi=checked_names(self.poi, "POI"),
-            axes=checked_names(self.axes, "axis"),
-            effort=positive(self.effort, "effort"),
-        )
-
-    def __repr__(self) -> str:
-        return f"PoiLqr({', '.join([*shown(self.poi, self.axes), f'effort={self.effort:g}'])})"
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return the cost [m^2] on a sampled plant.
@@ -94,9 +130,8 @@ class PoiLqr(Criterion):
         """
         self.check(plant, ())
         plant.check().require(("stabilisable",), "a stationary controller")
-        factors = factors_of(plant, self.poi, self.axes, every=True)
         A, B = plant.system.A, plant.B2
-        rows = poi_rows(plant, factors)
+        rows = poi_rows(plant, self.factors(plant))
         R = self.effort**2 * np.eye(B.shape[1])
         solution = control_dare(A, B, Q=rows.T @ rows, R=R)
         noise = plant.process_noise
@@ -104,20 +139,7 @@ class PoiLqr(Criterion):
         P = solve_stein(A - B @ solution.gain, noise)
         seen = np.vstack([rows, self.effort * solution.gain])
         found = float(np.einsum("ij,jk,ik->", seen, P, seen))
-        if not abs(found - cost) <= 1e-6 * abs(cost):
-            raise CertificateError(
-                f"the gain costs {found:.9g}, its Riccati equation says {cost:.9g}: the problem is "
-                "too badly conditioned. Give a larger effort."
-            )
-        return cost
-
-    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
-        """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
-        require_control(plant, factors_of(plant, self.poi, self.axes, every=True), repr(self))
-
-    def unit(self, plant: StandardPlant) -> str:
-        """Return the unit of the square root."""
-        return unit_of(plant, factors_of(plant, self.poi, self.axes, every=True))
+        return confirmed(cost, found)
 
     def scorer(self, plant: StandardPlant, candidates: Sequence[Any]) -> Scorer:
         """Return the cost as a function of the actuators alone; all else is computed once.
@@ -128,7 +150,7 @@ class PoiLqr(Criterion):
         """
         if not plain(plant, candidates):
             return super().scorer(plant, candidates)
-        A, noise, rows = structure_part(plant, factors_of(plant, self.poi, self.axes, every=True))
+        A, noise, rows = structure_part(plant, self.factors(plant))
         n = A.shape[0]
         # a plant made elsewhere holds its delay in its states
         whole, fraction = divmod(plant.delay if plant.is_assembled else 0.0, 1.0)
@@ -156,7 +178,7 @@ class PoiLqr(Criterion):
             ) from error
 
 
-def require_control(plant: StandardPlant, factors: Mapping[str, float], what: str) -> None:
+def _require_control(plant: StandardPlant, factors: Mapping[str, float], what: str) -> None:
     """Raise AssumptionError when w does not excite or the axes miss a rigid-body mode."""
     plant.check().require(("excited",), "a stationary controller")
     if not plant.is_assembled:
@@ -182,9 +204,5 @@ def _late(
         B = pushed_columns(plant, candidates)
         late = StateSpace(A, B, rows, np.zeros((len(rows), len(candidates))), dt=plant.dt)
     else:
-        real = plant.assembled.realisation
-        B = np.array([real.force(c.push(real)) for c in candidates]).T
-        D = np.zeros((len(rows), len(candidates)))
-        slow = StateSpace(real.A, B, rows, D, blocks=real.blocks)
-        late = held_exactly(slow, 1.0 / plant.dt, delay=fraction)
+        late = held_exactly(pushed(plant, candidates, rows), 1.0 / plant.dt, delay=fraction)
     return n + np.arange(late.n_states - n).reshape(len(candidates), -1), late

@@ -99,8 +99,7 @@ class Quadratic(Value, Convex):
 
     def cost(self, weights: FloatArray) -> float:
         """Return J at weights (N,); infinite where it has none."""
-        used = weights > 0
-        g = _compressed(np.sqrt(weights[used])[:, None] * self.items[used])
+        g = self._weighted(weights)
         try:
             return float(np.sum(_terms(self.S, solved(self.A, self.H, g), g))) + self.constant
         except SolverError:
@@ -144,16 +143,18 @@ class Quadratic(Value, Convex):
         self, weights: FloatArray
     ) -> tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]:
         """Return J, X+, M, the adjoint Y and the rows ``g_i' X+`` at weights."""
-        used = weights > 0
-        g = _compressed(np.sqrt(weights[used])[:, None] * self.items[used])
+        g = self._weighted(weights)
         X = solved(self.A, self.H, g)
-        gain = _gain(X, g)
-        left = np.eye(X.shape[0]) - gain @ g
-        after = left @ X @ left.T + gain @ gain.T
+        left, after = measured(X, g)
         closed = left @ self.A.T
         adjoint = doubled(closed.T, self.S.T @ self.S)
         cost = float(np.sum(_terms(self.S, X, g))) + self.constant
         return cost, after, closed, adjoint, self.items @ after
+
+    def _weighted(self, weights: FloatArray) -> FloatArray:
+        """Return g of the candidates with weights above zero, each times the root of its own."""
+        used = weights > 0
+        return _compressed(np.sqrt(weights[used])[:, None] * self.items[used])
 
 
 def quadratic(
@@ -195,9 +196,7 @@ def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
     """
     X = _doubled(A, g.T @ g, H)
     if X is not None:
-        gain = _gain(X, g)
-        left = np.eye(X.shape[0]) - gain @ g
-        residual = A.T @ (left @ X @ left.T + gain @ gain.T) @ A + H - X
+        residual = A.T @ measured(X, g)[1] @ A + H - X
         # closed loops that are barely stable look converged: `control_dare` distinguishes them
         if np.linalg.norm(residual) <= RESIDUAL * np.linalg.norm(X):
             return X
@@ -245,6 +244,13 @@ def _slopes(closed: FloatArray, seen: FloatArray, into: FloatArray) -> Iterator[
         turned = into @ modes
         yield (turned @ sums @ turned.conj().T).real
     yield np.array([into @ doubled(closed, np.outer(row, row)) @ into.T for row in seen])
+
+
+def measured(X: FloatArray, g: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return I - K g, and X+ as a sum of squares: ``(I - K g) X (I - K g)' + K K'``."""
+    gain = _gain(X, g)
+    left = np.eye(X.shape[0]) - gain @ g
+    return left, left @ X @ left.T + gain @ gain.T
 
 
 def _gain(X: FloatArray, g: FloatArray) -> FloatArray:

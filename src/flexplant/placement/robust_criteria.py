@@ -11,7 +11,7 @@ import numpy as np
 from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
 from ..values import FloatArray, one_of, short
-from .candidates import Port, checked_plant, side_of, with_side
+from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
 from .criterion import Scorer
 from .rigid_part import RigidPart
 from .wrapping import Wrapping
@@ -167,12 +167,12 @@ class AfterLoss(Wrapping):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        one_of(self.of, "of", ("sensors", "actuators"))
+        one_of(self.of, "of", SIDES)
         one_of(self.measure, "measure", _MEASURES)
 
     def __call__(self, plant: StandardPlant) -> float:
         """Return it for the devices of a plant: infinite where the others do not suffice."""
-        side = self._side
+        side = SIDES[self.of]
         own: tuple[Port, ...] = getattr(plant.assembled.ports, side)
         values = []
         for lost in own:
@@ -186,13 +186,9 @@ class AfterLoss(Wrapping):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the scores by those of choices of one less."""
         inner = self.inner.scorer(plant, candidates)
-        losable = tuple(side_of(port) == self._side for port in candidates)
-        sides = "".join(s for s in "yu" if s in {side_of(port) for port in candidates})
-        return LossScores(inner, RigidPart.of(plant, sides, candidates), losable, self.measure)
-
-    @property
-    def _side(self) -> str:
-        return "y" if self.of == "sensors" else "u"
+        losable = tuple(side_of(port) == SIDES[self.of] for port in candidates)
+        rigid = RigidPart.of(plant, sides_of(candidates), candidates)
+        return LossScores(inner, rigid, losable, self.measure)
 
 
 def _over(measure: str, values: Any) -> Any:

@@ -39,6 +39,12 @@ class LinearRows:
         return cls(rows, np.zeros(len(rows)), np.zeros(len(rows)))
 
     @classmethod
+    def counted(cls, row: FloatArray, at_least: int | None, at_most: int | None) -> LinearRows:
+        """Return one row (N,) between two limits, of which either may be absent."""
+        high = np.inf if at_most is None else float(at_most)
+        return cls(row[None], np.array([float(at_least or 0)]), np.array([high]))
+
+    @classmethod
     def equal(cls, pairs: Sequence[tuple[int, int]], total: int) -> LinearRows:
         """Return rows by which both or none of each pair are chosen."""
         rows = np.zeros((len(pairs), total))

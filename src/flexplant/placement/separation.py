@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..values import FloatArray
 from .criterion import Scorer
-from .quadratic import Quadratic, quadratic
+from .quadratic import Quadratic, measured, quadratic
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,10 +98,7 @@ class Separation(Scorer):
         """Return the covariance of the estimate after the measurement by some sensors."""
         if seeing not in self._covariances:
             g, X, _ = self._filter.solution(seeing)
-            seen = X @ g.T
-            gain = np.linalg.solve(np.eye(len(g)) + g @ seen, seen.T).T
-            left = np.eye(len(X)) - gain @ g
-            after = left @ X @ left.T + gain @ gain.T
+            _, after = measured(X, g)
             scale = self._filter.S.diagonal()
             self._covariances[seeing] = after * scale * scale[:, None]
         return self._covariances[seeing]

@@ -139,8 +139,7 @@ class Within(Constraint):
         inside = places.inside(_listed(self.zones))
         if self.at_least is None and self.at_most is None:
             return LinearRows.closed(inside == 0)
-        high = np.inf if self.at_most is None else float(self.at_most)
-        return LinearRows(inside[None], np.array([float(self.at_least or 0)]), np.array([high]))
+        return LinearRows.counted(inside, self.at_least, self.at_most)
 
 
 def _zones(given: Any, what: str) -> tuple[Zone, ...]:
