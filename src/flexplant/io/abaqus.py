@@ -15,9 +15,10 @@ from ..errors import FlexplantError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
+from .assembled import from_triplets
 from .formats import Format
 from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
-from .paths import check_size, check_whole, damaged, file_path, no_motion, unread, wrong_line_of
+from .paths import check_size, check_whole, file_path, no_motion, unread, wrong_line_of
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
 _HELD = 1e35
@@ -140,29 +141,7 @@ class _Triplets:
 
     def matrix(self, order: IntArray) -> sp.csc_array:
         i, j = np.searchsorted(order, self.rows), np.searchsorted(order, self.columns)
-        n = order.size
-        counts = np.unique(i * n + j, return_counts=True)[1]
-        if np.any(counts > 1):
-            what = f"{int(np.count_nonzero(counts > 1))} entries twice (several steps?)"
-            raise damaged(self.path, what)
-        return symmetric(sp.csc_array(sp.coo_array((self.values, (i, j)), shape=(n, n))))
-
-
-def symmetric(matrix: sp.csc_array) -> sp.csc_array:
-    """Return the full matrix of one that may hold one triangle only.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse matrix
-        A triangle, or the full matrix, which is returned as it is.
-    """
-    lower, upper = sp.tril(matrix, -1), sp.triu(matrix, 1)
-    if lower.count_nonzero() and upper.count_nonzero():
-        # unsorted labels put entries of a half on both sides: no entry then has its mirror image
-        both = abs(lower).multiply(abs(upper.T)).count_nonzero()
-        if both:
-            return matrix
-    return sp.csc_array(matrix + (lower + upper).T)
+        return from_triplets(self.values, i, j, order.size, self.path)
 
 
 def _triplets(path: str | Path) -> _Triplets:

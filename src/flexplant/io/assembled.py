@@ -6,15 +6,19 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import scipy.sparse as sp
+
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from ..structure.matrices import completed
 from ..structure.precision import digits_of
+from ..values import FloatArray, IntArray
 from .foreign_parsers import sound
 from .formats import USUAL
 from .numbers import printed_digits
-from .paths import file_path, parsing
+from .paths import damaged, file_path, parsing
 from .tables import read_dofs
 
 #: the names under which K, M and D are looked for, in any case
@@ -92,6 +96,23 @@ def one_matrix_each(
             parts[name], printed = read(file_path(path, name))
             digits = printed if name == "K" else digits
     return assembled(parts, dofs=dofs, source=Path(str(paths["K"])).name, digits=digits)
+
+
+def from_triplets(
+    values: FloatArray, i: IntArray, j: IntArray, n: int, path: object
+) -> sp.csc_array:
+    """Return the full matrix (n, n) of listed entries, of one triangle or of both.
+
+    Raises
+    ------
+    FlexplantError
+        When an entry is listed twice.
+    """
+    twice = np.count_nonzero(np.unique(i * n + j, return_counts=True)[1] > 1)
+    if twice:
+        raise damaged(path, f"{twice} entries twice (several steps?)")
+    # unsorted labels put entries of a half on both sides: no entry then has its mirror image
+    return completed(sp.coo_array((values, (i, j)), shape=(n, n)), "a matrix")[0]
 
 
 def chosen(

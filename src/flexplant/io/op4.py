@@ -11,6 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError, ModelError
 from ..labels import DofSet
+from ..structure.completion import completed
 from ..structure.matrices import FEMatrices
 from ..values import name_list
 from .formats import USUAL, Format
@@ -153,9 +154,7 @@ def _real(found: dict[str, Any], name: str | None, path: str | Path) -> sp.csc_a
         )
     sparse = sp.csc_array(matrix)
     if form == 6 and sparse.shape[0] == sparse.shape[1]:
-        lower, upper = sp.tril(sparse, -1), sp.triu(sparse, 1)
-        if not lower.count_nonzero() or not upper.count_nonzero():
-            sparse = sp.csc_array(sparse + (lower + upper).T)
+        return completed(sparse, name)[0]
     return sparse
 
 

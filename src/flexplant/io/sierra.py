@@ -12,7 +12,7 @@ from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
-from .abaqus import symmetric
+from .assembled import from_triplets
 from .exodus import opened
 from .formats import Format
 from .numbers import printed_digits, rows_of_numbers, wrong_line
@@ -92,11 +92,7 @@ def read_sierra(
             return None
         table = tables[str(file)][0]
         at = table[:, :2].astype(np.int64) - 1
-        counts = np.unique(at[:, 0] * n + at[:, 1], return_counts=True)[1]
-        if np.any(counts > 1):
-            raise damaged(file, "an entry stands twice")
-        entries = sp.coo_array((table[:, 2], (at[:, 0], at[:, 1])), shape=(n, n))
-        return symmetric(sp.csc_array(entries))
+        return from_triplets(table[:, 2], at[:, 0], at[:, 1], n, file)
 
     located = True
     if dof_map is not None:

@@ -64,7 +64,7 @@ class MotionAndEffort(Criterion):
 
 
 def confirmed(cost: float, found: float) -> float:
-    """Return the cost by Riccati equations, which that of the loop's stationary covariance confirms.
+    """Return the cost by Riccati equations, confirmed by that of the loop's covariance.
 
     Raises
     ------

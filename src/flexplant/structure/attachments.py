@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import scipy.sparse as sp
@@ -258,12 +258,13 @@ def _iterated(parts: Any) -> Iterable[Any]:
     return given
 
 
-def sum_of(matrix: Matrix | None, added: sp.csc_array | None) -> Matrix | None:
-    """Return the sum of two symmetric matrices, of which either may be None."""
-    if added is None or matrix is None:
-        return matrix if added is None else added
-    total: Any = matrix + added
-    return cast(Matrix, total if sp.issparse(total) else np.asarray(total, dtype=np.float64))
+def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
+    """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
+    if matrix is None or change is None:
+        return change if matrix is None else matrix
+    if sp.issparse(matrix):
+        return sp.csc_array(matrix + sp.csc_array(change))
+    return np.asarray(matrix + change, dtype=np.float64)
 
 
 def checked_place(at: Any, owner: str) -> Any:

@@ -20,9 +20,9 @@ _TOO_MANY = 10_000
 _SINGULAR = 1e-12
 
 
-def no_mass(M: Any) -> Any:
-    """Return which DOFs (n,) have no mass at all: their rows are zero."""
-    return _row_sums(M) == 0
+def empty_rows(matrix: Any) -> Any:
+    """Return which rows (n,) are zero: those of M belong to DOFs without any mass."""
+    return _row_sums(matrix) == 0
 
 
 def held_rows(K: Any, M: Any, D: Any) -> Any:
@@ -31,7 +31,7 @@ def held_rows(K: Any, M: Any, D: Any) -> Any:
     held = size == 0 if M is None else size <= np.abs(K.diagonal())
     for matrix in (M, D):
         if matrix is not None:
-            held &= _row_sums(matrix) == 0
+            held &= empty_rows(matrix)
     return held
 
 
@@ -57,7 +57,7 @@ def condensed(
     if not m.size:
         raise ModelError("no DOF has mass: M is zero. Was another matrix read as M?")
     if D is not None:
-        damped = s[_row_sums(D)[s] > 0]
+        damped = s[~empty_rows(D)[s]]
         if damped.size:
             raise ModelError(
                 f"damping acts on the massless DOFs {list(names(damped[:6]))}: they would not "

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..values import IntArray
-from .condense import condensed, no_mass
+from .condense import condensed, empty_rows
 from .singular_mass import left_out, null_motions, projected
 
 
@@ -52,7 +52,7 @@ def inertial(
     """
     notes: tuple[str, ...] = ()
     rows: IntArray = np.arange(M.shape[0])
-    without = no_mass(M)
+    without = empty_rows(M)
     if without.any():
         if massless == "refuse":
             some = names(np.flatnonzero(without))

@@ -17,7 +17,7 @@ from ..sparse.factor import is_positive_definite
 from ..values import IntArray, Value, flag, instance, name_list, one_of, real_array, whole
 from .completion import completed as completed
 from .completion import square
-from .condense import held_rows, no_mass
+from .condense import empty_rows, held_rows
 from .definite import SEMIDEFINITE
 from .local_axes import cosines
 from .massless_motions import inertial
@@ -143,7 +143,7 @@ class FEMatrices(Value):
         """The DOFs without any mass: labels, or rows (from 1) where there are no names."""
         if self.M is None:
             return ()
-        return self.names(np.flatnonzero(no_mass(self.M)))
+        return self.names(np.flatnonzero(empty_rows(self.M)))
 
     def names(self, rows: IntArray) -> tuple[str, ...]:
         """Return the labels of some rows (from 0), or 'row 1', 'row 2', ... without names."""

@@ -15,7 +15,7 @@ from ..errors import ModelError, counted, warn
 from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
-from .attachments import HeldShape, Part, added_matrices, sum_of
+from .attachments import HeldShape, Part, added_matrices, summed
 from .damping import Damping, Rayleigh
 from .damping_matrix import damping_matrix
 from .definite import MatrixLike, check_semidefinite, slow, symmetric, without_inertia
@@ -289,7 +289,7 @@ class FEModel(Placed, Value):
         added = added_matrices(self.dofs, parts)
         # sums of definite matrices are definite: nothing to check again
         return self._with(
-            **{name: frozen(sum_of(getattr(self, name), more)) for name, more in added.items()}
+            **{name: frozen(summed(getattr(self, name), more)) for name, more in added.items()}
         )
 
     def fixed(self, labels: Iterable[str]) -> FEModel:

@@ -15,6 +15,7 @@ from ..modes.dynamic_basis import static_shapes
 from ..modes.sparse_modes import counted_modes
 from ..reduction import ReducedModel
 from ..sparse.orthonormal import beyond
+from ..structure.attachments import summed
 from ..structure.model import FEModel
 from ..values import FloatArray
 from .pairing import pair
@@ -23,7 +24,6 @@ from .point_model import Point
 from .residuals.residual import Residual
 from .search import Objective
 from .search.objective import numbers
-from .updated_model import summed
 
 #: modes of the basis for each coordinate of the reduced model
 WIDER = 4

@@ -7,11 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import scipy.sparse as sp
 
 from ..errors import FlexplantWarning, ModelError
 from ..modes import solve_modes
 from ..modes.normal_form import RIGID_DRAG
+from ..structure.attachments import summed
 from ..structure.model import FEModel
 from ..structure.rigid import orthonormalised
 from ..values import FloatArray, Matrix
@@ -114,12 +114,3 @@ def _replaced(
         raise ModelError(
             f"the update ended at {text}, which the {type(model).__name__} refuses: {error}"
         ) from None
-
-
-def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
-    """Return the sum of two matrices, sparse where the first one is, of which any may be None."""
-    if matrix is None or change is None:
-        return change if matrix is None else matrix
-    if sp.issparse(matrix):
-        return sp.csc_array(matrix + sp.csc_array(change))
-    return np.asarray(matrix + change, dtype=np.float64)

@@ -13,6 +13,7 @@ from ...sparse.factor import by_rows, diagonal, is_positive_definite, unit_diago
 from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
 from ...values import FloatArray, IntArray
 from ..components import pieces
+from ..condense import empty_rows
 from ..masses import RigidMass, rigid_mass
 from ..matrices import FEMatrices
 from ..precision import loss, shown_digits
@@ -101,8 +102,8 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
     }
     K, M, D = (_halved(matrix) for matrix in (given.K, given.M, given.D))
     n = given.n_dof
-    no_stiffness = _empty(K)
-    no_mass = np.zeros(n, dtype=bool) if M is None else _empty(M)
+    no_stiffness = empty_rows(K)
+    no_mass = np.zeros(n, dtype=bool) if M is None else empty_rows(M)
     absent = no_stiffness & (no_mass if M is not None else True)
     there = np.flatnonzero(~absent)
     mass_definite, negative, weak = _mass_state(given, M, no_mass)
@@ -190,10 +191,6 @@ def _skew(matrix: Any) -> tuple[float, int, int]:
 
 def _halved(matrix: Any) -> Any:
     return None if matrix is None else sp.csc_array(0.5 * (matrix + matrix.T))
-
-
-def _empty(matrix: Any) -> Any:
-    return np.asarray(abs(matrix).sum(axis=1)).ravel() == 0
 
 
 def _mass_state(given: FEMatrices, M: Any, no_mass: Any) -> tuple[bool | None, IntArray, IntArray]:
@@ -294,7 +291,7 @@ def _lowest(
 
 
 def _damping(D: Any, motions: ZeroEnergy | None) -> dict[str, Any]:
-    kept = np.flatnonzero(~_empty(D))
+    kept = np.flatnonzero(~empty_rows(D))
     definite = not kept.size or is_positive_definite(D[kept][:, kept], 1e-9)
     drag = 0.0
     if motions is not None and motions.n_rigid and kept.size:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -36,38 +36,33 @@ def spread(found: Facts, motion: FloatArray) -> tuple[str, ...]:
     return found.names(most_moved(motion))
 
 
-def matrices(found: Facts) -> list[Line]:
+def matrices(found: Facts) -> Iterator[Line]:
     """Return the lines on symmetry and definiteness."""
-    lines: list[Line] = []
     wrong = {name: skew for name, skew in found.skew.items() if skew[0] > _SYMMETRY}
     for name, (size, i, j) in wrong.items():
         matrix: Any = getattr(found.given, name)
-        lines.append(
+        yield (
+            "fail",
+            f"symmetry of {name}",
             (
-                "fail",
-                f"symmetry of {name}",
-                (
-                    f"entries ({i + 1}, {j + 1}) and ({j + 1}, {i + 1}) are {matrix[i, j]:.6g} and "
-                    f"{matrix[j, i]:.6g} ({size:.2g} of the diagonal)"
-                ),
-                "gyroscopic, follower or contact terms have no place here; a triangle read twice?",
-            )
+                f"entries ({i + 1}, {j + 1}) and ({j + 1}, {i + 1}) are {matrix[i, j]:.6g} and "
+                f"{matrix[j, i]:.6g} ({size:.2g} of the diagonal)"
+            ),
+            "gyroscopic, follower or contact terms have no place here; a triangle read twice?",
         )
     if not wrong:
-        lines.append(("ok", "symmetry", f"{', '.join(found.skew)} symmetric", ""))
+        yield ("ok", "symmetry", f"{', '.join(found.skew)} symmetric", "")
     if found.swapped:
-        lines.append(
-            (
-                "fail",
-                "order of K and M",
-                "M resists no rigid translation as a stiffness does, K every one as a mass does",
-                "they are swapped: FEMatrices(K, M), but FEModel(M, K)",
-            )
+        yield (
+            "fail",
+            "order of K and M",
+            "M resists no rigid translation as a stiffness does, K every one as a mass does",
+            "they are swapped: FEMatrices(K, M), but FEModel(M, K)",
         )
-    lines += [_mass_line(found), _stiffness_line(found)]
+    yield _mass_line(found)
+    yield _stiffness_line(found)
     if found.damping:
-        lines.append(_damping_line(found))
-    return lines
+        yield _damping_line(found)
 
 
 def _mass_line(found: Facts) -> Line:
@@ -135,118 +130,95 @@ def _damping_line(found: Facts) -> Line:
     return ("ok", "definiteness of D", "positive semi-definite", "")
 
 
-def zero_rows(found: Facts) -> list[Line]:
+def zero_rows(found: Facts) -> Iterator[Line]:
     """Return the lines on DOFs without mass, without stiffness, without both."""
-    lines: list[Line] = []
     if found.empty.size:
-        lines.append(
-            (
-                "fail",
-                "empty rows",
-                f"neither mass nor stiffness: {listed(found.names(found.empty))}",
-                "held DOFs that the export kept? Drop them: FEMatrices.without([...])",
-            )
+        yield (
+            "fail",
+            "empty rows",
+            f"neither mass nor stiffness: {listed(found.names(found.empty))}",
+            "held DOFs that the export kept? Drop them: FEMatrices.without([...])",
         )
     if found.massless.size:
-        lines.append(
-            (
-                "fail",
-                "without mass",
-                listed(found.names(found.massless)),
-                "condense them, exactly: FEMatrices.model(massless='condense')",
-            )
+        yield (
+            "fail",
+            "without mass",
+            listed(found.names(found.massless)),
+            "condense them, exactly: FEMatrices.model(massless='condense')",
         )
     if found.without_inertia.size:
-        lines.append(
+        yield (
+            "fail",
+            "without inertia",
             (
-                "fail",
-                "without inertia",
-                (
-                    f"{found.without_inertia.size} motions that no mass resists, moving "
-                    f"{listed(found.names(found.without_inertia))}"
-                ),
-                "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
-            )
+                f"{found.without_inertia.size} motions that no mass resists, moving "
+                f"{listed(found.names(found.without_inertia))}"
+            ),
+            "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
         )
     if found.stiffless.size:
-        lines.append(
-            (
-                "fail",
-                "without stiffness",
-                f"{listed(found.names(found.stiffless))}: free to drift away",
-                "join them to the structure, or drop them",
-            )
+        yield (
+            "fail",
+            "without stiffness",
+            f"{listed(found.names(found.stiffless))}: free to drift away",
+            "join them to the structure, or drop them",
         )
-    if not lines:
-        lines.append(("ok", "rows", "every DOF has mass and stiffness", ""))
-    return lines
+    rows = (found.empty, found.massless, found.without_inertia, found.stiffless)
+    if not any(some.size for some in rows):
+        yield ("ok", "rows", "every DOF has mass and stiffness", "")
 
 
-def rigid(found: Facts) -> list[Line]:
+def rigid(found: Facts) -> Iterator[Line]:
     """Return the lines on rigid-body motions, expected and found, and on mechanisms."""
     if found.lowest is None:
-        return []
+        return
     if found.motions is None:
-        return [
-            (
-                "note",
-                "rigid body",
-                f"{found.n_zero} motions without energy; rigid-body ones are known with DOFs only",
-                "with_dofs(DofSet(nodes, directions, xyz))",
-            )
-        ]
+        yield (
+            "note",
+            "rigid body",
+            f"{found.n_zero} motions without energy; rigid-body ones are known with DOFs only",
+            "with_dofs(DofSet(nodes, directions, xyz))",
+        )
+        return
     motions = found.motions
-    lines: list[Line] = []
     text = _freedom(found, motions)
     extra = motions.mechanisms.shape[1]
     expected = f"{motions.n_rigid} by the geometry, {found.n_zero} found in K"
     odd = motions.length_factor
     if odd is not None:
-        lines.append(
-            (
-                "fail",
-                "coordinates",
-                f"rotations cost energy, but would not with coordinates times {odd:.6g}",
-                "the coordinates are in another unit than the matrices: converted(...) one of them",
-            )
+        yield (
+            "fail",
+            "coordinates",
+            f"rotations cost energy, but would not with coordinates times {odd:.6g}",
+            "the coordinates are in another unit than the matrices: converted(...) one of them",
         )
     if not found.given.located:
-        lines.append(
-            (
-                "note",
-                "rigid body",
-                f"{text}; coordinates are not known, hence nor are rotations ({expected})",
-                "give them: located_at(nodes, xyz)",
-            )
-        )
-        return lines
-    partly = motions.n_rigid > 0 and bool(motions.grounded) and odd is None
-    lines.append(
-        (
-            "note" if partly else "ok",
+        yield (
+            "note",
             "rigid body",
-            f"{text} ({expected})",
-            "the supports leave that free: a mode at 0 Hz. Hold it where the machine does"
-            if partly
-            else "",
+            f"{text}; coordinates are not known, hence nor are rotations ({expected})",
+            "give them: located_at(nodes, xyz)",
         )
+        return
+    partly = motions.n_rigid > 0 and bool(motions.grounded) and odd is None
+    yield (
+        "note" if partly else "ok",
+        "rigid body",
+        f"{text} ({expected})",
+        "the supports leave that free: a mode at 0 Hz. Hold it where the machine does"
+        if partly
+        else "",
     )
     if not extra:
-        lines.append(("ok", "mechanisms", "none", ""))
+        yield ("ok", "mechanisms", "none", "")
     elif odd is None:
         moved = listed(spread(found, motions.mechanisms[:, 0]), most=4)
-        lines.append(
-            (
-                "fail",
-                "mechanisms",
-                (
-                    f"{counted(extra, 'zero-energy motion')} beyond rigid body; the first "
-                    f"moves {moved}"
-                ),
-                "join or hold these; wrong coordinates or directions look alike (all DOFs move)",
-            )
+        yield (
+            "fail",
+            "mechanisms",
+            (f"{counted(extra, 'zero-energy motion')} beyond rigid body; the first moves {moved}"),
+            "join or hold these; wrong coordinates or directions look alike (all DOFs move)",
         )
-    return lines
 
 
 def _freedom(found: Facts, motions: ZeroEnergy) -> str:
@@ -271,68 +243,58 @@ def _freedom(found: Facts, motions: ZeroEnergy) -> str:
     return f"{f'free in {free}' if free else 'held'}{grounded}{absent}"
 
 
-def masses(found: Facts) -> list[Line]:
+def masses(found: Facts) -> Iterator[Line]:
     """Return the lines on mass, centre of gravity and inertia."""
     mass, center = found.body.mass, found.body.center
     known = np.isfinite(mass)
     if not known.any():
-        return []
+        return
     shown = [f"{m:.6g} kg in {d}" for m, d, k in zip(mass, "xyz", known, strict=False) if k]
     same = np.ptp(mass[known]) <= 1e-6 * np.abs(mass[known]).max()
-    lines: list[Line] = []
     if same:
         text = f"{mass[known][0]:.6g} kg in {', '.join(d for d, k in zip('xyz', known) if k)}"  # noqa: B905
-        lines.append(("ok", "total mass", text, ""))
+        yield ("ok", "total mass", text, "")
     else:
-        lines.append(
-            (
-                "note",
-                "total mass",
-                "; ".join(shown) + ": differs between directions",
-                "dropped (held) DOFs take their mass along; else look at directions and labels",
-            )
+        yield (
+            "note",
+            "total mass",
+            "; ".join(shown) + ": differs between directions",
+            "dropped (held) DOFs take their mass along; else look at directions and labels",
         )
     if np.isfinite(center).any():
         at = ", ".join(f"{c:.6g}" if np.isfinite(c) else "?" for c in center)
-        lines.append(("ok", "centre of gravity", f"({at}) m", ""))
+        yield ("ok", "centre of gravity", f"({at}) m", "")
     turns = np.diag(found.body.inertia)
     if np.isfinite(turns).any():
         of = [
             f"{j:.6g} ({d})" for j, d in zip(turns, DIRECTIONS[3:], strict=True) if np.isfinite(j)
         ]
-        lines.append(("ok", "inertia about it", f"{', '.join(of)} kg m^2", ""))
-    return lines
+        yield ("ok", "inertia about it", f"{', '.join(of)} kg m^2", "")
 
 
-def scales(found: Facts) -> list[Line]:
+def scales(found: Facts) -> Iterator[Line]:
     """Return the lines on penalties and odd units."""
     K: Any = found.given.K
     entries = np.abs(diagonal(K))
     coupling = np.asarray(abs(K).sum(axis=1)).ravel() - entries
-    lines: list[Line] = []
     alone = np.flatnonzero((coupling == 0) & (entries > 0))
     if alone.size and alone.size < entries.size:
-        lines.append(
-            (
-                "note",
-                "uncoupled rows",
-                f"joined to nothing but ground: {listed(found.names(alone))}",
-                "rows that a solver put there for held DOFs? FEMatrices.without([...])",
-            )
+        yield (
+            "note",
+            "uncoupled rows",
+            f"joined to nothing but ground: {listed(found.names(alone))}",
+            "rows that a solver put there for held DOFs? FEMatrices.without([...])",
         )
     coupled = coupling > 0
     typical = float(np.median(entries[coupled])) if coupled.any() else 0.0
     penalty = np.flatnonzero(coupled & (entries > _PENALTY * np.maximum(coupling, typical)))
     if penalty.size:
-        lines.append(
-            (
-                "note",
-                "penalties",
-                f"held by a huge stiffness: {listed(found.names(penalty))}",
-                "their rounding exceeds soft modes; hold them: FEMatrices.without([...])",
-            )
+        yield (
+            "note",
+            "penalties",
+            f"held by a huge stiffness: {listed(found.names(penalty))}",
+            "their rounding exceeds soft modes; hold them: FEMatrices.without([...])",
         )
     odd = unusual(found)
     if odd is not None:
-        lines.append(("note", "units", *odd))
-    return lines
+        yield ("note", "units", *odd)
