@@ -11,9 +11,8 @@ from timing import best
 import flexplant as fx
 from flexplant.loop.noise_sources import white_noise
 from flexplant.parallel import one_thread
-from flexplant.simulation.drawn import Drawn
 from flexplant.simulation.runs import SampleBySample
-from flexplant.simulation.stepping import machine
+from flexplant.simulation.stepping import Drawn, machine
 from stages import L, ports
 
 COUNT = 100_000

@@ -10,9 +10,8 @@ import numpy.typing as npt
 from ..errors import ModelError, unknown_label
 from ..lti.frequency import Frf
 from ..values import positive
-from .dropouts import dropouts_warned
 from .periodic import Periodic, periodic_frf
-from .records import records
+from .records import dropouts_warned, records
 from .spectra import H1Estimator, SpectralMethod, spectral_frf
 
 Signals: TypeAlias = npt.ArrayLike | Mapping[str, Any]

@@ -1,4 +1,4 @@
-"""ANSYS Mechanical: matrices of .full files, coordinates of .rst and .cdb files."""
+"""ANSYS Mechanical: matrices of .full files, modes of .rst files, coordinates of both and .cdb."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from ..structure import FEMatrices
 from ..values import FloatArray, IntArray
 from .assembled import assembled, missing_extra
 from .child import in_child
+from .file_shapes import FileShapes, ModesFormat
 from .formats import Elsewhere, Format, is_text
 from .paths import file_path, no_motion, unread
 from .tables import read_nodes_table
@@ -175,3 +176,50 @@ ELEMENTS = Elsewhere(
     "single elements, or data of ANSYS' own. Matrices: a modal analysis with WRFULL,1 writes the "
     "assembled ones as .full, read_ansys",
 )
+
+
+_KINDS = dict(zip(("UX", "UY", "UZ", "ROTX", "ROTY", "ROTZ"), DIRECTIONS, strict=True))
+#: of the header: a modal analysis
+_MODAL = 2
+
+
+def read_rst_shapes(path: Path, nodes: Path | None) -> FileShapes:
+    """Return the mode shapes of an ANSYS result file, turned to global directions by its reader.
+
+    Parameters
+    ----------
+    path : Path
+        The .rst file of a modal analysis. Needs ansys-mapdl-reader.
+    nodes : Path, optional
+        Not needed: the file holds its nodes.
+
+    Raises
+    ------
+    FlexplantError
+        When the package is missing, or the file is damaged.
+    ModelError
+        When it is of another analysis or a cyclic sector, or DOFs are no displacements.
+    """
+    found = read_parsed("ansys_modes", path)
+    if found["analysis"] != _MODAL or found["cyclic"]:
+        what = "a cyclic sector" if found["cyclic"] else "another analysis"
+        do = "Write it with ANTYPE,MODAL of the whole model."
+        raise unread(path.name, f"is of {what}: its steps are no modes of a structure", do)
+    strange = [name for name in found["kinds"] if name not in _KINDS]
+    if strange or not found["kinds"]:
+        raise no_motion(path.name, strange)
+    directions = tuple(_KINDS[name] for name in found["kinds"])
+    ids = np.asarray(found["ids"], dtype=np.int64)
+    values = np.asarray(found["shapes"], dtype=np.float64)  # (k, nodes, DOFs)
+    known = np.asarray(found["nodes"], dtype=np.int64)
+    places = np.asarray(found["xyz"], dtype=np.float64)[:, :3]
+    xyz = at_nodes(ids, known, places, str(path))
+    m = len(directions)
+    dofs = DofSet(np.repeat(ids, m), directions * ids.size, np.repeat(xyz, m, axis=0))
+    phi = values.reshape(len(values), -1).T
+    omega = 2 * np.pi * np.asarray(found["freq"], dtype=np.float64)
+    note = "ANSYS normalises to unit mass unless MODOPT's Nrmkey is ON"
+    return FileShapes(omega, phi, dofs, notes=(note,))
+
+
+RESULTS = ModesFormat((".rst",), read_rst_shapes)

@@ -12,12 +12,12 @@ from typing import Any, cast
 import numpy as np
 import scipy.io
 
-from ..errors import FlexplantError, LabelError
+from ..errors import FlexplantError, LabelError, ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..modes import Modes
 from ..values import FloatArray, Matrix, one_of, real_array
 from .assembled import missing_extra
-from .file_shapes import check_mass, frequencies
+from .file_shapes import FileShapes, ModesFormat, check_mass, frequencies
 from .formats import Elsewhere
 from .paths import damaged, file_path, parsing
 
@@ -270,3 +270,29 @@ class ExodusFile:
 
 MODES = Elsewhere((".exo", ".e"), "modes: flexplant.io.read_modes reads them")
 MESH = Elsewhere((".g",), "a mesh: give it to read_sierra(..., exodus=...)")
+
+
+def read_exodus_shapes(path: Path, nodes: Path | None) -> FileShapes:
+    """Return the mode shapes of an Exodus file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    nodes : Path, optional
+        Must not be given: the file holds its nodes.
+
+    Raises
+    ------
+    FlexplantError
+        When it is no Exodus file, cut off, or without shapes.
+    ModelError
+        When `nodes` is given.
+    """
+    if nodes is not None:
+        raise ModelError(f"{str(path)!r} holds its nodes: leave nodes= out.")
+    omega, phi, dofs = read_shapes(path)
+    return FileShapes(omega, phi, dofs)
+
+
+EXODUS = ModesFormat((".exo", ".e"), read_exodus_shapes)

@@ -16,8 +16,7 @@ from ..plant import StandardPlant
 from ..reduction import ReducedModel
 from ..store import written
 from ..values import short
-from .mat_models import frf_fields, frf_of, reduced_fields, reduced_of
-from .mat_systems import system_fields, system_of
+from .mat_models import frf_fields, frf_of, reduced_fields, reduced_of, system_fields, system_of
 from .mat_variables import mat_variables
 from .paths import parsing
 

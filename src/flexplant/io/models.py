@@ -24,7 +24,6 @@ from . import (
     sierra,
     uff,
 )
-from .elsewhere import OTHERS
 from .formats import HEAD, USUAL, Elsewhere, Format, ends
 from .paths import file_path, three_units
 from .tables import read_dofs, read_nodes_table
@@ -46,7 +45,26 @@ ELSEWHERE: tuple[Elsewhere, ...] = (
     uff.UNIVERSAL,
     ansys.MARKUP,
     ansys.ELEMENTS,
-    *OTHERS,
+    Elsewhere(
+        (".op2",),
+        "results, of which flexplant.io.read_modes reads the modes. Matrices: EXTSEOUT(ASMBULK, "
+        "EXTID=1, DMIGOP4) in the case control writes them as .op4, read_op4",
+    ),
+    Elsewhere(
+        (".f06", ".f04", ".out"),
+        "what a run printed, with too few digits. Matrices: EXTSEOUT(ASMBULK, EXTID=1, DMIGOP4) in "
+        "the case control writes them as .op4, read_op4",
+    ),
+    Elsewhere(
+        (".odb", ".fil", ".sim"),
+        "results in a form of Abaqus' own. Matrices: *MATRIX GENERATE, STIFFNESS, MASS and *MATRIX "
+        "OUTPUT, STIFFNESS, MASS write them as .mtx, read_abaqus",
+    ),
+    Elsewhere(
+        (".mph",),
+        "a model of COMSOL. Matrices: LiveLink's mphmatrix(model, 'sol1', 'out', {'Kc', 'Ec'}), "
+        "of which Ec is M, saved as .mat: read_matlab",
+    ),
 )
 
 

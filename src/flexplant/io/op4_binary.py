@@ -12,7 +12,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError
 from ..structure.precision import digits_of
-from .op4_shapes import check_shape, is_thin
+from .op4_text import check_shape, is_thin
 from .paths import damaged
 
 

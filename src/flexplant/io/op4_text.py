@@ -11,8 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import FlexplantError
 from .numbers import fixed_numbers
-from .op4_shapes import check_shape, is_thin
-from .paths import damaged
+from .paths import check_size, damaged
 
 #: digits of single precision (types 1 and 3), however many are printed
 _SINGLE = 7
@@ -194,3 +193,25 @@ class _Reader:
         dense = np.zeros(shape, dtype=numbers.dtype, order="F")
         dense[rows, columns] = numbers
         return dense
+
+
+#: entries that are kept dense however few of them the file holds
+_SMALL = 2**20
+#: a dense matrix may take so many times the numbers in the file
+_TIMES = 16
+
+
+def check_shape(columns: int, rows: int, held: int, path: str) -> None:
+    """Refuse a size of a matrix that a file of `held` bytes cannot hold.
+
+    Raises
+    ------
+    FlexplantError
+        When rows or columns are too many: a damaged count.
+    """
+    check_size(max(columns, abs(rows)), held, path)
+
+
+def is_thin(shape: tuple[int, int], held: int) -> bool:
+    """Return whether a matrix of which the file holds so many numbers is too large to be dense."""
+    return shape[0] * shape[1] > max(_SMALL, _TIMES * held)

@@ -12,7 +12,7 @@ from ..modes import Modes
 from ..structure import FEMatrices, FEModel
 from ..structure.units import units as unit_system
 from ..values import FloatArray, instance
-from . import ansys_modes, exodus_modes, op2, punch_modes, uff_modes
+from . import ansys, exodus, op2, punch_modes, uff
 from .file_shapes import ModesFormat, check_mass, modes_of
 from .formats import HEAD, ends
 from .paths import file_path, three_units
@@ -20,9 +20,9 @@ from .paths import file_path, three_units
 FORMATS: tuple[ModesFormat, ...] = (
     op2.OUTPUT2,
     punch_modes.PUNCH,
-    ansys_modes.RESULTS,
-    exodus_modes.EXODUS,
-    uff_modes.UNIVERSAL_MODES,
+    ansys.RESULTS,
+    exodus.EXODUS,
+    uff.UNIVERSAL_MODES,
 )
 
 

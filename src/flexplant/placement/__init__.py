@@ -8,12 +8,12 @@ from .closed_loop_h2 import ClosedLoopH2 as ClosedLoopH2
 from .constraint import Constraint as Constraint
 from .criterion import Criterion as Criterion
 from .criterion import Scorer as Scorer
-from .device_budget import Budget as Budget
 from .exchange import Exchange as Exchange
 from .exhaustive import Exhaustive as Exhaustive
 from .gramian import ModalControllability as ModalControllability
 from .gramian import ModalObservability as ModalObservability
 from .groups import Among as Among
+from .groups import Budget as Budget
 from .groups import Mirrored as Mirrored
 from .groups import Together as Together
 from .hinf_level import HinfLevel as HinfLevel
@@ -42,9 +42,9 @@ from .search import place_both as place_both
 from .search import place_sensors as place_sensors
 from .sensor_map import SensorMap as SensorMap
 from .sensor_map import sensor_map as sensor_map
-from .spacing import MinimumDistance as MinimumDistance
 from .worth import DeviceWorth as DeviceWorth
 from .worth import device_worth as device_worth
 from .zones import Excluded as Excluded
+from .zones import MinimumDistance as MinimumDistance
 from .zones import OffPoi as OffPoi
 from .zones import Within as Within

@@ -1,4 +1,4 @@
-"""What a layout is judged by: any function from plant to float, some with a fast form."""
+"""What a layout is judged by: any function from plant to float, or one made of another."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from ..arguments import function
 from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, short, with_unit
@@ -168,3 +169,37 @@ def in_words(value: float, unit: str) -> str:
     if not unit or not np.isfinite(value):
         return f"{value:.4g}"
     return f"{with_unit(float(np.sqrt(max(value, 0.0))), unit)} rms"
+
+
+@dataclass(frozen=True, eq=False)
+class Wrapping(Criterion):
+    """A criterion of the values of another one, or of a callable; the base of them.
+
+    Parameters
+    ----------
+    criterion : Criterion or callable
+        From plant to float.
+
+    Raises
+    ------
+    ModelError
+        When it is not callable.
+    """
+
+    criterion: Any
+
+    def __post_init__(self) -> None:
+        function(self.criterion, "a criterion", "Pass PoiVariance(), say.")
+
+    @property
+    def inner(self) -> Criterion:
+        """The criterion that is wrapped."""
+        return as_criterion(self.criterion)
+
+    def unit(self, plant: StandardPlant) -> str:
+        """Return the unit of the criterion that is wrapped."""
+        return self.inner.unit(plant)
+
+    def check(self, plant: StandardPlant, candidates: Sequence[Any]) -> None:
+        """Check the criterion that is wrapped."""
+        as_criterion(self.criterion, sides_of(candidates)).check(plant, candidates)

@@ -15,7 +15,7 @@ from ..values import FloatArray, Rng, Value, positive, real_array, short
 from .candidates import checked_plant
 from .constraint import Constraint
 from .criterion import Criterion, in_words
-from .device_budget import Budget
+from .groups import Budget
 from .placement import Placement
 from .problem import Search
 from .search import place_actuators, place_sensors

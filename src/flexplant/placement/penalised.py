@@ -15,8 +15,7 @@ from ..plant import StandardPlant, larger_plant
 from ..values import FloatArray, one_of, positive
 from .candidate_shapes import Shapes, shapes_of
 from .candidates import SIDES, side_of, sides_of
-from .criterion import Criterion, Scorer, as_criterion
-from .wrapping import Wrapping
+from .criterion import Criterion, Scorer, Wrapping, as_criterion
 
 
 @dataclass(frozen=True, eq=False)

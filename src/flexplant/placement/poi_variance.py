@@ -29,8 +29,7 @@ from .poi_axes import (
     structure_part,
     unit_of,
 )
-from .quadratic import quadratic
-from .worst_row import WorstRow
+from .quadratic import WorstRow, quadratic
 
 
 @dataclass(frozen=True, eq=False, repr=False)

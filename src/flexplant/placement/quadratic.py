@@ -1,4 +1,4 @@
-"""A stationary quadratic cost as a function of which candidates are used: one Riccati each."""
+"""Stationary quadratic costs as functions of which candidates are used: one Riccati each."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from ..errors import SolverError
 from ..lti.lyapunov import doubled
 from ..lti.riccati import control_dare
 from ..values import FloatArray, IntArray, Value
+from .criterion import Scorer
 from .tangent import Convex, Tangent
 
 #: a doubling has converged when every diagonal entry grows by less than this: the next one would
@@ -268,3 +269,34 @@ def _terms(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:
     gain = S @ _gain(X, g)
     left = S - gain @ g
     return np.asarray(np.einsum("ij,jk,ik->i", left, X, left) + np.sum(gain**2, axis=1))
+
+
+@dataclass(frozen=True, eq=False)
+class WorstRow(Scorer):
+    """``max_a (s_a X+ s_a' + constant_a)`` over the rows of a quadratic cost.
+
+    Parameters
+    ----------
+    costs : Quadratic
+        Its rows S are the terms.
+    constants : (k,) array
+        What no candidate can change of each.
+    """
+
+    costs: Quadratic
+    constants: FloatArray
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return the largest term with some candidates."""
+        return float(np.max(self.costs.terms(chosen) + self.constants))
+
+    def bound(self, count: int, required: Sequence[int]) -> float:
+        """Return the largest bound of any one term, or of their mean: the maximum is above both."""
+        k = len(self.constants)
+        parts = [
+            self.costs.replace(S=self.costs.S[[i]], constant=float(self.constants[i]))
+            for i in range(k)
+        ]
+        mean = float(np.mean(self.constants))
+        parts.append(self.costs.replace(S=self.costs.S / np.sqrt(k), constant=mean))
+        return max(part.bound(count, required) for part in parts)

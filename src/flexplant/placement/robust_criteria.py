@@ -12,9 +12,8 @@ from ..errors import FlexplantError, ModelError
 from ..plant import StandardPlant
 from ..values import FloatArray, one_of, short
 from .candidates import SIDES, Port, checked_plant, side_of, sides_of, with_side
-from .criterion import Scorer
+from .criterion import Scorer, Wrapping
 from .rigid_part import RigidPart
-from .wrapping import Wrapping
 
 _MEASURES = ("worst", "mean")
 

@@ -18,9 +18,9 @@ from ..work import Work
 from .candidate_places import places_of
 from .candidates import checked_plant
 from .constraint import Constraint
-from .constraints import all_of, rows_of
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
+from .zones import all_of, rows_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)

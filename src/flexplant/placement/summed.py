@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..values import FloatArray
-from .ascent import ascended
-from .branch import Branch
+from .branch import Branch, ascended
 from .criterion import Scorer
 from .tangent import Below, Convex
 

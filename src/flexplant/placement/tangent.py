@@ -10,8 +10,7 @@ import numpy as np
 
 from ..errors import SolverError
 from ..values import FloatArray
-from .ascent import ascended
-from .branch import Branch
+from .branch import Branch, ascended
 from .criterion import Scorer
 
 #: steps in the weights on one tangent, and the relative gap at which they stop

@@ -14,11 +14,11 @@ from ..values import name_list, whole
 from .candidate_places import places_of
 from .candidates import Port, known_candidates, side_of
 from .constraint import Constraint
-from .constraints import rows_of
 from .layouts import layouts_of
 from .problem import Problem
 from .rows import LinearRows
 from .separation import Separation
+from .zones import rows_of
 
 
 def problem_of(

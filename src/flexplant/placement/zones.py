@@ -1,4 +1,4 @@
-"""Constraints on where devices may be: zones without any, or with so many, and off the die."""
+"""Constraints on where devices may be: zones, off the die, at a distance from each other."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..errors import ModelError
 from ..structure import Disc
-from ..values import real_array, short
+from ..values import positive, real_array, short
 from .candidate_places import Places, Zone
 from .constraint import Constraint, limits
 from .rows import LinearRows
@@ -157,3 +157,71 @@ def _zones(given: Any, what: str) -> tuple[Zone, ...]:
 
 def _listed(zones: Zone | Sequence[Zone]) -> tuple[Zone, ...]:
     return (zones,) if isinstance(zones, Zone) else tuple(zones)
+
+
+@dataclass(frozen=True, eq=False)
+class MinimumDistance(Constraint):
+    """A smallest distance between any two chosen candidates.
+
+    Parameters
+    ----------
+    distance : float [m]
+        Between the nearest points of the two.
+
+    Raises
+    ------
+    ModelError
+        When it is not positive.
+
+    Examples
+    --------
+    >>> import flexplant as fx
+    >>> plant = fx.testbeds.three_masses()
+    >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
+    >>> apart = fx.placement.MinimumDistance(1.5)
+    >>> fx.place_sensors(plant, candidates, 2, constraints=[apart]).chosen
+    ('s1', 's3')
+    """
+
+    distance: float
+
+    def __post_init__(self) -> None:
+        self._set(distance=positive(self.distance, "distance"))
+
+    def rows(self, places: Places) -> LinearRows:
+        """Return x_i + x_j <= 1 for each pair that is too close."""
+        close = places.distances(places.points) < self.distance - places.same
+        first, second = np.nonzero(np.triu(close, 1))
+        pairs = np.zeros((first.size, places.total))
+        line = np.arange(first.size)
+        pairs[line, first] = pairs[line, second] = 1.0
+        return LinearRows(pairs, np.zeros(first.size), np.ones(first.size))
+
+
+def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
+    """Return the rows of all constraints, OffPoi() among them for sensors unless one is given.
+
+    Raises
+    ------
+    ModelError
+        When something is no constraint.
+    """
+    return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
+
+
+def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:
+    """Return constraints as a tuple, OffPoi() among them for sensors unless one is given."""
+    given = (constraints,) if isinstance(constraints, Constraint) else constraints
+    if isinstance(given, str) or not isinstance(given, Sequence):
+        raise ModelError(
+            f"constraints are a list of Excluded(...), MinimumDistance(...) and others, got "
+            f"{short(given)}. Put them in a list."
+        )
+    for item in given:
+        if not isinstance(item, Constraint):
+            raise ModelError(
+                f"a constraint is Excluded(...), MinimumDistance(...) or another such value, got "
+                f"{short(item)}. Write Excluded(Disc((0.3, 0.3), radius=0.05)), say."
+            )
+    usual = "y" in side and not any(isinstance(item, OffPoi) for item in given)
+    return (*given, OffPoi()) if usual else tuple(given)

@@ -9,12 +9,13 @@ what is drawn into them later keeps it. Frequencies are in Hz, gains in dB with 
 from ._style import CYCLE as CYCLE
 from ._style import STYLES as STYLES
 from .bode import bode as bode
+from .bode import singular_values as singular_values
 from .budget import budget as budget
 from .consistency import consistency as consistency
-from .error_map import error_map as error_map
 from .estimation import estimate as estimate
 from .estimation import lag_report as lag_report
 from .estimation import predictions as predictions
+from .exposures import error_map as error_map
 from .exposures import exposures as exposures
 from .frequency import frf as frf
 from .identification import identified as identified
@@ -31,7 +32,6 @@ from .report import report as report
 from .response import response as response
 from .sensitivity import sensitivities as sensitivities
 from .sensitivity import sensitivity as sensitivity
-from .singular_values import singular_values as singular_values
 from .spectra import spectra as spectra
 from .step import step as step
 from .structure import layout as layout

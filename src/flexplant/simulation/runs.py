@@ -9,14 +9,12 @@ import numpy as np
 
 from ..loop import ClosedLoop
 from ..loop.noise_sources import WhiteNoise
-from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, cheapest
-from ..values import FloatArray
+from ..lti.recursion import CALL, ONE_VECTOR, PIECE, Blocks, Recursion, cheapest
+from ..values import FloatArray, IntArray
 from .anti_windup import split_law
 from .conditions import Conditions, Moving
-from .drawn import Drawn
-from .lifting import lifted
 from .nonlinear_elements import Acting
-from .stepping import Buffers, Machine, machine, step_through
+from .stepping import Buffers, Drawn, Machine, machine, step_through
 
 #: samples per stretch and runs side by side: what fits the cache of one core
 STRETCH, ABREAST = 128, 16
@@ -273,3 +271,50 @@ class InBlocks:
         wrong = np.abs(self._run(v, start)[0][:, : self.n_shown].T - expected[0]).max(axis=1)
         allowed = _AGREE * np.abs(expected[0]).max(axis=1) + _ROUNDING * rounding
         return bool(np.all(wrong <= allowed))
+
+
+def lifted(
+    loop: ClosedLoop, factor: FloatArray, columns: IntArray, hold: int, states: bool
+) -> Recursion:
+    """Return a sampled loop whose controller acts in the first of every `hold` samples.
+
+    Parameters
+    ----------
+    loop : ClosedLoop
+        Its plant in the finer samples, without feedthrough from u to y.
+    factor : (n, r) array
+        How white samples enter the plant's states.
+    columns : (k,) int array
+        Of w that are inputs.
+    hold : int
+        Samples of the plant in one of the controller.
+    states : bool
+        Whether the plant's states are outputs too.
+
+    Returns
+    -------
+    Recursion
+        From `hold` stacked inputs [w[columns]; white] to as many outputs [z; y; driven; monitored;
+        states]; states of the plant, then of the controller.
+    """
+    plant, law, g = loop.plant, loop.controller, loop.plant.system
+    used = [plant.u.index(name) for name in loop.driven]
+    enter = np.hstack([plant.B1[:, columns], factor])
+    n, nc, m, k = g.n_states, law.n_states, enter.shape[1], columns.size
+    both = n + nc
+    # every signal as a matrix over [x; c; inputs of the first sample; of the second; ...]
+    unit = np.eye(both + hold * m)
+    x, c = unit[:n], unit[n:both]
+    seen = []
+    for j in range(hold):
+        v = unit[both + j * m : both + (j + 1) * m]
+        y = plant.C2 @ x + plant.D21[:, columns] @ v[:k]
+        if not j:
+            c, out = law.A @ c + law.B @ y, law.C @ c + law.D @ y
+            u = out[: len(used)]
+        z = plant.C1 @ x + plant.D12[:, used] @ u + plant.D11[:, columns] @ v[:k]
+        seen += [z, y, out, *([x] if states else [])]
+        x = g.A @ x + plant.B2[:, used] @ u + enter @ v
+    step, shown = np.vstack([x, c]), np.vstack(seen)
+    parts = (step[:, :both], step[:, both:], shown[:, :both], shown[:, both:])
+    return Recursion(*map(np.ascontiguousarray, parts))

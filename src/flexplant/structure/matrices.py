@@ -20,9 +20,9 @@ from .completion import square
 from .condense import empty_rows, held_rows
 from .definite import SEMIDEFINITE
 from .local_axes import cosines
-from .massless_motions import inertial
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding, shown_digits
+from .singular_mass import inertial
 from .units import units
 from .zero_energy import freed
 

@@ -16,8 +16,7 @@ from ..labels import DofSet
 from ..sparse.factor import is_positive_definite
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, summed
-from .damping import Damping, Rayleigh
-from .damping_matrix import damping_matrix
+from .damping import Damping, Rayleigh, damping_matrix
 from .definite import MatrixLike, check_semidefinite, slow, symmetric, without_inertia
 from .eigen import has_negative_springs
 from .negative_stiffness import unstable_stiffness

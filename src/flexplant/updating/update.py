@@ -13,8 +13,7 @@ from ..progress import Progress
 from ..structure.model import FEModel
 from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
 from .full_basis import MOST_ROUNDS, FullBasis, is_large
-from .judgement.covariance import covariance
-from .judgement.goodness import chi_square, is_bad, worst
+from .judgement.goodness import chi_square, covariance, is_bad, worst
 from .parameters.added import Parameter
 from .residuals.eigenvalues import Eigenvalues
 from .residuals.residual import Residual
@@ -23,8 +22,7 @@ from .search import GaussNewton, Objective, SearchEnd, TrustRegion, UpdateMethod
 from .search.update_method import ITERATIONS
 from .searching import from_one_start, from_starts
 from .sensitivities import checked_parameters, checked_values
-from .starts import all_starts, summary
-from .unit_check import check_units
+from .starts import all_starts, check_units, summary
 from .update_result import History, UpdateResult
 from .updated_model import changed_model
 

@@ -23,15 +23,14 @@ from ...simulation import ErrorMap, ExposureErrors, Response, Verdict
 from ...synthesis import Controller
 from ...updating import Localisation, UpdateResult
 from ...values import with_unit
-from ..bode import bode
+from ..bode import bode, singular_values
 from ..budget import budget
-from ..error_map import error_map
 from ..estimation import lag_report
+from ..exposures import error_map
 from ..identification import stabilisation
 from ..localisation import localisation
 from ..placement import pareto_curve, placed, sensor_map
 from ..response import response
-from ..singular_values import singular_values
 from ..updating import parameters, residual
 from .design import Design
 from .page import Chapter, table

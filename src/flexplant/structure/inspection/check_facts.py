@@ -14,10 +14,9 @@ from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
 from ...values import FloatArray, IntArray
 from ..components import pieces
 from ..condense import empty_rows
-from ..masses import RigidMass, rigid_mass
 from ..matrices import FEMatrices
 from ..precision import loss, shown_digits
-from ..rigid import rigid_motions
+from ..rigid import RigidMass, rigid_mass, rigid_motions
 from ..singular_mass import left_out, null_motions
 from ..soft_springs import PRECISION, unheld
 from ..zero_energy import ZeroEnergy, own_motions, zero_energy
