@@ -7,6 +7,7 @@ import scipy.sparse as sp
 
 import meshes
 from flexplant.errors import ModelError
+from flexplant.modes import shifted
 from flexplant.modes import sparse_modes as counted
 from flexplant.modes.lanczos import BlockLanczos
 from flexplant.modes.shifted import modes_below, stiffness_factor
@@ -139,3 +140,28 @@ def test_negative_stiffness_is_counted():
     expected = np.count_nonzero(la.eigvalsh(model.K.toarray()) < 0)
     with pytest.raises(ModelError, match=f"{expected} negative eigenvalue"):
         counted_modes(model, 5)
+
+
+@pytest.mark.parametrize("soft", [0.0, 1e-4])
+def test_a_search_in_single_precision(structure, monkeypatch, soft):
+    """As accurate as one in double precision, which follows where it does not suffice."""
+    model, expected = structure
+    r = model.body_motions.shape[1]
+    if soft:  # on springs
+        spring = soft * expected[0]
+        model = FEModel(model.M, sp.csc_array(model.K + spring * model.M), dofs=model.dofs)
+        expected = np.concatenate([np.full(r, spring), expected + spring])
+    used, search = [], counted._search
+
+    def recorded(model, factor, *rest):
+        used.append(factor.single)
+        return search(model, factor, *rest)
+
+    monkeypatch.setattr(counted, "_search", recorded)
+    monkeypatch.setattr(shifted, "_WORTH", 0.0)
+    if r < 6:  # far below the modes of the plate: it does not suffice
+        monkeypatch.setattr(shifted, "_SINGLE_SHIFT", -1e8)
+    squares, phi, certificate = counted_modes(model, 12)
+    assert_modes_of(model, squares, phi, expected)
+    assert certificate["counted"] == certificate["found"]
+    assert used == ([True] if r == 6 else [True, False])

@@ -83,6 +83,8 @@ def test_meshes(mesh, known):
     A = sp.csc_array(K + squares[n_rigid] * M)
     x = MultifrontalCholesky(A, dissection).solve(b)
     assert la.norm(A @ x - b) < 1e-10 * la.norm(b)
+    near = MultifrontalCholesky(1e60 * A, dissection, single=True).solve(1e-50 * b)
+    assert 1e-9 * la.norm(x) < la.norm(1e110 * near - x) < 1e-3 * la.norm(x)
     # DOFs of a node stay together
     assert np.all(np.ptp(nodes[dissection.order].reshape(-1, 3), axis=1) == 0)
 

@@ -143,7 +143,9 @@ class BlockLanczos:
             # a step brings no more than a block of new ones, usually half of it
             check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
             if full:
-                self._restart(theta, mix, min(count + self._block, theta.size))
+                keep = min(count + self._block, theta.size)
+                self._restart(theta, mix, keep)
+                self._over = self._over @ mix[-self._over.shape[1] :, :keep]
         raise SolverError(
             f"Lanczos did not converge for {count} modes in {self.steps} steps: M and K are badly "
             "conditioned. Look for DOFs with next to no mass, or request fewer modes."
@@ -165,12 +167,7 @@ class BlockLanczos:
         block, width = self._next, self._next.shape[1]
         moved = self._solve(self._loaded)
         at = self._r + self._m
-        if at + width > self._V.shape[0]:
-            grown = np.empty((at + 2 * width + _STEPS * width, self._V.shape[1]))
-            grown[:at] = self._V[:at]
-            self._V, self._capacity = grown, grown.shape[0]
-        self._V[at : at + width] = block.T
-        self._m += width
+        self._append(block)
         # nearly all of it along the basis lies along the last block and those before it that T
         # couples to it: what is left is small, and one orthogonalisation enough
         main, coupling = self._loaded.T @ moved, self._over.T
@@ -190,6 +187,16 @@ class BlockLanczos:
         self.steps += 1
         tick(STEPS)
 
+    def _append(self, block: FloatArray) -> None:
+        """Add a block to the basis."""
+        at, width = self._r + self._m, block.shape[1]
+        if at + width > self._V.shape[0]:
+            grown = np.empty((at + 2 * width + _STEPS * width, self._V.shape[1]))
+            grown[:at] = self._V[:at]
+            self._V, self._capacity = grown, grown.shape[0]
+        self._V[at : at + width] = block.T
+        self._m += width
+
     def _pairs(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return Ritz values, vectors in terms of the basis, and residuals."""
         theta, mix = la.eigh(self._T)
@@ -198,14 +205,13 @@ class BlockLanczos:
         return theta, mix, np.linalg.norm(over @ mix[-over.shape[1] :], axis=0)
 
     def _restart(self, theta: FloatArray, mix: FloatArray, keep: int) -> None:
-        """Keep the best Ritz vectors only; the next block holds the residuals of all of them."""
+        """Keep the best Ritz vectors only."""
         basis = self._V[self._r : self._r + self._m]
         n = basis.shape[1]
         for begin in range(0, n, 65536):  # in place
             columns = slice(begin, min(begin + 65536, n))
             basis[:keep, columns] = mix[:, :keep].T @ basis[:, columns]
         self._m, self._T = keep, np.diag(theta[:keep])
-        self._over = self._over @ mix[-self._over.shape[1] :, :keep]
 
     def _orthonormal(
         self, W: FloatArray
@@ -222,7 +228,7 @@ class BlockLanczos:
         loaded = self._M @ W
         for _ in range(3):
             for _ in range(2):
-                part = _along(basis, loaded)
+                part = along_basis(basis, loaded)
                 _subtract(W, basis, part)
                 along += part @ over
                 before = float(np.sqrt(np.abs(np.sum(W * loaded, axis=0)).min()))
@@ -256,7 +262,7 @@ def _unfinished(theta: FloatArray, error: FloatArray, required: FloatArray) -> i
     return int(np.count_nonzero(error[: theta.size] > limit))
 
 
-def _along(basis: FloatArray, loaded: FloatArray) -> FloatArray:
+def along_basis(basis: FloatArray, loaded: FloatArray) -> FloatArray:
     """Return `basis @ loaded`, rows of the basis in pieces that fit the cache."""
     found = np.zeros((basis.shape[0], loaded.shape[1]))
     for begin in range(0, loaded.shape[0], _PIECE):

@@ -20,6 +20,12 @@ from ..values import FloatArray
 #: the shift, in roundings of the energies of rigid-body motions: far below the first elastic mode
 #: of nearly all models, yet K - sigma M is well away from singular
 _SHIFT = -3e3
+#: the same in single precision: the lowest elastic modes of a bulky structure are higher, or not
+#: much lower, and rounding leaves K - sigma M definite
+_SINGLE_SHIFT = -30.0
+#: multiplications per entry of a factor from which on half its cost is worth single precision:
+#: those of bulky structures, whose modes lie closer together than rounding to it confuses
+_WORTH = 350.0
 _held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]]
 _dissected: weakref.WeakKeyDictionary[FEModel, Dissection]
 
@@ -35,30 +41,41 @@ class StiffnessFactor:
         The structure; K may be singular for its rigid-body motions.
     method : Pardiso, optional
         In place of the multifrontal factor.
+    single : bool
+        Whether it is in single precision, sigma further from zero: to precondition with.
 
     Raises
     ------
     ModelError
         When K is indefinite.
+    SolverError
+        When K - sigma M is not definite in single precision.
     """
 
-    def __init__(self, model: FEModel, method: Pardiso | None = None) -> None:
+    def __init__(
+        self, model: FEModel, method: Pardiso | None = None, *, single: bool = False
+    ) -> None:
         self.M: Any = sp.csc_array(model.M)
         self.K: Any = sp.csc_array(model.K)
         self.rigid = model.rigid_body
         # of motions, not of single DOFs: next to no inertia in some of these says nothing
         near = self.sigma = _SHIFT * float(np.max(rounding_of(self.K, model.body_motions)))
-        if model.n_unstable:  # below the lowest eigenvalue
+        self.single = single
+        if single:
+            self.sigma *= _SINGLE_SHIFT / _SHIFT * (np.finfo(np.float32).eps / np.finfo(float).eps)
+        elif model.n_unstable:  # below the lowest eigenvalue
             self.sigma += 2.0 * float(unstable_stiffness(self.K, model.body_motions)[0])
         shifted = sp.csc_array(self.K - self.sigma * self.M)
         self.dissection = dissection_of(model)
         try:
             self._cholesky: MultifrontalCholesky | PardisoCholesky = (
-                MultifrontalCholesky(shifted, self.dissection)
+                MultifrontalCholesky(shifted, self.dissection, single=single)
                 if method is None
                 else PardisoCholesky(shifted, method)
             )
         except SolverError as error:
+            if single:
+                raise
             beside = sp.csc_array(self.K - near * self.M)
             negative = multifrontal_inertia(beside, self.dissection)
             if not negative:
@@ -69,7 +86,7 @@ class StiffnessFactor:
             ) from error
 
     def __repr__(self) -> str:
-        size = self._cholesky.n_entries * 8e-9
+        size = self._cholesky.n_entries * (4e-9 if self.single else 8e-9)
         return f"<StiffnessFactor: {counted(self.K.shape[0], 'DOF')}, {size:.2g} GB>"
 
     def solve(self, force: FloatArray) -> FloatArray:
@@ -141,6 +158,31 @@ def stiffness_factor(model: FEModel, method: Pardiso | None = None) -> Stiffness
         factor = StiffnessFactor(model, method)
         _held[model] = weakref.ref(factor)
     return factor
+
+
+def search_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
+    """Return a factor to search modes with: the one in use, or one in single precision if it pays.
+
+    Parameters
+    ----------
+    model : FEModel
+        The structure.
+    method : Pardiso, optional
+        How a new one is made; None: multifrontal.
+
+    Raises
+    ------
+    ModelError
+        When K is indefinite.
+    """
+    known, order = _held.get(model), dissection_of(model)
+    unused = known is None or known() is None
+    if unused and method is None and not model.n_unstable and order.work > _WORTH * order.n_factor:
+        try:
+            return StiffnessFactor(model, single=True)
+        except SolverError:
+            pass
+    return stiffness_factor(model, method)
 
 
 def dissection_of(model: FEModel) -> Dissection:

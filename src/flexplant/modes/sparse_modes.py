@@ -16,8 +16,9 @@ from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
 from ..structure.negative_stiffness import are_rigid
 from ..values import FloatArray, Rng
+from .davidson import BlockDavidson
 from .lanczos import REACHED, BlockLanczos
-from .shifted import StiffnessFactor, modes_below, stiffness_factor
+from .shifted import StiffnessFactor, modes_below, search_factor, stiffness_factor
 
 #: modes beyond the last wanted one among which a gap is searched
 _EXTRA = 4
@@ -78,7 +79,8 @@ def _counted(
     model: FEModel, count: int, top: float, method: Pardiso | None
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
-    factor: StiffnessFactor | None = stiffness_factor(model, method)
+    new = search_factor
+    factor: StiffnessFactor | None = new(model, method)
     below = None
     if np.isfinite(top):
         below = modes_below(model, top) - r
@@ -94,9 +96,18 @@ def _counted(
     squares, phi = np.zeros(0), np.zeros((n, 0))
     missing = min(count + _EXTRA, n - r)
     for search in range(_SEARCHES):
-        factor = factor or stiffness_factor(model, method)
+        factor = factor or new(model, method)
         locked = np.hstack([model.rigid_body, phi])
-        squares, phi = _beside(model, phi, *_search(model, factor, locked, missing, search))
+        try:
+            found = _search(model, factor, locked, missing, search)
+        except SolverError:
+            if not factor.single:
+                raise
+            # soft modes beside stiff ones need double precision
+            factor, new = None, stiffness_factor
+            factor = new(model, method)
+            found = _search(model, factor, locked, missing, search)
+        squares, phi = _beside(model, phi, *found)
         rounding = rounding_of(model.K, phi)
         # a motion of the geometry that is not free has springs, which rounding does not hide
         suspended = are_rigid(model.M, model.body_motions, phi)
@@ -170,10 +181,20 @@ def _searched(
     start: FloatArray | None,
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes, up to `want`, of one search."""
-    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, rng=rng, start=start)
     extra = min(_EXTRA, want - 1)
     mass, stiffness = by_rows(model.M), by_rows(model.K)
-    size, deflated = absolute(stiffness), np.asarray(mass @ locked)
+    size = absolute(stiffness)
+    if factor.single:
+        davidson = BlockDavidson(
+            factor.solve, stiffness, mass, factor.sigma, locked, want=want, rng=rng, start=start
+        )
+        phi = davidson.modes(want, extra, partial(_tolerance, stiffness, size, 1.0))
+        squares, phi = rayleigh_ritz(stiffness, mass, phi)
+        if _excess(stiffness, mass, size, squares[: want - extra], phi, 0.0) > 1:
+            raise SolverError("modes found with a factor in single precision are not accurate.")
+        return squares, phi
+    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, rng=rng, start=start)
+    deflated = np.asarray(mass @ locked)
     best, squares, found = np.inf, np.zeros(0), np.zeros((locked.shape[0], 0))
     for part in _PARTS:
         steps = lanczos.steps
@@ -189,20 +210,28 @@ def _searched(
             moved -= locked @ (deflated.T @ moved)
             phi[:, at] = moved
         values, phi = rayleigh_ritz(stiffness, mass, phi)
+        kept = values[: values.size - extra] if values.size == want else values
         # what the rounding of the largest 1 / (omega^2 - sigma) lets be reached
-        reached = 2 * REACHED * (values - factor.sigma) / (values[0] - factor.sigma)
-        kept = values.size - extra if values.size == want else values.size
-        left = 0.0
-        for at in column_groups(kept):
-            force, limit = _let_pass(stiffness, size, phi[:, at])
-            limit = np.maximum(limit, reached[at]) * np.linalg.norm(force, axis=0)
-            force -= (mass @ phi[:, at]) * values[at]
-            left = max(left, float(np.max(np.linalg.norm(force, axis=0) / limit)))
+        reached = 2 * REACHED * (kept - factor.sigma) / (values[0] - factor.sigma)
+        left = _excess(stiffness, mass, size, kept, phi, reached)
         if left < best:
             best, squares, found = left, values, phi
         if left <= 1:
             break
     return squares, found
+
+
+def _excess(
+    K: Any, M: Any, size_of_K: Any, squares: FloatArray, phi: FloatArray, least: FloatArray | float
+) -> float:
+    """Return the largest residual of the first shapes, relative to what is let pass or `least`."""
+    left, least = 0.0, np.broadcast_to(least, squares.shape)
+    for at in column_groups(squares.size):
+        force, limit = _let_pass(K, size_of_K, phi[:, at])
+        limit = np.maximum(limit, least[at]) * np.linalg.norm(force, axis=0)
+        force -= (M @ phi[:, at]) * squares[at]
+        left = max(left, float(np.max(np.linalg.norm(force, axis=0) / limit)))
+    return left
 
 
 def _tolerance(K: Any, size_of_K: Any, part: float, phi: FloatArray) -> FloatArray:

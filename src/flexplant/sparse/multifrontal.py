@@ -33,6 +33,9 @@ class MultifrontalCholesky:
         From `dissect`; None: found from the graph of the matrix.
     keep : bool
         Whether the factor is kept; without it only the definiteness of the matrix is seen.
+    single : bool
+        Whether it is computed and kept in single precision, at half the cost: solutions are then
+        approximate, to precondition with.
 
     Raises
     ------
@@ -41,14 +44,25 @@ class MultifrontalCholesky:
     """
 
     def __init__(
-        self, matrix: Any, dissection: Dissection | None = None, *, keep: bool = True
+        self,
+        matrix: Any,
+        dissection: Dissection | None = None,
+        *,
+        keep: bool = True,
+        single: bool = False,
     ) -> None:
         lower = sp.csc_array(matrix)
+        # in single precision the range of numbers is small
+        self._single = single
+        self._scale = float(np.abs(lower.data).max(initial=0.0)) if single else 1.0
+        if single:
+            lower = sp.csc_array((lower / self._scale).astype(np.float32))
+        potrf, trtri, self._trsm, syrk = _kernels(lower.dtype)
         self.dissection = dissect(lower) if dissection is None else dissection
         self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
         with one_thread():
             for front, pivots, below, rest in assembled(lower, self.dissection):
-                _, info = lapack.dpotrf(pivots, lower=1, overwrite_a=1, clean=0)
+                _, info = potrf(pivots, lower=1, overwrite_a=1, clean=0)
                 if info:
                     raise SolverError(
                         "a sparse Cholesky factorisation met a pivot that is not positive: the "
@@ -56,12 +70,12 @@ class MultifrontalCholesky:
                         "stiffness or mass."
                     )
                 if front.rows.size:
-                    below = blas.dtrsm(
+                    below = self._trsm(
                         1.0, pivots, below, side=1, lower=1, trans_a=1, overwrite_b=1
                     )
-                    blas.dsyrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
+                    syrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
                 if keep:
-                    self._blocks.append(_stored(pivots, below))
+                    self._blocks.append(_stored(pivots, below, trtri))
 
     @property
     def n_entries(self) -> int:
@@ -73,6 +87,10 @@ class MultifrontalCholesky:
         order = self.dissection.order
         # rows in C order: one right-hand side after the other in each, for BLAS 3 on the fronts
         x = np.ascontiguousarray(right.reshape(order.size, -1)[order], dtype=np.float64)
+        scale = None
+        if self._single:
+            largest = np.abs(x).max(axis=0, initial=np.finfo(np.float64).tiny)
+            x, scale = (x / largest).astype(np.float32), self._scale / largest
         fronts = self.dissection.fronts
         with one_thread():
             for front, (pivots, below) in zip(fronts, self._blocks, strict=True):
@@ -84,7 +102,7 @@ class MultifrontalCholesky:
                     if rows.size:
                         x[rows] -= moved[last - first :]
                     continue
-                blas.dtrsm(1.0, pivots, part.T, side=1, lower=1, trans_a=1, overwrite_b=1)
+                self._trsm(1.0, pivots, part.T, side=1, lower=1, trans_a=1, overwrite_b=1)
                 if rows.size:
                     x[rows] -= below @ part
             for front, (pivots, below) in zip(fronts[::-1], self._blocks[::-1], strict=True):
@@ -99,17 +117,26 @@ class MultifrontalCholesky:
                     continue
                 if rows.size:
                     part -= below.T @ x[rows]
-                blas.dtrsm(1.0, pivots, part.T, side=1, lower=1, overwrite_b=1)
-        answer = np.empty_like(x)
-        answer[order] = x
+                self._trsm(1.0, pivots, part.T, side=1, lower=1, overwrite_b=1)
+        answer = np.empty(x.shape)
+        answer[order] = x if scale is None else x / scale
         return answer.reshape(right.shape)
 
 
-def _stored(pivots: FloatArray, below: FloatArray) -> tuple[FloatArray | None, FloatArray]:
+def _kernels(dtype: Any) -> tuple[Any, Any, Any, Any]:
+    """Return LAPACK's potrf and trtri, and BLAS's trsm and syrk, of a precision."""
+    of_lapack: Any = lapack.get_lapack_funcs(("potrf", "trtri"), dtype=dtype)
+    of_blas: Any = blas.get_blas_funcs(("trsm", "syrk"), dtype=dtype)
+    return *of_lapack, *of_blas
+
+
+def _stored(
+    pivots: FloatArray, below: FloatArray, trtri: Any
+) -> tuple[FloatArray | None, FloatArray]:
     """Return a front as it is kept: small ones as ``[L^-1; B L^-1]``, for one product per solve."""
     if pivots.shape[0] > _INVERTED:
         return pivots, below
-    inverse, _ = lapack.dtrtri(pivots, lower=1, overwrite_c=1)
+    inverse, _ = trtri(pivots, lower=1, overwrite_c=1)
     inverse = np.tril(inverse)
     return None, np.vstack([inverse, below @ inverse])
 

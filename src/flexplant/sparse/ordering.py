@@ -48,6 +48,12 @@ class Dissection:
         """Entries of the factor, the diagonal blocks counted as squares."""
         return int(sum((f.last - f.first) * (f.last - f.first + f.rows.size) for f in self.fronts))
 
+    @property
+    def work(self) -> float:
+        """Multiplications of a Cholesky factorisation."""
+        sizes = ((float(f.last - f.first), float(f.rows.size)) for f in self.fronts)
+        return sum(p * (p * p / 6 + q * (p + q) / 2) for p, q in sizes)
+
 
 def dissect(
     matrix: sp.csc_array,

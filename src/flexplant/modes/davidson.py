@@ -1,0 +1,139 @@
+"""Block Davidson: the lowest modes of a large structure by an approximate inverse."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import scipy.linalg as la
+
+from ..errors import SolverError
+from ..progress import tick
+from ..sparse.factor import by_rows
+from ..values import FloatArray, IntArray, Matrix, Rng
+from .lanczos import STEPS, BlockLanczos, along_basis
+
+#: steps with M times the last block in place of residuals
+_FIRST = 10
+#: residual, relative to ||K phi||, at which a value is known: its error is of the second order
+_VALUE = 1e-5
+#: residual below which the limit of a shape is computed
+_NEAR = 1e-8
+#: a residual near its limit that is no smaller than this part of the last one is rounding
+_STAYS = 0.9
+#: steps before giving up, beyond one for each mode
+_MOST = 40
+#: after so many steps modes must not be lower than this part of -sigma, to converge fast
+_EARLY, _FAR = 12, 0.1
+
+
+class BlockDavidson(BlockLanczos):
+    """The lowest modes by corrections ``P (K phi - omega^2 M phi)``, P near ``(K - sigma M)^-1``.
+
+    The basis of Lanczos, but extended by corrections of its Ritz vectors: P may be in error, since
+    the residuals are those of K and M [MorganScott1986]_.
+
+    Parameters
+    ----------
+    solve : callable
+        Forces (n, m) to ``P`` times them.
+    K, M : (n, n) matrix
+        Stiffness and mass, M positive definite.
+    sigma : float [rad^2/s^2]
+        The shift, negative.
+    locked, want, rng, start
+        As those of `BlockLanczos`.
+    """
+
+    def __init__(
+        self,
+        solve: Callable[[FloatArray], FloatArray],
+        K: Matrix,
+        M: Matrix,
+        sigma: float,
+        locked: FloatArray,
+        *,
+        want: int,
+        rng: Rng = 0,
+        start: FloatArray | None = None,
+    ) -> None:
+        super().__init__(solve, M, locked, want=want, rng=rng, start=start)
+        self._K, self._sigma = by_rows(K), sigma
+        # until errors of P show, the steps of Lanczos do as well and cost less
+        for _ in range(_FIRST):
+            if self._loaded.shape[1]:
+                self._extend(self._loaded)
+
+    def modes(
+        self, count: int, extra: int, needed: Callable[[FloatArray], FloatArray]
+    ) -> FloatArray:
+        """Return the lowest shapes (n, count), the last `extra` of them for their values only.
+
+        `needed` says of shapes (n, m) which residuals (m,), relative to ``||K phi||``, they may
+        leave; one that rounding keeps above is let pass.
+
+        Raises
+        ------
+        SolverError
+            When they do not converge: P is far from the inverse, or sigma far from the modes.
+        """
+        found = np.zeros(count, dtype=bool)
+        self._limit, self._left = np.zeros(count), np.full(count, np.inf)
+        for _ in range(_MOST + count):
+            squares, mix = la.eigh(self._T)
+            if self.steps > _EARLY and squares[:count][-1] < -_FAR * self._sigma:
+                break
+            at = np.flatnonzero(~found[: self._m])[: self._block]
+            residual, found[at] = self._residuals(squares, mix, at, needed)
+            if np.all(found[: count - extra]) and np.all(self._left <= _VALUE):
+                # all of them once more: a mode found late moves those above it
+                at = np.arange(count)
+                self._limit[:], self._left[:] = 0.0, np.inf
+                residual, found = self._residuals(squares, mix, at, needed)
+                if np.all(found[: count - extra]) and np.all(self._left <= _VALUE):
+                    return self._shapes(mix[:, :count])
+            unfinished = residual[:, ~found[at]][:, : self._block]
+            if not unfinished.shape[1]:
+                continue
+            if self._r + self._m + 2 * self._block > self._capacity:
+                self._restart(squares, mix, max(count + self._block, 2 * self._m // 3))
+            self._extend(unfinished)
+        raise SolverError(
+            f"{count} modes did not converge in {self.steps} steps of a Davidson iteration: its "
+            "preconditioner is too far from the inverse of K - sigma M."
+        )
+
+    def _extend(self, forces: FloatArray) -> None:
+        """Add ``P forces`` to the basis."""
+        moved = self._solve(forces)
+        block, self._loaded, _ = self._orthonormal(moved / np.linalg.norm(moved, axis=0))
+        width = block.shape[1]
+        self._append(block)
+        along = along_basis(self._V[self._r : self._r + self._m], np.asarray(self._K @ block))
+        grown = np.zeros((self._m, self._m))
+        grown[:-width, :-width] = self._T
+        grown[:, -width:] = along
+        grown[-width:, :] = along.T
+        self._T = grown
+        self.steps += 1
+        tick(STEPS)
+
+    def _residuals(
+        self,
+        squares: FloatArray,
+        mix: FloatArray,
+        at: IntArray,
+        needed: Callable[[FloatArray], FloatArray],
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return ``K phi - omega^2 M phi`` of some shapes, and which of them are found."""
+        phi = self._shapes(mix[:, at])
+        force = np.asarray(self._K @ phi)
+        size = np.linalg.norm(force, axis=0)
+        force -= np.asarray(self._M @ phi) * squares[at]
+        left, before = np.linalg.norm(force, axis=0) / size, self._left[at]
+        near = left < _NEAR
+        new = np.flatnonzero(near & (self._limit[at] == 0))
+        if new.size:
+            self._limit[at[new]] = needed(phi[:, new])
+        self._left[at] = left
+        return force, near & ((left <= self._limit[at]) | (left > _STAYS * before))
