@@ -231,6 +231,8 @@
    Trans. Audio Electroacoust. 15, 1967.
 .. [Whittle1953] Whittle, The analysis of multiple stationary time series, and Estimation and
    information in stationary time series, Arkiv foer Matematik 2, 1953.
+.. [WolkowiczStyan1980] Wolkowicz, Styan, Bounds for eigenvalues using traces, Linear Algebra Appl.
+   29, 1980.
 .. [Young1990] Young, Doyle, Computation of mu with real and complex uncertainties, IEEE CDC, 1990.
 .. [YoungBudynas2002] Young, Budynas, Roark's Formulas for Stress and Strain, 7th ed., McGraw-Hill,
    2002.

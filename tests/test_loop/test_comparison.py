@@ -72,7 +72,8 @@ def test_eigenvalues_and_schur_forms_are_computed_once(monkeypatch):
     assert "stable" in repr(loop)
     loop.frequency_response([1.0, 10.0])
     compare_loops({"servo": loop})
-    assert sizes == {"eigvals": [loop.monitored.n_states], "schur": [loop.controller.n_states]}
+    blocks = [block.n_states for block in loop.blocks]
+    assert sizes == {"eigvals": [loop.monitored.n_states], "schur": blocks}
 
 
 def test_it_reads_as_a_table_and_survives_a_file(found, tmp_path):

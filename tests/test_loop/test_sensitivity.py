@@ -124,6 +124,29 @@ def test_modulus_margin_finds_a_narrow_peak(zeta):
     assert modulus_margin((plant, K)) == pytest.approx(1 / peak, rel=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_the_narrowest_of_many_peaks_is_seen_between_the_points_of_a_grid(seed):
+    """Modes in rotated axes, each moved by its own gain: |S| is the largest of closed forms.
+
+    In the axes ``S = (s^2 + 2 zeta w s + w^2) / (s^2 + 2 zeta w s + (1 - g) w^2)``.
+    """
+    rng = np.random.default_rng(seed)
+    w, zeta, g = 10 ** rng.uniform(0, 2, 5), 10 ** rng.uniform(-5, -2, 5), rng.uniform(0.1, 0.8, 5)
+    w[1] = w[0] * (1 + 1e-7 * seed)
+    U = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+    none, turn = np.zeros((5, 5)), np.diag(w)  # states w q and v of each mode
+    A = np.block([[none, turn], [-turn, -2 * zeta * turn]])
+    B, C = np.vstack([none, U.T]), np.hstack([U * w, none])
+    names = {"inputs": [f"u{i}" for i in range(5)], "outputs": [f"y{i}" for i in range(5)]}
+    plant = StateSpace(A, B, C, np.zeros((5, 5)), **names)
+    back = {"inputs": names["outputs"], "outputs": names["inputs"]}
+    K = StateSpace([], [], [], U @ np.diag(g) @ U.T, **back)
+    top = w * np.sqrt(1 - g)
+    s = 1j * (top + zeta * w * np.linspace(-2, 2, 40001)[:, None])
+    size = abs((s**2 + 2 * zeta * w * s + w**2) / (s**2 + 2 * zeta * w * s + (1 - g) * w**2))
+    assert modulus_margin((plant, K)) == pytest.approx(1 / size.max(), rel=1e-6)
+
+
 def test_bandwidth_of_an_integrator():
     """L = -c/s: |S| = |s/(s + c)| stays below 1; with a second lag it crosses at a known place."""
     c, tau = 10.0, 0.05

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
 from ..errors import LabelError, ModelError, unknown_label
 from ..lti.interconnection import connect
+from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray
+
+#: blocks that are prepared for their responses once: an observer serves many controllers
+prepared = lru_cache(maxsize=8)(responder)
 
 
 def joined(
@@ -43,6 +49,52 @@ def joined(
         outputs=[*driven, *watched],
         adding=driven,
     )
+
+
+def commands(
+    systems: Sequence[StateSpace], read: Sequence[str], driven: Sequence[str]
+) -> Responder:
+    """Return the response of the blocks from y to the driven actuators, each by its own structure.
+
+    With G of all blocks beside each other: outputs ``v = G (route v + enter y)``, ``u = leave v``.
+
+    Parameters
+    ----------
+    systems : sequence of StateSpace
+        The blocks.
+    read, driven : sequences of str
+        Channels of y and u.
+    """
+    needed = [name for sys in systems for name in sys.inputs]
+    produced = [name for sys in systems for name in sys.outputs]
+    used = [i for i, name in enumerate(produced) if name in driven or name in needed]
+
+    def same(rows: Sequence[str], columns: Sequence[str]) -> FloatArray:
+        return np.array([[float(a == b) for b in columns] for a in rows])
+
+    route = same(needed, produced)[:, used]
+    enter, leave = same(needed, read), same(driven, produced)[:, used]
+    finds = [prepared(sys) for sys in systems]
+
+    def found(freq: FloatArray) -> ComplexArray:
+        G = np.zeros((len(produced), len(needed), freq.size), dtype=np.complex128)
+        row = column = 0
+        for find, sys in zip(finds, systems, strict=True):
+            p, m = sys.D.shape
+            G[row : row + p, column : column + m] = find(freq)
+            row, column = row + p, column + m
+        G = np.ascontiguousarray(G[used].transpose(2, 0, 1))
+        v = G @ enter
+        if route.any():
+            try:
+                v[:] = np.linalg.solve(np.eye(len(used)) - G @ route, v)
+            except np.linalg.LinAlgError as error:
+                raise ModelError(
+                    "the controller has a pole at one of the frequencies: move it."
+                ) from error
+        return np.asarray((leave @ v).transpose(1, 2, 0))
+
+    return found
 
 
 def as_block(block: Any, place: int, dt: float) -> StateSpace:

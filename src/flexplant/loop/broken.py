@@ -4,20 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property
-from typing import Literal
+from functools import cached_property, lru_cache
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from ..errors import LabelError
-from ..lti.grid import highest, resonance_grid
-from ..lti.responses import Responder
+from ..lti.grid import SOUGHT, highest, resonance_grid
+from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, short
 
 Side = Literal["u", "y"]
-#: loop gain below which |S| is within 1 / (1 - 0.05)
-_SMALL = 0.05
+#: loop gain below which |S| is at most 1 / (1 - 0.5), which is seldom the largest
+_SMALL = 0.5
+#: part of the largest |S| from which on it is computed, not bounded
+_NEAR = 0.8
+#: logarithmic part of a grid that is refined at the peaks of |S|
+_POINTS = 100
+#: plants whose path is kept: loops of other controllers on them begin with it
+_KEPT = 8
 #: change of a loop gain of 1, relative to it, that makes I - L regular
 _BESIDE = 1e-15
 
@@ -90,8 +97,13 @@ class BrokenLoop:
     @cached_property
     def worst(self) -> tuple[float, float]:
         """The largest sigma_max(S_u) and its frequency [Hz], over a grid refined at its peaks."""
-        rounds = 6 if self.measured is None else 0
-        return highest(lambda freq: sensitivity_size(self.gain(freq)), self.grid, rounds)
+        if self.measured is not None:
+            return highest(self._size, self.measured, 0)
+        grid = resonance_grid(self.poles(), self.dt, points=_POINTS, around=SOUGHT)
+        return highest(self._size, grid, 6)
+
+    def _size(self, freq: FloatArray) -> FloatArray:
+        return sensitivity_size(self.gain(freq))
 
     @property
     def modulus_margin(self) -> float:
@@ -114,19 +126,48 @@ def largest(S: ComplexArray) -> FloatArray:
 
 
 def sensitivity_size(L: ComplexArray) -> FloatArray:
-    """Return sigma_max of ``S = (I - L)^-1`` at each frequency, a lower bound where L is small.
+    """Return sigma_max of ``S = (I - L)^-1`` at each frequency, a lower bound where it is not high.
 
-    Where the Frobenius norm of L is l < 0.05, sigma_max lies between 1 / (1 + l), which is given,
-    and 1 / (1 - l) < 1.053; when no larger value is found elsewhere, all are computed.
+    Where the Frobenius norm of L is l < 1, sigma_max lies between 1 / (1 + l) and 1 / (1 - l).
+    Elsewhere, with m and s^2 the mean and the variance of the n eigenvalues of S* S, its square
+    lies between ``m + s / sqrt(n - 1)`` and ``m + s sqrt(n - 1)`` [WolkowiczStyan1980]_.
     """
-    small = np.sqrt(np.sum(L.real**2 + L.imag**2, axis=(1, 2)))
-    acts = small >= _SMALL
-    size = 1.0 / (1.0 + small)
-    if np.any(acts):
-        size[acts] = largest(inverted(L[acts]))
-    if size.max(initial=0.0) < 1.0 / (1.0 - _SMALL):
-        size[~acts] = largest(inverted(L[~acts]))
+    gain = np.sqrt(np.sum(L.real**2 + L.imag**2, axis=(1, 2)))
+    size, acts = 1.0 / (1.0 + gain), gain >= _SMALL
+    size[acts] = _bounded(L[acts])
+    acts = ~acts & (size.max(initial=0.0) * (1.0 - gain) < 1.0)
+    size[acts] = _bounded(L[acts])
     return np.asarray(size)
+
+
+def _bounded(L: ComplexArray) -> FloatArray:
+    """Return sigma_max of S where it may come near the largest, else its lower bound."""
+    S, n = inverted(L), L.shape[-1]
+    square = S.conj().swapaxes(1, 2) @ S
+    mean = np.einsum("fii->f", square).real / n
+    spread = np.sum(square.real**2 + square.imag**2, axis=(1, 2)) / n - mean**2
+    spread = np.sqrt(np.maximum(spread, 0.0) / max(n - 1, 1))
+    low = mean + spread
+    near = mean + (n - 1) * spread >= _NEAR**2 * low.max(initial=0.0)
+    low[near] = np.linalg.eigvalsh(square[near])[:, -1]
+    return np.asarray(np.sqrt(low))
+
+
+class Path(NamedTuple):
+    """A plant between the driven u and y, prepared for all its loops."""
+
+    #: to all of y, the y that u can move, and the response to these
+    system: StateSpace
+    fed_back: tuple[str, ...]
+    respond: Responder
+
+
+@lru_cache(maxsize=_KEPT)
+def plant_path(plant: StandardPlant, driven: tuple[str, ...]) -> Path:
+    """Return what lies between some actuators and y."""
+    system = plant.system.select(plant.y, driven)
+    fed_back = moved(system)
+    return Path(system, fed_back, responder(system.select(fed_back)))
 
 
 def moved(g: StateSpace) -> tuple[str, ...]:

@@ -18,7 +18,8 @@ from ..lti.stability import Obstacle, obstacle
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, Value
-from .broken import BrokenLoop, moved
+from .blocks import commands
+from .broken import BrokenLoop, Path, plant_path
 from .budget import ErrorBudget, error_budget, source_variances
 from .noise_sources import Source, check_direct, sources, stationary_row
 from .spectrum import Spectrum, densities
@@ -99,15 +100,15 @@ class ClosedLoop(Value):
         blocks = {name: unit for block in self.blocks for name, unit in block.units.items()}
         return blocks | self.plant.units
 
-    @cached_property
+    @property
     def fed_back(self) -> tuple[str, ...]:
         """The channels of y that u can move; references are not among them."""
-        return moved(self._path)
+        return self._path.fed_back
 
     @cached_property
-    def _path(self) -> StateSpace:
+    def _path(self) -> Path:
         """From the driven u to y."""
-        return self.plant.system.select(self.plant.y, self.driven)
+        return plant_path(self.plant, self.driven)
 
     @cached_property
     def _command(self) -> StateSpace:
@@ -116,7 +117,7 @@ class ClosedLoop(Value):
 
     @cached_property
     def _poles(self) -> ComplexArray:
-        return loop_poles(self._path, self._command)
+        return loop_poles(self._path.system, self._command)
 
     def poles(self) -> ComplexArray:
         """Return the eigenvalues of the closed loop [rad/s or 1]."""
@@ -197,7 +198,7 @@ class ClosedLoop(Value):
     @cached_property
     def _controller_response(self) -> Responder:
         """From y to the driven actuators; the first grid, that of all poles, is needed again."""
-        return remembered(responder(self._command))
+        return remembered(commands(self.blocks, self.controller.inputs, self.driven))
 
     @cached_property
     def broken(self) -> BrokenLoop:
@@ -207,7 +208,7 @@ class ClosedLoop(Value):
             self.driven,
             self.fed_back,
             lambda freq: self._controller_response(freq)[:, read],
-            responder(self._path.select(self.fed_back)),
+            self._path.respond,
             self.poles,
             self.plant.dt,
             units=self.units,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -24,9 +24,11 @@ NARROWEST = 1e-8
 #: local maxima that are climbed at most, and the part of the highest that each has at least
 _PEAKS, _HIGH = 6, 0.5
 #: a bracket and its inner points; a maximum that gains less than this part is found
-_ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-11
-#: around a resonance, in units of its half-power half-width
-_AROUND = np.array([0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0])
+_ASIDE, _EIGHTHS, _GAIN = np.array([-1, 0, 1]), np.arange(1, 8) / 8.0, 1e-9
+#: around a resonance, in units of its half-power half-width: for a curve that is drawn through
+#: the points, and for a search that seeks the top between them
+DRAWN = (0.0, 0.3, 0.7, 1.2, 2.0, 3.5, 6.0, 12.0)
+SOUGHT = (0.0, 0.7, 2.0, 6.0)
 
 
 def default_freq(sys: System, *, points: int = 10_000, tolerance: float = 0.05) -> FloatArray:
@@ -144,7 +146,9 @@ def _turn(a: ComplexArray, b: ComplexArray) -> FloatArray:
     return np.asarray(np.minimum(step, 2 * np.pi - step))
 
 
-def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 600) -> FloatArray:
+def resonance_grid(
+    poles: ComplexArray, dt: float, *, points: int = 600, around: Sequence[float] = DRAWN
+) -> FloatArray:
     """Return frequencies [Hz], log-spaced over all poles and dense around each resonance.
 
     Parameters
@@ -155,6 +159,8 @@ def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 600) -> Floa
         Sampling time, 0 when continuous; sampled systems are covered up to half the rate.
     points : int
         Of the logarithmic part.
+    around : sequence of float
+        Distances from each resonance, from 0 on, in half-power half-widths.
     """
     s: ComplexArray = np.array(poles, dtype=np.complex128)
     if dt:
@@ -170,7 +176,7 @@ def resonance_grid(poles: ComplexArray, dt: float, *, points: int = 600) -> Floa
     base = np.geomspace(low, high, points)
     swing = s.imag > 0
     centre, width = s.imag[swing] / (2 * np.pi), np.abs(s.real[swing]) / (2 * np.pi)
-    steps = np.concatenate([-_AROUND[:0:-1], _AROUND])
+    steps = np.concatenate([np.negative(around[:0:-1]), around])
     near = (centre[:, None] + width[:, None] * steps).ravel()
     grid = np.unique(np.concatenate([base, near]))
     return np.asarray(grid[(grid >= low) & (grid <= high)])

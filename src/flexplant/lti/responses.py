@@ -19,8 +19,8 @@ from .statespace import StateSpace
 CHUNK = 400_000
 #: rows of a back substitution that are solved together
 ROWS = 32
-#: functions of frequency at a time in block form
-MODAL_CHUNK, PARTS = 19_200, 7
+#: functions of frequency at a time in block form; so many complex numbers are less than 128 kB
+MODAL_CHUNK, PARTS, SMALL = 19_200, 7, 7000
 
 #: the responses (p, m, n_freq) at frequencies [Hz]
 Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
@@ -58,7 +58,7 @@ def responder(g: StateSpace) -> Responder:
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
         s, tame = points(g, freq), True
-        step = max(1, min(entries // g.n_states, max(128, freq.size // parts)))
+        step = max(1, min(entries // g.n_states, max(SMALL // g.n_states, freq.size // parts)))
         out = np.empty((*g.D.shape, freq.size), dtype=np.complex128)
         out[:] = g.D[:, :, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
@@ -137,20 +137,31 @@ def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
 
 
 def _side_by_side(g: StateSpace | Part, owner: npt.NDArray[np.int32]) -> Solver:
-    """Systems that share no state, such as the axes of a servo: each with its own channels."""
-    solvers = []
+    """Systems that share no state, such as the axes of a servo: each with its own channels.
+
+    Those of one A, as axes of one law have, are solved together.
+    """
+    alike: dict[bytes, list[IntArray]] = {}
     for own in (np.flatnonzero(owner == i) for i in range(owner.max() + 1)):
-        fed, seen = np.flatnonzero(g.B[own].any(axis=0)), np.flatnonzero(g.C[:, own].any(axis=1))
-        if not fed.size * seen.size:
-            continue
-        one = Part(g.A[np.ix_(own, own)], g.B[np.ix_(own, fed)], g.C[np.ix_(seen, own)], g.dt)
-        solvers.append((_schur(one), np.ix_(seen, fed)))
+        alike.setdefault(g.A[np.ix_(own, own)].tobytes(), []).append(own)
+    solvers = []
+    for parts in alike.values():
+        fed = [np.flatnonzero(g.B[own].any(axis=0)) for own in parts]
+        seen = [np.flatnonzero(g.C[:, own].any(axis=1)) for own in parts]
+        B = np.hstack([g.B[np.ix_(own, j)] for own, j in zip(parts, fed, strict=True)])
+        C = np.vstack([g.C[np.ix_(i, own)] for own, i in zip(parts, seen, strict=True)])
+        if B.size * C.size:
+            X, turned = _substituted(Part(g.A[np.ix_(parts[0], parts[0])], B, C, g.dt))
+            rows = np.split(turned, np.cumsum([i.size for i in seen])[:-1])
+            solvers.append((X, list(zip(seen, fed, rows, strict=True))))
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
-        for solve, channels in solvers:
-            found = np.zeros((channels[0].size, channels[1].size, s.size), dtype=np.complex128)
-            solve(s, found)
-            out[channels] += found
+        for X, channels in solvers:
+            states, at = X(s), 0
+            for i, j, row in channels:
+                moved = states[:, at : at + j.size].reshape(len(states), -1)
+                out[np.ix_(i, j)] += (row @ moved).reshape(i.size, j.size, -1)
+                at += j.size
         return False
 
     return add
@@ -260,26 +271,27 @@ def _fed_by_lines(g: StateSpace | Part, head: int, pairs: FloatArray, slots: Int
 
     With A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
     sparse (a line belongs to one input), and the head is again one matrix product: that of the
-    inputs [B_h, A_ht].
+    inputs [B_h, A_ht], of B_h those that do not wait in a line alone.
     """
     n, m = g.B.shape
+    direct = np.flatnonzero(np.any(g.B[:head], axis=0))
     feeding = np.flatnonzero(np.any(g.A[:head, head:], axis=0))
-    inputs = np.hstack([g.B[:head], g.A[:head, head + feeding]])
+    inputs = np.hstack([g.B[:head, direct], g.A[:head, head + feeding]])
     driven = _modal(Part(g.A[:head, :head], inputs, g.C[:, :head], g.dt), pairs, slots)
     rest = list(g.blocks or ())[len(slots) :]
     lines = Part(g.A[head:, head:], g.B[head:], np.eye(n - head), g.dt, rest)
-    (tail, *_), reached = _solver(lines), _reached(lines.A, lines.B)
+    tail, reached = _substitution(lines, *_paired(lines)), _reached(lines.A, lines.B)
     seen = np.flatnonzero(np.any(g.C[:, head:], axis=0))
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
         X = np.zeros((n - head, m, s.size), dtype=np.complex128)
         tail(s, X)
-        both = np.zeros((len(out), m + feeding.size, s.size), dtype=np.complex128)
+        both = np.zeros((len(out), inputs.shape[1], s.size), dtype=np.complex128)
         driven(s, both)
-        out += both[:, :m]
-        for i, line in enumerate(feeding):
+        out[:, direct] += both[:, : direct.size]
+        for i, line in enumerate(feeding, direct.size):
             for j in np.flatnonzero(reached[line]):
-                out[:, j] += both[:, m + i] * X[line, j]
+                out[:, j] += both[:, i] * X[line, j]
         for line in seen:
             for j in np.flatnonzero(reached[line]):
                 out[:, j] += g.C[:, head + line, None] * X[line, j]
@@ -359,12 +371,28 @@ def _substitution(
 
 
 def _schur(g: StateSpace | Part) -> Solver:
-    """Any A: back substitution with the Schur form of A in even units."""
-    d, T, U = g.schur_form
-    n, m = g.B.shape
-    turned, seen = U.conj().T @ (g.B / d[:, None]), (g.C * d) @ U
+    """Any A, by its Schur form."""
+    X, seen = _substituted(g)
 
     def add(s: ComplexArray, out: ComplexArray) -> bool:
+        out += (seen @ X(s).reshape(seen.shape[1], -1)).reshape(out.shape)
+        return False
+
+    return add
+
+
+def _substituted(
+    g: StateSpace | Part,
+) -> tuple[Callable[[ComplexArray], ComplexArray], ComplexArray]:
+    """Return the function of s (n_s,) that gives ``(s I - T)^-1 U* B`` (n, m, n_s), and C U.
+
+    Back substitution with the Schur form ``A = U T U*`` in even units.
+    """
+    d, T, U = g.schur_form
+    n, m = g.B.shape
+    turned = U.conj().T @ (g.B / d[:, None])
+
+    def found(s: ComplexArray) -> ComplexArray:
         X = np.broadcast_to(turned[:, :, None], (n, m, s.size)).copy()
         for end in range(n, 0, -ROWS):  # rows below a block go into it by one matrix product
             block = slice(max(end - ROWS, 0), end)
@@ -375,7 +403,6 @@ def _schur(g: StateSpace | Part) -> Solver:
                 known = X[i + 1 : end].reshape(end - 1 - i, m * s.size)
                 X[i] += (T[i, i + 1 : end] @ known).reshape(m, s.size)
                 X[i] /= s - T[i, i]
-        out += (seen @ X.reshape(n, -1)).reshape(out.shape)
-        return False
+        return X
 
-    return add
+    return found, (g.C * d) @ U

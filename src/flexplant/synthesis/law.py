@@ -296,9 +296,10 @@ class Law(Element):
         ModelError
             When it is not.
         """
-        return self._response(sampled_freq(freq, 1.0 / self.rate if self.rate else 0.0))
+        return self.at(sampled_freq(freq, 1.0 / self.rate if self.rate else 0.0))
 
-    def _response(self, freq: FloatArray) -> ComplexArray:
+    def at(self, freq: FloatArray) -> ComplexArray:
+        """Return the response at frequencies [Hz] in any order, which are not checked."""
         # Tustin's s: 2 rate (z - 1) / (z + 1)
         rate = self.rate
         omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq

@@ -47,20 +47,21 @@ class ServoLoop:
     through: ComplexArray
     modes: FloatArray
 
-    @cached_property
-    def _size(self) -> FloatArray:
-        return np.asarray(np.linalg.norm(self.through, axis=(1, 2)))
-
     def peak(self, axis: Axis) -> float:
         """Return max_f sigma_max(S_u) over the grid; of an unstable loop too, so check that."""
         gain = axis.response(self.freq)
         return float(sensitivity_size(-gain[:, None, None] * self.through).max())
 
+    @cached_property
+    def _near(self) -> FloatArray:
+        """Size of T_u G beside each mode (n_freq, k), elsewhere 0."""
+        near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
+        return np.asarray(near * np.linalg.norm(self.through, axis=(1, 2))[:, None])
+
     def resonant(self, axis: Axis) -> FloatArray:
         """Return the modes [Hz] whose resonances have loop gain, the largest first."""
-        gain = np.abs(axis.response(self.freq)) * self._size
-        near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
-        peaks = np.max(np.where(near, gain[:, None], 0.0), axis=0, initial=0.0)
+        gain = np.abs(axis.response(self.freq))
+        peaks = np.max(gain[:, None] * self._near, axis=0, initial=0.0)
         order = np.argsort(-peaks, kind="stable")
         return np.asarray(self.modes[order][peaks[order] > _QUIET])
 
