@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from test_uncertainty import closed
 
-from flexplant.errors import ModelError, ShapeError
+from flexplant.errors import CertificateError, ModelError, ShapeError
 from flexplant.identification import (
     MeasuredModes,
     PoleSelection,
@@ -78,6 +78,11 @@ def test_a_value_of_delta_is_the_plant_with_that_shape():
     sampled = seen.uncertain(measured, shapes=shapes, deviations=1.0)
     found = delta_channels(sampled)
     assert found.distance < 1e-4
+    # an acceleration holds the product of both shapes: no rate makes it affine
+    seen = plant.with_ports(PORTS.replace(y=[Sensor("y3", at="3:z", quantity="acceleration")]))
+    fast = seen.discretized(2e5).uncertain(measured, shapes=3.0 * shapes, deviations=1.0)
+    with pytest.raises(CertificateError, match=r"what y3 measure .* measure displacements there"):
+        delta_channels(fast)
     assert dict(found.deltas)["mode3:shape1"] == 2
     with pytest.raises(ShapeError, match="shapes"):
         plant.uncertain(measured, shapes=shapes[:, :2])

@@ -10,7 +10,7 @@ from .factors import controllability_factor, observability_factor
 from .interconnection import parallel
 from .joining import is_block_diagonal
 from .modal import modal_form
-from .scaling import state_scale
+from .scaling import reciprocal, state_scale
 from .splitting import split_stable
 from .statespace import StateSpace, System, as_statespace
 
@@ -91,10 +91,10 @@ def _less(g: StateSpace, tol: float) -> StateSpace:
     judged = _stabilised(g)
     # one size for all channels: what reaches the states from each input, what each output sees
     seen = observability_factor(judged)
-    drive = _inverse(np.linalg.norm(seen.T @ g.B, axis=0))
+    drive = reciprocal(np.linalg.norm(seen.T @ g.B, axis=0))
     judged = judged.replace(B=judged.B * drive)
     reached = controllability_factor(judged)
-    sight = _inverse(np.linalg.norm(g.C @ reached, axis=1))
+    sight = reciprocal(np.linalg.norm(g.C @ reached, axis=1))
     judged = judged.replace(C=judged.C * sight[:, None])
     seen = observability_factor(judged)
     left, values, right = np.linalg.svd(seen.T @ reached)
@@ -133,7 +133,3 @@ def _speed(g: StateSpace, A: FloatArray) -> float:
     """Return the size of A of a system in even units of its states, a root mean square."""
     d = state_scale(A, g.B, g.C)
     return float(np.linalg.norm(A * d / d[:, None]) / np.sqrt(g.n_states))
-
-
-def _inverse(size: FloatArray) -> FloatArray:
-    return np.asarray(1.0 / np.where(size > 0, size, 1.0))

@@ -69,3 +69,8 @@ def mean_speed(poles: ComplexArray) -> float:
     sizes = np.abs(poles)
     moving = sizes[sizes > 1e-6 * sizes.max(initial=0.0)]
     return float(np.exp(np.mean(np.log(moving)))) if moving.size else 1.0
+
+
+def reciprocal(size: FloatArray) -> FloatArray:
+    """Return ``1 / size``, and 1 for what is of no size."""
+    return np.asarray(1.0 / np.where(size > 0, size, 1.0))

@@ -11,7 +11,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..values import ComplexArray, FloatArray
-from .scaling import mean_speed, state_scale
+from .scaling import mean_speed, reciprocal, state_scale
 
 #: a zero closer to the limit than this, relative to its size, is tested as if it were on it
 _NEAR = 1e-6
@@ -145,11 +145,7 @@ def _speed(g: Any) -> float:
 def _scaled(g: Any) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
     """Return the matrices with time in units of the poles, inputs and outputs of unit size."""
     A, B = g.A / _speed(g), g.B / _speed(g)
-    into = _inverse(np.linalg.norm(B, axis=0) + 0.0)
+    into = reciprocal(np.linalg.norm(B, axis=0) + 0.0)
     B, D = B * into, g.D * into
-    out = _inverse(np.linalg.norm(np.hstack([g.C, D]), axis=1))
+    out = reciprocal(np.linalg.norm(np.hstack([g.C, D]), axis=1))
     return A, B, g.C * out[:, None], D * out[:, None]
-
-
-def _inverse(sizes: FloatArray) -> FloatArray:
-    return np.asarray(1.0 / np.where(sizes > 0, sizes, 1.0))

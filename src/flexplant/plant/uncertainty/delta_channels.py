@@ -66,8 +66,7 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     if distance > _LARGEST:
         raise CertificateError(
             f"sampled machines at the corners of the uncertainty lie {100 * distance:.3g} % off "
-            "the affine channels of their Deltas: the uncertainty is too large at this rate. "
-            "Lower deviations, measure better, or raise the rate."
+            f"the affine channels of their Deltas: {_cause(uncertain)}"
         )
     if uncertain.neglected is not None and uncertain.neglected.sampled is None:
         raise ModelError(
@@ -76,6 +75,21 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
         )
     sampled = None if uncertain.neglected is None else uncertain.neglected.sampled
     return _with_neglected(system, sizes, sampled, distance)
+
+
+def _cause(uncertain: UncertainPlant[Any]) -> str:
+    """Return why sampled machines are not affine in the Deltas, and what to do."""
+    moving = [sensor.name for sensor in uncertain.plant.assembled.ports.y if sensor.order]
+    if moving and any(delta.kind == "shape" for delta in uncertain.deltas):
+        return (
+            f"what {', '.join(moving)} measure (velocities, accelerations) holds the product of a "
+            "mode's shape there and where a force acts, which is not affine in an uncertain shape. "
+            "Lower the deviations of shapes, or measure displacements there."
+        )
+    return (
+        "the uncertainty is too large at this rate. Lower deviations, measure better, or raise the "
+        "rate."
+    )
 
 
 def _grouped(uncertain: UncertainPlant[Any]) -> tuple[StateSpace, list[tuple[str, int]]]:
