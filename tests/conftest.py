@@ -1,6 +1,7 @@
 """Profiles of hypothesis, a backend without windows, oracles on the path, a rule on tolerances."""
 
 import os
+import re
 import sys
 from pathlib import Path
 
@@ -20,6 +21,10 @@ from tolerances import guard
 
 guard()
 
+# many processes read the same modules, here and in what the tests start: compiled once for all
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+
 settings.register_profile(
     "dev",
     max_examples=20,
@@ -29,3 +34,9 @@ settings.register_profile(
 )
 settings.register_profile("nightly", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave out benchmarks, and the peers that they import, in a run that does not name them."""
+    named = re.search(r"(?<!not )benchmark", config.option.markexpr)
+    return True if collection_path.name == "benchmarks" and not named else None
