@@ -67,13 +67,10 @@ class ModesFormat:
         Endings of their names, in lower case.
     read : callable
         The file, and where its nodes are (a path or None), to FileShapes.
-    begins : callable, optional
-        Decides from the first bytes of the file.
     """
 
     suffixes: tuple[str, ...]
     read: Callable[[Path, Path | None], FileShapes]
-    begins: Callable[[bytes], bool] = lambda head: True
 
 
 def modes_of(

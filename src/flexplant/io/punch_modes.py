@@ -91,8 +91,4 @@ def _wrong(path: Path, at: int, line: bytes) -> FlexplantError:
     return wrong_line_of(path, at + 1, "a point of an eigenvector is", line, do)
 
 
-def _begins(head: bytes) -> bool:
-    return b"$eigenvalue" in head or not head.startswith(b"dmig")
-
-
-PUNCH = ModesFormat((".pch",), read_punch_shapes, _begins)
+PUNCH = ModesFormat((".pch",), read_punch_shapes)

@@ -14,7 +14,7 @@ from ..structure.units import units as unit_system
 from ..values import FloatArray, instance
 from . import ansys, exodus, op2, punch_modes, uff
 from .file_shapes import ModesFormat, check_mass, modes_of
-from .formats import HEAD, ends
+from .formats import ends
 from .paths import file_path, three_units
 
 FORMATS: tuple[ModesFormat, ...] = (
@@ -100,14 +100,13 @@ def read_modes(
     """
     path = file_path(path)
     sizes = () if units is None else three_units(units)
-    with path.open("rb") as file:
-        head = file.read(HEAD).lower()
-    form = next((f for f in FORMATS if ends(path, f.suffixes) and f.begins(head)), None)
+    form = next((f for f in FORMATS if ends(path, f.suffixes)), None)
     if form is None:
         known = ", ".join(suffix for f in FORMATS for suffix in f.suffixes)
         raise FlexplantError(
-            f"{path.name!r} is no file of modes that is read here; known are {known}. Matrices are "
-            "read by read_model."
+            f"{path.name!r} is no file of modes that is read here; known are {known}. Nastran "
+            "writes .op2 with DISPLACEMENT=ALL and PARAM,POST,-1, ANSYS .rst; of the others export "
+            "a universal file, or matrices, which read_model reads."
         )
     shapes = form.read(path, None if nodes is None else file_path(nodes, "nodes"))
     system = shapes.units or unit_system() if units is None else unit_system(*sizes)
