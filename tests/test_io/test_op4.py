@@ -91,6 +91,11 @@ def test_words_and_markers_of_any_length(tmp_path, order, marker, integer):
     expected[1:3, 0], expected[0, 2] = (1.5, -2.5), 0.25
     assert np.array_equal(found["KAA"], expected)
     assert found["MAA"].toarray().tolist() == [[0, 7], [0, 0], [0, 8], [0, 9]]
+    # the form of many rows, with a length whose bytes have no number of 64 bits
+    long = record(whole(2, 0, 4), whole(2 ** (8 * integer - 4) + 1, 1), real(7.0, 8.0))
+    path.write_bytes(record(whole(2, -4, 2, 1), name) + long + record(whole(3, 1, 1), real(1.0)))
+    with pytest.raises(FlexplantError, match="impossible length"):
+        read_op4_matrices(path)
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")

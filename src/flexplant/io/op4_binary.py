@@ -171,12 +171,13 @@ def _matrix(
         data, rows, places = (np.concatenate(part) for part in zip(*parts, strict=True))
         return sp.csc_array(sp.coo_array((data.astype(target), (rows, places)), shape=shape))
     first = np.array(starts, dtype=np.int64) + 3 * size
-    counts = np.array([count for _, _, count in heads], dtype=np.int64)
+    counts = np.clip([count for _, _, count in heads], 0, words.size)  # sums of them must not wrap
     end = np.minimum(first + counts * size, np.array(stops, dtype=np.int64))
     place, length, row, column = _strings(words, first, end, big, per, name)
     column = np.array([c for c, _, _ in heads], dtype=np.int64)[column] - 1
-    if row.size and (row.min() < 1 or np.any(row - 1 + length > shape[0])):
-        bad = int(np.argmax((row < 1) | (row - 1 + length > shape[0])))
+    outside = (row < 1) | (row > shape[0] + 1 - length)
+    if np.any(outside):
+        bad = int(np.argmax(outside))
         raise _outside(words.path, int(place[bad]), name, int(row[bad] - 1 + length[bad]), shape)
     # strings in the order of columns, as they are in the file
     order = np.argsort(column, kind="stable")
@@ -212,8 +213,9 @@ def _strings(words: _Words, first: Any, end: Any, big: bool, per: int, name: str
             length, row = numbers.reshape(-1, 2).T - np.array([[1], [0]])
         else:
             length, row = (numbers >> 16) - 1, numbers & 0xFFFF
-        bytes_ = length * size
-        wrong = (length < 1) | (bytes_ % per != 0) | (here + head + bytes_ > end[alive])
+        wrong = (length < 1) | (length > (end[alive] - here - head) // size)
+        bytes_ = np.where(wrong, 0, length) * size  # no product wraps
+        wrong |= bytes_ % per != 0
         if np.any(wrong):
             raise _broken(words.path, int(here[np.argmax(wrong)]), name)
         found.append((here + head, bytes_ // per, row, alive))
