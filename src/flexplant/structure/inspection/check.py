@@ -143,16 +143,10 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
             "Pass FEMatrices(K, M, dofs=...), which takes matrices of any quality."
         )
     found = facts(matrices_, given.joint_motions if isinstance(model, FEModel) else None)
-    lines: list[Line] = [
-        *matrices(found),
-        *zero_rows(found),
-        *rigid(found),
-        *_pieces(found),
-        *masses(found),
-        *scales(found),
-        *_digits(found),
-        *(("note", "reader", note, "") for note in matrices_.notes),
-    ]
+    parts = (matrices, zero_rows, rigid, _pieces, masses, scales, _digits)
+    # of swapped matrices all else would be nonsense
+    lines = [line for part in parts[: 1 if found.swapped else None] for line in part(found)]
+    lines += [("note", "reader", note, "") for note in matrices_.notes]
     if matrices_.constrained:
         lines.append(("note", "constrained", f"{listed(matrices_.constrained)} dropped", ""))
     return ModelCheck(

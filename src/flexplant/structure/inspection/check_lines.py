@@ -60,6 +60,7 @@ def matrices(found: Facts) -> Iterator[Line]:
             "M resists no rigid translation as a stiffness does, K every one as a mass does",
             "they are swapped: FEMatrices(K, M), but FEModel(M, K)",
         )
+        return
     yield _mass_line(found)
     yield _stiffness_line(found)
     if found.damping:
