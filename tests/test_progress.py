@@ -36,9 +36,17 @@ unknowns = [fx.AddedMass(at, bounds=(0.0, 2.0)), fx.AddedDamping(at, bounds=(-20
 small = fx.assemble_plant(some_modes(count=8, attached=False), ports())
 weights = fx.stage_weights(small, 50.0)
 weighted = small.through(fx.reference_errors(small)).weighted(z=weights.z, w=weights.w)
+plate = fx.kirchhoff_plate(size=(0.4, 0.3), thickness=0.01, elements=(4, 3), density=2700,
+                           youngs_modulus=70e9, poisson_ratio=0.33)
+four, z1 = fx.Guyan(["1:z", "5:z", "16:z", "20:z"]), {"inputs": ["1:z"], "outputs": ["1:z"]}
 noise = rng.standard_normal((4, 16000))
 WORK = {
     "modes, steps of Lanczos": lambda: fx.solve_modes(block, count=30),
+    "frequency response:": lambda: fx.frequency_response(
+        plate, fx.Ports(u=[fx.Actuator("f", "1:z")], y=[fx.Sensor("s", "1:z")]), [10.0, 900.0]),
+    "check:": lambda: fx.check(plate),
+    "reduction:": lambda: fx.reduce(plate, four),
+    "quality:": lambda: fx.reduce(plate, four).quality(plate, band=(10.0, 200.0), **z1),
     "update, iterations": lambda: fx.update(rom, unknowns, [fx.Eigenvalues(poles)], starts=20),
     "parts of the record": lambda: fx.identification.identify_output_only(
         noise, rate=1e3, band=(20.0, 200.0), orders=range(4, 12, 2)),
@@ -88,7 +96,8 @@ def test_bars_on_a_terminal_and_none_in_a_pipe():
     os.close(ours)
     assert process.wait(timeout=300) == 0
     text = seen.decode()
-    for name in ("modes, steps", "update, iter", "parts of the", "steps of the bis"):
+    for name in ("modes, steps", "update, iter", "parts of the", "steps of the bis", "check: ",
+                 "reduction: ", "quality: ", "frequency response: "):
         assert name in text
     piped = child(SHOWN, subprocess.PIPE)
     assert piped.communicate(timeout=300) == (b"done\n", b"")
@@ -142,7 +151,7 @@ def test_interrupted_work_leaves_nothing_behind():
         process.kill()
     assert process.returncode == 0, err.decode()
     answer = json.loads(out)
-    assert len(answer["found"]) == 5 and answer["same"]
+    assert len(answer["found"]) == 9 and answer["same"]
     for name, left in answer["found"].items():
         assert left == {"threads": True, "bars": 0, "children": 0, "alive": 1}, name
 

@@ -23,7 +23,7 @@ class Progress:
     Parameters
     ----------
     total : int or None
-        Number of items; None where it is not known.
+        Number of items; None where it is not known, 0 for work in one piece: the bar shows time.
     description : str
         What is done.
     progress : bool, optional
@@ -46,6 +46,7 @@ class Progress:
             self.bar = tqdm(
                 total=total,
                 desc=description,
+                bar_format=None if total != 0 else "{desc}: {elapsed}",
                 delay=0.0 if progress else PATIENCE,
                 leave=bool(progress),
                 file=stream or sys.stderr,

@@ -21,6 +21,7 @@ from ..modes import Modes
 from ..modes.direct_check import checked_response
 from ..modes.dynamic_basis import DynamicBasis
 from ..modes.solve import modes_reaching
+from ..progress import Progress
 from ..reduction import ReducedModel
 from ..structure import Damping, FEModel
 from ..values import ComplexArray, FloatArray, instance, positive, real_array, whole
@@ -200,22 +201,14 @@ def frequency_response(
         data = through.seen(grid, _realised(model, grid, through.rows, through.loads))
         route = f"all modes of the {type(model).__name__}"
         return through.frf(grid, data, route=route)
-    basis = DynamicBasis(
-        model,
-        modes_reaching(model, float(grid.max(initial=0.0))),
-        np.hstack([through.loads, through.rows.T]),
-        damping,
-    )
-    limit = positive(tolerance, "tolerance")
-    basis, data, check = checked_response(
-        basis,
-        grid,
-        through.rows,
-        through.loads,
-        checks=whole(checks, "checks", minimum=0),
-        tolerance=limit,
-        seen=through.seen,
-    )
+    limit, most = positive(tolerance, "tolerance"), whole(checks, "checks", minimum=0)
+    rows, loads = through.rows, through.loads
+    with Progress(0, "frequency response"):
+        modes = modes_reaching(model, float(grid.max(initial=0.0)))
+        basis = DynamicBasis(model, modes, np.hstack([loads, rows.T]), damping)
+        basis, data, check = checked_response(
+            basis, grid, rows, loads, checks=most, tolerance=limit, seen=through.seen
+        )
     if check.freq.size and not check.holds(limit):
         warnings.warn(
             f"the responses of {model!r:.60} are not good to {limit:g}: {check}. Give more modes, "

@@ -15,6 +15,7 @@ from ..labels import DofSet, Place
 from ..modes.attachment_vectors import places
 from ..modes.modes import Modes
 from ..modes.solve import solve_modes
+from ..progress import Progress
 from ..structure import Damping, FEModel
 from ..structure.negative_stiffness import refuse_unstable
 from ..values import FloatArray, Value
@@ -250,7 +251,8 @@ def reduce(model: FEModel | Modes, method: ReductionMethod) -> ReducedModel:
         )
     if not isinstance(method, DesiredDofs):
         refuse_unstable(model, f"reduction by {type(method).__name__}")
-    return method.reduced(model)
+    with Progress(0, "reduction"):
+        return method.reduced(model)
 
 
 def _named(modes: Modes) -> str:

@@ -14,6 +14,7 @@ from ..labels import DofSet, Place
 from ..modes.damped_modes import leaving_overdamped
 from ..modes.modes import Modes
 from ..modes.normal_form import normal_form
+from ..progress import Progress
 from ..structure import FEModel
 from ..structure.negative_stiffness import refuse_unstable, unstable_stiffness
 from ..structure.placed import SPANNED
@@ -337,4 +338,5 @@ class ReducedModel(Spanned, Value):
             When a place is unknown.
         """
         refuse_unstable(self, "a comparison of responses")
-        return quality_of(self, full, band, inputs, outputs, count, freq, loss)
+        with Progress(0, "quality"):
+            return quality_of(self, full, band, inputs, outputs, count, freq, loss)

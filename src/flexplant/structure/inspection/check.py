@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import ModelError, counted
+from ...progress import Progress
 from ...values import FloatArray, Value
 from ..matrices import FEMatrices
 from ..model import FEModel
@@ -142,7 +143,8 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
             f"check needs an FEModel or FEMatrices, got {type(model).__name__}. "
             "Pass FEMatrices(K, M, dofs=...), which takes matrices of any quality."
         )
-    found = facts(matrices_, given.joint_motions if isinstance(model, FEModel) else None)
+    with Progress(0, "check"):
+        found = facts(matrices_, given.joint_motions if isinstance(model, FEModel) else None)
     parts = (matrices, zero_rows, rigid, _pieces, masses, scales, _digits)
     # of swapped matrices all else would be nonsense
     lines = [line for part in parts[: 1 if found.swapped else None] for line in part(found)]
