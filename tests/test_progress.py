@@ -96,8 +96,8 @@ def test_bars_on_a_terminal_and_none_in_a_pipe():
     os.close(ours)
     assert process.wait(timeout=300) == 0
     text = seen.decode()
-    for name in ("modes, steps", "update, iter", "parts of the", "steps of the bis", "check: ",
-                 "reduction: ", "quality: ", "frequency response: "):
+    names = "modes, steps, update, iter, parts of the, steps of the bis, check:, reduction:, quality:"
+    for name in [*names.split(", "), "frequency response:"]:
         assert name in text
     piped = child(SHOWN, subprocess.PIPE)
     assert piped.communicate(timeout=300) == (b"done\n", b"")
