@@ -17,7 +17,7 @@ Every message says what is wrong, what was got, why it matters and what to do ne
 
 import sys
 import warnings
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable
 from difflib import get_close_matches
 
 
@@ -119,5 +119,5 @@ def require_known(
     """Raise the LabelError of `unknown_label` for the first of some names that is not known."""
     listed = list(known)
     for name in names:
-        if name not in listed:
+        if not isinstance(name, Hashable) or name not in listed:
             raise unknown_label(kind, name, listed, owner)

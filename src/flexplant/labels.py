@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from .dof_columns import columns_of, component_columns, direction_names, listed, node_numbers
 from .dof_index import DofIndex, in_box, unknown_dof
-from .errors import LabelError, ShapeError, counted, unknown_label
+from .errors import LabelError, ShapeError, counted, require_known, unknown_label
 from .places import DIRECTIONS as DIRECTIONS
 from .places import Interpolation as Interpolation
 from .places import Place as Place
@@ -346,8 +346,7 @@ class DofSet(Value):
                 row += part * self.row(place, direction)
             return row
         point = real_array(at, "at", (3,))
-        if direction not in DIRECTIONS:
-            raise unknown_label("direction", direction, DIRECTIONS)
+        require_known("direction", [direction], DIRECTIONS)
         if self.interpolation is not None:
             return self.interpolation.row(point, direction)
         label = self.nearest(point, direction)

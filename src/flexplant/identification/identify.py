@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import between
-from ..errors import LabelError, ModelError, ShapeError, SolverError, unknown_label
+from ..errors import LabelError, ModelError, ShapeError, SolverError, require_known
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
 from ..values import instance, positive, real_array, short, whole
@@ -313,10 +313,7 @@ def checked_channels(dofs: Any, frf: Frf) -> dict[str, str]:
     if dofs is None:
         return {}
     instance(dofs, Mapping, "dofs", "Pass {channel: DOF label}.", LabelError)
-    known = {*frf.inputs, *frf.outputs}
-    for name in dofs:
-        if name not in known:
-            raise unknown_label("channel", name, sorted(known))
+    require_known("channel", dofs, sorted({*frf.inputs, *frf.outputs}))
     return {str(name): str(label) for name, label in dofs.items()}
 
 

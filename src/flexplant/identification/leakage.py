@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 
 import numpy as np
 
-from ..errors import FlexplantWarning, SolverError
+from ..errors import SolverError, warn
 from ..lti.frequency import Frf
 from ..values import ComplexArray
 from .identified import IdentifiedModes
@@ -63,15 +62,13 @@ def leakage_warned(frf: Frf, found: IdentifiedModes) -> None:
     freq = np.abs(poles) / (2 * np.pi)
     listed = ", ".join(f"{freq[k]:.4g} Hz (2 zeta f = {width[k]:.2g} Hz)" for k in narrow[:4])
     more = f" and {narrow.size - 4} more" if narrow.size > 4 else ""
-    warnings.warn(
+    warn(
         f"segments of {1 / frf.resolution:.3g} s are too short for the damping near "
         f"{listed}{more}: below about {fewest:g}/segment = {fewest * frf.resolution:.2g} Hz "
         "leakage widens a resonance and splits it into several poles, so that damping and the "
         "number of modes are wrong by more than their stated deviation. Take segment= of at least "
         f"{fewest * widened / width[worst]:.2g} s (the true damping is less than what is seen), "
-        "or excite with whole periods, Periodic(...).",
-        FlexplantWarning,
-        4,
+        "or excite with whole periods, Periodic(...)."
     )
 
 

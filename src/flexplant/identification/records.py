@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, ShapeError
+from ..errors import ShapeError, warn
 from ..values import FloatArray, real_array, signal_names
 
 
@@ -101,13 +100,11 @@ def dropouts_warned(data: Records) -> None:
         for signal in record:
             at, length = _longest(signal)
             if length:
-                warnings.warn(
+                warn(
                     f"{name} keeps the value {signal[at]:.4g} for {length} samples from "
                     f"{at / data.rate:.4g} s on ({length / data.rate:.3g} s): a drop-out? The "
                     "estimate counts it as measured. Leave that part of the record out, or the "
-                    "period it lies in.",
-                    FlexplantWarning,
-                    stacklevel=3,
+                    "period it lies in."
                 )
                 break
 

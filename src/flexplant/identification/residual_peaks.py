@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantWarning, SolverError
+from ..errors import SolverError, warn
 from ..values import ComplexArray, FloatArray
 from .pole_test import CHANCE, corroborated, freedom, price
 from .refine import Fit, Lines, projected_cost, refined
@@ -224,23 +223,19 @@ def warned(left: list[Peak]) -> None:
     """Warn of stretches that no pole explains, and of single lines."""
     stretches = [peak for peak in left if not peak.isolated]
     if stretches:
-        warnings.warn(
+        warn(
             f"more than noise is left near {_listed(stretches)}: a mode may be missed or merged "
             "there, and its neighbours be off by more than their stated deviation. Look at "
             "plot.identified and plot.stabilisation, choose poles by hand (start=), or narrow the "
-            "band.",
-            FlexplantWarning,
-            4,
+            "band."
         )
     single = [peak for peak in left if peak.isolated]
     if single:
-        warnings.warn(
+        warn(
             f"single lines hold more than noise, with noise alone around them: {_listed(single)}. "
             "No pole was fitted to them: a disturbance of one frequency (mains, a pump) or a "
             "variance from few segments looks so, and so does a mode narrower than the lines are "
-            "apart. Measure with longer segments to distinguish them, or average more.",
-            FlexplantWarning,
-            4,
+            "apart. Measure with longer segments to distinguish them, or average more."
         )
 
 

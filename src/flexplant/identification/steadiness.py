@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning
+from ..errors import warn
 from ..values import ComplexArray, FloatArray
 
 #: power of the inputs' lines over what lies between them below which they are not periodic
@@ -59,13 +58,11 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     lags = np.arange(samples // 2, 3 * n_time // 4)
     best = int(lags[np.argmin(change[lags])])
     if here > SAME and change[best] < BETTER * here:
-        warnings.warn(
+        warn(
             f"the inputs repeat after {best} samples, {best / rate:.6g} s, better than after the "
             f"stated period of {samples} samples (they change by {np.sqrt(change[best]):.2g} and "
             f"{np.sqrt(here):.2g} of their size): period= or rate is wrong, and the FRF with it. "
-            f"If the period is right the rate is {rate * best / samples:.6g} Hz.",
-            FlexplantWarning,
-            4,
+            f"If the period is right the rate is {rate * best / samples:.6g} Hz."
         )
         return False
     if spectra.shape[2] < 2:
@@ -73,14 +70,12 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     power = np.sum(np.abs(spectra) ** 2, axis=(0, 1))
     ratio = float(np.median(power[0] / np.maximum(power[1:].mean(axis=0), 1e-300)))
     if ratio < PERIODIC:
-        warnings.warn(
+        warn(
             f"the inputs are not periodic: at half of the lines or more their power is "
             f"{10 * np.log10(ratio):.1f} dB of what lies between the lines, where periodic "
             "signals have nothing. Check period= and rate; random excitation needs "
             "H1Estimator(...), noise that comes back through a controller reference= or more "
-            "periods.",
-            FlexplantWarning,
-            4,
+            "periods."
         )
         return False
     return True
@@ -189,12 +184,10 @@ def transient_warned(found: Transient | None, discard: int) -> None:
     """Warn of a transient that has not died away in the periods kept."""
     if found is None:
         return
-    warnings.warn(
+    warn(
         f"a transient has not died away in the periods kept: near {found.freq:.4g} Hz "
         f"{found.decay:.0%} of it is left after a period, and biases the FRF by {found.bias:.2g} "
         "standard deviations of its noise; damping and the number of modes would be wrong. "
         f"Measure {found.more} periods more and discard {discard + found.more}, "
-        f"discard={discard + found.more}, or shake so long before recording.",
-        FlexplantWarning,
-        4,
+        f"discard={discard + found.more}, or shake so long before recording."
     )

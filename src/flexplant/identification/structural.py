@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantWarning, LabelError, ModelError
+from ..errors import LabelError, ModelError, warn
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
@@ -339,17 +338,13 @@ def expansion(over: Modes, rows: Any) -> FloatArray:
 
 def _warn(certificate: dict[str, float]) -> None:
     if certificate["imaginary"] > COMPLEX:
-        warnings.warn(
+        warn(
             f"a measured shape has an imaginary part of {certificate['imaginary']:.0%}: the modes "
             "of this structure are real, so that it is left out. Measure longer, or look for two "
-            "modes that were taken for one.",
-            FlexplantWarning,
-            stacklevel=3,
+            "modes that were taken for one."
         )
     if certificate.get("expansion", 0.0) > MISSED:
-        warnings.warn(
+        warn(
             f"{certificate['expansion']:.0%} of a measured shape is none of the model's modes: "
-            "the expansion is that far off at least. Give more of its modes, or update it first.",
-            FlexplantWarning,
-            stacklevel=3,
+            "the expansion is that far off at least. Give more of its modes, or update it first."
         )

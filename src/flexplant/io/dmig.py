@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, LabelError, ModelError, unknown_label
+from ..errors import FlexplantError, LabelError, ModelError, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
@@ -339,8 +339,8 @@ def _dofs(order: IntArray, nodes: Nodes | None, scalar: str | None, path: str) -
             "and no direction. Say what they move in, scalar_direction='z' (generalised "
             "coordinates of a reduced model are no DOFs at a node: punch the g-set instead)."
         )
-    if scalar is not None and scalar not in DIRECTIONS:
-        raise unknown_label("direction", scalar, DIRECTIONS)
+    if scalar is not None:
+        require_known("direction", [scalar], DIRECTIONS)
     directions = [scalar or "" if c == 0 else DIRECTIONS[c - 1] for c in components.tolist()]
     if nodes is None:
         return DofSet(ids, tuple(directions), np.zeros((ids.size, 3)))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantError, ModelError, ShapeError, unknown_label
+from ..errors import FlexplantError, ModelError, ShapeError, require_known, unknown_label
 from ..lti.frequency import Frf
 from .mat_variables import mat_variables
 from .paths import file_path, parsing
@@ -140,9 +140,7 @@ def _frf(
     quantity: str | None,
     axis: int | None,
 ) -> Frf:
-    for name in (freq, data):
-        if name not in content:
-            raise unknown_label("array", name, content, repr(str(path)))
+    require_known("array", (freq, data), content, repr(str(path)))
     grid, responses = np.ravel(content[freq]), np.asarray(content[data])
     for name, array in ((freq, grid), (data, responses)):
         if array.dtype.kind not in "iufc":

@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import scipy.io
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..loop import ClosedLoop
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System
@@ -118,8 +118,7 @@ def read_mat(path: str | Path, name: str | None = None) -> MatValue:
     content = mat_variables(path)
     named = {key: item for key, item in content.items() if isinstance(item, dict)}
     if name is not None:
-        if name not in named:
-            raise unknown_label("structure", name, named, repr(str(path)))
+        require_known("structure", [name], named, repr(str(path)))
         return _value(named[name], f"{name!r} of {str(path)!r}")
     if not _kind(content) and len(named) == 1:
         return _value(next(iter(named.values())), repr(str(path)))

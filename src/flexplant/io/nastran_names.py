@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from .formats import USUAL
 
 _LETTERS = {"stiffness": "K", "mass": "M", "damping": "B"}
@@ -44,7 +44,7 @@ def named_matrices(
             names.append(None)
             continue
         name = None if said == USUAL else said
-        check_held(() if name is None else (name,), found, path)
+        require_known("matrix", () if name is None else (name,), found, repr(path))
         usual = [_LETTERS[what] + ending for ending in endings]
         there = [one for one in usual if one in found] if name is None else [name]
         if len(there) > 1:
@@ -59,10 +59,3 @@ def named_matrices(
             )
         names.append(there[0] if there else None)
     return names
-
-
-def check_held(names: Iterable[str], found: Iterable[str], path: str) -> None:
-    """Raise LabelError unless the file holds all these matrices."""
-    for name in names:
-        if name not in found:
-            raise unknown_label("matrix", name, found, repr(path))

@@ -9,13 +9,13 @@ from typing import Any, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, ModelError
+from ..errors import FlexplantError, ModelError, require_known
 from ..labels import DofSet
 from ..structure.completion import completed
 from ..structure.matrices import FEMatrices
 from ..values import name_list
 from .formats import USUAL, Format
-from .nastran_names import check_held, named_matrices
+from .nastran_names import named_matrices
 from .op4_binary import binary_matrices
 from .op4_text import text_matrices
 from .paths import file_path
@@ -190,7 +190,7 @@ def _read(
         found[key] = (matrix, form, digits)
     if names is None:
         return found
-    check_held(names, found, str(path))
+    require_known("matrix", names, found, repr(str(path)))
     return {name: found[name] for name in names}
 
 

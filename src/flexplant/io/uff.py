@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ..dof_columns import at_nodes
-from ..errors import FlexplantError, LabelError, ModelError, unknown_label
+from ..errors import FlexplantError, LabelError, ModelError, require_known
 from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
 from ..lti.frequency import Frf
@@ -103,8 +103,8 @@ def read_frf_uff(
     >>> frf["41:z", "u 7:z"]
     array([1.+0.j, 0.+2.j])
     """
-    if quantity is not None and quantity not in ORDERS:
-        raise unknown_label("quantity", quantity, ORDERS)
+    if quantity is not None:
+        require_known("quantity", [quantity], ORDERS)
     if scale is not None:
         scale = positive(scale, "scale")
     sets = datasets(path, (58, 164))

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..dof_columns import component_columns
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..labels import DofSet
 from ..reduction import ReducedModel
 from ..structure import FEModel
@@ -88,9 +88,7 @@ def components_of(models: Any, placed: Any) -> list[Component]:
     names = list(models)
     component_columns(names, np.zeros(0, np.int64), 0)
     poses = {} if placed is None else dict(instance(placed, Mapping, "placed", "Pass {name: Pose}"))
-    for name in poses:
-        if name not in names:
-            raise unknown_label("component", name, names)
+    require_known("component", poses, names)
     found = []
     for name, model in models.items():
         pose = instance(poses.get(name, Pose()), Pose, f"placed[{name!r}]", "Pass Pose(shift=...).")

@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from ..errors import LabelError, unknown_label
+from ..errors import LabelError, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..values import FloatArray
 from .joint import Joint
@@ -74,8 +74,7 @@ class JointEnd:
         if isinstance(end, str):
             name, rest = _split(end, [part.name for part in parts])
         names = [part.name for part in parts]
-        if name not in names:
-            raise unknown_label("component", name, names)
+        require_known("component", [name], names)
         self.index, self._size = names.index(name), size
         self._dofs, self._motions = parts[self.index].dofs, motions[self.index]
         self.label = ":" in rest

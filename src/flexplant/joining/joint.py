@@ -8,7 +8,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..labels import DIRECTIONS
 from ..values import FloatArray, Value, name_list, real_array
 from .patch import Patch
@@ -64,9 +64,7 @@ class Joint(Value):
 
     def __post_init__(self) -> None:
         axes = None if self.axes is None else name_list(self.axes, "axes of a joint")
-        unknown = [axis for axis in axes or () if axis not in DIRECTIONS]
-        if unknown:
-            raise unknown_label("axis", unknown[0], DIRECTIONS)
+        require_known("axis", axes or (), DIRECTIONS)
         if axes is not None and (not axes or len(set(axes)) < len(axes)):
             raise LabelError(f"axes of a joint must be different ones, got {axes!r}: name each.")
         self._set(

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import warnings
 from dataclasses import dataclass
 from functools import partial
 from time import monotonic
@@ -11,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..parallel import Progress
 from ..values import FloatArray, positive, whole
 from ..work import Work
@@ -111,12 +110,10 @@ class BranchAndBound(Search):
         stopped = ""
         if batch:
             stopped = f"the time limit of {self.time_limit:.3g} s was reached"
-            warnings.warn(
+            warn(
                 f"{stopped}: no choice is more than {100 * (1 - bound / tree.value):.2g} % better "
                 f"in value than the one found, but {100 * self.gap:.2g} % was wanted. Raise "
-                "time_limit, or accept a larger gap.",
-                FlexplantWarning,
-                stacklevel=4,
+                "time_limit, or accept a larger gap."
             )
         return Found(
             tree.chosen,

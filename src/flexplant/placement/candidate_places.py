@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..plant import StandardPlant
 from ..structure import Disc, Rectangle
 from ..values import FloatArray
@@ -39,9 +39,7 @@ class Places:
 
     def index(self, names: Sequence[str], what: str) -> list[int]:
         """Return the places of candidates by name."""
-        for name in names:
-            if name not in self.names:
-                raise unknown_label(what, name, self.names)
+        require_known(what, names, self.names)
         return [self.names.index(name) for name in names]
 
     def inside(self, zones: Sequence[Zone]) -> FloatArray:

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, require_known
 from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
@@ -93,13 +93,11 @@ def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) ->
         )
     found: dict[str, float] = {}
     for name, weight in _factors(poi if poi is not None else tuple(known)).items():
-        if name not in known:
-            raise unknown_label("POI", name, known)
+        require_known("POI", [name], known)
         own = known[name]
         usual = tuple(own) if every else tuple(own)[:1]
         for axis, factor in _factors(usual if axes is None else axes).items():
-            if axis not in own:
-                raise unknown_label(f"axis of POI {name!r}", axis, own)
+            require_known(f"axis of POI {name!r}", [axis], own)
             found[own[axis]] = weight * factor
     return found
 

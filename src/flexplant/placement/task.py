@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InfeasibleError, LabelError, ModelError, unknown_label
+from ..errors import InfeasibleError, LabelError, ModelError, require_known
 from ..plant import StandardPlant
 from ..values import name_list, whole
 from .candidate_places import places_of
@@ -114,7 +114,5 @@ def _require_start(
 
 def _required(names: Sequence[str], required: Sequence[str]) -> tuple[int, ...]:
     listed = name_list(required, "required candidates")
-    for name in listed:
-        if name not in names:
-            raise unknown_label("required candidate", name, names)
+    require_known("required candidate", listed, names)
     return tuple(sorted({names.index(name) for name in listed}))

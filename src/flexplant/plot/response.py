@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 from matplotlib.axes import Axes
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..simulation import Response
 from ..values import instance, name_list, real_array
 from ._axes import finish, legend, named, panel_axes, quantity_of, shown_in
@@ -76,9 +76,8 @@ def response(
     chosen = None if channels is None else name_list(channels, "channels")
     names = list(chosen or [n for n in run if n.endswith(":error")] or list(run)[:1])
     panels: dict[str | None, list[str]] = {}
+    require_known("channel", names, run)
     for name in names:
-        if name not in run:
-            raise unknown_label("channel", name, list(run))
         panels.setdefault(run.units.get(name, unit), []).append(name)
     if ax is not None and len(panels) > 1:
         listed = "; ".join(f"{', '.join(group)} [{u or '?'}]" for u, group in panels.items())

@@ -9,7 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..loop.known import references
 from ..lti.discretisation import held_exactly
@@ -79,8 +79,7 @@ def step(
     columns = list(moves if inputs is None else name_list(inputs, "inputs"))
     for label, g in found.items():
         for name, known in [(r, g.outputs) for r in rows] + [(c, g.inputs) for c in columns]:
-            if name not in known:
-                raise unknown_label("channel", name, known, f"the system {label}".strip())
+            require_known("channel", [name], known, f"the system {label}".strip())
     end = (
         max(map(_duration, found.values())) if duration is None else positive(duration, "duration")
     )

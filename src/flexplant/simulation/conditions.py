@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import ModelError, unknown_label
+from ..errors import ModelError, require_known
 from ..loop import ClosedLoop
 from ..loop.known import with_known
 from ..plant import StandardPlant
@@ -79,8 +79,7 @@ def _paths(plant: StandardPlant, moving: Any, time: FloatArray) -> dict[str, Flo
     pois = [poi.name for poi in plant.assembled.ports.z]
     found = {}
     for name, path in moving.items():
-        if name not in pois:
-            raise unknown_label("POI to move", name, pois)
+        require_known("POI to move", [name], pois)
         points: Callable[[FloatArray], Any] | Any = path(time) if callable(path) else path
         found[name] = real_array(points, f"the path of {name!r}", (time.size, 3))
         ends = [*found[name].argmin(axis=0), *found[name].argmax(axis=0)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, unknown_label
+from ..errors import LabelError, ModelError, require_known, unknown_label
 from ..estimation import KalmanEstimator, StaticEstimator
 from ..estimation.estimator_channels import estimates, poi_channels, row_of
 from ..lti.statespace import StateSpace
@@ -53,8 +53,7 @@ class EstimatorComparison(Value):
         self._set(names=tuple(self.names), errors=self.errors)
 
     def __getitem__(self, name: str) -> FloatArray:
-        if name not in self.names:
-            raise unknown_label("estimator", name, self.names)
+        require_known("estimator", [name], self.names)
         found: FloatArray = self.errors[self.names.index(name)]
         return found
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, ShapeError, unknown_label
+from ..errors import ModelError, ShapeError, require_known
 from ..values import FloatArray, Value, instance, name_list, positive, real_array
 from .moments import moving_moments, unit_of
 from .response import Numbers, Response
@@ -61,8 +61,7 @@ class ExposureErrors(Value):
         self._set(channels=tuple(self.channels), units=tuple(self.units), values=self.values)
 
     def __getitem__(self, channel: str) -> ExposureFigures:
-        if channel not in self.channels:
-            raise unknown_label("channel", channel, self.channels)
+        require_known("channel", [channel], self.channels)
         return ExposureFigures(*self.values[self.channels.index(channel)].tolist())
 
     def __repr__(self) -> str:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..loop import ClosedLoop, close_loop
 from ..loop.known import force_name
 from ..lti.responses import responder
@@ -124,12 +122,10 @@ def inverse_forces(
     if outside > _OUTSIDE * float(np.max(np.abs(force))):
         late = np.flatnonzero(np.max(np.abs(force), axis=1) > _OUTSIDE * np.abs(force).max())
         ahead = (size - late[late > size // 2].min(initial=size)) * plant.dt
-        warnings.warn(
+        warn(
             f"forces up to {outside:.3g} N fall outside the run and are cut off: the inverse acts "
             f"{ahead:.3g} s before the run begins, or after it ends. Give the set-point a longer "
-            "rest and the run more time, or lower the bandwidth.",
-            FlexplantWarning,
-            stacklevel=2,
+            "rest and the run more time, or lower the bandwidth."
         )
     own = force[:steps] - _feedback(loop, force[:steps], move, name)
     return {force_name(actuator): own[:, i] for i, actuator in enumerate(plant.u)}

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import AssumptionError, FlexplantWarning, LabelError, ModelError, unknown_label
+from ..errors import AssumptionError, LabelError, ModelError, require_known, warn
 from ..loop import ClosedLoop
 from ..loop.known import DERIVATIVES, references
 from ..loop.noise_sources import white_noise
@@ -204,12 +203,10 @@ def _warn_unstable(loop: ClosedLoop, steps: int) -> bool:
     with np.errstate(over="ignore"):
         growth = float(np.float64(radius) ** steps)
     by = f"{growth:.3g} times" if np.isfinite(growth) else "beyond all numbers"
-    warnings.warn(
+    warn(
         f"the loop is unstable (spectral radius {radius:.9g}; {found.reason}): what grows fastest "
         f"grows {by} in these {steps} samples, and no rms of it means anything. Lower the gain or "
-        "the delay of its controller; loop.modulus_margin shows how far a loop is from this.",
-        FlexplantWarning,
-        stacklevel=3,
+        "the delay of its controller; loop.modulus_margin shows how far a loop is from this."
     )
     return True
 
@@ -243,8 +240,7 @@ def _given(
         ("disturbance", others, disturbance or {}),
     ):
         for name, signal in signals.items():
-            if name not in known:
-                raise unknown_label(kind, name, known, "the plant's w")
+            require_known(kind, [name], known, "the plant's w")
             given[:, plant.w.index(name)] = _sampled(signal, f"{kind} {name!r}", time)
     return given
 
@@ -292,22 +288,18 @@ def _check_setpoint(move: SetPoint, name: str, time: FloatArray) -> None:
     dt = float(time[1]) if time.size > 1 else 0.0
     end = float(time[-1]) + dt
     if move.duration > end * (1.0 + 1e-9):
-        warnings.warn(
+        warn(
             f"{name} lasts {move.duration:.6g} s, longer than the run of {end:.6g} s: it is cut "
             f"off at {float(move.at(end).position):.6g} on its way to {move.stop:.6g}. Simulate "
-            f"for duration={move.duration:.6g} or more.",
-            FlexplantWarning,
-            stacklevel=5,
+            f"for duration={move.duration:.6g} or more."
         )
     if move.rate is not None and dt:
         ratio = 1.0 / (move.rate * dt)
         if abs(ratio - round(ratio)) > 1e-6 * ratio or round(ratio) < 1:
-            warnings.warn(
+            warn(
                 f"{name} switches on a grid of {move.rate:g} Hz, between the samples of the loop's "
                 f"{1.0 / dt:g} Hz: its derivatives are not in phase there. Make it with "
-                f"rate={1.0 / dt:g}.",
-                FlexplantWarning,
-                stacklevel=5,
+                f"rate={1.0 / dt:g}."
             )
 
 

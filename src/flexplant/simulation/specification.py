@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError, unknown_label
+from ..errors import AssumptionError, ModelError, require_known
 from ..loop import ClosedLoop, bandwidth
 from ..values import FloatArray, Value, in_unit, instance, positive, short
 from .exposure import exposure_errors, settling_time
@@ -81,8 +81,7 @@ class Verdict(Value):
 
     def __getitem__(self, name: str) -> float:
         """Return what is reached of a requirement."""
-        if name not in self.names:
-            raise unknown_label("requirement", name, self.names)
+        require_known("requirement", [name], self.names)
         return float(self.values[self.names.index(name)])
 
     def __repr__(self) -> str:
@@ -260,8 +259,7 @@ class Specification(Value):
             given = self.effort
             each = given if isinstance(given, Mapping) else dict.fromkeys(loop.driven, given)
             for name, limit in each.items():
-                if name not in loop.driven:
-                    raise unknown_label("driven actuator", name, loop.driven)
+                require_known("driven actuator", [name], loop.driven)
                 force = float(np.max(np.abs(run[name])))
                 rows.append((f"effort {name}", loop.units.get(name, ""), force, limit, False))
         return rows

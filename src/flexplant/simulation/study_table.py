@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, counted, unknown_label
+from ..errors import ModelError, counted, require_known
 from ..values import Value, instance, short
 
 #: reasons that the repr lists
@@ -49,8 +49,7 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
     def __getitem__(self, name: str) -> npt.NDArray[Any]:
         if name == "failed":
             return np.array(self.failed, dtype=np.str_)
-        if name not in self.columns:
-            raise unknown_label("column", name, self)
+        require_known("column", [name], self)
         return self.columns[name]
 
     def __iter__(self) -> Iterator[str]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import LabelError, ModelError, counted, unknown_label
+from ..errors import LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet, Interpolation, Place
 from ..values import FloatArray, IntArray, Matrix, Value, instance, positive, real_array
 
@@ -118,10 +118,10 @@ class Spring(Value):
     to: Place | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        require_known("direction", [self.direction], DIRECTIONS)
         self._set(
             at=checked_place(self.at, "a spring"),
             stiffness=float(real_array(self.stiffness, "stiffness of a spring", ())),
-            direction=_checked_direction(self.direction),
             to=None if self.to is None else checked_place(self.to, "a spring"),
         )
 
@@ -166,10 +166,10 @@ class Damper(Value):
     to: Place | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
+        require_known("direction", [self.direction], DIRECTIONS)
         self._set(
             at=checked_place(self.at, "a damper"),
             rate=positive(self.rate, "rate of a damper", zero=True),
-            direction=_checked_direction(self.direction),
             to=None if self.to is None else checked_place(self.to, "a damper"),
         )
 
@@ -284,12 +284,6 @@ def checked_place(at: Any, owner: str) -> Any:
             f"{owner} must be at a DOF label like '41:z', a point (x, y, z) in metres or a mapping "
             f"{{label: weight}}, got {at!r:.80}. Use dofs.nearest((x, y, z)), which finds a label."
         ) from None
-
-
-def _checked_direction(direction: Any) -> str:
-    if direction not in DIRECTIONS:
-        raise unknown_label("direction", direction, DIRECTIONS)
-    return str(direction)
 
 
 def _stretch(part: Spring | Damper, dofs: DofSet) -> FloatArray:

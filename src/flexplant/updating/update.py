@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError, SolverError
+from ..errors import ModelError, SolverError, warn
 from ..progress import Progress
 from ..structure.model import FEModel
 from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
@@ -198,27 +197,23 @@ def update(
                 objective, basis, method, best, rounds=rounds, most=max_iterations, tolerance=enough
             )
     if basis is not None and moved(objective, best.p, estimates[-2]) > UNSETTLED:
-        warnings.warn(
+        warn(
             f"defect correction has not settled: round {len(estimates) - 1} still moved the "
             f"estimate by {moved(objective, best.p, estimates[-2]):.2g} standard deviations. "
-            "Give more rounds=, or a reduced model with more modes.",
-            FlexplantWarning,
-            stacklevel=2,
+            "Give more rounds=, or a reduced model with more modes."
         )
     if not best.converged:
         error = best.trail.error
-        warnings.warn(
+        warn(
             f"the update did not converge in {len(best.trail.p) - 1} steps: {best.reason}, error "
             f"{error[-1]:.3g} from {error[0]:.3g}. Look at .history; try other mode numbers, "
-            "start=, starts= or more iterations.",
-            FlexplantWarning,
-            stacklevel=2,
+            "start=, starts= or more iterations."
         )
     fit = _result(model, objective, method, best, begins[0])
     fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates))
     if method.least_squares and is_bad(fit.p_value):
         fit = _widened(fit)
-        warnings.warn(_complaint(fit, objective, best.p), FlexplantWarning, stacklevel=2)
+        warn(_complaint(fit, objective, best.p))
     return fit
 
 

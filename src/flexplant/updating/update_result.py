@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import between
-from ..errors import ModelError, counted, unknown_label
+from ..errors import ModelError, counted, require_known
 from ..modes import Modes, solve_modes
 from ..values import ComplexArray, FloatArray, Rng, Value, generator, short, whole
 from .judgement.goodness import chance
@@ -173,8 +173,7 @@ class UpdateResult(Value):
     rounds: FloatArray | None = None
 
     def __getitem__(self, name: str) -> float:
-        if name not in self.parameters:
-            raise unknown_label("parameter", name, self.parameters)
+        require_known("parameter", [name], self.parameters)
         return float(self.values[self.parameters.index(name)])
 
     @property

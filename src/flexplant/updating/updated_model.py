@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..modes import solve_modes
 from ..modes.normal_form import RIGID_DRAG
 from ..structure.attachments import summed
@@ -47,12 +46,10 @@ def applied(model: Any, parameters: Sequence[Parameter], p: FloatArray) -> Any:
     if damped and any(
         q.matrices(model)[1] is not None and v for q, v in zip(parameters, p, strict=True)
     ):
-        warnings.warn(
+        warn(
             "the model has no D of its own: that of the updated model holds the parameters of the "
             "update alone, and solve_modes(..., damping=) would replace it. Apply the update to a "
-            "model that has its damping, model.with_damping(ModalDamping(0.01)), say.",
-            FlexplantWarning,
-            stacklevel=3,
+            "model that has its damping, model.with_damping(ModalDamping(0.01)), say."
         )
     return changed_model(model, parameters, p)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ...errors import unknown_label
+from ...errors import require_known
 from ...values import FloatArray, Value
 from .goodness import chance, is_bad
 
@@ -80,8 +80,7 @@ class Localisation(Value):
 
     def __getitem__(self, name: str) -> float:
         """Return the score of a candidate."""
-        if name not in self.candidates:
-            raise unknown_label("candidate", name, self.candidates)
+        require_known("candidate", [name], self.candidates)
         return float(self.score[self.candidates.index(name)])
 
     @property

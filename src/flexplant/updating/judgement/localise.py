@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from ...errors import FlexplantWarning, ModelError
+from ...errors import ModelError, warn
 from ...parallel import Progress
 from ...structure.model import FEModel
 from ...values import FloatArray
@@ -152,15 +151,13 @@ def localise(
     )
     if fit is not None and is_bad(found.p_value):
         full = len(best) >= most
-        warnings.warn(
+        warn(
             f"{' and '.join(found.chosen) or 'no change'}, the best that {len(listed)} candidates "
             f"give, {'leave' if len(best) > 1 else 'leaves'} more than noise: chi-square "
             f"{chi2:.4g} for {dof} degrees of freedom. It fits worst {fits.worst(best)}. "
             "Something else differs between model and machine, or the noise is understated: give "
             f"{'most= more, ' if full else ''}candidates at other places or of another kind, "
-            "or what is wrong everywhere as nuisance=.",
-            FlexplantWarning,
-            stacklevel=2,
+            "or what is wrong everywhere as nuisance=."
         )
     return found
 

@@ -10,7 +10,7 @@ from typing import Any, ClassVar, TypeAlias
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import LabelError, ModelError, unknown_label
+from ...errors import LabelError, ModelError, require_known
 from ...labels import DIRECTIONS, Place
 from ...values import FloatArray, Matrix, Value, real_array, short
 
@@ -112,7 +112,7 @@ class PointParameter(Parameter):
     acts_on: ClassVar[int] = 0
 
     def __post_init__(self) -> None:
-        checked_direction(self.direction)
+        require_known("direction", [self.direction], DIRECTIONS)
         place, text = checked_place(self.at, self.direction)
         other = self.to
         if other is not None:
@@ -274,13 +274,6 @@ def checked_text(value: Any, what: str) -> str:
     """
     if not isinstance(value, str):
         raise LabelError(f"{what} must be a text, got {short(value)}. Use quotes.")
-    return value
-
-
-def checked_direction(value: Any) -> str:
-    """Return a direction of motion."""
-    if not isinstance(value, str) or value not in DIRECTIONS:
-        raise unknown_label("direction", value, DIRECTIONS)
     return value
 
 

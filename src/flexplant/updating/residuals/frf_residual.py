@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,12 +10,11 @@ import numpy as np
 import scipy.sparse as sp
 
 from ...arguments import positive_array
-from ...errors import FlexplantWarning, ModelError, ShapeError, counted
-from ...labels import Place
+from ...errors import ModelError, ShapeError, counted, require_known, warn
+from ...labels import DIRECTIONS, Place
 from ...lti import Frf
 from ...values import ComplexArray, FloatArray, flag, instance, positive, short
 from ..family import Family
-from ..parameters.added import checked_direction
 from ..point_model import Point
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
 from .zero_order_hold import Held
@@ -106,7 +104,7 @@ class FrfResidual(Residual):
                     f"variance of shape {given.shape} does not spread to the data's "
                     f"{frf.data.shape}."
                 ) from None
-        checked_direction(self.direction)
+        require_known("direction", [self.direction], DIRECTIONS)
         channel_places([*frf.outputs, *frf.inputs], self.places)
         lines = _checked_lines(self.lines, frf, variance)
         hold, delay = _checked_hold(self.hold, self.delay, frf, lines)
@@ -259,12 +257,10 @@ def _fair(frf: Frf) -> FloatArray | None:
     if frf.variance is None or frf.freedom is None:
         return frf.variance
     if frf.freedom <= LEAST:
-        warnings.warn(
+        warn(
             f"the variance of this Frf has {frf.freedom:.3g} degrees of freedom: |error|^2 / "
             "variance has hardly a mean, and chi-square says little. Average more runs or periods, "
-            "or give variance= that is known otherwise.",
-            FlexplantWarning,
-            stacklevel=5,
+            "or give variance= that is known otherwise."
         )
     nu = max(frf.freedom, LEAST)
     return np.asarray(frf.variance * (nu / (nu - 1)))

@@ -10,13 +10,13 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arguments import positive_array
-from ...errors import LabelError, ModelError, ShapeError, counted
+from ...errors import LabelError, ModelError, ShapeError, counted, require_known
 from ...identification import MeasuredModes
-from ...labels import Place
+from ...labels import DIRECTIONS, Place
 from ...values import ComplexArray, FloatArray, flag, instance, real_array, short, whole
 from ..family import Family, groups
 from ..pairing import CLUSTER, measured_pairs
-from ..parameters.added import checked_direction, checked_place
+from ..parameters.added import checked_place
 from ..point_model import Point
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
 
@@ -80,7 +80,7 @@ class ModeShapes(Residual):
         )
         if self.measured.modes is None:
             raise LabelError(f"{name} needs mode numbers: MeasuredModes(poles, modes=[...]).")
-        checked_direction(self.direction)
+        require_known("direction", [self.direction], DIRECTIONS)
         at, given = _rows(self, name)
         shape = (len(at), len(self.measured))
         real = real_array(np.real(given), "shapes", shape)

@@ -9,11 +9,11 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arguments import positive_array
-from ...errors import ModelError, ShapeError
-from ...labels import Place
+from ...errors import ModelError, ShapeError, require_known
+from ...labels import DIRECTIONS, Place
 from ...values import ComplexArray, FloatArray, positive, real_array
 from ..family import Family
-from ..parameters.added import checked_direction, checked_place
+from ..parameters.added import checked_place
 from ..point_model import Point
 from .residual import Bound, Residual, place_rows, split_parts
 from .zero_order_hold import Held
@@ -286,7 +286,7 @@ class _BoundStatic(Bound):
 
 
 def _check_places(residual: Antiresonances | StaticCompliance) -> None:
-    checked_direction(residual.direction)
+    require_known("direction", [residual.direction], DIRECTIONS)
     for what in ("output", "input"):
         checked_place(getattr(residual, what), residual.direction, what)
 
