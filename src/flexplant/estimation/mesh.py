@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning
+from ..errors import warn
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..structure import FEModel
@@ -95,11 +93,9 @@ def unresolved_share(
     share = float(np.max(shares))
     if share > WARNED:
         named = [c for c, part in zip(poi_channels(plant), shares, strict=True) if part > WARNED]
-        warnings.warn(
+        warn(
             f"{share:.0%} of the predicted variance of {', '.join(named)} is from modes "
             f"that the mesh of larger= resolves with fewer than {NODES:g} nodes a wavelength: "
-            "these errors may be off by as much. Pass a model with a finer mesh as larger=.",
-            FlexplantWarning,
-            stacklevel=4,
+            "these errors may be off by as much. Pass a model with a finer mesh as larger=."
         )
     return max(share, 0.0)

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from typing import Any
 
-from ..errors import FlexplantWarning, ModelError, require_known
+from ..errors import ModelError, require_known, warn
 from ..lti.statespace import System
 from ..plant import StandardPlant, larger_plant, standard_plant
 from ..values import name_list
@@ -96,20 +95,16 @@ def close_loop(
     found = loop.left_out
     if not loop.is_stable:
         if loop.obstacle and loop.obstacle.reason.startswith("unstable"):
-            warnings.warn(
+            warn(
                 f"the closed loop is {loop.obstacle.reason} ({loop.decay}): its signals grow, and "
                 "it has no margin, bandwidth or norm. Check the sign (u = K y), lower the "
-                "bandwidth, or notch the mode at that frequency.",
-                FlexplantWarning,
-                stacklevel=2,
+                "bandwidth, or notch the mode at that frequency."
             )
     elif found is not None and not found.is_stable:
-        warnings.warn(
+        warn(
             f"the loop is stable on its plant, but with the modes left out it is {found.summary}. "
             "The machine has these modes: lower the bandwidth, keep them in the plant, or let the "
-            "controller roll off (or notch) before them.",
-            FlexplantWarning,
-            stacklevel=2,
+            "controller roll off (or notch) before them."
         )
     return loop
 

@@ -77,7 +77,7 @@ def discretized(
             f"{g!r} is sampled already: a rate cannot be changed exactly without the continuous "
             "model. Discretise that one."
         )
-    check_rate(light_modes(g.poles()), rate, delay, stacklevel=2)
+    check_rate(light_modes(g.poles()), rate, delay)
     return held_exactly(g, rate, delay=delay, delayed=delayed)
 
 

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import warnings
-
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..values import ComplexArray, FloatArray, positive
 
 #: times half the rate: where even the lowest mode lies above this, the rate is in another unit
@@ -19,7 +17,7 @@ _LONGEST = 1000.0
 _LIGHT = 0.3
 
 
-def check_rate(modes: FloatArray, rate: float, delay: float, stacklevel: int) -> None:
+def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
     """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate.
 
     Raises
@@ -31,7 +29,7 @@ def check_rate(modes: FloatArray, rate: float, delay: float, stacklevel: int) ->
     Warns
     -----
     FlexplantWarning
-        When all modes lie above half the rate; `stacklevel` as for `warnings.warn`.
+        When all modes lie above half the rate.
     """
     rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
     if 0 < delay < _NO_DELAY:
@@ -55,7 +53,7 @@ def check_rate(modes: FloatArray, rate: float, delay: float, stacklevel: int) ->
     if modes.min() > 0.5 * _HOPELESS * rate:
         raise ModelError(f"{said}{_meant(rate, float(modes.min()))}.")
     said = f"{said}, the model in SI units: are both?"
-    warnings.warn(said, FlexplantWarning, stacklevel=stacklevel + 1)
+    warn(said)
 
 
 def _meant(rate: float, lowest: float) -> str:

@@ -101,7 +101,7 @@ def sampled(plant: P, rate: float, delay: float) -> P:
             f"the plant is {plant.alteration}: sample plant.unweighted, then do so again with "
             "sampled weights and blocks (continuous ones would be distorted by the hold)."
         )
-    check_rate(_elastic(plant), rate, delay, stacklevel=3)
+    check_rate(_elastic(plant), rate, delay)
     for name, late in (plant.assembled.ports.latencies if plant.is_assembled else {}).items():
         check_latency(name, late, rate)
     if not plant.is_assembled:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import warnings
 from abc import abstractmethod
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import FlexplantWarning, ModelError
+from ..errors import ModelError, warn
 from ..values import Value, instance, positive
 from .realisation import MODAL, ModalRealisation, Structure, realised
 
@@ -135,11 +134,9 @@ def modes_of(
     instance(way, ResidualForm, "residual", "Pass FastStates() or Feedthrough().")
     realisation = realised(model)
     if realisation.form != MODAL and realisation is not model:
-        warnings.warn(
+        warn(
             f"this plant is not in modal blocks but {realisation.form}. It is exact all the same; "
             "the damping couples its modes, so that what costs O(n) a frequency or sample costs "
-            "O(n^2) or more, and mode by mode uncertainty is not defined. See plant.form.",
-            FlexplantWarning,
-            stacklevel=3,
+            "O(n^2) or more, and mode by mode uncertainty is not defined. See plant.form."
         )
     return way.applied(realisation)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 from typing import Any, NamedTuple, overload
@@ -11,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 
-from ..errors import FlexplantWarning, ModelError, counted
+from ..errors import ModelError, counted, warn
 from ..lti.frequency import Frf
 from ..lti.frequency import frequency_response as system_response
 from ..lti.grid import sampled_freq
@@ -210,11 +209,9 @@ def frequency_response(
             basis, grid, rows, loads, checks=most, tolerance=limit, seen=through.seen
         )
     if check.freq.size and not check.holds(limit):
-        warnings.warn(
+        warn(
             f"the responses of {model!r:.60} are not good to {limit:g}: {check}. Give more modes, "
-            "solve_modes(model, below=...), which are used while you hold them.",
-            FlexplantWarning,
-            stacklevel=2,
+            "solve_modes(model, below=...), which are used while you hold them."
         )
     return through.frf(
         grid,

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from ..errors import FlexplantWarning, LabelError, ModelError, counted, require_known
+from ..errors import LabelError, ModelError, counted, require_known, warn
 from ..loop import LoopReport, SpillOver, in_axes, report_loops
 from ..loop.axes import static_map
 from ..loop.sensitivity import taken_apart
@@ -230,12 +229,10 @@ def design_loops(
     axes = axes_of(plant, before, after, rate, delay, hold)
     found = made(axes, checked_laws(axes, laws), rigid, unstable, references, larger)
     if found.report.is_stable is False:
-        warnings.warn(
+        warn(
             f"the loops are unstable ({found.report.poles}){_where(axes, found)}. Check sign "
             "and unit of the laws against the crossovers, notch what resonates there, add "
-            "lead, or change the gain.",
-            FlexplantWarning,
-            stacklevel=3,
+            "lead, or change the gain."
         )
     return found
 

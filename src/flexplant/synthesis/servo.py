@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from typing import Any
 
 from ..arguments import between
-from ..errors import FlexplantWarning, ModelError, SolverError
+from ..errors import ModelError, SolverError, warn
 from ..loop import ClosedLoop
 from ..loop.spill_over import growing_modes, named
 from ..parallel import one_thread
@@ -148,12 +147,10 @@ def design_servo(
     if not closed.is_stable:
         _refuse(closed, float(bandwidth), observer is not None, advice)
     elif left_out is not None and not left_out.is_fine:
-        warnings.warn(
+        warn(
             f"with the modes that the plant left out the servo's loop at {bandwidth:g} Hz is "
             f"{left_out.summary}. The machine has these modes{CLOSE if left_out.is_high else ''}. "
-            f"{advice}",
-            FlexplantWarning,
-            stacklevel=3,
+            f"{advice}"
         )
     return Controller(
         task.controller(axis),
@@ -233,9 +230,7 @@ def _refuse(closed: ClosedLoop, bandwidth: float, observed: bool, advice: str) -
     )
     if observed:
         raise SolverError(text)
-    warnings.warn(
-        f"{text} Pass observer= to check the loop that will run.", FlexplantWarning, stacklevel=4
-    )
+    warn(f"{text} Pass observer= to check the loop that will run.")
 
 
 def _notes(task: ServoTask, axis: Axis, checked: bool) -> tuple[str, ...]:

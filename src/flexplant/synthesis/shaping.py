@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..certificates import stability_name
-from ..errors import CertificateError, FlexplantWarning, SolverError
+from ..errors import CertificateError, SolverError, warn
 from ..loop import LoopReport, report_loops
 from ..lti.discretisation import tustin
 from ..lti.interconnection import series, side_by_side
@@ -206,18 +205,14 @@ def shape_loop(
 def _unusual(bandwidth: float, rolloff: float | None, rho: float | None) -> None:
     """Warn of numbers that are allowed and rarely meant."""
     if rolloff is not None and positive(rolloff, "rolloff") < 2.0 * bandwidth:
-        warnings.warn(
+        warn(
             f"rolloff {rolloff:g} Hz is not above twice the bandwidth, {bandwidth:g} Hz: its phase "
-            "lag takes the margin. Three to ten times the bandwidth is usual.",
-            FlexplantWarning,
-            stacklevel=4,
+            "lag takes the margin. Three to ten times the bandwidth is usual."
         )
     if rho is not None and rho > _HEAVY:
-        warnings.warn(
+        warn(
             f"weight {rho:g} counts following the model so much more than robustness that little "
-            "margin is left: 1 to 3 is usual.",
-            FlexplantWarning,
-            stacklevel=4,
+            "margin is left: 1 to 3 is usual."
         )
 
 

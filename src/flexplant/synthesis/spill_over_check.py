@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Sequence
 from typing import Any
 
-from ..errors import FlexplantWarning
+from ..errors import FlexplantWarning, warn
 from ..loop import SpillOver, close_loop
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant, larger_plant
@@ -44,12 +44,10 @@ def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> Spil
         warnings.simplefilter("ignore", FlexplantWarning)
         found = close_loop(plain, *before, *blocks, larger=whole).left_out
     if found is not None and not found.is_fine:
-        warnings.warn(
+        warn(
             f"with the modes that the plant left out the loop is {found.summary}. The machine has "
             f"these modes{CLOSE if found.is_high else ''}: choose less bandwidth, keep them in "
-            "the plant, or weight the efforts (or roll the controller off) before them.",
-            FlexplantWarning,
-            stacklevel=5,
+            "the plant, or weight the efforts (or roll the controller off) before them."
         )
     return found
 
