@@ -85,7 +85,7 @@ def test_what_op2_files_lack_is_said(tmp_path):
         path.write_bytes(content[:cut])
         with pytest.raises(FlexplantError):
             read_modes(path, zeta=0.01, rigid_below=0.1)
-    with pytest.raises(FlexplantError, match=r"run\.op2.*read_modes.*DMIGOP4"):
+    with pytest.raises(FlexplantError, match=r"run\.op2.*read_modes.*MATOP4"):
         fx.read_model(path)
 
 

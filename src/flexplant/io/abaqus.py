@@ -43,7 +43,7 @@ def read_abaqus(
     Parameters
     ----------
     stiffness, mass, damping : str or Path
-        The files `job_STIF2.mtx`, `job_MASS2.mtx` and (viscous damping) `job_DMPV2.mtx`.
+        Of step 1: `job_STIF1.mtx`, `job_MASS1.mtx` and (viscous damping) `job_DMPV1.mtx`.
     inp : str or Path, optional
         The input file, for the coordinates in its `*NODE` blocks.
     dofs : DofSet, optional
@@ -78,7 +78,7 @@ def read_abaqus(
     >>> import flexplant as fx
     >>> import pathlib, tempfile
     >>> with tempfile.TemporaryDirectory() as folder:
-    ...     file = pathlib.Path(folder, "job_STIF2.mtx")
+    ...     file = pathlib.Path(folder, "job_STIF1.mtx")
     ...     _ = file.write_text("1,1, 1,1, 4e5\n2,1, 1,1, -4e5\n2,1, 2,1, 4e5\n")
     ...     found = fx.io.read_abaqus(file)
     >>> found.dofs.labels, found.K.toarray().tolist()

@@ -39,6 +39,10 @@ FORMATS: tuple[Format, ...] = (
     abaqus.ABAQUS,
     sierra.SIERRA,
 )
+_NASTRAN = (
+    "Matrices: EXTSEOUT(ASMBULK,EXTID=1,MATOP4=31) in the case control and ASSIGN "
+    "OUTPUT4='run.op4',UNIT=31 above it write them as .op4, read_op4"
+)
 ELSEWHERE: tuple[Elsewhere, ...] = (
     exodus.MODES,
     exodus.MESH,
@@ -47,14 +51,9 @@ ELSEWHERE: tuple[Elsewhere, ...] = (
     ansys.ELEMENTS,
     Elsewhere(
         (".op2",),
-        "results, of which flexplant.io.read_modes reads the modes. Matrices: EXTSEOUT(ASMBULK, "
-        "EXTID=1, DMIGOP4) in the case control writes them as .op4, read_op4",
+        f"results, of which flexplant.io.read_modes reads the modes. {_NASTRAN}",
     ),
-    Elsewhere(
-        (".f06", ".f04", ".out"),
-        "what a run printed, with too few digits. Matrices: EXTSEOUT(ASMBULK, EXTID=1, DMIGOP4) in "
-        "the case control writes them as .op4, read_op4",
-    ),
+    Elsewhere((".f06", ".f04", ".out"), f"what a run printed, with too few digits. {_NASTRAN}"),
     Elsewhere(
         (".odb", ".fil", ".sim"),
         "results in a form of Abaqus' own. Matrices: *MATRIX GENERATE, STIFFNESS, MASS and *MATRIX "
