@@ -11,6 +11,7 @@ from ..errors import LabelError, ModelError, require_known
 from ..lti.grid import climbed
 from ..values import FloatArray, Value, short
 from .closed import ClosedLoop
+from .margins import first_above
 
 #: share of the bandwidth at which low-frequency suppression is compared
 LOW = 0.1
@@ -222,13 +223,11 @@ def _bandwidth(curve: tuple[FloatArray, FloatArray] | None) -> float:
     if curve is None:
         return float("nan")
     freq, size = curve
-    below = np.flatnonzero(size < 1.0)
-    if not below.size:
+    if not np.any(size < 1.0):
         return 0.0
-    above = np.flatnonzero(size[below[0] :] >= 1.0)
-    if not above.size:
+    right = first_above(size)
+    if right is None:
         return float("inf")
-    right = int(below[0] + above[0])
     pair = slice(right - 1, right + 1)
     return float(np.exp(np.interp(0.0, np.log(size[pair]), np.log(freq[pair]))))
 

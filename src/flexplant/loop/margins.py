@@ -88,22 +88,26 @@ def bandwidth(loop: Loop) -> float:
     vectors, gains, _ = np.linalg.svd(loop_low)
     acting = np.asarray(vectors[:, gains >= 1e-6 * gains[0]], dtype=np.complex128)
     values = _sensitivity_along(acting, parts, grid)
-    below = np.flatnonzero(values < 1.0)
-    if not below.size:
+    if not np.any(values < 1.0):
         raise AssumptionError(
             f"|S| is nowhere below 0 dB (least {values.min():.4g}): this feedback suppresses "
             "nothing, so it has no bandwidth. Check the sign of the controller, u = K y."
         )
-    above = np.flatnonzero(values[below[0] :] >= 1.0)
-    if not above.size:
+    right = first_above(values)
+    if right is None:
         return float("inf")
-    right = int(below[0] + above[0])
     low, high = float(grid[right - 1]), float(grid[right])
     for _ in range(6 if parts.measured is None else 0):
         inner = np.linspace(low, high, 17)
         first = int(np.argmax(_sensitivity_along(acting, parts, inner[1:]) >= 1.0))
         low, high = float(inner[first]), float(inner[first + 1])
     return high
+
+
+def first_above(size: FloatArray) -> int | None:
+    """Return where a size that was below 1 first is not, or None."""
+    beyond = np.flatnonzero((size >= 1.0) & np.logical_or.accumulate(size < 1.0))
+    return int(beyond[0]) if beyond.size else None
 
 
 def _sensitivity_along(acting: ComplexArray, parts: BrokenLoop, grid: FloatArray) -> FloatArray:

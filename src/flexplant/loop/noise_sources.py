@@ -105,25 +105,17 @@ def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
         When the process noise of a sampled plant is not known.
     """
     white, sensors = white_names(plant)
-    size, rows = monitored.n_states, len(monitored.outputs)
-    if not plant.dt:
-        return [_continuous(plant, monitored, name) for name in (*white, *sensors)]
     found = []
-    for name, factor in _factors(plant, white).items():
-        G = np.zeros((size, factor.shape[1]))
+    for name, factor in _factors(plant, white).items() if plant.dt else ():
+        G = np.zeros((monitored.n_states, factor.shape[1]))
         G[: factor.shape[0]] = factor
-        found.append(Source(name, G, np.zeros((rows, G.shape[1]))))
-    for name in sensors:
+        found.append(Source(name, G, np.zeros((len(monitored.outputs), G.shape[1]))))
+    root = np.sqrt(0.5 / (plant.dt or 1.0))
+    for name in sensors if plant.dt else (*white, *sensors):
         column = [monitored.inputs.index(name)]
-        sigma = plant.asd[name] * np.sqrt(0.5 / plant.dt)
-        found.append(Source(name, monitored.B[:, column] * sigma, monitored.D[:, column] * sigma))
+        size = plant.asd[name] * root
+        found.append(Source(name, monitored.B[:, column] * size, monitored.D[:, column] * size))
     return found
-
-
-def _continuous(plant: StandardPlant, monitored: StateSpace, name: str) -> Source:
-    column = [monitored.inputs.index(name)]
-    intensity = plant.asd[name] / np.sqrt(2.0)
-    return Source(name, monitored.B[:, column] * intensity, monitored.D[:, column] * intensity)
 
 
 def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:

@@ -8,13 +8,15 @@ import numpy as np
 
 from ..values import ComplexArray, FloatArray
 
+#: how deep a dip is at least, as a share of the lower one of the two maxima that it lies between
+_DEPTH = 0.5
+#: how many are refined, the deepest on the grid first
+_MOST = 40
+
 
 def dips(
     find: Callable[[FloatArray], ComplexArray],
     grid: FloatArray,
-    *,
-    depth: float = 0.5,
-    most: int = 40,
 ) -> FloatArray:
     """Return the antiresonances [Hz] of responses: deep local minima of the size of a channel.
 
@@ -24,10 +26,6 @@ def dips(
         Of frequencies (m,) [Hz], gives responses (m, ...).
     grid : (n_freq,) array [Hz]
         Where minima are bracketed; each is then found within its bracket to 1e-9 of it.
-    depth : float
-        Of the lower one of the two maxima that a minimum lies between; higher ones are left out.
-    most : int
-        How many are refined, the deepest on the grid first.
 
     Returns
     -------
@@ -39,7 +37,7 @@ def dips(
     lowest = size[place + 1, channel]
     ends = zip(place.tolist(), channel, strict=True)
     sides = np.array([_lower_side(size[:, own], at + 1) for at, own in ends])
-    first = np.argsort(lowest / np.maximum(sides, 1e-300), kind="stable")[:most]
+    first = np.argsort(lowest / np.maximum(sides, 1e-300), kind="stable")[:_MOST]
     place, channel, lowest, sides = place[first], channel[first], lowest[first], sides[first]
     left, centre, right = grid[place], grid[place + 1], grid[place + 2]
     part = np.linspace(0.0, 1.0, 9)[1:-1]
@@ -54,7 +52,7 @@ def dips(
         left, right = edges[rows, best], edges[rows, best + 2]
     share = lowest / np.maximum(sides, 1e-300)
     order = np.argsort(share, kind="stable")
-    return np.asarray(centre[order][share[order] < depth])
+    return np.asarray(centre[order][share[order] < _DEPTH])
 
 
 def _lower_side(size: FloatArray, at: int) -> float:

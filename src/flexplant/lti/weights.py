@@ -63,12 +63,7 @@ def lowpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(fx.lowpass(100.0)(2j * 3.141592653589793 * 100.0)), 4)
     0.7071
     """
-    omega, gain = 2.0 * np.pi * positive(freq, "freq"), _number(gain)
-    if order == 1:
-        return first_order(0.0, gain, omega)
-    if order == 2:
-        return second_order(0.0, 0.0, gain, omega, np.sqrt(0.5))
-    raise ModelError(f"order must be 1 or 2, got {order!r}. Put filters in series for more.")
+    return _butterworth(freq, order, 0.0, _number(gain))
 
 
 def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
@@ -100,11 +95,15 @@ def highpass(freq: float, *, order: int = 1, gain: float = 1.0) -> StateSpace:
     >>> round(abs(high(2j * np.pi * 10.0)), 4), round(abs(high(0.0)), 4)
     (0.7071, 0.0)
     """
-    omega, gain = 2.0 * np.pi * positive(freq, "freq"), _number(gain)
+    return _butterworth(freq, order, _number(gain), 0.0)
+
+
+def _butterworth(freq: float, order: int, high: float, low: float) -> StateSpace:
+    omega = 2.0 * np.pi * positive(freq, "freq")
     if order == 1:
-        return first_order(gain, 0.0, omega)
+        return first_order(high, low, omega)
     if order == 2:
-        return second_order(gain, 0.0, 0.0, omega, np.sqrt(0.5))
+        return second_order(high, 0.0, low, omega, np.sqrt(0.5))
     raise ModelError(f"order must be 1 or 2, got {order!r}. Put filters in series for more.")
 
 

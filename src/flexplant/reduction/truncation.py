@@ -164,12 +164,13 @@ class ModalTruncation(ReductionMethod):
         right = np.sum(C.T * flexible[:, q:]) - np.sum(seen[:, r:].T ** 2 / square)
         both = float(np.sqrt(max(float(left), 0.0) * max(float(right), 0.0)))
         value = both * float(peak_gains(np.ones(1), np.array([law.ratio]))[0])
-        value += _vector_peaks(kept, B, C)
+        vectors, _ = _parts(_vectors(kept), (self.inputs, self.outputs))
+        value += _peaks(vectors)
         # of the lowest modes: none unseen is below the last, all are at most like one there
         lowest = self._numbers == tuple(range(1, kept.n_modes + 1))
         omega = kept.omega[-1] if lowest else 0.0
         terms = [[both * omega**2, omega, law.ratio]] if omega else []
-        terms += _vector_terms(kept, B, C)
+        terms += vectors.tolist()
         return ErrorBound(value, into, out, _RESIDUE, terms=np.array(terms) if omega else None)
 
 
@@ -290,30 +291,13 @@ def truncated(
         kept = _corrected(kept, basis[:, others], omega[others], zeta[others], static)
     bound = None
     if bound_of is not None:
-        whole_set = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
-        into, out, force, seen = channels(whole_set, *bound_of)
-        with np.errstate(invalid="ignore"):
-            value = float(
-                np.linalg.norm(force, axis=1)
-                * np.linalg.norm(seen, axis=0)
-                @ peak_gains(omega[others], zeta[others])
-            )
-        pushed = places(bound_of[0])
-        watched = places(bound_of[1]) or pushed
-        B = np.column_stack([modes.dofs.row(place) for place in pushed])
-        C = np.array([modes.dofs.row(place) for place in watched])
-        value += _vector_peaks(kept, B, C)
-        gain = np.linalg.norm(force, axis=1) * np.linalg.norm(seen, axis=0)
-        terms = np.vstack(
-            [
-                np.column_stack([gain, omega[others], zeta[others]]),
-                np.reshape(_vector_terms(kept, B, C), (-1, 3)),
-            ]
-        )
-        missed = (seen / omega[others] ** 2) @ force
-        if kept.n_vectors:
-            missed = missed - (C @ kept.vectors / kept.vector_omega**2) @ (kept.vectors.T @ B)
-        at_rest = float(np.linalg.norm(missed, 2)) if others.size else 0.0
+        gone = Modes(omega[others], zeta[others], basis[:, others], modes.dofs)
+        into, out, _, _ = channels(gone, *bound_of)
+        terms, missed = _parts(gone, bound_of)
+        vectors, given = _parts(_vectors(kept), bound_of)
+        at_rest = float(np.linalg.norm(missed - given, 2)) if others.size else 0.0
+        terms = np.vstack([terms, vectors])
+        value = _peaks(terms)
         if np.isfinite(value):
             bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest)
     found = _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
@@ -356,21 +340,23 @@ def _corrected(
     )
 
 
-def _vector_peaks(kept: Modes, B: FloatArray, C: FloatArray) -> float:
-    """Return the sum of the peaks of attachment vectors between channels."""
-    if not kept.n_vectors:
-        return 0.0
-    force = np.linalg.norm(kept.vectors.T @ B, axis=1)
-    seen = np.linalg.norm(C @ kept.vectors, axis=0)
-    return float(force * seen @ peak_gains(kept.vector_omega, kept.vector_zeta))
+def _vectors(kept: Modes) -> Modes:
+    """Return attachment vectors as modes of their own."""
+    return Modes(kept.vector_omega, kept.vector_zeta, kept.vectors, kept.dofs)
 
 
-def _vector_terms(kept: Modes, B: FloatArray, C: FloatArray) -> list[list[float]]:
-    """Return gain, frequency and damping of attachment vectors between channels."""
-    if not kept.n_vectors:
-        return []
-    gain = np.linalg.norm(kept.vectors.T @ B, axis=1) * np.linalg.norm(C @ kept.vectors, axis=0)
-    return list(np.column_stack([gain, kept.vector_omega, kept.vector_zeta]).tolist())
+def _parts(modes: Modes, bound_of: tuple[Any, Any]) -> tuple[FloatArray, FloatArray]:
+    """Return gain, frequency and damping (k, 3) of modes between channels, and their static sum."""
+    _, _, force, seen = channels(modes, *bound_of)
+    gain = np.linalg.norm(force, axis=1) * np.linalg.norm(seen, axis=0)
+    return np.column_stack([gain, modes.omega, modes.zeta]), (seen / modes.omega**2) @ force
+
+
+def _peaks(terms: FloatArray) -> float:
+    """Return the sum of the peaks of modes, by gain, frequency and damping."""
+    gain, omega, zeta = terms.T
+    with np.errstate(invalid="ignore"):
+        return float(gain @ peak_gains(omega, zeta))
 
 
 def _diagonal(

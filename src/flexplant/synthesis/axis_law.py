@@ -9,7 +9,7 @@ import numpy as np
 
 from ..values import ComplexArray, FloatArray, IntArray
 from .controller_elements import LowPass, Notch, Pid
-from .law import Law, Section
+from .law import Law, Section, product, tustin_s
 from .measured_axis import MeasuredAxis
 
 #: corner of the integrator beside the bandwidth
@@ -87,7 +87,7 @@ class AxisLaw:
     def _scale(self, numbers: FloatArray) -> float:
         """Return the gain with which the loop of the rigid body crosses 1 at the bandwidth."""
         w = float(np.exp(numbers[0]))
-        there = product(self.sections(numbers), self.tustin(np.array([w])))
+        there = product(self.sections(numbers), tustin_s(np.array([w]), self.axis.rate))
         return float(self.axis.inertia * (2.0 * np.pi * w) ** 2 / abs(there[0]))
 
     def sections(self, numbers: FloatArray) -> list[Section]:
@@ -152,18 +152,4 @@ class AxisLaw:
     @cached_property
     def s(self) -> ComplexArray:
         """The s of each point, by Tustin's rule where the law is sampled."""
-        return self.tustin(self.axis.points[0])
-
-    def tustin(self, freq: FloatArray) -> ComplexArray:
-        """Return the s at which a sampled law has its response at frequencies [Hz]."""
-        rate = self.axis.rate
-        omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq
-        return np.asarray(1j * omega, dtype=np.complex128)
-
-
-def product(sections: list[Section], s: ComplexArray) -> ComplexArray:
-    """Return the response of sections one after the other at complex frequencies s [rad/s]."""
-    value = np.ones(s.shape, dtype=np.complex128)
-    for section in sections:
-        value *= section.gain(s)
-    return value
+        return tustin_s(self.axis.points[0], self.axis.rate)

@@ -17,6 +17,7 @@ from ..lti.statespace import StateSpace
 from ..parallel import Progress
 from ..values import Value, positive
 from .central import OnAxisError, central, indefinite, quadratic, riccati_solutions
+from .lower_bound import parrott
 from .method import SolvedController
 from .reach import beyond_rounding
 from .singular import made_regular, missing_ranks, require_ranks
@@ -205,16 +206,12 @@ def _direct_bound(problem: Prepared) -> float:
 
 
 def _bound_at(problem: Prepared, omega: float) -> float:
-    """Return a lower bound of gamma at one frequency: the part that u or y does not reach."""
-    m1, p1 = problem.B1.shape[1], problem.C1.shape[0]
+    """Return a lower bound of gamma at one frequency, 0 at an undamped pole."""
     try:
         P = problem.system.evaluated(1j * omega)
-    except ModelError:  # an undamped pole lies there
+    except ModelError:
         return 0.0
-    out_of_reach = la.svd(P[:p1, m1:])[0][:, P.shape[1] - m1 :]
-    unseen = la.svd(P[p1:, :m1])[2].conj().T[:, P.shape[0] - p1 :]
-    parts = (out_of_reach.conj().T @ P[:p1, :m1], P[:p1, :m1] @ unseen)
-    return max(float(np.linalg.norm(part, 2)) if part.size else 0.0 for part in parts)
+    return float(parrott(P[None], problem.B1.shape[1], problem.C1.shape[0])[0])
 
 
 def _norm(problem: Prepared, controller: StateSpace) -> float:

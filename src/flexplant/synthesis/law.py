@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ..errors import ModelError
 from ..lti.discretisation import trapezoidal
 from ..lti.frequency import sampled_freq
-from ..lti.joining import cascaded
+from ..lti.joining import Matrices, cascaded
 from ..lti.statespace import StateSpace
 from ..values import ComplexArray, FloatArray, Value, flag, instance, positive, real_array, short
 
@@ -265,18 +265,15 @@ class Law(Element):
     def system(self) -> StateSpace:
         """The system from error to command, sampled where the law is."""
         a = 2.0 * self.rate
-        joined = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
-        for section in self._sections:
-            part = section.matrices
-            # sampled each on its own: states of one size
-            joined = cascaded(joined, trapezoidal(part, a) if a else part)
-        A, B, C, D = joined
+        parts = [section.matrices for section in self._sections]
+        # sampled each on its own: states of one size
+        A, B, C, D = chained(self.gain, [trapezoidal(one, a) for one in parts] if a else parts)
         sizes = [section.order for section in self._sections if section.order]
         return StateSpace(
             A,
             B,
-            self.gain * C,
-            self.gain * D,
+            C,
+            D,
             1.0 / self.rate if self.rate else 0.0,
             inputs=["error"],
             outputs=["command"],
@@ -300,11 +297,25 @@ class Law(Element):
 
     def at(self, freq: FloatArray) -> ComplexArray:
         """Return the response at frequencies [Hz] in any order, which are not checked."""
-        # Tustin's s: 2 rate (z - 1) / (z + 1)
-        rate = self.rate
-        omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq
-        s = np.asarray(1j * omega, dtype=np.complex128)
-        value = np.full(freq.shape, self.gain, dtype=np.complex128)
-        for section in self._sections:
-            value = value * section.gain(s)
-        return value
+        return self.gain * product(self._sections, tustin_s(freq, self.rate))
+
+
+def chained(gain: float, parts: Iterable[Matrices]) -> Matrices:
+    """Return A, B, C and D of matrices one after the other, then a gain."""
+    start = np.zeros((0, 0)), np.zeros((0, 1)), np.zeros((1, 0)), np.ones((1, 1))
+    A, B, C, D = reduce(cascaded, parts, start)
+    return A, B, gain * C, gain * D
+
+
+def tustin_s(freq: FloatArray, rate: float) -> ComplexArray:
+    """Return ``2 rate (z - 1) / (z + 1)`` at frequencies [Hz]; j omega of a continuous law."""
+    omega = 2.0 * rate * np.tan(np.pi * freq / rate) if rate else 2.0 * np.pi * freq
+    return np.asarray(1j * omega, dtype=np.complex128)
+
+
+def product(sections: Iterable[Section], s: ComplexArray) -> ComplexArray:
+    """Return the response of sections one after the other at complex frequencies s [rad/s]."""
+    value = np.ones(s.shape, dtype=np.complex128)
+    for section in sections:
+        value *= section.gain(s)
+    return value

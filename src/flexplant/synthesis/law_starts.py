@@ -9,7 +9,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ..values import ComplexArray, FloatArray, IntArray
-from .axis_law import AxisLaw, product
+from .axis_law import AxisLaw
+from .law import product, tustin_s
 
 #: shapes: zero below and pole above the bandwidth, low-pass above it
 _LEADS = tuple((a, b) for a in (2.0, 3.0, 4.2, 6.0, 10.0) for b in (4.0, 8.0, 20.0))
@@ -68,7 +69,7 @@ def _sets(of: AxisLaw, notches: int) -> list[FloatArray]:
 
 def _at(of: AxisLaw, w: float, sets: list[FloatArray], rows: IntArray) -> list[_Start]:
     """Return for each set of notches the best start at one bandwidth [Hz]."""
-    top, s = of.axis.ceiling, np.append(of.s[rows], of.tustin(np.array([w])))
+    top, s = of.axis.ceiling, np.append(of.s[rows], tustin_s(np.array([w]), of.axis.rate))
     shapes = sorted({(a, min(b, top / w), min(c, top / w)) for a, b in _LEADS for c in _TAILS})
     numbers = [np.log([w, *shape]) for shape in shapes]
     bodies = np.array([product(of.sections(one), s) for one in numbers])

@@ -62,8 +62,8 @@ def reconstructed(
     C: FloatArray,
     D: FloatArray,
 ) -> Matrices:
-    """Return the controller from the changed variables, with ``N M' = I - X Y`` by SVD."""
-    n, nw, nz = p.A.shape[0], p.B1.shape[1], p.C1.shape[0]
+    """Return the controller from the changed variables."""
+    nw, nz = p.B1.shape[1], p.C1.shape[0]
     Bw, Cz = p.B1 + p.B2 @ D @ p.D21, p.C1 + p.D12 @ D @ p.C2
     Dzw = p.D11 + p.D12 @ D @ p.D21
     inner = np.block([[gamma * np.eye(nw), -Dzw.T], [-Dzw, gamma * np.eye(nz)]])
@@ -72,14 +72,19 @@ def reconstructed(
     A = p.A + p.B2 @ D @ p.C2
     # the off-diagonal block of Schur's complement is made zero
     A_hat = -A.T - of_X @ np.linalg.solve(inner, of_Y.T)
-    left, values, right = la.svd(np.eye(n) - X @ Y)
+    return changed_back(p, X, Y, (A_hat, B, C, D))
+
+
+def changed_back(p: Plant, X: FloatArray, Y: FloatArray, changed: Matrices) -> Matrices:
+    """Return the controller of changed variables in the plant's units, with ``N M' = I - X Y``."""
+    A, B, C, D = changed
+    left, values, right = la.svd(np.eye(len(X)) - X @ Y)
     N, M = left * np.sqrt(values), right.T * np.sqrt(values)
-    CK, BK = C - D @ p.C2 @ Y, B - X @ p.B2 @ D
-    AK = A_hat - X @ A @ Y - X @ p.B2 @ CK - BK @ p.C2 @ Y
-    root = np.sqrt(p.speed)
-    AK, BK, CK = la.solve(N, la.solve(M, AK.T).T), la.solve(N, BK), la.solve(M, CK.T).T
-    u_size = p.u_size[:, None]
-    return p.speed * AK, root * BK / p.y_size, root * CK / u_size, D / p.y_size / u_size
+    C, B = C - D @ p.C2 @ Y, B - X @ p.B2 @ D
+    A = A - X @ (p.A + p.B2 @ D @ p.C2) @ Y - X @ p.B2 @ C - B @ p.C2 @ Y
+    A, B, C = la.solve(N, la.solve(M, A.T).T), la.solve(N, B), la.solve(M, C.T).T
+    root, u_size = np.sqrt(p.speed), p.u_size[:, None]
+    return p.speed * A, root * B / p.y_size, root * C / u_size, D / p.y_size / u_size
 
 
 def verified(problem: Prepared, K: Matrices, target: float) -> float:

@@ -13,7 +13,7 @@ from ..loop import LoopReport, SpillOver, in_axes, report_loops
 from ..loop.axes import static_map
 from ..loop.sensitivity import taken_apart
 from ..lti.frequency import Frf
-from ..lti.interconnection import append, series
+from ..lti.interconnection import series, side_by_side
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..parallel import one_thread
 from ..plant import StandardPlant, decouple
@@ -143,16 +143,9 @@ def axes_of(
 
 def axes_controller(axes: Axes, laws: Mapping[str, Law]) -> StateSpace:
     """Return motions to commands of the axes, ``-diag(laws)``."""
-    each = [
-        (-laws[name].system).replace(
-            inputs=[name],
-            outputs=[command],
-            states=[f"{name}|{s}" for s in laws[name].system.states],
-        )
-        for name, command in zip(axes.names, axes.before.inputs, strict=True)
-    ]
     dt = 1.0 / axes.rate if axes.rate else 0.0
-    return append(*(one.replace(dt=dt) for one in each))
+    each = [(-laws[name].system).replace(dt=dt) for name in axes.names]
+    return side_by_side(each, axes.names).replace(outputs=axes.before.inputs)
 
 
 @one_thread()

@@ -67,13 +67,13 @@ def pointwise_bound(problem: Prepared) -> float:
     grid = grid[np.all(apart > _UNDAMPED * (1.0 + np.abs(undamped.imag)), axis=1)]
 
     def bounds(freq: FloatArray) -> FloatArray:
-        return _parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
+        return parrott(np.moveaxis(responses(system, freq), 2, 0), m1, p1)
 
     swept, _ = highest(bounds, grid, _REFINEMENTS)
-    return max(swept, float(_parrott(system.D[None], m1, p1)[0]))
+    return max(swept, float(parrott(system.D[None], m1, p1)[0]))
 
 
-def _parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:
+def parrott(P: ComplexArray | FloatArray, m1: int, p1: int) -> FloatArray:
     """Return the bound of each of a stack of responses (n_freq, p, m)."""
     Pzw = P[:, :p1, :m1]
     parts = (_beyond(P[:, :p1, m1:], Pzw), _beyond(_adjoint(P[:, p1:, :m1]), _adjoint(Pzw)))

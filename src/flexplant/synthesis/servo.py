@@ -108,15 +108,7 @@ def design_servo(
     >>> fx.close_loop(plant, observer, servo).is_stable
     True
     """
-    task = servo_task(
-        plant,
-        poi=poi,
-        rolloff=rolloff,
-        integrator=integrator,
-        notches=notches,
-        observer=observer,
-        larger=larger,
-    )
+    task = servo_task(plant, poi, rolloff, integrator, notches, observer, larger)
     if positive(bandwidth, "bandwidth") >= 0.2 * task.rate:
         raise ModelError(
             f"bandwidth {bandwidth:g} Hz is not well below the rate, {task.rate:g} Hz: the lead "
@@ -207,15 +199,7 @@ def servo_bandwidth(
     True
     """
     peak = between(peak, "peak", 1.0, float("inf"), "No loop keeps |S| below 1: try 2.")
-    task = servo_task(
-        plant,
-        poi=poi,
-        rolloff=rolloff,
-        integrator=integrator,
-        notches=notches,
-        observer=observer,
-        larger=larger,
-    )
+    task = servo_task(plant, poi, rolloff, integrator, notches, observer, larger)
     return task.largest(float(peak))
 
 

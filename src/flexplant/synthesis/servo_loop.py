@@ -203,9 +203,7 @@ def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace
     return inner if inner.dt == plant.dt else inner.replace(dt=plant.dt)
 
 
-def highest(
-    freq: Sequence[float], holds: Callable[[float], bool], *, halvings: int = 6
-) -> float | None:
+def highest(freq: Sequence[float], holds: Callable[[float], bool]) -> float | None:
     """Return the largest frequency that holds: of a descending grid, then by bisection above."""
     above: float | None = None
     for one in freq:
@@ -213,7 +211,7 @@ def highest(
             if above is None:
                 return one
             low, high = one, above
-            for _ in range(halvings):
+            for _ in range(6):
                 middle = float(np.sqrt(low * high))
                 low, high = (middle, high) if holds(middle) else (low, middle)
             return low

@@ -184,7 +184,6 @@ class ServoTask:
 
 def servo_task(
     given: StandardPlant,
-    *,
     poi: str | None,
     rolloff: float | None,
     integrator: float | None,

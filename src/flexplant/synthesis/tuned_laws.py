@@ -14,7 +14,7 @@ from ..lti.preparation import Prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, name_list, rebuild
-from .law import Element, Law, Section, SingleElement
+from .law import Element, Law, Section, SingleElement, chained
 from .loop_design import axes_of, checked_laws
 from .structured_loop import Matrices
 from .structures import DIFFERENCES, ControllerFamily
@@ -151,7 +151,7 @@ class _Laws(ControllerFamily):
                     scaled = {name: size * getattr(element, name)}
                     moved[factor] = _with(element, scaled).section.at(self._rate(i))
                     size = 1.0
-                parts = in_series(size * gain, moved)
+                parts = chained(size * gain, [one.matrices for one in moved])
                 found[k] += weight * sum(
                     float(np.sum(g * m)) for g, m in zip(mine, parts, strict=True)
                 )
@@ -194,7 +194,7 @@ class _Laws(ControllerFamily):
         count = len(self._each[axis].factors)
         corners = [f for i in range(count) for f in _corners(self._element(axis, i, theta))]
         far = any(corner > self._highest for corner in corners)
-        return in_series(np.nan if far else gain, sections)
+        return chained(np.nan if far else gain, [one.matrices for one in sections])
 
 
 def _factor(theta: float) -> float:
@@ -222,18 +222,3 @@ def _free(axis: int, law: Law, names: Sequence[str]) -> list[_Number]:
         found += [_Number(axis, i, name) for name in own if getattr(factor, name)]
     gains = any(number.name in "pid" for number in found)
     return found if gains or "p" not in names else [_Number(axis, -1, "gain"), *found]
-
-
-def in_series(gain: float, sections: Sequence[Section]) -> tuple[FloatArray, ...]:
-    """Return A, B, C and D of a gain and sections one after the other."""
-    parts = [section.matrices for section in sections]
-    n = sum(part[0].shape[0] for part in parts)
-    A, B, C, D = np.zeros((n, n)), np.zeros((n, 1)), np.zeros((1, n)), gain
-    at = 0
-    for a, b, c, d in parts:
-        end = at + a.shape[0]
-        A[at:end, :at], A[at:end, at:end] = b @ C[:, :at], a
-        B[at:end] = b * D
-        C[:, :at] *= d[0, 0]
-        C[:, at:end], D, at = c, d[0, 0] * D, end
-    return A, B, C, np.array([[D]])

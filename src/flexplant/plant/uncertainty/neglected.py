@@ -11,8 +11,9 @@ import numpy as np
 from ...errors import CertificateError, ModelError, counted
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import side_by_side
+from ...lti.splitting import part_of
 from ...lti.statespace import StateSpace, System
-from ...values import ComplexArray, FloatArray, IntArray, Value, whole
+from ...values import ComplexArray, FloatArray, Value, whole
 from ..building import sampled_like, with_modes_of
 from ..partition import Partition, is_plant
 from ..realisation import Structure
@@ -82,13 +83,7 @@ class NeglectedModes(Value):
         W = self.weights
         heads = tuple(f"{name}:neglected:" for name in outputs)
         kept = np.array([name.startswith(heads) for name in W.states], dtype=bool)
-        rows = W.output_index(outputs)
-        weights = StateSpace(
-            W.A[np.ix_(kept, kept)], W.B[np.ix_(kept, rows)], W.C[np.ix_(rows, kept)],
-            W.D[np.ix_(rows, rows)], W.dt, inputs=outputs, outputs=outputs,
-            states=[name for name, own in zip(W.states, kept, strict=True) if own],
-            blocks=_blocks_of(W, np.flatnonzero(kept)),
-        )  # fmt: skip
+        weights = part_of(W, kept).select(outputs, outputs)
         mirrored = {name: of for name, of in self.mirrored.items() if of in outputs}
         return self.replace(weights=weights, outputs=tuple(outputs), mirrored=mirrored)
 
@@ -244,32 +239,20 @@ def _elastic(small: Partition, big: Partition) -> Pair:
     systems, bodies = [], []
     for plant in (small, big):
         g = plant.system.select(*names)
-        rigid = np.arange(0)
+        rigid = np.zeros(g.n_states, dtype=bool)
         if plant.n_rigid:
-            rigid = plant.modal_states[: 2 * plant.n_rigid]
-        kept = np.setdiff1d(np.arange(g.n_states), rigid)
-        body = g.C[:, rigid] @ g.A[np.ix_(rigid, rigid)] @ g.B[rigid] if len(rigid) else 0.0
-        bodies.append(np.asarray(body))
-        systems.append(StateSpace(
-            g.A[np.ix_(kept, kept)], g.B[kept], g.C[:, kept], g.D,
-            g.dt, inputs=g.inputs, outputs=g.outputs, blocks=_blocks_of(g, kept),
-        ))  # fmt: skip
+            rigid[plant.modal_states[: 2 * plant.n_rigid]] = True
+        body = part_of(g, rigid)
+        bodies.append(body.C @ body.A @ body.B)
+        systems.append(part_of(g, ~rigid))
     _same_body(*bodies)
     return systems[0], systems[1]
-
-
-def _blocks_of(g: StateSpace, kept: IntArray) -> list[int] | None:
-    """Return the sizes of the blocks of A that are kept, each of them whole."""
-    if g.blocks is None:
-        return None
-    owner = np.repeat(np.arange(len(g.blocks)), g.blocks)[kept]
-    return [g.blocks[i] for i in np.unique(owner).tolist()]
 
 
 def _same_body(one: FloatArray, other: FloatArray) -> None:
     size = np.abs(one).max(initial=0.0), np.abs(other).max(initial=0.0)
     if one.shape != other.shape or np.any(
-        np.abs(one - other) > _SAME_BODY * np.abs(one).max(axis=-1, keepdims=True)
+        np.abs(one - other) > _SAME_BODY * np.abs(one).max(axis=-1, keepdims=True, initial=0.0)
     ):
         raise ModelError(
             "the difference grows toward low frequencies: the two differ in their rigid body "

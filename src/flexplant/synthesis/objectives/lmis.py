@@ -6,11 +6,10 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy.linalg as la
 
-from ...values import FloatArray
 from ..lmi_plant import Plant
 from ..lmi_programs import modelling, symmetric_blocks
+from ..lmi_solution import Matrices, changed_back
 from .sampled_poles import PoleDisc, PoleEdge
 
 #: strictness of the inequalities, relative to unit scale
@@ -85,19 +84,11 @@ class Variables:
         n = self.plant.A.shape[0]
         return symmetric_blocks([[self.Y, _APART * np.eye(n)], [self.X]]) >> _STRICT * np.eye(2 * n)
 
-    def controller(self) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-        """Return A, B, C, D of the controller in the plant's units, from ``N M' = I - X Y``."""
-        p = self.plant
-        X, Y, D = self.X.value, self.Y.value, self.K_D.value
-        n = p.A.shape[0]
-        left, values, right = la.svd(np.eye(n) - X @ Y)
-        N, M = left * np.sqrt(values), right.T * np.sqrt(values)
-        C, B = self.K_C.value - D @ p.C2 @ Y, self.K_B.value - X @ p.B2 @ D
-        A = self.K_A.value - X @ (p.A + p.B2 @ D @ p.C2) @ Y - X @ p.B2 @ C - B @ p.C2 @ Y
-        A, B, C = la.solve(N, la.solve(M, A.T).T), la.solve(N, B), la.solve(M, C.T).T
-        root, u_size = np.sqrt(p.speed), p.u_size[:, None]
-        A = p.speed * A + (np.eye(n) if self.root else 0.0)
-        return A, root * B / p.y_size, root * C / u_size, D / u_size / p.y_size
+    def controller(self) -> Matrices:
+        """Return A, B, C, D of the controller in the plant's units."""
+        changed = (self.K_A.value, self.K_B.value, self.K_C.value, self.K_D.value)
+        A, B, C, D = changed_back(self.plant, self.X.value, self.Y.value, changed)
+        return A + (np.eye(len(A)) if self.root else 0.0), B, C, D
 
 
 def hinf(v: Variables, channel: Channel, gamma: Any) -> list[Any]:

@@ -184,18 +184,14 @@ def _designed(
 def _judged(uncertain: UncertainPlant[Any], K: StateSpace, w: Any, z: Any) -> _DkStep:
     """Return mu of robust performance of a controller, real Deltas real."""
     loop = uncertain_loop(uncertain, [K], w=w, z=z)
-    p = len(loop.system.outputs) - sum(block.z for block in loop.blocks)
-    m = len(loop.system.inputs) - sum(block.w for block in loop.blocks)
-    blocks = [*loop.blocks, FullBlock(m, p, name="performance")]
+    blocks = [*loop.blocks, loop.performance]
     found = covered(loop.system, blocks, heights=loop.heights, accuracy=0.02)
     return _DkStep(float(np.sqrt(found.level)), K, loop, loop.freq(found.omega))
 
 
 def _scales_of(plant: OpenPlant, loop: UncertainLoop, order: int) -> _DFilters:
     """Return D of a loop as filters: one for each block, its Delta taken as complex."""
-    p = len(loop.system.outputs) - sum(block.z for block in loop.blocks)
-    m = len(loop.system.inputs) - sum(block.w for block in loop.blocks)
-    blocks = [FullBlock(block.w, block.z) for block in loop.blocks] + [FullBlock(m, p)]
+    blocks = [FullBlock(block.w, block.z) for block in (*loop.blocks, loop.performance)]
     scalings, where = Scalings(blocks), places(blocks)
     omega = _grid(loop.system)
     rows = []

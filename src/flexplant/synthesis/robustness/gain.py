@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from ...errors import AssumptionError, CertificateError, ModelError
-from ...loop import ClosedLoop
 from ...lti.frequency import frequency_response
 from ...lti.norms import peak_gain
 from ...lti.statespace import StateSpace
@@ -23,7 +22,7 @@ from .machine import machine, neglected_delta, values_of
 from .perturbation import Perturbation, matrix_of
 from .sweep import INTERVALS, Covered, covered
 from .uncertain_loop import UncertainLoop, uncertain_loop
-from .uncertainty_blocks import FullBlock, places
+from .uncertainty_blocks import places
 
 #: frequencies that start a search, starts at each, rounds over all real Deltas
 _SOUGHT, _STARTS, _ROUNDS = 5, 3, 3
@@ -154,14 +153,12 @@ def worst_case_gain(
             "a gain is from some w to some z: name them, w=['die:ref'], z=['die:error']."
         )
     loop = uncertain_loop(uncertain, blocks, w=w, z=z)
-    p = len(loop.system.outputs) - loop.n_real - len(loop.neglected_z)
-    m = len(loop.system.inputs) - loop.n_real - len(loop.neglected_w)
-    listed = [*loop.blocks, FullBlock(m, p, name="performance")]
+    listed = [*loop.blocks, loop.performance]
     inside = np.zeros(len(listed), dtype=bool)
     inside[-1] = True
-    nominal, _ = peak_gain(_performance(loop, loop.uncertain.plant, m, p))
+    nominal, _ = peak_gain(_performance(loop, loop.uncertain.plant))
     size = nominal or 1.0
-    M = _in_units(loop.system, size, p)
+    M = _in_units(loop.system, size, loop.performance.z)
     with Progress(None, INTERVALS, progress=progress):
         found = covered(M, listed, inside.tolist(), loop.heights)
     if not np.isfinite(found.level):
@@ -173,7 +170,7 @@ def worst_case_gain(
         )
     upper = size * float(np.sqrt(found.level))
     candidates = _candidates(loop, M, listed, found, chance)
-    reached = [_reached(loop, one, m, p) for one in candidates]
+    reached = [_reached(loop, one) for one in candidates]
     lower, freq, values, made = max(reached, key=lambda one: one[0])
     if not lower <= upper * (1.0 + 1e-2):
         raise CertificateError(
@@ -203,12 +200,12 @@ def _in_units(M: StateSpace, size: float, p: int) -> StateSpace:
 
 
 def _reached(
-    loop: UncertainLoop, one: Perturbation, m: int, p: int
+    loop: UncertainLoop, one: Perturbation
 ) -> tuple[float, float, dict[str, float], StandardPlant]:
     """Return the gain of the machine of a perturbation, where it is, its Deltas, and itself."""
     values = values_of(loop, one, 1.0)
     made = machine(loop, values, neglected_delta(loop, one, 1.0))
-    closed = _performance(loop, made, m, p)
+    closed = _performance(loop, made)
     if not loop.neglected_w:
         gain, freq = peak_gain(closed)
         return gain, freq, values, made
@@ -220,10 +217,10 @@ def _reached(
     return float(gains[where]), float(freqs[where]), values, made
 
 
-def _performance(loop: UncertainLoop, plant: StandardPlant, m: int, p: int) -> StateSpace:
+def _performance(loop: UncertainLoop, plant: StandardPlant) -> StateSpace:
     """Return the weighted w -> z of the loop around a machine, sampled as it is."""
-    nominal = loop.loop
-    closed = ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle).system
+    p, m = loop.performance.z, loop.performance.w
+    closed = loop.around(plant).system
     return loop.with_weights(closed.select(loop.system.outputs[-p:], loop.system.inputs[-m:]))
 
 

@@ -20,6 +20,8 @@ _LADDER = np.array([1.0, 1.005, 1.02, 1.05, 1.1, 1.2, 1.5, 2.0, 3.0, 5.0, 10.0, 
 _FINE = 1e-4
 #: phases of complex blocks that are tried
 _PHASES = 25
+#: random starts at each frequency
+_RESTARTS = 4
 #: steps towards worse signs of the real Deltas
 _ASCENTS = 6
 
@@ -303,8 +305,6 @@ def destabilising(
     blocks: Sequence[Block],
     omegas: Sequence[float],
     level: float,
-    *,
-    restarts: int = 4,
     rng: np.random.Generator,
 ) -> Destabilising | None:
     """Return the smallest perturbation found that makes a loop unstable.
@@ -319,8 +319,6 @@ def destabilising(
         Where to search.
     level : float
         mu from above: nothing smaller than its inverse destabilises.
-    restarts : int
-        Random starts at each frequency.
     rng : Generator
         Of the starts.
     """
@@ -329,7 +327,7 @@ def destabilising(
     best: Destabilising | None = None
     for omega in omegas:
         gain = M.evaluated(1j * omega)
-        starts = [power_iteration(gain, where, rng, omega) for _ in range(restarts)]
+        starts = [power_iteration(gain, where, rng, omega) for _ in range(_RESTARTS)]
         first = Destabilising(0.0, starts[0], omega)
         signs = worse_signs(M, blocks, first, near=1j * omega)
         for start in [*starts, *([] if signs is None else [signs])]:

@@ -139,7 +139,7 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     def hertz(omega: Any) -> Any:
         return np.arctan(0.5 * g.dt * omega) / (np.pi * g.dt) if g.dt else omega / (2 * np.pi)
 
-    best = destabilising(image, listed, sought(image, found), upper, rng=chance)
+    best = destabilising(image, listed, sought(image, found), upper, chance)
     delta: ComplexArray = np.zeros((len(g.inputs), len(g.outputs)), dtype=np.complex128)
     if best is not None:
         delta = best.size * matrix_of(best.found, places(listed))

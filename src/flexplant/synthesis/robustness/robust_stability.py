@@ -221,7 +221,7 @@ def _worst(
     """Return the smallest perturbation that destabilises, as far as it was found."""
     omegas = sought(loop.system, found)
     if not loop.neglected_w:
-        return destabilising(loop.system, loop.blocks, omegas, upper, rng=rng)
+        return destabilising(loop.system, loop.blocks, omegas, upper, rng)
     where, best = places(loop.blocks), None
     for omega in omegas:
         gain = loop.system.evaluated(1j * omega) * loop.heights(omega, omega)
@@ -250,7 +250,7 @@ def _shown(
             made = machine(loop, values, neglected_delta(loop, worst.found, size))
         except FlexplantError:  # no stiffness left, say: it can only be computed
             return values, None, 1.0 / worst.size
-        if not ClosedLoop(made, loop.loop.blocks, loop.loop.controller, loop.loop.idle).is_stable:
+        if not loop.around(made).is_stable:
             return values, made, 1.0 / size
     return values, None, 0.0
 
@@ -273,7 +273,7 @@ def _tried(
             zip(names, (size * rng.choice([-1.0, 1.0], len(names))).tolist(), strict=True)
         )
         made = loop.uncertain.lft(corner)
-        worst = max(worst, stability(close_loop_poles(loop, made), loop.dt))
+        worst = max(worst, stability(loop.around(made).poles(), loop.dt))
     if not worst < (1.0 if loop.dt else 0.0):
         raise CertificateError(
             f"a machine with Deltas of {size:.3g} is unstable ({worst:.9g}), but mu <= "
@@ -283,9 +283,3 @@ def _tried(
         return {}
     kind = "largest spectral radius" if loop.dt else "largest real part"
     return {f"{kind} of {count} machines": worst}
-
-
-def close_loop_poles(loop: UncertainLoop, plant: StandardPlant) -> Any:
-    """Return the poles of the controller's loop around another machine."""
-    nominal = loop.loop
-    return ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle).poles()

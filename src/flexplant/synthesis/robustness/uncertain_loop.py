@@ -15,6 +15,7 @@ from ...lti.discretisation import bilinear
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace
+from ...plant import StandardPlant
 from ...plant.uncertainty.delta_channels import DeltaChannels, delta_channels
 from ...plant.uncertainty.uncertain_plant import UncertainPlant
 from ...values import FloatArray, name_list, short
@@ -112,6 +113,19 @@ class UncertainLoop(OpenPlant):
     """``[z_Delta; neglected; z] = M [w_Delta; neglected; w]`` with the controller closed."""
 
     loop: ClosedLoop
+
+    @property
+    def performance(self) -> FullBlock:
+        """The block from z back to w."""
+        n, m = (sum(getattr(block, side) for block in self.blocks) for side in ("z", "w"))
+        return FullBlock(
+            len(self.system.inputs) - m, len(self.system.outputs) - n, name="performance"
+        )
+
+    def around(self, plant: StandardPlant) -> ClosedLoop:
+        """Return the controller's loop around another machine."""
+        nominal = self.loop
+        return ClosedLoop(plant, nominal.blocks, nominal.controller, nominal.idle)
 
 
 def open_plant(
