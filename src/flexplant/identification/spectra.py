@@ -81,12 +81,8 @@ class H2Estimator(SpectralMethod):
 
     Parameters
     ----------
-    segment : float, optional
-        Length of a segment [s]; an eighth of the record when not given.
-    overlap : float
-        Share of a segment that the next one sees again, 0 to below 1.
-    window : str or tuple
-        As `scipy.signal.get_window` takes.
+    segment, overlap, window : optional
+        As for `H1Estimator`.
 
     Raises
     ------
@@ -116,12 +112,8 @@ class HvEstimator(SpectralMethod):
 
     Parameters
     ----------
-    segment : float, optional
-        Length of a segment [s]; an eighth of the record when not given.
-    overlap : float
-        Share of a segment that the next one sees again, 0 to below 1.
-    window : str or tuple
-        As `scipy.signal.get_window` takes.
+    segment, overlap, window : optional
+        As for `H1Estimator`.
 
     Raises
     ------

@@ -89,19 +89,8 @@ def read_matrices(
     ----------
     path : str or Path
         The file; where each matrix has its own, that of K.
-    stiffness : str, optional
-        Name of the variable, in files that hold several (.mat, .op4, .pch).
-    mass, damping : str or Path, optional
-        Their files, or names of variables, likewise; where several matrices are in one file those
-        of the usual names are taken when not given. `damping=None`: none.
-    dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for, where the file does not say.
-    nodes : str or Path, optional
-        Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
-        .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
-    scalar_direction, dof_map, exodus, rotations : optional
-        Of one format each: what scalar points move in (`read_dmig`), the map and the mesh of
-        `read_sierra`, local systems (`read_ansys`).
+    stiffness, mass, damping, dofs, nodes, scalar_direction, dof_map, exodus, rotations : optional
+        As for `read_model`.
 
     Returns
     -------
@@ -199,7 +188,8 @@ def read_model(
         What the rows stand for, where the file does not say. Its coordinates are in the unit of
         length of the file, too.
     nodes : str or Path, optional
-        Coordinates, where the file names its rows but has none.
+        Coordinates, where the file names its rows but has none: a table `node, x, y, z`; an ANSYS
+        .rst or .cdb, a Nastran .bdf, an Abaqus .inp.
     units : (length, mass, time)
         Of the file: ("mm", "t", "s") for instance; the model is in SI.
     massless : "refuse" or "condense"
@@ -209,7 +199,8 @@ def read_model(
     name : str, optional
         For display; the name of the file when not given.
     scalar_direction, dof_map, exodus, rotations : optional
-        Of one format each; see `read_matrices`.
+        Of one format each: what scalar points move in (`read_dmig`), the map and the mesh of
+        `read_sierra`, local systems (`read_ansys`).
 
     Returns
     -------

@@ -35,10 +35,8 @@ class ClosedLoopH2(MotionAndEffort):
 
     Parameters
     ----------
-    poi : str, sequence of str or mapping {name: factor}, optional
-        The POIs; not needed when the plant has one only.
-    axes : str, sequence of str or mapping {axis: factor}, optional
-        Axes of each of them; all when not given, a rotation with the factor 1 m.
+    poi, axes : optional
+        As for `PoiLqr`.
     effort : float [m/N]
         The motion of the POI that one newton of one actuator is worth.
 

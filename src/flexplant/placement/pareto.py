@@ -112,18 +112,8 @@ def pareto_curve(
         As for `place_sensors` or `place_actuators`.
     costs : mapping {str: float}, optional
         Cost of candidates by name, 1 of others: for each budget every count that fits is tried.
-    required : sequence of str
-        Candidates that any choice includes.
-    constraints : sequence of Constraint, optional
-        What every choice satisfies.
-    method : Search, optional
-        As for `place_sensors`.
-    executor : concurrent.futures.Executor, optional
-        As for `place_sensors`.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
-    rng : int, SeedSequence or Generator, optional
-        For random starts.
+    required, constraints, method, executor, progress, rng : optional
+        As for `place_sensors` or `place_actuators`.
 
     Returns
     -------

@@ -187,10 +187,8 @@ def score_actuators(
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
     candidates : sequence of Actuator
         What names may stand for, besides the plant's own actuators.
-    executor : concurrent.futures.Executor, optional
-        Computes in chunks; the result is the same to the bit.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
+    executor, progress : optional
+        As for `score_sensors`.
 
     Returns
     -------

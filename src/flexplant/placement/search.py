@@ -133,24 +133,8 @@ def place_actuators(
         How many are chosen, `required` included.
     criterion : PoiLqr or callable, optional
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
-    required : sequence of str
-        Candidates that any choice includes.
-    constraints : sequence of Constraint, optional
-        What every choice satisfies: Excluded, OffPoi, Within, MinimumDistance, Together, Mirrored,
-        Among, Budget.
-    method : Search, optional
-        Exchange, BranchAndBound, Exhaustive or ByRows. Every subset where there are at most 1500,
-        else `Exchange()`, when not given.
-    executor : concurrent.futures.Executor, optional
-        Works on starts, chunks of subsets or branches; the result is the same to the bit. When a
-        process of a pool dies, its part is done once more.
-    checkpoint : path, optional
-        A file that keeps each part of the work as it comes. With a file that exists the search goes
-        on where it was stopped, also after being killed.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
-    rng : int, SeedSequence or Generator, optional
-        For the random starts.
+    required, constraints, method, executor, checkpoint, progress, rng : optional
+        As for `place_sensors`; OffPoi holds only where it is among the constraints.
 
     Returns
     -------
@@ -220,14 +204,8 @@ def place_both(
         a minimum distance is also one between a sensor and an actuator.
     method : Search, optional
         Every pair where there are at most 1500, else `Exchange()`, when not given.
-    executor : concurrent.futures.Executor, optional
+    executor, checkpoint, progress, rng : optional
         As for `place_sensors`.
-    checkpoint : path, optional
-        As for `place_sensors`.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
-    rng : int, SeedSequence or Generator, optional
-        For the random starts.
 
     Returns
     -------

@@ -114,10 +114,8 @@ def sensor_map(
     constraints : sequence of Constraint, optional
         As for `place_sensors`: points at which one more sensor breaks one are left out. A point on
         a POI is, unless OffPoi(-1) is among them.
-    executor : concurrent.futures.Executor, optional
-        Computes in chunks; the result is the same to the bit.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
+    executor, progress : optional
+        As for `score_sensors`.
 
     Returns
     -------

@@ -86,10 +86,8 @@ def device_worth(
         From `place_sensors`, `place_actuators` or `place_both`.
     criterion : Criterion or callable, optional
         As for the placement.
-    executor : concurrent.futures.Executor, optional
+    executor, progress : optional
         As for `place_sensors`.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
 
     Raises
     ------

@@ -39,8 +39,19 @@ def labelled(found: Any) -> dict[str, Any]:
     numbers = (int, float, list, tuple)  # of a static gain
     if isinstance(found, list | tuple) and not any(isinstance(one, numbers) for one in found):
         found = {f"system {k}": one for k, one in enumerate(found, 1)}
-    several = isinstance(found, Mapping) and not isinstance(found, Frf)
-    named = {str(label): one for label, one in found.items()} if several else {"": found}
+    return by_label(found)
+
+
+def by_label(found: Any, one: type = Frf) -> dict[str, Any]:
+    """Return the entries of a mapping, or {"": found} of anything else and of `one` kind of them.
+
+    Raises
+    ------
+    ModelError
+        When there is nothing in it.
+    """
+    several = isinstance(found, Mapping) and not isinstance(found, one)
+    named = {str(label): part for label, part in found.items()} if several else {"": found}
     if not named:
         raise ModelError("there is nothing to draw: the mapping or list is empty.")
     return named

@@ -18,7 +18,7 @@ from ..lti.statespace import as_statespace
 from ..values import FloatArray, real_array, short
 from ._axes import axes, finish, legend
 from ._style import GREY, STYLES, Style, styles
-from .gains import decibel, readable, shared_reference
+from .gains import by_label, decibel, readable, shared_reference
 
 #: what weights limit
 _LIMITED = ("S", "T", "KS")
@@ -75,7 +75,7 @@ def sensitivity(
     >>> ax.get_xlabel()
     'frequency [Hz]'
     """
-    lines = {label: _size(one, freq) for label, one in _named(curves).items()}
+    lines = {label: _size(one, freq) for label, one in by_label(curves).items()}
     given, ax = ax is not None, axes(ax, figsize=(8.0, 4.5))
     for (label, line), style in zip(lines.items(), styles(lines, colors), strict=True):
         if label in dashed:
@@ -143,7 +143,7 @@ def sensitivities(
     >>> [ax.get_ylabel() for ax in fx.plot.sensitivities(loop).figure.axes]
     ['|S| [dB]', '|T| [dB]', '|KS| [dB, 0 dB = 1 N/m]']
     """
-    named, limits = _named(loops), dict(weights or {})
+    named, limits = by_label(loops), dict(weights or {})
     if unknown := set(limits) - set(_LIMITED):
         raise ModelError(f"weights are of {', '.join(_LIMITED)}, got {sorted(map(str, unknown))}.")
     responses = {
@@ -201,14 +201,6 @@ def singular(response: Frf) -> FloatArray:
 def largest(response: Frf) -> FloatArray:
     """Return the largest singular value of a response at each frequency."""
     return singular(response)[:, 0]
-
-
-def _named(found: Any) -> dict[str, Any]:
-    if isinstance(found, Mapping) and not isinstance(found, Frf):
-        if not found:
-            raise ModelError("there is nothing to draw: the mapping is empty.")
-        return {str(label): one for label, one in found.items()}
-    return {"": found}
 
 
 def _kind_of(what: str, loop: Any, at: Literal["u", "y"], freq: FloatArray | None) -> Frf:

@@ -14,6 +14,7 @@ from ..simulation import Response
 from ..values import short
 from ._axes import axes, finish, legend, named, shown_in
 from ._style import styles
+from .gains import by_label
 
 
 def spectra(
@@ -61,11 +62,8 @@ def spectra(
     >>> fx.plot.spectra({"model": loop}, "die:error").get_ylabel()
     'amplitude spectral density [nm/√Hz]'
     """
-    several = isinstance(found, Mapping) and not isinstance(found, Response)
-    named_ones = {str(k): one for k, one in found.items()} if several else {"": found}
+    named_ones = by_label(found, Response)
     spectra_of = {label: _spectrum(one, channel) for label, one in named_ones.items()}
-    if not spectra_of:
-        raise ModelError("there is nothing to draw: the mapping is empty.")
     known = [getattr(one, "units", {}).get(channel) for one in named_ones.values()]
     unit = unit or next(filter(None, known), None)
     lines = {k: (s.freq[s.freq > 0], np.sqrt(s.psd[s.freq > 0])) for k, s in spectra_of.items()}

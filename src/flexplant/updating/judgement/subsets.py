@@ -246,9 +246,7 @@ class Subsets:
         if point.turned:
             return []
         J, r = self.whole.slopes(point), self.whole.values(point)
-        Q = np.linalg.qr(J[:, self.beside])[0]
-        J, r = J[:, : self.count], r - Q @ (Q.T @ r)
-        J = J - Q @ (Q.T @ J)
+        J, r = _beside(J[:, : self.count], J[:, self.beside], r)
         length = np.linalg.norm(J, axis=0)
         J = J / np.where(length > 1e-12 * length.max(initial=0.0), length, np.inf)
         a, overlap = J.T @ r, J.T @ J
@@ -369,18 +367,22 @@ def _left(objective: Objective, values: FloatArray, point: Point) -> SubsetFit:
     return SubsetFit(values, float(r @ r), chi2)
 
 
+def _beside(J: FloatArray, beside: FloatArray, r: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return J and r without what the columns `beside` explain of them."""
+    Q = np.linalg.qr(beside)[0]
+    return J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
+
+
 def _alone(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
     """Return what each parameter alone would be to first order, beside others."""
-    Q = np.linalg.qr(beside)[0]
-    J, r = J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
+    J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
     return np.asarray(-(J.T @ r) / np.where(length > 0, length, np.inf))
 
 
 def _share(J: FloatArray, beside: FloatArray, r: FloatArray) -> FloatArray:
-    Q = np.linalg.qr(beside)[0]
     whole = np.sum(J**2, axis=0)
-    J, r = J - Q @ (Q.T @ J), r - Q @ (Q.T @ r)
+    J, r = _beside(J, beside, r)
     length = np.sum(J**2, axis=0)
     # a candidate that is all nuisance explains nothing of its own
     own = length > 1e-12 * whole

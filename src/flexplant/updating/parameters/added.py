@@ -190,16 +190,8 @@ class AddedDamping(PointParameter):
     at : str, (3,) array [m] or mapping
         DOF label, point (interpolated between nodes) or {label: weight}; a mapping
         {a: 1, b: -1} is a damper between two DOFs.
-    direction : str
-        Of the motion at a point; labels carry their own.
-    name : str, optional
-        For results; made from the place when not given.
-    to : str, (3,) array [m] or mapping, optional
-        The other end; the ground when not given.
-    bounds : (lowest, highest), optional
-        The parameter is kept between them.
-    prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
+    direction, name, to, bounds, prior : optional
+        As for `AddedMass`.
 
     Examples
     --------
@@ -224,16 +216,8 @@ class AddedStiffness(PointParameter):
     at : str, (3,) array [m] or mapping
         DOF label, point (interpolated between nodes) or {label: weight}; a mapping
         {a: 1, b: -1} is a spring between two DOFs.
-    direction : str
-        Of the motion at a point; labels carry their own.
-    name : str, optional
-        For results; made from the place when not given.
-    to : str, (3,) array [m] or mapping, optional
-        The other end; the ground when not given.
-    bounds : (lowest, highest), optional
-        The parameter is kept between them.
-    prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
+    direction, name, to, bounds, prior : optional
+        As for `AddedMass`.
 
     Examples
     --------
