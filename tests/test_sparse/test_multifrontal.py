@@ -9,9 +9,11 @@ from hypothesis import strategies as st
 
 import meshes
 from flexplant.errors import SolverError
+from flexplant.sparse import ordering
 from flexplant.sparse.complex_symmetric import ComplexSymmetricFactor
 from flexplant.sparse.factor import is_positive_definite, lowest_eigenvalue_bound
-from flexplant.sparse.multifrontal import MultifrontalCholesky, multifrontal_inertia
+from flexplant.sparse.inertia import SignedFactor, multifrontal_inertia
+from flexplant.sparse.multifrontal import MultifrontalCholesky
 from flexplant.sparse.ordering import dissect
 
 
@@ -166,3 +168,26 @@ def test_a_complex_symmetric_factor_between_resonances():
         np.testing.assert_allclose(factor.solve(b[:, 0]), factor.solve(b)[:, 0], rtol=1e-12)
     with pytest.raises(SolverError, match="singular"):
         ComplexSymmetricFactor(sp.csc_array((3, 3), dtype=complex))
+
+
+@pytest.mark.parametrize("mesh", [meshes.plate(6), meshes.solid(3, 3, 3)], ids=["plate", "solid"])
+def test_a_count_in_single_precision(mesh, monkeypatch):
+    """Taken where the error of the factor is too small to change a sign, which is shown."""
+    M, K, nodes, xyz, _ = mesh
+    squares = la.eigh(K.toarray(), M.toarray(), eigvals_only=True)
+    dissection = dissect(K, nodes, xyz, leaf=40)
+    monkeypatch.setattr(ordering, "_COSTLY", 0.0)
+    taken = []
+    for first in (6, 60):
+        k = first + int(np.argmax(np.diff(squares[first : first + 6])))
+        for part in (0.5, 1e-6):
+            A = sp.csc_array(K - (squares[k] + part * (squares[k + 1] - squares[k])) * M)
+            factor = SignedFactor(A, dissection)
+            bound = factor.error_radius(A)
+            error = np.eye(len(nodes)) - factor.solve(A.toarray())
+            assert np.abs(la.eigvals(error)).max() < bound
+            taken.append(bool(bound < 0.1))
+            assert factor.negative == k + 1 or not taken[-1]
+            assert multifrontal_inertia(A, dissection) == k + 1
+    assert taken[0::2] == [True, True]
+    assert taken[1::2] == [False, False]

@@ -19,8 +19,6 @@ _FIRST = 10
 _VALUE = 1e-5
 #: residual below which the limit of a shape is computed
 _NEAR = 1e-8
-#: a residual near its limit that is no smaller than this part of the last one is rounding
-_STAYS = 0.9
 #: steps before giving up, beyond one for each mode
 _MOST = 40
 #: after so many steps modes must not be lower than this part of -sigma, to converge fast
@@ -70,7 +68,7 @@ class BlockDavidson(BlockLanczos):
         """Return the lowest shapes (n, count), the last `extra` of them for their values only.
 
         `needed` says of shapes (n, m) which residuals (m,), relative to ``||K phi||``, they may
-        leave; one that rounding keeps above is let pass.
+        leave.
 
         Raises
         ------
@@ -130,10 +128,10 @@ class BlockDavidson(BlockLanczos):
         force = np.asarray(self._K @ phi)
         size = np.linalg.norm(force, axis=0)
         force -= np.asarray(self._M @ phi) * squares[at]
-        left, before = np.linalg.norm(force, axis=0) / size, self._left[at]
+        left = np.linalg.norm(force, axis=0) / size
         near = left < _NEAR
         new = np.flatnonzero(near & (self._limit[at] == 0))
         if new.size:
             self._limit[at[new]] = needed(phi[:, new])
         self._left[at] = left
-        return force, near & ((left <= self._limit[at]) | (left > _STAYS * before))
+        return force, near & (left <= self._limit[at])

@@ -9,7 +9,8 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError, counted
-from ..sparse.multifrontal import MultifrontalCholesky, multifrontal_inertia
+from ..sparse.inertia import multifrontal_inertia
+from ..sparse.multifrontal import MultifrontalCholesky
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
@@ -23,9 +24,6 @@ _SHIFT = -3e3
 #: the same in single precision: the lowest elastic modes of a bulky structure are higher, or not
 #: much lower, and rounding leaves K - sigma M definite
 _SINGLE_SHIFT = -30.0
-#: multiplications per entry of a factor from which on half its cost is worth single precision:
-#: those of bulky structures, whose modes lie closer together than rounding to it confuses
-_WORTH = 350.0
 _held: weakref.WeakKeyDictionary[FEModel, weakref.ref[StiffnessFactor]]
 _dissected: weakref.WeakKeyDictionary[FEModel, Dissection]
 
@@ -177,7 +175,7 @@ def search_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFac
     """
     known, order = _held.get(model), dissection_of(model)
     unused = known is None or known() is None
-    if unused and method is None and not model.n_unstable and order.work > _WORTH * order.n_factor:
+    if unused and method is None and not model.n_unstable and order.is_costly:
         try:
             return StiffnessFactor(model, single=True)
         except SolverError:

@@ -188,7 +188,7 @@ def _searched(
         davidson = BlockDavidson(
             factor.solve, stiffness, mass, factor.sigma, locked, want=want, rng=rng, start=start
         )
-        phi = davidson.modes(want, extra, partial(_tolerance, stiffness, size, 1.0))
+        phi = davidson.modes(want, extra, partial(_tolerance, stiffness, size, 0.5))
         squares, phi = rayleigh_ritz(stiffness, mass, phi)
         if _excess(stiffness, mass, size, squares[: want - extra], phi, 0.0) > 1:
             raise SolverError("modes found with a factor in single precision are not accurate.")

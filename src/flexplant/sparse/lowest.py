@@ -14,7 +14,8 @@ import scipy.sparse.linalg as spla
 from ..errors import SolverError
 from ..values import FloatArray, IntArray
 from .factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
-from .multifrontal import MultifrontalCholesky, multifrontal_inertia
+from .inertia import multifrontal_inertia
+from .multifrontal import MultifrontalCholesky
 from .ordering import Dissection, dissect
 
 #: up to this many DOFs dense LAPACK finds every eigenvalue

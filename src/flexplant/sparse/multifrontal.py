@@ -18,8 +18,6 @@ from .ordering import Dissection, Front, dissect
 _SLICE = 600
 #: pivot blocks of up to this many DOFs are kept as inverses
 _INVERTED = 128
-#: rounding let pass in the energies that accompany a count of negative eigenvalues
-_ENERGY = 1e-4
 
 
 class MultifrontalCholesky:
@@ -139,108 +137,6 @@ def _stored(
     inverse, _ = trtri(pivots, lower=1, overwrite_c=1)
     inverse = np.tril(inverse)
     return None, np.vstack([inverse, below @ inverse])
-
-
-def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> int:
-    """Return how many eigenvalues of a sparse symmetric matrix are negative (Sylvester).
-
-    ``A = L D L^T`` front by front: Cholesky where the pivot block is positive definite,
-    Bunch-Kaufman within the block where it is not. The factor is not kept. A random ``b = A x`` is
-    eliminated along: ``x^T A x = y^T D^-1 y`` with ``L y = b`` shows whether pivots restricted to
-    the blocks were stable.
-
-    Raises
-    ------
-    SolverError
-        When the factorisation is not accurate: the matrix is close to singular.
-    """
-    lower = sp.csc_array(matrix)
-    chosen = dissect(lower) if dissection is None else dissection
-    n = lower.shape[0]
-    x = np.random.default_rng(0).standard_normal((n, 3))
-    b = np.asarray(lower @ x)
-    wanted, size = np.sum(x * b, axis=0), np.sum(np.abs(x * b), axis=0)
-    b = b[chosen.order]
-    energy = np.zeros(3)
-    negative = 0
-    with one_thread():
-        for front, pivots, below, rest in assembled(lower, chosen):
-            kept = pivots.copy(order="F")
-            _, info = lapack.dpotrf(pivots, lower=1, overwrite_a=1, clean=0)
-            y = b[front.first : front.last]
-            if not info:
-                y = blas.dtrsm(1.0, pivots, y, lower=1)
-                energy += np.sum(y**2, axis=0)
-                if front.rows.size:
-                    below = blas.dtrsm(
-                        1.0, pivots, below, side=1, lower=1, trans_a=1, overwrite_b=1
-                    )
-                    b[front.rows] -= below @ y
-                    blas.dsyrk(-1.0, below, beta=1.0, c=rest, lower=1, overwrite_c=1)
-                continue
-            y, moved, signs = _signed(kept, y, below)
-            negative += int(np.count_nonzero(signs < 0))
-            energy += np.sum(signs[:, None] * y**2, axis=0)
-            if front.rows.size:
-                b[front.rows] -= moved @ (signs[:, None] * y)
-                blas.dsyrk(-1.0, moved, beta=1.0, c=rest, lower=1, overwrite_c=1)
-                # the few with a negative sign are added, not taken away
-                few = np.asfortranarray(moved[:, signs < 0])
-                blas.dsyrk(2.0, few, beta=1.0, c=rest, lower=1, overwrite_c=1)
-    if not np.all(np.abs(energy - wanted) <= _ENERGY * size):
-        raise SolverError(
-            f"a count of eigenvalues by L D L^T is not accurate (energies differ by "
-            f"{np.max(np.abs(energy - wanted) / size):.1g}): the shift is too close to an "
-            "eigenvalue. Count at another frequency."
-        )
-    return negative
-
-
-def _signed(
-    block: FloatArray, y: FloatArray, below: FloatArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return G^-1 y, below G^-T and s of +1 and -1, ``A = G diag(s) G^T`` (Bunch-Kaufman).
-
-    The lower triangle of A is overwritten.
-    """
-    work, _ = lapack.dsytrf_lwork(block.shape[0], lower=1)
-    block, exchanges, _ = lapack.dsytrf(block, lower=1, lwork=int(work), overwrite_a=1)
-    factor, off, _ = lapack.dsyconv(block, exchanges, lower=1, overwrite_a=1)
-    order = _exchanged(exchanges)
-    y = blas.dtrsm(1.0, factor, y[order], lower=1, diag=1)
-    below = below.T[order].T
-    if below.size:
-        below = blas.dtrsm(1.0, factor, below, side=1, lower=1, trans_a=1, diag=1, overwrite_b=1)
-    main = np.diag(factor).copy()
-    # 2 x 2 pivots by a rotation each
-    one = np.flatnonzero(off)
-    two = one + 1
-    pivots = np.array([[main[one], off[one]], [off[one], main[two]]]).transpose(2, 0, 1)
-    values, turn = np.linalg.eigh(pivots)
-    main[one], main[two] = values.T
-    for part in (y, below.T):
-        part[one], part[two] = (
-            turn[:, 0, j, None] * part[one] + turn[:, 1, j, None] * part[two] for j in (0, 1)
-        )
-    if np.any(main == 0):
-        raise SolverError(
-            "a count of eigenvalues by L D L^T met a zero pivot: the shift hits an eigenvalue. "
-            "Count at another frequency."
-        )
-    scale = np.sqrt(np.abs(main))
-    return y / scale[:, None], below / scale, np.sign(main)
-
-
-def _exchanged(exchanges: IntArray) -> IntArray:
-    """Return the order of the rows after LAPACK's exchanges by Bunch-Kaufman, lower triangle."""
-    order = np.arange(exchanges.size)
-    k = 0
-    while k < order.size:
-        pair = exchanges[k] < 0
-        last, other = k + int(pair), abs(int(exchanges[k])) - 1
-        order[[last, other]] = order[[other, last]]
-        k = last + 1
-    return order
 
 
 def assembled(

@@ -18,6 +18,8 @@ LEAF = 96
 _HUB = 20
 #: a first separator with more than this part of the nodes: the coordinates do not fit the graph
 _USELESS = 0.25
+#: multiplications of a factorisation for each entry of the factor from which on it is costly
+_COSTLY = 350.0
 #: points from which distances through the graph stand in for missing coordinates
 _LANDMARKS = 8
 
@@ -49,10 +51,14 @@ class Dissection:
         return int(sum((f.last - f.first) * (f.last - f.first + f.rows.size) for f in self.fronts))
 
     @property
-    def work(self) -> float:
-        """Multiplications of a Cholesky factorisation."""
+    def is_costly(self) -> bool:
+        """Whether single precision pays: a factorisation costs far more than solutions with it.
+
+        So it is for bulky structures, whose modes are also not lost in its rounding.
+        """
         sizes = ((float(f.last - f.first), float(f.rows.size)) for f in self.fronts)
-        return sum(p * (p * p / 6 + q * (p + q) / 2) for p, q in sizes)
+        work = sum(p * (p * p / 6 + q * (p + q) / 2) for p, q in sizes)
+        return work > _COSTLY * self.n_factor
 
 
 def dissect(
