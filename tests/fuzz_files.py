@@ -440,7 +440,7 @@ DAMAGES = np.array(
 )
 
 
-def forked(function, path, *, keep=False):
+def forked(function, path, *, keep=""):
     """What `in_child` would return: the child starts in a millisecond, all is imported."""
     with tempfile.TemporaryFile() as answer:
         process = os.fork()

@@ -1,6 +1,7 @@
 """Poles and shapes from responses of known modes; the truth is the oracle."""
 
 import warnings
+from functools import cache
 
 import numpy as np
 import pytest
@@ -43,6 +44,12 @@ def measured(poles=CLOSE, phi=PHI, n_in=3, level=1e-4, seed=1, freq=FREQ, rigid=
     variance = np.full(H.shape, deviation**2) if known else None
     data = noisy(H, deviation, np.random.default_rng(seed))
     return Frf(freq, data, variance=variance, quantity="displacement")
+
+
+@cache
+def identified():
+    """What is found in these responses, for all tests that compare with it."""
+    return identify_modes(measured(), orders=ORDERS)
 
 
 def z_scores(found, truth):
@@ -280,7 +287,7 @@ def test_without_noise_to_machine_precision():
 @pytest.mark.slow
 def test_without_variance_doubt_comes_from_what_is_left():
     found = identify_modes(measured(known=False), orders=ORDERS)
-    known = identify_modes(measured(), orders=ORDERS)
+    known = identified()
     assert len(found) == 7
     assert np.all(np.abs(found.std.real / known.std.real - 1)[[2, 3, 6]] < 0.5)
     assert np.abs(z_scores(found, known.poles)).max() < 4.0
@@ -300,8 +307,7 @@ def test_fewer_outputs_than_inputs():
 @pytest.mark.slow
 @pytest.mark.parametrize("quantity", ["velocity", "acceleration"])
 def test_the_quantity_and_the_unit_do_not_matter(quantity):
-    frf = measured()
-    base = identify_modes(frf, orders=ORDERS)
+    frf, base = measured(), identified()
     other = frf.replace(data=frf.data * 1e-9, variance=frf.variance * 1e-18).converted(quantity)
     found = identify_modes(other, orders=ORDERS)
     assert np.abs(found.poles / base.poles - 1).max() < 1e-8
@@ -315,7 +321,7 @@ def test_poles_by_hand_give_the_same_fit(tmp_path):
     picked = diagram.select(freq=[47.5, 48.2, 90.0, 90.09, 120.0, 120.0, 160.0])
     assert len(picked) == 7
     by_hand = identify_modes(frf, start=picked)
-    base = identify_modes(frf, orders=ORDERS)
+    base = identified()
     assert np.abs(by_hand.poles / base.poles - 1).max() < 1e-8
     for value in (diagram, picked, base):
         value.save(tmp_path / "v.npz")

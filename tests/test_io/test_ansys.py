@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError
-from flexplant.io import ansys
+from flexplant.io import ansys, child
 from flexplant.io.ansys import cosines_of
 
 FULL = Path("/work/shared/data/fe/ansys/file.full")
@@ -52,7 +52,7 @@ class TestSample:
 
 def stand_in(monkeypatch, K, M, table, damped=False):
     full = {"table": np.asarray(table), "K": K, "M": M, "damped": damped}
-    monkeypatch.setattr(ansys, "in_child", lambda function, path: ("value", full))
+    monkeypatch.setattr(ansys, "in_child", lambda function, path, keep: ("value", full))
 
 
 def local_pair():
@@ -112,6 +112,8 @@ def test_what_is_no_structure_is_refused(monkeypatch, K, M, kinds, match):
 
 def test_a_missing_extra_gives_the_line_to_type(monkeypatch, tmp_path):
     (tmp_path / "x.full").write_bytes(b"")
+    child._close_all()  # one that waits has imported it
+    child._WAITING.clear()
     monkeypatch.setattr(sys, "path", [place for place in sys.path if "site-packages" not in place])
     with pytest.raises(FlexplantError, match=r"pip install 'flexplant\[ansys\]'"):
         fx.io.read_ansys(tmp_path / "x.full")

@@ -79,7 +79,7 @@ def error_variances(
         primal = np.sum((joint.E @ X) * joint.E, axis=1)
         dual = np.array([_dual_dense(joint, row) for row in joint.E])
     else:
-        primal, dual = _primal(joint), np.array([_dual(joint, row) for row in joint.E])
+        primal, dual = _primal(joint), _dual(joint)
     size = np.where(primal > 0, primal, 1.0)
     difference = float(np.max(np.abs(dual - primal) / size, initial=0.0))
     if not difference <= AGREEMENT:
@@ -270,20 +270,26 @@ def _own(A: FloatArray, load: FloatArray, d: FloatArray) -> FloatArray:
     return np.asarray(X * d * d[:, None])
 
 
-def _dual(joint: _Joint, row: FloatArray) -> float:
-    """Return ``trace(noise' Y noise)`` with ``Y = A' Y A + row' row``."""
+def _dual(joint: _Joint) -> FloatArray:
+    """Return ``trace(noise' Y noise)`` with ``Y = A' Y A + row' row`` for each row of E."""
     values, A, coupling, driven, noise = _modal_parts(joint)
     assert joint.modal is not None  # noqa: S101
     n = joint.n_elastic
-    see, keep = _right(row[None, :n], joint.modal[1])[0], row[n:]
-    own = _own(A.T, np.outer(keep, keep), 1.0 / _sizes(joint))
-    cross = _columns(A.T, values, A.T @ own @ coupling + np.outer(keep, see))
-    back = coupling.conj().T @ cross * values
-    load = coupling.conj().T @ own @ coupling + back + back.conj().T + np.outer(see.conj(), see)
-    inner = load / (1 - np.outer(values.conj(), values))
-    total = np.sum(driven.conj() * (inner @ driven)).real
-    total += 2 * np.sum(noise * (cross @ driven)).real
-    return float(total + np.sum(noise * (own @ noise)))
+    see, keep = _right(joint.E[:, :n], joint.modal[1]), joint.E[:, n:]
+    sizes = 1.0 / _sizes(joint)
+    own = np.array([_own(A.T, np.outer(row, row), sizes) for row in keep])
+    right = A.T @ own @ coupling + keep[:, :, None] * see[:, None, :]
+    # the columns of all rows side by side, by one Schur form
+    cross = _columns(A.T, np.tile(values, len(keep)), np.hstack(list(right)))
+    found = []
+    for row, mine, across in zip(see, own, np.split(cross, len(keep), axis=1), strict=True):
+        back = coupling.conj().T @ across * values
+        load = coupling.conj().T @ mine @ coupling + back + back.conj().T
+        inner = (load + np.outer(row.conj(), row)) / (1 - np.outer(values.conj(), values))
+        total = np.sum(driven.conj() * (inner @ driven)).real
+        total += 2 * np.sum(noise * (across @ driven)).real
+        found.append(float(total + np.sum(noise * (mine @ noise))))
+    return np.array(found)
 
 
 def _dual_dense(joint: _Joint, row: FloatArray) -> float:

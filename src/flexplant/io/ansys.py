@@ -133,7 +133,7 @@ def read_parsed(function: str, path: Path) -> dict[str, Any]:
     ModelError
         When the package does not support what is in the file.
     """
-    kind, found = in_child(function, path)
+    kind, found = in_child(function, path, keep="ansys")
     if kind in ("ImportError", "ModuleNotFoundError"):
         raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}")
     if kind == "NotImplementedError":

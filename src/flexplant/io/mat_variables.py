@@ -22,7 +22,7 @@ def mat_variables(path: str | Path) -> dict[str, Any]:
         When there is no such file.
     """
     wrong = _cut(file_path(path).read_bytes())
-    kind, found = ("cut off", {}) if wrong else in_child("matlab", path, keep=True)
+    kind, found = ("cut off", {}) if wrong else in_child("matlab", path, keep="matlab")
     if kind != "value":
         raise FlexplantError(
             f"{str(path)!r} cannot be read as a MATLAB file ({wrong or found!s:.80}). It is "
