@@ -310,7 +310,7 @@ def test_the_common_door_hands_on_what_this_reader_takes(tmp_path):
 def test_included_files_are_followed_or_named(tmp_path):
     (tmp_path / "parts").mkdir()
     deck = "BEGIN BULK\n{}\nGRID,1,,1.,0.,0.\nENDDATA\n"
-    for form in ("INCLUDE 'parts/a.blk'", 'include "parts/a.blk"', "INCLUDE 'parts/\na.blk'"):
+    for form in ("INCLUDE 'parts/a.blk'", 'include "parts/a.blk"', "INCLUDE 'parts/\n  a.blk'"):
         written(tmp_path, deck.format(form), "x.bdf")
         # the second is in the folder of the file that names it, the third in that of the first
         (tmp_path / "parts" / "a.blk").write_text("INCLUDE 'b.blk'\nGRID,2,,2.,0.,0.\n")

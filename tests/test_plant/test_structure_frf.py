@@ -74,6 +74,7 @@ def test_every_damping_beside_dense_solutions(plate):
         assert apart(found.data, dense_response(plate, damping_at)) < 1e-4
         assert found.error.max() < 1e-4
         assert found.error.size >= 3
+        assert found.quantity == "displacement"  # joined with springs or converted as it is
     # modal damping over all modes: what is beyond the basis moves statically
     law = fx.ModalDamping(2e-3)
     every = plate.with_damping(law).D
@@ -118,6 +119,7 @@ def test_all_kinds_of_ports_as_in_a_plant(plate):
         floor = 1e-5 * np.sqrt(np.outer(size.max(axis=1), size.max(axis=0)))
         gap = np.abs(found.data - wanted.data).max(axis=2) / np.maximum(size, floor)
         assert gap.max() < (1e-4 if model is damped else 1e-8)
+        assert found.quantity is None
         assert found.unit("v", "u1") == wanted.unit("v", "u1") == "m/s/N"
     late = ports.replace(u=[ports.u[0].replace(latency=1e-3)])
     prompt, delayed = (fx.frequency_response(modes, given, FREQ) for given in (ports, late))

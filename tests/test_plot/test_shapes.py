@@ -72,7 +72,8 @@ def test_torsion_of_a_plate(kind):
     torsion = (x - L / 2) * (y - L / 2)
     assert np.abs(z).max() == pytest.approx(0.1 * L, rel=1e-6)
     assert abs(np.corrcoef(z, torsion)[0, 1]) > 0.98
-    assert ax.get_title() == f"mode 4, {modes.freq[3]:.1f} Hz"
+    known = f"{modes.freq[3]:.1f} Hz, damping {100 * modes.zeta[3]:.2g} %"
+    assert ax.get_title() == f"mode 4, {known}"
     assert [ax.get_xlabel(), ax.get_zlabel()] == ["x [mm]", "z [mm]"]
     assert ax.figure.axes[1].get_ylabel() == "displacement, largest 1 [-]"
     for bad in (0, modes.omega.size + 1):

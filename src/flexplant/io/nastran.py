@@ -112,7 +112,7 @@ def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str
     found = []
     continued = ""
     for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
-        joined = continued + line
+        joined = continued + (line.lstrip() if continued else line)
         # the name may go on in the next line, until its quote is closed
         continued = joined.rstrip() if _goes_on(joined) else ""
         match = None if continued else _INCLUDE.match(joined)

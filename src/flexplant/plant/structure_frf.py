@@ -247,6 +247,8 @@ class _PortChannels:
             *(sensor.name for sensor in ports.y),
         ]
         self.units = ports.units
+        seen_as = {sensor.quantity for sensor in ports.y} | {"displacement" for _ in ports.z}
+        self._quantity = seen_as.pop() if len(seen_as) == 1 else None
         seen = [poi.see(motions, axis) for poi in ports.z for axis in poi.axes]
         orders = [0] * len(seen) + [sensor.order for sensor in ports.y]
         seen += [sensor.see(motions) for sensor in ports.y]
@@ -283,6 +285,7 @@ class _PortChannels:
             inputs=self.inputs,
             outputs=self.outputs,
             units=self.units,
+            quantity=self._quantity,
             **found,
         )
 

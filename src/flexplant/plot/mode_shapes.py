@@ -150,7 +150,9 @@ class _Moving:
         finer = np.sqrt(_MANY / max(len(self.skin.triangles), 1))
         self.parts = _parts(int(np.clip(finer, 1, _PARTS)))
         self.faces, self.lines = self._start(color)
-        self.ax.set_title(f"mode {number}, {modes.freq[number - 1]:.1f} Hz")
+        zeta = modes.zeta[number - 1]
+        damped = f", damping {100 * zeta:.2g} %" if zeta else ""
+        self.ax.set_title(f"mode {number}, {modes.freq[number - 1]:.1f} Hz{damped}")
 
     def _start(self, color: str | None) -> tuple[Poly3DCollection | None, Line3DCollection]:
         skin, rest = self.skin, self.skin.xyz / self.factor
