@@ -54,17 +54,17 @@ def test_figures_are_those_of_a_dense_sweep(loops, found):
     assert found["half"].low > 1.5 * found["servo"].low
 
 
-def test_eigenvalues_and_schur_forms_are_computed_once(monkeypatch):
-    """For stability, margin, repr, response and comparison together."""
-    sizes = {"eigvals": [], "schur": []}
-    for name, seen in sizes.items():
-        plain = getattr(la, name)
+def test_eigenvalues_and_eigenvectors_are_computed_once(monkeypatch):
+    """For stability, margin, repr, response and comparison together: of the loop, of each block."""
+    sizes = {"eigvals": [], "eig": []}
+    for owner, (name, seen) in zip((la, np.linalg), sizes.items(), strict=True):
+        plain = getattr(owner, name)
 
         def counted(A, *rest, plain=plain, seen=seen, **options):
             seen.append(len(A))
             return plain(A, *rest, **options)
 
-        monkeypatch.setattr(la, name, counted)
+        monkeypatch.setattr(owner, name, counted)
     loop = close_loop(stage(), observer(), servo())
     assert loop.is_stable
     assert loop.system.is_stable
@@ -73,7 +73,7 @@ def test_eigenvalues_and_schur_forms_are_computed_once(monkeypatch):
     loop.frequency_response([1.0, 10.0])
     compare_loops({"servo": loop})
     blocks = [block.n_states for block in loop.blocks]
-    assert sizes == {"eigvals": [loop.monitored.n_states], "schur": blocks}
+    assert sizes == {"eigvals": [loop.monitored.n_states], "eig": blocks}
 
 
 def test_it_reads_as_a_table_and_survives_a_file(found, tmp_path):

@@ -8,6 +8,7 @@ from hypothesis import strategies as st
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import Frf, StateSpace, append, frequency_response, series
+from flexplant.lti.dense_responses import diagonal_form
 from flexplant.lti.discretisation import discretized
 from flexplant.lti.frequency import default_freq
 from oracles_lti import sweep
@@ -92,6 +93,17 @@ def test_dense_systems(seed):
         rng.standard_normal((1, 2)),
     )  # fmt: skip
     assert_same(g, np.geomspace(1e-3, 10.0, 30), rtol=1e-8)
+
+
+@pytest.mark.parametrize("split", [0.0, 1e-12, 1e-3])
+def test_dense_systems_whose_eigenvectors_are_next_to_parallel(split):
+    """Five poles at -1, or next to it, in one chain: no residues are formed of them."""
+    rng = np.random.default_rng(4)
+    U = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+    A = U @ (np.diag(-1.0 - split * np.arange(5)) + np.eye(5, k=1)) @ U.T
+    g = StateSpace(A, rng.standard_normal((5, 2)), rng.standard_normal((3, 5)), np.zeros((3, 2)))
+    assert diagonal_form(g.A, g.B, g.C).left is None
+    assert_same(g, np.geomspace(1e-3, 10.0, 30), rtol=1e-9)
 
 
 def test_series_of_two_machines_uses_its_blocks():

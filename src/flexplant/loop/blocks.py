@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -14,9 +13,6 @@ from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray
-
-#: blocks that are prepared for their responses once: an observer serves many controllers
-prepared = lru_cache(maxsize=8)(responder)
 
 
 def joined(
@@ -65,33 +61,43 @@ def commands(
     read, driven : sequences of str
         Channels of y and u.
     """
-    needed = [name for sys in systems for name in sys.inputs]
-    produced = [name for sys in systems for name in sys.outputs]
-    used = [i for i, name in enumerate(produced) if name in driven or name in needed]
+    needed = {name for sys in systems for name in sys.inputs}
+    used = [[n for n in sys.outputs if n in driven or n in needed] for sys in systems]
+    outputs = [name for names in used for name in names]
 
     def same(rows: Sequence[str], columns: Sequence[str]) -> FloatArray:
-        return np.array([[float(a == b) for b in columns] for a in rows])
+        return np.array([[float(a == b) for b in columns] for a in rows]).reshape(len(rows), -1)
 
-    route = same(needed, produced)[:, used]
-    enter, leave = same(needed, read), same(driven, produced)[:, used]
-    finds = [prepared(sys) for sys in systems]
+    each = [
+        (responder(sys), sys.output_index(names), same(sys.inputs, [*outputs, *read]))
+        for sys, names in zip(systems, used, strict=True)
+    ]
+    leave, count = same(driven, outputs), len(outputs)
+    # first those outputs that do not depend on each other, all of them without an inner loop
+    ends = np.cumsum([len(names) for names in used])
+    free = [
+        end
+        for k, end in enumerate(ends.tolist(), 1)
+        if not any(into[:, :end].any() for _, _, into in each[:k])
+    ]
+    cut = max(free, default=0)
 
     def found(freq: FloatArray) -> ComplexArray:
-        G = np.zeros((len(produced), len(needed), freq.size), dtype=np.complex128)
-        row = column = 0
-        for find, sys in zip(finds, systems, strict=True):
-            p, m = sys.D.shape
-            G[row : row + p, column : column + m] = find(freq)
-            row, column = row + p, column + m
-        G = np.ascontiguousarray(G[used].transpose(2, 0, 1))
-        v = G @ enter
-        if route.any():
+        parts = [
+            np.ascontiguousarray(find(freq)[rows].transpose(2, 0, 1)) @ into
+            for find, rows, into in each
+        ]
+        R, v = np.split(np.concatenate(parts, axis=1), [count], axis=2)
+        if cut < count:
+            ab, ba = R[:, :cut, cut:], R[:, cut:, :cut]
+            back = np.eye(count - cut) - R[:, cut:, cut:] - ba @ ab
             try:
-                v[:] = np.linalg.solve(np.eye(len(used)) - G @ route, v)
+                v[:, cut:] = np.linalg.solve(back, v[:, cut:] + ba @ v[:, :cut])
             except np.linalg.LinAlgError as error:
                 raise ModelError(
                     "the controller has a pole at one of the frequencies: move it."
                 ) from error
+            v[:, :cut] += ab @ v[:, cut:]
         return np.asarray((leave @ v).transpose(1, 2, 0))
 
     return found

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
 from ..values import ComplexArray, FloatArray
+from .dense_responses import diagonal_form
 from .responses import ModalPairs, modal_pairs
-from .scaling import state_scale
 from .statespace import StateSpace
 
-#: largest condition of eigenvectors whose residues are used
-POOR = 1e5
 #: a distance that counts as none
 TINY = 1e-100
 #: entries of all residues from which on they are not formed
@@ -134,16 +132,7 @@ def _of_blocks(pairs: ModalPairs) -> _Found:
 
 def _of_eigenvectors(g: StateSpace) -> _Found:
     """Return poles and residues of any A, no residues where its eigenvectors are poor."""
-    d = state_scale(g.A, g.B, g.C)
-    A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
-    found: Any = np.linalg.eig(A)
-    poles, V = (np.asarray(part, dtype=np.complex128) for part in found)
-    try:
-        inverse = np.linalg.inv(V)
-    except np.linalg.LinAlgError:
+    poles, left, right = diagonal_form(g.A, g.B, g.C)
+    if left is None or right is None:
         return poles, None, poles
-    with np.errstate(over="ignore"):  # of defective poles
-        condition = np.linalg.norm(V) * np.linalg.norm(inverse)
-    if not condition < POOR:
-        return poles, None, poles
-    return poles, (C @ V).T[:, :, None] * (inverse @ B)[:, None, :], poles
+    return poles, left.T[:, :, None] * right[:, None, :], poles

@@ -1,47 +1,26 @@
-"""The gains of a system at many frequencies: closed-form block solves, else Schur form."""
+"""The gains of a system at many frequencies: closed-form block solves, else those of any A."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
-from scipy.sparse import csgraph
 
 from ..errors import ModelError
 from ..parallel import one_thread
 from ..values import ComplexArray, FloatArray, IntArray
-from .scaling import scaled_schur
+from .dense_responses import CHUNK, MODAL_CHUNK, PARTS, Part, Solver, dense_solver
 from .statespace import StateSpace
 
-#: entries of the largest intermediate array of a back substitution (complex): it stays in cache
-CHUNK = 400_000
-#: rows of a back substitution that are solved together
-ROWS = 32
-#: functions of frequency at a time in block form; so many complex numbers are less than 128 kB
-MODAL_CHUNK, PARTS, SMALL = 19_200, 7, 7000
+#: so many complex numbers are less than 128 kB
+SMALL = 7000
+#: where a system keeps what was prepared: it is often swept again and again
+_KEPT = "_responder"
 
 #: the responses (p, m, n_freq) at frequencies [Hz]
 Responder: TypeAlias = Callable[[FloatArray], ComplexArray]
-#: adds ``C (s I - A)^-1 B`` (p, m, n_s) to its second argument, and says whether it is finite for
-#: certain: large arrays are not read again
-Solver: TypeAlias = Callable[[ComplexArray, ComplexArray], bool]
-
-
-class Part(NamedTuple):
-    """A, B, C, sampling time and blocks of a part of a system."""
-
-    A: FloatArray
-    B: FloatArray
-    C: FloatArray
-    dt: float
-    blocks: Sequence[int] | None = None
-
-    @property
-    def schur_form(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-        """As of a StateSpace."""
-        return scaled_schur(self.A, self.B, self.C)
 
 
 def responses(g: StateSpace, freq: FloatArray) -> ComplexArray:
@@ -50,17 +29,26 @@ def responses(g: StateSpace, freq: FloatArray) -> ComplexArray:
 
 
 def responder(g: StateSpace) -> Responder:
-    """Return the function of frequency [Hz] that gives the responses, prepared once."""
-    if not g.n_states or not g.D.size:
-        return lambda freq: np.repeat(g.D[:, :, None], freq.size, axis=2).astype(np.complex128)
+    """Return the function of frequency [Hz] that gives the responses, prepared once and kept."""
+    known = g.__dict__.get(_KEPT)
+    if known is None:
+        part = Part(g.A, g.B, g.C, g.dt, g.blocks)
+        known = g.__dict__[_KEPT] = _responder(part, g.D)
+    return known
+
+
+def _responder(g: Part, D: FloatArray) -> Responder:
+    n = len(g.A)
+    if not n or not D.size:
+        return lambda freq: np.repeat(D[:, :, None], freq.size, axis=2).astype(np.complex128)
     solve, entries, parts = _solver(g)
 
     @one_thread()
     def found(freq: FloatArray) -> ComplexArray:
         s, tame = points(g, freq), True
-        step = max(1, min(entries // g.n_states, max(SMALL // g.n_states, freq.size // parts)))
-        out = np.empty((*g.D.shape, freq.size), dtype=np.complex128)
-        out[:] = g.D[:, :, None]
+        step = max(1, min(entries // n, max(SMALL // n, freq.size // parts)))
+        out = np.empty((*D.shape, freq.size), dtype=np.complex128)
+        out[:] = D[:, :, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             for start in range(0, freq.size, step):
                 part = slice(start, start + step)
@@ -86,7 +74,7 @@ def remembered(find: Responder) -> Responder:
     return found
 
 
-def points(g: StateSpace, freq: FloatArray) -> ComplexArray:
+def points(g: StateSpace | Part, freq: FloatArray) -> ComplexArray:
     """Return the points s, or z, of frequencies [Hz]."""
     omega = 2 * np.pi * freq
     return np.asarray(np.exp(1j * omega * g.dt) if g.dt else 1j * omega)
@@ -114,16 +102,14 @@ def continuous_poles(g: StateSpace) -> ComplexArray:
     return np.asarray(logs[np.isfinite(logs)] / g.dt)
 
 
-def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
+def _solver(g: Part) -> tuple[Solver, int, int]:
     """Return what solves, how many frequencies at a time, times states, and least parts of a grid.
 
     The arrays of a part of a short grid are below 128 kB: no memory is fetched from the system.
     """
-    n, m = g.B.shape
-    whole = CHUNK // (m + 2), 1
     if g.blocks is None or not set(g.blocks) <= {1, 2}:
-        count, owner = csgraph.connected_components(g.A != 0, directed=False)
-        return _side_by_side(g, owner) if count > 1 else _schur(g), *whole
+        return dense_solver(g)
+    n, m = g.B.shape
     pairs, slots, coupling = _paired(g)
     tied = np.flatnonzero(np.any(coupling, axis=0))
     head = int(slots[np.isin(slots, tied).any(axis=1), 0].min(initial=n))  # before: decoupled
@@ -133,38 +119,7 @@ def _solver(g: StateSpace | Part) -> tuple[Solver, int, int]:
     if head and 4 * (n - head) <= n:
         cut = int(np.searchsorted(slots[:, 0], head))
         return _fed_by_lines(g, head, pairs[:cut], slots[:cut]), *modal
-    return _substitution(g, pairs, slots, coupling), *whole
-
-
-def _side_by_side(g: StateSpace | Part, owner: npt.NDArray[np.int32]) -> Solver:
-    """Systems that share no state, such as the axes of a servo: each with its own channels.
-
-    Those of one A, as axes of one law have, are solved together.
-    """
-    alike: dict[bytes, list[IntArray]] = {}
-    for own in (np.flatnonzero(owner == i) for i in range(owner.max() + 1)):
-        alike.setdefault(g.A[np.ix_(own, own)].tobytes(), []).append(own)
-    solvers = []
-    for parts in alike.values():
-        fed = [np.flatnonzero(g.B[own].any(axis=0)) for own in parts]
-        seen = [np.flatnonzero(g.C[:, own].any(axis=1)) for own in parts]
-        B = np.hstack([g.B[np.ix_(own, j)] for own, j in zip(parts, fed, strict=True)])
-        C = np.vstack([g.C[np.ix_(i, own)] for own, i in zip(parts, seen, strict=True)])
-        if B.size * C.size:
-            X, turned = _substituted(Part(g.A[np.ix_(parts[0], parts[0])], B, C, g.dt))
-            rows = np.split(turned, np.cumsum([i.size for i in seen])[:-1])
-            solvers.append((X, list(zip(seen, fed, rows, strict=True))))
-
-    def add(s: ComplexArray, out: ComplexArray) -> bool:
-        for X, channels in solvers:
-            states, at = X(s), 0
-            for i, j, row in channels:
-                moved = states[:, at : at + j.size].reshape(len(states), -1)
-                out[np.ix_(i, j)] += (row @ moved).reshape(i.size, j.size, -1)
-                at += j.size
-        return False
-
-    return add
+    return _substitution(g, pairs, slots, coupling), CHUNK // (m + 2), 1
 
 
 def _paired(g: StateSpace | Part) -> tuple[FloatArray, IntArray, FloatArray]:
@@ -215,7 +170,7 @@ def _halved(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> ModalPa
     return ModalPairs(mean, N, q, g.B[slots] * real[:, :, None], C)
 
 
-def _modal(g: StateSpace | Part, pairs: FloatArray, slots: IntArray) -> Solver:
+def _modal(g: Part, pairs: FloatArray, slots: IntArray) -> Solver:
     """Block-diagonal A: one real matrix product of residues and scalar functions of frequency.
 
     ``(s I - A)^-1 = ((s - m) I + N) / ((s - m)^2 - q)`` of each block: no cancellation near s = m,
@@ -266,7 +221,7 @@ def _chosen(residues: FloatArray) -> npt.NDArray[np.bool_] | slice:
     return slice(None) if some.all() else some
 
 
-def _fed_by_lines(g: StateSpace | Part, head: int, pairs: FloatArray, slots: IntArray) -> Solver:
+def _fed_by_lines(g: Part, head: int, pairs: FloatArray, slots: IntArray) -> Solver:
     """Modes, the first states, fed by a few further ones, such as a sampled plant's delay lines.
 
     With A = [[A_h, A_ht], [0, A_t]] and A_h block diagonal, the tail's response X_t is cheap and
@@ -309,7 +264,7 @@ def _reached(A: FloatArray, B: FloatArray) -> npt.NDArray[np.bool_]:
 
 
 def _closed_form(
-    g: StateSpace | Part, pairs: FloatArray, real: npt.NDArray[np.bool_]
+    g: Part, pairs: FloatArray, real: npt.NDArray[np.bool_]
 ) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, ComplexArray, ComplexArray]:
     a, b, c, d = (pairs[:, i, j].copy() for i in (0, 1) for j in (0, 1))
     # a 1 x 1 block gets a partner that nothing drives, with a pole at no frequency of interest
@@ -321,9 +276,7 @@ def _closed_form(
     return a, b, c, d, first, second
 
 
-def _substitution(
-    g: StateSpace | Part, pairs: FloatArray, slots: IntArray, coupling: FloatArray
-) -> Solver:
+def _substitution(g: Part, pairs: FloatArray, slots: IntArray, coupling: FloatArray) -> Solver:
     """Block upper triangular A: all blocks of one level (no coupling among them) at once."""
     real = slots >= 0
     a, b, c, d, first, second = _closed_form(g, pairs, real)
@@ -368,41 +321,3 @@ def _substitution(
         return False
 
     return add
-
-
-def _schur(g: StateSpace | Part) -> Solver:
-    """Any A, by its Schur form."""
-    X, seen = _substituted(g)
-
-    def add(s: ComplexArray, out: ComplexArray) -> bool:
-        out += (seen @ X(s).reshape(seen.shape[1], -1)).reshape(out.shape)
-        return False
-
-    return add
-
-
-def _substituted(
-    g: StateSpace | Part,
-) -> tuple[Callable[[ComplexArray], ComplexArray], ComplexArray]:
-    """Return the function of s (n_s,) that gives ``(s I - T)^-1 U* B`` (n, m, n_s), and C U.
-
-    Back substitution with the Schur form ``A = U T U*`` in even units.
-    """
-    d, T, U = g.schur_form
-    n, m = g.B.shape
-    turned = U.conj().T @ (g.B / d[:, None])
-
-    def found(s: ComplexArray) -> ComplexArray:
-        X = np.broadcast_to(turned[:, :, None], (n, m, s.size)).copy()
-        for end in range(n, 0, -ROWS):  # rows below a block go into it by one matrix product
-            block = slice(max(end - ROWS, 0), end)
-            X[block] += (T[block, end:] @ X[end:].reshape(n - end, m * s.size)).reshape(
-                -1, m, s.size
-            )
-            for i in range(end - 1, block.start - 1, -1):
-                known = X[i + 1 : end].reshape(end - 1 - i, m * s.size)
-                X[i] += (T[i, i + 1 : end] @ known).reshape(m, s.size)
-                X[i] /= s - T[i, i]
-        return X
-
-    return found, (g.C * d) @ U

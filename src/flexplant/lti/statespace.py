@@ -25,7 +25,6 @@ from .channels import Channels, chosen_pair, rows_of
 from .direct import direct_gain
 from .foreign import foreign_fields
 from .joining import block_eigenvalues, checked_blocks, short_list
-from .scaling import scaled_schur
 from .system_arithmetic import SystemArithmetic
 from .zeros import invariant_zeros
 
@@ -143,11 +142,6 @@ class StateSpace(SystemArithmetic):
         if self.blocks is None:
             return np.asarray(la.eigvals(self.A), dtype=np.complex128)
         return block_eigenvalues(self.A, self.blocks)
-
-    @cached_property
-    def schur_form(self) -> tuple[FloatArray, ComplexArray, ComplexArray]:
-        """`scaled_schur` of it, kept: a system is often swept again and again."""
-        return scaled_schur(self.A, self.B, self.C)
 
     def poles(self) -> ComplexArray:
         """Return the eigenvalues of A, block by block where its blocks are known [rad/s or 1]."""

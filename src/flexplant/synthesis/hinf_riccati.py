@@ -226,7 +226,7 @@ def _seen(problem: Prepared, controller: StateSpace) -> float:
         return np.inf
     if not loop.n_states:
         return float(np.linalg.norm(loop.D, 2))
-    poles = loop.schur_form[1].diagonal()  # of the form that its gains need
+    poles = loop.poles()
     if poles.real.max() >= 0:
         return np.inf
     freq = np.unique(np.concatenate([[0.0], np.abs(poles), np.abs(poles.imag)])) / (2.0 * np.pi)

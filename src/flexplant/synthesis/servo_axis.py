@@ -101,12 +101,9 @@ def rigid_body(rate: float, delay: float, suspension: float) -> StateSpace:
     return held_exactly(body, rate, delay=delay)
 
 
-_prepared = lru_cache(maxsize=64)(responder)
-
-
 def rigid_peak(body: StateSpace, axis: Axis) -> float:
     """Return max |S| of one motion of the rigid body, stable or not."""
-    respond = _prepared(body)
+    respond = responder(body)
 
     def size(freq: FloatArray) -> FloatArray:
         return np.asarray(1.0 / np.abs(1.0 - respond(freq)[0, 0] * axis.response(freq)))
