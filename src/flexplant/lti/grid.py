@@ -230,10 +230,8 @@ def highest(
 
     Parameters
     ----------
-    find : function
-        Of frequencies [Hz], gives a value for each.
-    grid : (n_freq,) array [Hz]
-        Where it begins.
+    find, grid
+        As for `climbed`.
     rounds : int
         How often brackets are divided at most.
     """

@@ -74,12 +74,8 @@ class Foreign(_Unknown, Value):
 
     Parameters
     ----------
-    noise_factor : (n, r) array, optional
-        G with G G' the covariance of x that disturbances add in one sample.
-    delay : float [samples]
-        Of the inputs u.
-    continuous : StandardPlant, optional
-        The plant before sampling.
+    noise_factor, delay, continuous
+        As for `Assembled`.
 
     Examples
     --------

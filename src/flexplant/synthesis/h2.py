@@ -50,11 +50,8 @@ def design_h2(
     ----------
     plant : StandardPlant
         Continuous or sampled. A labelled StateSpace (ours or python-control's) serves too.
-    u, y : sequences of str, optional
-        Channels of the controller, for a StateSpace.
-    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes that the plant left out, as for `larger_plant`: the loop is checked
-        there too. Unless given, with those that the plant's reduced model still has.
+    u, y, larger
+        As for `design_hinf`.
 
     Returns
     -------

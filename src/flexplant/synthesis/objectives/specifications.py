@@ -83,10 +83,8 @@ class Hinf(_ChannelNorm):
 
     Parameters
     ----------
-    w, z : sequences of str, optional
-        Channels; all when not given.
-    below : float, optional
-        What it has to stay below; none for what is minimised.
+    w, z, below
+        As for `H2`.
 
     Examples
     --------
@@ -109,10 +107,8 @@ class PeakGain(_ChannelNorm):
 
     Parameters
     ----------
-    w, z : sequences of str, optional
-        Channels; all when not given.
-    below : float, optional
-        What it has to stay below; none for what is minimised.
+    w, z, below
+        As for `H2`.
     decay : float [rad/s], optional
         Rate at which the reachable set is taken to shrink; several are tried when not given.
 

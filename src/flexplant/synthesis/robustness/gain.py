@@ -95,16 +95,14 @@ def worst_case_gain(
 
     Parameters
     ----------
-    uncertain : UncertainPlant
-        From `plant.uncertain(fit, neglected=larger)`.
-    *blocks : StateSpace, or values with a `system`
-        The controller, as for `close_loop`.
+    uncertain, *blocks
+        As for `robust_stability`.
     w, z : sequence of str, or mapping {name: weight}
         Channels of the gain; weights are numbers or systems of one input and output.
     rng : int, SeedSequence, Generator or None
         Of the search.
     progress : bool, optional
-        A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
+        As for `robust_stability`.
 
     Returns
     -------
