@@ -10,6 +10,7 @@ import scipy.linalg as la
 from ..errors import SolverError
 from ..progress import tick
 from ..sparse.factor import by_rows, without_zeros
+from ..sparse.rayleigh_ritz import mixed
 from ..values import FloatArray, Matrix, Rng
 
 #: vectors that are solved for at a time
@@ -25,6 +26,8 @@ _STEPS = 12
 _RESTARTS = 60
 #: a block with directions this much shorter than others is orthonormalised again
 _LOST = 1e-3
+#: least of greatest eigenvalue of a block's Gram matrix for one turn to be exact to rounding
+_EVEN = 1e-2
 #: what one orthogonalisation may take away, relative, for rounding to leave nothing of it
 _SMALL = 1e-4
 #: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
@@ -81,6 +84,7 @@ class BlockLanczos:
         # rows: locked vectors, then the basis; only touched rows take memory
         self._V = np.empty((self._capacity, n))
         self._V[: self._r] = locked.T
+        self._locked = np.asarray(self._M @ locked)
         self._m = 0
         self._T = np.zeros((0, 0))
         self.steps = 0
@@ -138,14 +142,17 @@ class BlockLanczos:
                 close = np.flatnonzero(error[:shapes] > _SURE * theta[:shapes])
                 strict[close] = np.minimum(tolerance, needed(self._shapes(mix[:, close])))
                 left, needed = _unfinished(theta[:wanted], error, strict), None
-            if theta.size >= wanted and not left:
-                return theta[:wanted], self._shapes(mix[:, :wanted])
-            # a step brings no more than a block of new ones, usually half of it
-            check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
-            if full:
+            done = theta.size >= wanted and not left
+            if done or full:
                 keep = min(count + self._block, theta.size)
                 self._restart(theta, mix, keep)
                 self._over = self._over @ mix[-self._over.shape[1] :, :keep]
+            if done:
+                # the memory of the others is needed
+                self._V = self._V[: self._r + keep].copy()
+                return theta[:wanted], np.ascontiguousarray(self._V[self._r :][:wanted].T)
+            # a step brings no more than a block of new ones, usually half of it
+            check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
         raise SolverError(
             f"Lanczos did not converge for {count} modes in {self.steps} steps: M and K are badly "
             "conditioned. Look for DOFs with next to no mass, or request fewer modes."
@@ -164,19 +171,17 @@ class BlockLanczos:
 
     def _step(self) -> None:
         """Extend the basis by the next block."""
-        block, width = self._next, self._next.shape[1]
+        width, at = self._next.shape[1], self._r + self._m
+        self._append(self._next)
+        self._next = np.zeros((0, width))  # the basis has it
         moved = self._solve(self._loaded)
-        at = self._r + self._m
-        self._append(block)
         # nearly all of it along the basis lies along the last block and those before it that T
         # couples to it: what is left is small, and one orthogonalisation enough
-        main, coupling = self._loaded.T @ moved, self._over.T
-        before = slice(at - coupling.shape[0], at)
-        moved -= block @ main
-        moved -= self._V[before].T @ coupling
+        near = np.vstack([self._over.T, self._loaded.T @ moved])
+        rows = slice(at + width - near.shape[0], at + width)
+        _subtract(moved, self._V[rows], near)
         self._next, self._loaded, (along, self._over) = self._orthonormal(moved)
-        along[at:] += main
-        along[before] += coupling
+        along[rows] += near
         along = along[self._r :]
         grown_T = np.zeros((self._m, self._m))
         grown_T[:-width, :-width] = self._T
@@ -225,6 +230,8 @@ class BlockLanczos:
         along = np.zeros((basis.shape[0], W.shape[1]))
         over = np.eye(W.shape[1])
         W = np.ascontiguousarray(W)
+        # rounding of W is along what is locked: M times that is known
+        _subtract(W, self._V[: self._r], self._locked.T @ W)
         loaded = self._M @ W
         for _ in range(3):
             for _ in range(2):
@@ -247,9 +254,11 @@ class BlockLanczos:
                     empty = np.zeros((W.shape[0], 0))
                     return empty, empty, (along, np.zeros((0, over.shape[1])))
                 root = np.sqrt(size[keep])
-                W, loaded = (X @ (turn[:, keep] / root) for X in (W, loaded))
+                W, loaded = (mixed(X, turn[:, keep] / root) for X in (W, loaded))
                 over = (turn[:, keep] * root).T @ over
                 poor = poor or bool(size[0] < _LOST**2 * size[-1])
+                if size[0] > _EVEN * size[-1]:
+                    break
             if not poor:
                 break
             loaded = self._M @ W

@@ -63,7 +63,7 @@ class StiffnessFactor:
             self.sigma *= _SINGLE_SHIFT / _SHIFT * (np.finfo(np.float32).eps / np.finfo(float).eps)
         elif model.n_unstable:  # below the lowest eigenvalue
             self.sigma += 2.0 * float(unstable_stiffness(self.K, model.body_motions)[0])
-        shifted = sp.csc_array(self.K - self.sigma * self.M)
+        shifted = _shifted(self.K, self.M, self.sigma)
         self.dissection = dissection_of(model)
         try:
             self._cholesky: MultifrontalCholesky | PardisoCholesky = (
@@ -74,8 +74,7 @@ class StiffnessFactor:
         except SolverError as error:
             if single:
                 raise
-            beside = sp.csc_array(self.K - near * self.M)
-            negative = multifrontal_inertia(beside, self.dissection)
+            negative = multifrontal_inertia(_shifted(self.K, self.M, near), self.dissection)
             if not negative:
                 raise
             raise ModelError(
@@ -189,8 +188,7 @@ def dissection_of(model: FEModel) -> Dissection:
     if found is None:
         M, K = sp.csc_array(model.M), sp.csc_array(model.K)
         # of both matrices: entries that cancel in one stay in the other
-        same = np.array_equal(M.indptr, K.indptr) and np.array_equal(M.indices, K.indices)
-        pattern = K if same else sp.csc_array(abs(K) + abs(M))
+        pattern = K if _alike(K, M) else sp.csc_array(abs(K) + abs(M))
         found = dissect(pattern, model.dofs.node_index, model.dofs.xyz)
         _dissected[model] = found
     return found
@@ -204,7 +202,19 @@ def modes_below(model: FEModel, square: float) -> int:
     SolverError
         When `square` is so close to a mode that the count is not sure.
     """
-    return multifrontal_inertia(sp.csc_array(model.K - square * model.M), dissection_of(model))
+    return multifrontal_inertia(_shifted(model.K, model.M, square), dissection_of(model))
+
+
+def _shifted(K: Any, M: Any, square: float) -> Any:
+    """Return ``K - square M``, its indices those of K where both have the same."""
+    if not _alike(K, M):
+        return sp.csc_array(K - square * M)
+    return sp.csc_array((K.data - square * M.data, K.indices, K.indptr), shape=K.shape)
+
+
+def _alike(K: Any, M: Any) -> bool:
+    """Return whether the same entries of two matrices are stored."""
+    return np.array_equal(M.indptr, K.indptr) and np.array_equal(M.indices, K.indices)
 
 
 _held = weakref.WeakKeyDictionary()

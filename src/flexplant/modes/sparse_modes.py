@@ -34,6 +34,8 @@ _RESIDUAL = 1e-11
 _ROUNDINGS = 10.0
 #: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at
 _PARTS = (1.0, 0.03)
+#: shapes that are solved for at a time: each time, the whole factor is read
+_SOLVED = 32
 
 
 def counted_modes(
@@ -183,14 +185,13 @@ def _searched(
     """Return omega^2 and shapes, up to `want`, of one search."""
     extra = min(_EXTRA, want - 1)
     mass, stiffness = by_rows(model.M), by_rows(model.K)
-    size = absolute(stiffness)
     if factor.single:
         davidson = BlockDavidson(
             factor.solve, stiffness, mass, factor.sigma, locked, want=want, rng=rng, start=start
         )
-        phi = davidson.modes(want, extra, partial(_tolerance, stiffness, size, 0.5))
+        phi = davidson.modes(want, extra, partial(_tolerance, stiffness, 0.5))
         squares, phi = rayleigh_ritz(stiffness, mass, phi)
-        if _excess(stiffness, mass, size, squares[: want - extra], phi, 0.0) > 1:
+        if _excess(stiffness, mass, squares[: want - extra], phi, 0.0) > 1:
             raise SolverError("modes found with a factor in single precision are not accurate.")
         return squares, phi
     lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, rng=rng, start=start)
@@ -198,12 +199,12 @@ def _searched(
     best, squares, found = np.inf, np.zeros(0), np.zeros((locked.shape[0], 0))
     for part in _PARTS:
         steps = lanczos.steps
-        needed = partial(_tolerance, stiffness, size, part)
+        needed = partial(_tolerance, stiffness, part)
         _, phi = lanczos.lowest(want, extra=extra, needed=needed)
         if steps == lanczos.steps:
             break
         # one inverse iteration: what is left in phi of high modes, most of its residual, is gone
-        for at in column_groups(phi.shape[1]):
+        for at in column_groups(phi.shape[1], _SOLVED):
             force = mass @ phi[:, at]
             force -= deflated @ (locked.T @ force)
             moved = factor.solve(force)
@@ -213,7 +214,7 @@ def _searched(
         kept = values[: values.size - extra] if values.size == want else values
         # what the rounding of the largest 1 / (omega^2 - sigma) lets be reached
         reached = 2 * REACHED * (kept - factor.sigma) / (values[0] - factor.sigma)
-        left = _excess(stiffness, mass, size, kept, phi, reached)
+        left = _excess(stiffness, mass, kept, phi, reached)
         if left < best:
             best, squares, found = left, values, phi
         if left <= 1:
@@ -222,10 +223,10 @@ def _searched(
 
 
 def _excess(
-    K: Any, M: Any, size_of_K: Any, squares: FloatArray, phi: FloatArray, least: FloatArray | float
+    K: Any, M: Any, squares: FloatArray, phi: FloatArray, least: FloatArray | float
 ) -> float:
     """Return the largest residual of the first shapes, relative to what is let pass or `least`."""
-    left, least = 0.0, np.broadcast_to(least, squares.shape)
+    left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), absolute(K)
     for at in column_groups(squares.size):
         force, limit = _let_pass(K, size_of_K, phi[:, at])
         limit = np.maximum(limit, least[at]) * np.linalg.norm(force, axis=0)
@@ -234,9 +235,12 @@ def _excess(
     return left
 
 
-def _tolerance(K: Any, size_of_K: Any, part: float, phi: FloatArray) -> FloatArray:
+def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
     """Return the relative error of each shape at which `part` of its residual is let pass."""
-    return part * _let_pass(K, size_of_K, phi)[1]
+    size_of_K, limit = absolute(K), np.zeros(phi.shape[1])
+    for at in column_groups(limit.size):
+        limit[at] = part * _let_pass(K, size_of_K, phi[:, at])[1]
+    return limit
 
 
 def _let_pass(K: Any, size_of_K: Any, phi: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -19,7 +19,7 @@ _END = 1e-3
 #: rows that are mixed at a time
 _ROWS = 65536
 #: shapes that are multiplied at a time: a product of all at once is memory at its peak
-_COLUMNS = 32
+_COLUMNS = 16
 _EPS = float(np.finfo(np.float64).eps)
 
 
@@ -64,10 +64,11 @@ def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
     return found
 
 
-def column_groups(count: int) -> Iterator[slice]:
-    """Yield the columns of a wide array in groups: what is made of a group fits the cache."""
-    for begin in range(0, count, _COLUMNS):
-        yield slice(begin, min(begin + _COLUMNS, count))
+def column_groups(count: int, most: int = _COLUMNS) -> Iterator[slice]:
+    """Yield the columns of a wide array in groups of one size: made of one, little is large."""
+    groups = -(-count // most)
+    for k in range(groups):
+        yield slice(k * count // groups, (k + 1) * count // groups)
 
 
 def absolute(K: Any) -> Any:
