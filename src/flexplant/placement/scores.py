@@ -14,9 +14,12 @@ from ..parallel import mapped
 from ..plant import StandardPlant
 from ..values import FloatArray, IntArray, Value, short, whole
 from ..work import Work
+from .candidate_places import places_of
 from .candidates import Port, Side, checked_plant, known_candidates, with_side
+from .constraint import Constraint
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
+from .zones import all_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -112,6 +115,7 @@ def score_sensors(
     criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     candidates: Sequence[Any] = (),
+    constraints: Sequence[Constraint] = (),
     executor: Executor | None = None,
     progress: bool | None = None,
 ) -> Scores:
@@ -132,6 +136,9 @@ def score_sensors(
         From a plant to a float, smaller is better; `PoiVariance()` when not given.
     candidates : sequence of Sensor
         What names may stand for, besides the plant's own sensors.
+    constraints : sequence of Constraint, optional
+        As for `place_sensors`: a layout that breaks one is infeasible. One with a sensor on a POI
+        is, unless OffPoi(-1) is among them.
     executor : concurrent.futures.Executor, optional
         Computes in chunks; the result is the same to the bit.
     progress : bool, optional
@@ -160,10 +167,10 @@ def score_sensors(
     >>> plant = fx.testbeds.three_masses()
     >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> scores = fx.score_sensors(plant, [["s1"], ["s2"], ["s3"]], candidates=candidates)
-    >>> scores.best
-    ('s2',)
+    >>> scores.layouts, scores.reasons  # the POI is on mass 2
+    ((('s1',), ('s3',), ('s2',)), ('', '', 'against OffPoi(radius=0.0).'))
     """
-    return _scored(plant, "y", layouts, criterion, candidates, executor, progress)
+    return _scored(plant, "y", layouts, criterion, candidates, constraints, executor, progress)
 
 
 def score_actuators(
@@ -172,6 +179,7 @@ def score_actuators(
     criterion: Criterion | Callable[[StandardPlant], float] | None = None,
     *,
     candidates: Sequence[Any] = (),
+    constraints: Sequence[Constraint] = (),
     executor: Executor | None = None,
     progress: bool | None = None,
 ) -> Scores:
@@ -187,6 +195,8 @@ def score_actuators(
         From a plant to a float, smaller is better; `PoiLqr()` when not given.
     candidates : sequence of Actuator
         What names may stand for, besides the plant's own actuators.
+    constraints : sequence of Constraint, optional
+        As for `place_actuators`: a layout that breaks one is infeasible.
     executor, progress : optional
         As for `score_sensors`.
 
@@ -216,7 +226,7 @@ def score_actuators(
     >>> scores.best
     ('a2',)
     """
-    return _scored(plant, "u", layouts, criterion, candidates, executor, progress)
+    return _scored(plant, "u", layouts, criterion, candidates, constraints, executor, progress)
 
 
 def _scored(
@@ -225,6 +235,7 @@ def _scored(
     layouts: Sequence[Sequence[Any]],
     criterion: Criterion | Callable[[StandardPlant], float] | None,
     candidates: Sequence[Any],
+    constraints: Sequence[Constraint],
     executor: Executor | None,
     progress: bool | None,
 ) -> Scores:
@@ -247,10 +258,16 @@ def _scored(
     position = {port.name: i for i, port in enumerate(ports)}
     judged = layouts_of(plant, side, ports, criterion)
     chosen = [tuple(position[name] for name in layout) for layout in names]
-    values = judged.scores(chosen, Work(executor, progress))
-    lost = np.flatnonzero(~np.isfinite(values)).tolist()
+    places, values = places_of(plant, ports), np.full(len(chosen), np.inf)
+    reasons: dict[int, str] = {}
+    for constraint in all_of(constraints, side):
+        held = constraint.rows(places).hold(chosen)
+        reasons |= dict.fromkeys(np.flatnonzero(~held).tolist(), f"against {constraint!r}.")
+    kept = [i for i in range(len(chosen)) if i not in reasons]
+    values[kept] = judged.scores([chosen[i] for i in kept], Work(executor, progress))
+    lost = [i for i in kept if not np.isfinite(values[i])]
     why = mapped(judged.reason, [chosen[i] for i in lost], executor=executor, progress=progress)
-    reasons = dict(zip(lost, why, strict=True))
+    reasons |= dict(zip(lost, why, strict=True))
     order = np.argsort(values, kind="stable")
     judged.confirm(chosen[order[0]], float(values[order[0]]))
     return Scores(
