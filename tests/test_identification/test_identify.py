@@ -465,7 +465,7 @@ def test_covariance_of_shapes_is_that_of_many_measurements():
         ({"dofs": ["y1"]}, LabelError, "dofs must be of type Mapping"),
         ({"dofs": {"y9": "1:z"}}, LabelError, "y9"),
         ({"start": [1.0]}, ModelError, "PoleSelection"),
-        ({"start": PoleSelection([-1 + 300j], [[1.0]])}, ShapeError, "references"),
+        ({"start": PoleSelection([-1 + 300j], [[1.0]])}, ShapeError, "1 reference,"),
     ],
 )
 def test_bad_arguments_are_refused(arguments, error, text):

@@ -173,7 +173,7 @@ def test_the_pointwise_bound_by_hand():
 
 def test_the_time_limit_is_for_everything_and_named():
     start = time.process_time()
-    with pytest.raises(SolverError, match=r"the time limit of 0\.01 s was reached after \d+ steps"):
+    with pytest.raises(SolverError, match=r"the time limit of 0\.01 s was reached after \d+ step"):
         StructuredLmi(time_limit=0.01).solve(prepared(*flexible(10)))
     assert time.process_time() - start < 10.0
 

@@ -393,7 +393,7 @@ def test_a_single_parameter_that_no_residual_sees():
     assert (found.rank, found.unseen) == (0, ("mass at 2:x",))
     assert np.isinf(found.std[0])
     assert found.missing == {"mass at 2:x": (3,)}
-    assert "0 of 1 combinations" in repr(found)
+    assert "0 of 1 combination," in repr(found)
     assert identifiability(drawing, [AddedMass("1:x")], poles).rank == 1
 
 

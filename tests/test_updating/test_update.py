@@ -279,7 +279,7 @@ def test_first_step_is_equation_13_with_W(make):
     W = np.array([2.0, 0.5, 7.0])
     measured = MeasuredModes(target, modes=[1, 2, 3])
     places = ["1:z", "2:z"]
-    with pytest.warns(FlexplantWarning, match="did not converge in 1 steps"):
+    with pytest.warns(FlexplantWarning, match="did not converge in 1 step:"):
         fit = update(
             model,
             [AddedMass(place) for place in places],

@@ -86,7 +86,11 @@ class Estimate(Value, Mapping[str, FloatArray]):
 
     def __repr__(self) -> str:
         missing = int(np.count_nonzero(np.isnan(self.innovations)))
-        gaps = f", {missing} of {self.innovations.size} innovations missing" if missing else ""
+        gaps = (
+            f", {missing} of {counted(self.innovations.size, 'innovation')} missing"
+            if missing
+            else ""
+        )
         last = sizes_of(dict(zip(self.names, self._typical(), strict=True)), self.units)
         return (
             f"<Estimate by {self.lag!r}: {counted(self.time.size, 'sample')}{gaps};\n"

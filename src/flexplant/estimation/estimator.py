@@ -83,7 +83,7 @@ class KalmanEstimator(Value):
         beyond = (
             "modes left out are not known: truncation is not in these numbers"
             if count is None
-            else f"with {count} modes left out"
+            else f"with {counted(count, 'mode')} left out"
             if count
             else "as if no modes were left out"
         )

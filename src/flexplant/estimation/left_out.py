@@ -99,7 +99,7 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     genuine = np.setdiff1d(np.arange(kept_omega.size), _of_vectors(small))
     if genuine.size > all_modes.omega.size:
         raise ModelError(
-            f"the larger model has {all_modes.omega.size} elastic modes, the plant "
+            f"the larger model has {counted(all_modes.omega.size, 'elastic mode')}, the plant "
             f"{genuine.size}: it is not larger. Pass more modes of the full structure."
         )
     rows, columns = _paired(kept, all_modes, genuine)

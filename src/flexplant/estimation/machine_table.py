@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import members
-from ..errors import AssumptionError, FlexplantWarning, ModelError, require_known
+from ..errors import AssumptionError, FlexplantWarning, ModelError, counted, require_known
 from ..loop import close_loop
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, in_unit, short
@@ -63,7 +63,7 @@ class MachineTable(Value):
         heads = ("own model", "median", "95 %", "worst", "worst / own")
         title = f"rms error of {self.channel} [{unit or '?'}]"
         lines = [
-            f"{title} on {self.values.shape[1]} machines",
+            f"{title} on {counted(self.values.shape[1], 'machine')}",
             " " * width + "".join(f"{head:>13s}" for head in heads),
         ]
         for name, own, row in zip(self.names, self.nominal, self.values, strict=True):

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, ShapeError, require_known
+from ..errors import LabelError, ShapeError, counted, require_known
 from ..plant import StandardPlant
 from ..values import FloatArray, real_array, short
 from .filter_model import FilterModel, filter_model
@@ -66,8 +66,8 @@ def moving_sight(
         points = real_array(points, f"the path of {name!r}", (None, 3))
         if len(points) != count:
             raise ShapeError(
-                f"the path of {name!r} has {len(points)} points, the record {count} samples. "
-                "Pass the point at each sample."
+                f"the path of {name!r} has {counted(len(points), 'point')}, the record {count} "
+                "samples. Pass the point at each sample."
             )
         distinct, which = np.unique(points, axis=0, return_inverse=True)
         which = which.reshape(-1)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arguments import between
-from ..errors import LabelError, ModelError, ShapeError, SolverError, require_known
+from ..errors import LabelError, ModelError, ShapeError, SolverError, counted, require_known
 from ..lti.frequency import Frf
 from ..parallel import Progress, one_thread
 from ..values import instance, positive, real_array, short, whole
@@ -236,8 +236,8 @@ def _identified(
             raise no_pole(frf, error) from None
     elif start.participation.shape[0] != ready.data.shape[1]:
         raise ShapeError(
-            f"start was chosen with {start.participation.shape[0]} references, this FRF has "
-            f"{ready.data.shape[1]}: make the diagram from the same channels."
+            f"start was chosen with {counted(start.participation.shape[0], 'reference')}, this FRF "
+            f"has {ready.data.shape[1]}: make the diagram from the same channels."
         )
     else:
         chosen = start

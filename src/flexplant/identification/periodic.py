@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..lti.frequency import Frf
 from ..values import ComplexArray, FloatArray, Value, generator, positive, real_array, whole
 from .records import Records
@@ -86,8 +86,8 @@ def periodic_frf(data: Records, method: Periodic, quantity: str | None) -> Frf:
         )
     if n_exp < n_in:
         raise ModelError(
-            f"{n_exp} experiments cannot separate {n_in} periodic inputs: make one per input, "
-            "with the phases of `multisine`."
+            f"{counted(n_exp, 'experiment')} cannot separate {counted(n_in, 'periodic input')}: "
+            "make one per input, with the phases of `multisine`."
         )
     Y, U = (line_spectra(side, samples, periods) for side in (data.y, data.u))
     lines = np.arange(1, (samples + 1) // 2)

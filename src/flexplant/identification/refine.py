@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import SolverError
+from ..errors import SolverError, counted
 from ..values import ComplexArray, FloatArray, IntArray
 from .basis import axis, residual_terms, seen_terms
 
@@ -180,8 +180,8 @@ def refined(
 def unsettled(count: int, steps: int) -> SolverError:
     """Return the error of a fit that does not converge."""
     return SolverError(
-        f"the refinement of {count} poles did not settle within {steps} steps: leave out "
-        "poles that do not stand out of the noise, or narrow the band."
+        f"the refinement of {counted(count, 'pole')} did not settle within {steps} steps: leave "
+        "out poles that do not stand out of the noise, or narrow the band."
     )
 
 

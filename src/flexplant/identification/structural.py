@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import LabelError, ModelError, warn
+from ..errors import LabelError, ModelError, counted, warn
 from ..labels import DofSet
 from ..modes import Modes
 from ..structure import interpolated
@@ -330,8 +330,8 @@ def expansion(over: Modes, rows: Any) -> FloatArray:
     count, places = over.n_modes, len(rows)
     if np.linalg.matrix_rank(seen / np.linalg.norm(Phi, axis=0)) < count:
         raise ModelError(
-            f"{places} measured places do not determine {count} modes of the model: expand over "
-            "fewer, solve_modes(model, count=...), or measure at more places."
+            f"{counted(places, 'measured place')} cannot determine {counted(count, 'mode')} of the "
+            "model: expand over fewer, solve_modes(model, count=...), or measure at more places."
         )
     return np.asarray(np.linalg.lstsq(seen.T, Phi.T)[0].T)
 

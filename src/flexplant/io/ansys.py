@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..dof_columns import at_nodes
-from ..errors import FlexplantError
+from ..errors import FlexplantError, counted
 from ..labels import DIRECTIONS, DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray, IntArray
@@ -105,7 +105,7 @@ def read_ansys(
     left = set() if result.dofs is None else set(result.dofs.nodes.tolist())
     turned = {node: cosines for node, cosines in angles.items() if node in left}
     if turned:
-        note = f"{len(turned)} local coordinate systems turned to global directions"
+        note = f"{counted(len(turned), 'local coordinate system')} turned to global directions"
         result = result.rotated(turned).replace(notes=(*result.notes, note))
     return result
 

@@ -110,7 +110,7 @@ def from_triplets(
     """
     twice = np.count_nonzero(np.unique(i * n + j, return_counts=True)[1] > 1)
     if twice:
-        raise damaged(path, f"{twice} entries twice (several steps?)")
+        raise damaged(path, f"entries stored twice: {twice} (several steps?)")
     # unsorted labels put entries of a half on both sides: no entry then has its mirror image
     return completed(sp.coo_array((values, (i, j)), shape=(n, n)), "a matrix")[0]
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import FlexplantError, LabelError, ModelError, require_known
+from ..errors import FlexplantError, LabelError, ModelError, counted, require_known
 from ..labels import DIRECTIONS, DofSet
 from ..structure.matrices import FEMatrices
 from ..values import FloatArray, IntArray
@@ -122,7 +122,7 @@ def read_dmig(
     turned = {n: C for n, C in local.items() if np.abs(C - np.eye(3)).max() > 1e-14}
     if not turned:
         return found
-    note = f"{len(turned)} nodes moved in local directions: turned into the basic ones"
+    note = f"{counted(len(turned), 'node')} moved in local directions: turned into the basic ones"
     return found.rotated(turned).replace(notes=(*found.notes, note))
 
 

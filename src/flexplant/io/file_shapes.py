@@ -100,7 +100,7 @@ def modes_of(
     damping = real_array(damping, "zeta")
     if damping.shape not in ((), (k,)):
         raise ShapeError(
-            f"zeta must be one number or one of each of {k} modes, got {damping.shape}."
+            f"zeta must be one number or one of each of {counted(k, 'mode')}, got {damping.shape}."
         )
     damping = np.array(np.broadcast_to(damping, (k,)))
     phi, moved = shapes.phi, np.any(shapes.phi != 0, axis=1)

@@ -82,7 +82,7 @@ class JoiningCertificate(Value):
         if len(self.pieces) > 1:
             listed = [f"{names}: {count}" for names, count in self.pieces.items()]
             pieces = f"{len(listed)} pieces ({'; '.join(listed)})"
-        independent = f"{self.rank} of {self.constraints} rigid constraints independent"
+        independent = f"{self.rank} of {counted(self.constraints, 'rigid constraint')} independent"
         errors = f"gap {self.gap:.1g}, balance {self.balance:.1g}, inertia {self.inertia_error:.1g}"
         errors += f", rigid force {self.rigid_force:.1g}"
         head = f"{counted(self.n_rigid, 'rigid-body motion')} (alone: {before}), {pieces}"
@@ -152,7 +152,7 @@ def certified(
         )
     if found.n_rigid != expected:
         raise CertificateError(
-            f"the machine has {found.n_rigid} rigid-body motions, but {expected} of its "
+            f"the machine has {counted(found.n_rigid, 'rigid-body motion')}, but {expected} of its "
             "components' stretch no joint: a joint is too soft or too stiff for the digits of the "
             "matrices. Look for a wrong unit of a stiffness, or leave the joint out."
         )

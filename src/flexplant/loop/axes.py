@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, ShapeError, counted
 from ..lti.between_lines import between_lines
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
@@ -210,8 +210,8 @@ def static_map(given: System | FloatArray | None, names: Sequence[str], side: st
         ends = T.outputs if side == "before" else T.inputs
         if len(ends) != len(names):
             raise ShapeError(
-                f"{side} has {len(ends)} channels at the plant, which has {len(names)}: give one "
-                "row (of before) or column (of after) for each."
+                f"{side} has {counted(len(ends), 'channel')} at the plant, which has {len(names)}: "
+                "give one row (of before) or column (of after) for each."
             )
         return T.replace(outputs=names) if side == "before" else T.replace(inputs=names)
     return T

@@ -226,7 +226,7 @@ def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> Ny
         return NyquistCount(
             None,
             f"at the lowest lines, from {grid[0]:.4g} Hz, the plant falls with slope {slope:.2g}, "
-            f"but {rigid} rigid-body modes were stated: a free body falls with slope 2, a held one "
+            f"but rigid={rigid} was stated: a free body falls with slope 2, a held one "
             "does not. State rigid=, or measure at lower frequencies",
         )
     freq, L = continued(grid, plant, parts.controller, 2 if rigid else 0)

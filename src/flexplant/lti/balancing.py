@@ -135,8 +135,8 @@ def balanced(
     reduced = _reduced(stable, W, T, r, residual=match_dc)
     if (problem := obstacle(reduced)) is not None:
         raise SolverError(
-            f"the weighted reduction to {r} stable states is {problem.reason}: with weights on "
-            "both sides stability is not promised. Take another order or one weight."
+            f"the weighted reduction to {counted(r, 'stable state')} is {problem.reason}: with "
+            "weights on both sides stability is not promised. Take another order or one weight."
         )
     error, freq = _error(stable, reduced, before, after)
     weighted = before is not None or after is not None

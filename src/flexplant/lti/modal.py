@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import scipy.linalg as la
 
+from ..errors import counted
 from ..values import ComplexArray, FloatArray, Value, positive
 from .joining import is_block_diagonal
 from .scaling import state_scale
@@ -50,7 +51,7 @@ class ModalForm(Value):
     reason: str = ""
 
     def __repr__(self) -> str:
-        found = self.reason or f"{len(self.system.blocks or ())} blocks"
+        found = self.reason or f"{counted(len(self.system.blocks or ()), 'block')}"
         return f"<ModalForm: {found}, condition {self.condition:.1e}>"
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 import scipy.sparse as sp
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..labels import DofSet, Place
 from ..sparse.factor import DENSE_LIMIT, dense, diagonal
 from ..sparse.multifrontal import MultifrontalCholesky
@@ -143,8 +143,9 @@ def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) 
             factor = la.cho_factor(stiffness / size / size.T)
         except la.LinAlgError as error:
             raise ModelError(
-                f"K is singular beyond the {r} rigid-body motions of the geometry (a mechanism, a "
-                "DOF without stiffness, or wrong coordinates): there is no static response."
+                f"K is singular beyond the {counted(r, 'rigid-body motion')} of the geometry (a "
+                "mechanism, a DOF without stiffness, or wrong coordinates): there is no static "
+                "response."
             ) from error
         part = np.asarray(la.cho_solve(factor, balanced[free] / size) / size)
     response[free] = part

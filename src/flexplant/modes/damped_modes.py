@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import SolverError, warn
+from ..errors import SolverError, counted, warn
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.orthonormal import beyond
 from ..sparse.pardiso import Pardiso
@@ -115,8 +115,8 @@ def damped_modes(
     worst = float((size[wrong] / limit[wrong]).max()) * _RESIDUAL[0]
     raise SolverError(
         f"complex modes leave a relative residual of {worst:.2g} (limit {_RESIDUAL[0]:g}) after "
-        f"{V.shape[1]} vectors: the damping is strong. Want fewer modes, or reduce the model by "
-        "CraigBampton at the dampers, which keeps D, and take its modes()."
+        f"{counted(V.shape[1], 'vector')}: the damping is strong. Want fewer modes, or reduce the "
+        "model by CraigBampton at the dampers, which keeps D, and take its modes()."
     )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import SolverError
+from ..errors import SolverError, counted
 from ..progress import tick
 from ..sparse.factor import by_rows
 from ..values import FloatArray, IntArray, Matrix, Rng
@@ -97,8 +97,8 @@ class BlockDavidson(BlockLanczos):
                 self._restart(squares, mix, max(count + self._block, 2 * self._m // 3))
             self._extend(unfinished)
         raise SolverError(
-            f"{count} modes did not converge in {self.steps} steps of a Davidson iteration: its "
-            "preconditioner is too far from the inverse of K - sigma M."
+            f"{counted(count, 'mode')} did not converge in {self.steps} steps of a Davidson "
+            "iteration: its preconditioner is too far from the inverse of K - sigma M."
         )
 
     def _extend(self, forces: FloatArray) -> None:

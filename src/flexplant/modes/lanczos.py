@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import SolverError
+from ..errors import SolverError, counted
 from ..progress import tick
 from ..sparse.factor import by_rows, without_zeros
 from ..sparse.rayleigh_ritz import mixed
@@ -154,8 +154,8 @@ class BlockLanczos:
             # a step brings no more than a block of new ones, usually half of it
             check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
         raise SolverError(
-            f"Lanczos did not converge for {count} modes in {self.steps} steps: M and K are badly "
-            "conditioned. Look for DOFs with next to no mass, or request fewer modes."
+            f"Lanczos did not converge for {counted(count, 'mode')} in {self.steps} steps: M and K "
+            "are badly conditioned. Look for DOFs with next to no mass, or request fewer modes."
         )
 
     def _random(self, columns: int) -> FloatArray:

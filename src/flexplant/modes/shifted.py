@@ -128,8 +128,8 @@ class StiffnessFactor:
         if not np.all((part <= 1e-7) | (wanted == 0)):
             raise SolverError(
                 f"a static response is not found (the last step is {part.max():.1g} of it): K is "
-                f"singular beyond the {R.shape[1]} rigid-body motions of the geometry. Look for a "
-                "mechanism, a DOF without stiffness, or wrong coordinates."
+                f"singular beyond the {counted(R.shape[1], 'rigid-body motion')} of the geometry. "
+                "Look for a mechanism, a DOF without stiffness, or wrong coordinates."
             )
         return u - R @ (inertia.T @ u)
 

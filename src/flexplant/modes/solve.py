@@ -218,7 +218,7 @@ def _asked(model: FEModel, count: int | None, below: float | None) -> tuple[int,
     number = isinstance(count, int | np.integer) and not isinstance(count, bool)
     if not number or not max(r, 1) <= count <= n:
         raise ModelError(
-            f"count must be a whole number from {max(r, 1)} ({r} rigid-body modes are always kept) "
+            f"count must be a whole number from {max(r, 1)} (rigid-body modes stay: {r}) "
             f"to {n} (all modes), got {short(count)}. Choose one there, or give below= in Hz."
         )
     return int(count), top

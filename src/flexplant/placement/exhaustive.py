@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..values import whole
 from ..work import Work
 from .problem import Found, Problem, Search
@@ -50,9 +50,9 @@ class Exhaustive(Search):
         """
         if problem.subsets > self.limit:
             raise ModelError(
-                f"there are {problem.subsets} subsets, more than Exhaustive(limit={self.limit}) "
-                "allows. Use Exchange(), whose bound shows how far from the optimum it can be, or "
-                "a higher limit."
+                f"there are {counted(problem.subsets, 'subset')}, more than "
+                f"Exhaustive(limit={self.limit}) allows. Use Exchange(), whose bound shows how far "
+                "from the optimum it can be, or a higher limit."
             )
         sets = list(problem.choices())
         values = problem.layouts.scores(sets, work, "every subset")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, CertificateError
+from ..errors import AssumptionError, CertificateError, counted
 from ..plant import Assumption, StandardPlant, assemble_plant
 from ..values import FloatArray
 from ..work import Work
@@ -77,7 +77,7 @@ class Layouts:
         if not lost:
             return self.scorer.outcome(sorted(chosen))[1]
         found = self._finding(chosen)
-        return f"{lost} rigid-body modes are missed." if found.holds else found.finding
+        return f"It misses {counted(lost, 'rigid-body mode')}." if found.holds else found.finding
 
     def require_any(self) -> None:
         """Raise AssumptionError when even all candidates together miss a rigid-body mode."""

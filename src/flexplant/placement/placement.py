@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..errors import counted
 from ..plant import StandardPlant
 from ..values import Value
 from .candidates import Port, Side, side_of, with_side
@@ -78,7 +79,7 @@ class Placement(Value):
         return (
             f"<Placement {' '.join(self.chosen):.120}: {in_words(self.value, self.unit)} by "
             f"{self.criterion}, {proof}; {agree} of {len(ends)} starts agree, "
-            f"{self.evaluations} evaluations"
+            f"{counted(self.evaluations, 'evaluation')}"
             f"{', ' if self.stopped else ''}{self.stopped}>"
         )
 

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..errors import LabelError, ModelError, require_known
+from ..errors import LabelError, ModelError, counted, require_known
 from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
@@ -88,8 +88,8 @@ def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) ->
     known = channels_of(plant)
     if poi is None and len(known) != 1:
         raise LabelError(
-            f"the plant has {len(known)} POIs ({', '.join(known)}): say which count, such as "
-            f"PoiVariance({next(iter(known), 'die')!r}), or all of them in a list."
+            f"the plant has {counted(len(known), 'POI')} ({', '.join(known)}): say which count, "
+            f"such as PoiVariance({next(iter(known), 'die')!r}), or all of them in a list."
         )
     found: dict[str, float] = {}
     for name, weight in _factors(poi if poi is not None else tuple(known)).items():

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, ModelError
+from ..errors import LabelError, ModelError, counted
 from ..parallel import mapped
 from ..plant import StandardPlant
 from ..values import FloatArray, IntArray, Value, short, whole
@@ -69,7 +69,9 @@ class Scores(Value):
 
     def __repr__(self) -> str:
         feasible = int(np.count_nonzero(np.isfinite(self.values)))
-        head = f"<Scores of {len(self)} layouts by {self.criterion}, {feasible} feasible>"
+        head = (
+            f"<Scores of {counted(len(self), 'layout')} by {self.criterion}, {feasible} feasible>"
+        )
         return "\n".join([head, *self._lines(5)])
 
     @property

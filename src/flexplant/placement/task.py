@@ -81,7 +81,7 @@ def _check_counts(counts: Mapping[str, int], kept: Sequence[Port]) -> None:
     for side, count in counts.items():
         needed = sum(side_of(port) == side for port in kept)
         if needed > count:
-            raise ModelError(f"{needed} candidates are required, but only {count} are chosen.")
+            raise ModelError(f"count is {count}, and {needed} candidates are required.")
 
 
 def _shares(ports: Sequence[Port], counts: Mapping[str, int]) -> LinearRows:

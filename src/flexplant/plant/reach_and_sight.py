@@ -66,7 +66,7 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
             text = "; ".join(texts[:_SHOWN]) + (f"; and {more} more" if more > 0 else "")
             found.append(Assumption(case.key, False, f"{text} {listed}.", case.remedy))
         else:
-            text = f"{' and '.join(words)}, by {len(case.names)} channels."
+            text = f"{' and '.join(words)}, by {counted(len(case.names), 'channel')}."
             found.append(
                 Assumption(case.key, True, text if words else "every mode decays by itself.")
             )
@@ -76,7 +76,8 @@ def reach_and_sight(plant: Partition) -> list[Assumption]:
 def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
     """Return, in words, how many modes of each kind do not decay."""
     rigid, pairs = plant.n_rigid, len(plant.unstable_modes)
-    words = [f"all {rigid} rigid-body modes"] if rigid else []
+    every = f"all {rigid} rigid-body modes" if rigid > 1 else "the rigid-body mode"
+    words = [every] if rigid else []
     words += [counted(pairs, "unstable rigid-body pair")] if pairs else []
     count = sum(pole.left.shape[1] for pole in poles) - rigid - pairs
     known = np.zeros(0)
@@ -95,7 +96,7 @@ def _counted(plant: Partition, poles: list[_Pole]) -> list[str]:
             span = f"{min(freq):.4g}" + (f" to {max(freq):.4g}" if len(freq) > 1 else "")
             words.append(f"{counted(len(freq), kind)} at {span} Hz")
             count -= len(freq)
-    words += [f"{count} other poles that are not stable"] if count > 0 else []
+    words += [f"{counted(count, 'other pole')} without decay"] if count > 0 else []
     return words
 
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from ..errors import counted
 from ..loop import ErrorBudget
 from ..values import in_unit, instance, with_unit
 from ._axes import axes, finish, named
@@ -63,7 +64,7 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
     layers = [(found.names[i], stairs[i], found[found.names[i]]) for i in shown]
     if rest:
         others = float(np.sqrt(found.variances[rest].sum()))
-        layers.append((f"{len(rest)} others", stairs[rest].sum(axis=0), others))
+        layers.append((f"{counted(len(rest), 'other')}", stairs[rest].sum(axis=0), others))
     base = np.zeros(freq.size)
     for i, (name, rows, rms) in enumerate(layers):
         ax.fill_between(

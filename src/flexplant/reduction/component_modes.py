@@ -104,7 +104,7 @@ class CraigBampton(ReductionMethod):
             T,
             dofs=model.dofs.select(labels),
             coordinates=names,
-            method=f"{count} fixed-interface modes (Craig-Bampton)",
+            method=f"{counted(count, 'fixed-interface mode')} (Craig-Bampton)",
             damping=self.damping,
             static_at=labels,
         )
@@ -113,8 +113,8 @@ class CraigBampton(ReductionMethod):
         rows = part.others
         if self.modes > rows.size:
             raise ModelError(
-                f"{self.modes} fixed-interface modes of an interior of {rows.size} DOFs: choose "
-                "fewer."
+                f"{counted(self.modes, 'fixed-interface mode')} of an interior of {rows.size} "
+                "DOFs: choose fewer."
             )
         interior = FEModel(
             block(model.M, rows, rows),
@@ -153,7 +153,7 @@ class _FreeInterface(ReductionMethod):
     def reduced(self, structure: FEModel | Modes) -> ReducedModel:
         """Return the reduced model; `reduce` is the public way."""
         labels = tuple(self.boundary)
-        method = f"{self.modes} free modes and {self._kind} ({type(self).__name__})"
+        method = f"{counted(self.modes, 'free mode')} and {self._kind} ({type(self).__name__})"
         parts = self._parts(fe_model(structure, self), labels)
         return _built(*parts, labels, self.damping, massless=self._massless, method=method)
 

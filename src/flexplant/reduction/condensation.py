@@ -69,7 +69,7 @@ class DofPartition:
         others[self.kept] = False
         self.others: IntArray = np.flatnonzero(others)
         if not self.others.size:
-            raise ShapeError(f"all {n} DOFs are kept: nothing is left to condense.")
+            raise ShapeError(f"all {counted(n, 'DOF')} would be kept: nothing is left to condense.")
         rigid = model.rigid_body
         if rigid.shape[1]:
             # held at the kept DOFs, no rigid-body motion may be left
@@ -330,7 +330,7 @@ class Serep(ReductionMethod):
             model,
             la.solve(phi[rows].T, phi.T).T,
             dofs=model.dofs.select(labels),
-            method=f"{len(labels)} modes (SEREP)",
+            method=f"{counted(len(labels), 'mode')} (SEREP)",
             damping=self.damping,
             condition=condition,
             condition_of="phi_kk",

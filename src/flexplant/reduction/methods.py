@@ -110,12 +110,13 @@ class DesiredDofs(ReductionMethod):
             )
         if len(labels) != k:
             raise ShapeError(
-                f"{len(labels)} desired DOFs for {modes.n_modes} modes plus {modes.n_vectors} "
-                f"attachment vectors = {k}: phi_kk in equation (7) must be square. "
+                f"{counted(len(labels), 'desired DOF')} for {counted(modes.n_modes, 'mode')} plus "
+                f"{modes.n_vectors} attachment vectors = {k}: phi_kk in equation (7) must be "
+                "square. "
                 + (
-                    f"Name {k - len(labels)} more DOFs or keep fewer modes"
+                    f"Name {counted(k - len(labels), 'more DOF')} or keep fewer modes"
                     if len(labels) < k
-                    else f"Leave out {len(labels) - k} DOFs or keep more modes"
+                    else f"Leave out {counted(len(labels) - k, 'DOF')} or keep more modes"
                 )
                 + f"; select_dofs(modes, {k}) finds a good set."
             )

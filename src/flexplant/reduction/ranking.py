@@ -78,7 +78,7 @@ class ModeRanking(Value):
         return (
             f"<ModeRanking: {counted(self.modes.size, 'elastic mode')}, "
             f"{counted(len(self.inputs), 'input')} to "
-            f"{len(self.outputs)} outputs; by Hankel value: {first}{more}>"
+            f"{counted(len(self.outputs), 'output')}; by Hankel value: {first}{more}>"
         )
 
     def table(self, most: int = 12) -> str:

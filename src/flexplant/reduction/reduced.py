@@ -149,7 +149,11 @@ class ReducedModel(Spanned, Value):
         shown = f"{held} of {counted(len(self.full_dofs), 'DOF')}"
         if held < self.n_dof:
             extra = counted(self.n_dof - held, "generalised coordinate")
-            shown = f"{shown} and {extra}" if held else f"{extra} for {len(self.full_dofs)} DOFs"
+            shown = (
+                f"{shown} and {extra}"
+                if held
+                else f"{extra} for {counted(len(self.full_dofs), 'DOF')}"
+            )
         left = ""
         if self.truncated is not None:
             count = self.truncated.n_modes
@@ -257,7 +261,7 @@ class ReducedModel(Spanned, Value):
             rigid_body=np.vstack(
                 [self.rigid_body[kept], np.zeros((omega.size, self.rigid_body.shape[1]))]
             ),
-            method=f"{self.method}, with {more.n_modes} modes left out",
+            method=f"{self.method}, with {counted(more.n_modes, 'mode')} left out",
             condition=self.condition,
             condition_of=self.condition_of,
             coordinates=[

@@ -120,7 +120,7 @@ def select_dofs(
     if not max(1, len(kept)) <= number <= k:
         raise ShapeError(
             f"count must be from {max(1, len(kept))} (the required DOFs) to {k} ({modes.n_modes} "
-            f"modes plus {modes.n_vectors} attachment vectors), got {count!r}."
+            f"modes plus {counted(modes.n_vectors, 'attachment vector')}), got {count!r}."
         )
     missing = number - len(kept)
     if missing > len(pool):

@@ -327,8 +327,8 @@ def _corrected(
     vectors, values, _ = la.svd(moved, full_matrices=False)
     if not values.size or values[-1] <= 1e-9 * values[0] or moved.shape[1] > moved.shape[0]:
         raise ModelError(
-            f"the truncated modes cannot give {len(static)} independent static shapes at "
-            f"{', '.join(names)}: they are too few, or a place is there twice."
+            f"the truncated modes cannot give {counted(len(static), 'independent static shape')} "
+            f"at {', '.join(names)}: they are too few, or a place is there twice."
         )
     squares, mix = la.eigh((vectors.T * omega**2) @ vectors)
     mix = vectors @ mix
@@ -366,7 +366,7 @@ def _diagonal(
     omega, zeta = modes.basis_omega, modes.basis_zeta
     k, r = omega.size, modes.n_rigid
     static = [f"{STATIC}{i}" for i in range(1, modes.n_vectors + 1)]
-    extra = f" and {modes.n_vectors} static vectors" if modes.n_vectors else ""
+    extra = f" and {counted(modes.n_vectors, 'static vector')}" if modes.n_vectors else ""
     return ReducedModel(
         M=np.eye(k),
         D=np.diag(2 * zeta * omega),
@@ -375,7 +375,7 @@ def _diagonal(
         dofs=modes.dofs.select(()),
         full_dofs=modes.dofs,
         rigid_body=np.eye(k, r),
-        method=f"{method}, {modes.n_modes} modes{extra}",
+        method=f"{method}, {counted(modes.n_modes, 'mode')}{extra}",
         coordinates=[*names, *static],
         condition_of="M*",
         bound=bound if bound is None or np.isfinite(bound.value) else None,

@@ -79,7 +79,7 @@ class Response(Value, Mapping[str, FloatArray]):
         self._set(time=time, data=data, names=names, units=known_units(self.units, names))
 
     def __repr__(self) -> str:
-        runs = "" if self.data.ndim == 2 else f"{self.data.shape[0]} runs, "
+        runs = "" if self.data.ndim == 2 else f"{counted(self.data.shape[0], 'run')}, "
         shown = ", ".join(self.names[:6]) + (", ..." if len(self.names) > 6 else "")
         span = self.time.size * self.dt
         drawn = "" if self.seed is None else f", seed {self.seed}"

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import scipy.sparse as sp
 
-from ..errors import ModelError, SolverError
+from ..errors import ModelError, SolverError, counted
 from ..sparse.factor import symmetric_lu, unit_diagonal
 from ..values import IntArray
 
@@ -81,8 +81,9 @@ def condensed(
     touched = np.flatnonzero(np.diff(K_sm.indptr))
     if touched.size > _TOO_MANY:
         raise ModelError(
-            f"condensing {s.size} massless DOFs would fill a block of {touched.size} DOFs (limit "
-            f"{_TOO_MANY}). Export a consistent mass matrix, or one with rotary inertia."
+            f"condensing {counted(s.size, 'massless DOF')} would fill a block of {touched.size} "
+            f"DOFs (limit {_TOO_MANY}). Export a consistent mass matrix, or one with rotary "
+            "inertia."
         )
     sides: Any = sp.diags_array(scale) @ K_sm[:, touched]
     block = np.zeros((touched.size, touched.size))

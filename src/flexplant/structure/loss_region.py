@@ -10,7 +10,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..arguments import between, element_mask
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, ShapeError, counted
 from ..labels import DofSet
 from ..values import FloatArray, Matrix, Value, instance, real_array
 from .attachments import Spring, added_matrices
@@ -65,7 +65,7 @@ class LossRegion(Value):
         if isinstance(given, tuple):
             what = f"{len(given)} spring{'s' * (len(given) != 1)}"
         else:
-            what = f"a matrix of {given.shape[0]} DOFs"
+            what = f"a matrix of {counted(given.shape[0], 'DOF')}"
         return f"<LossRegion: loss factor {self.loss_factor:g}, {what}>"
 
     @classmethod

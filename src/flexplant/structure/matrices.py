@@ -113,7 +113,7 @@ class FEMatrices(Value):
         where = f" of {self.source!r}" if self.source else ""
         parts = [counted(self.n_dof, "DOF"), *stored]
         if self.constrained:
-            parts.append(f"{len(self.constrained)} constrained DOFs dropped")
+            parts.append(f"{counted(len(self.constrained), 'constrained DOF')} dropped")
         if self.digits is not None:
             parts.append(f"{self.digits} digits")
         if self.dofs is None:
@@ -218,7 +218,7 @@ class FEMatrices(Value):
         held = held_rows(self.K, self.M, self.D)
         if not held.any() or held.all():
             return self
-        note = f"{int(held.sum())} rows of held DOFs dropped"
+        note = f"{counted(int(held.sum()), 'row')} of held DOFs dropped"
         left = self._kept(np.flatnonzero(~held))
         return left.replace(notes=(*left.notes, note))
 

@@ -10,7 +10,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 import scipy.sparse.csgraph as csgraph
 
-from ..errors import ModelError
+from ..errors import ModelError, counted
 from ..sparse.factor import dense, diagonal, is_positive_definite, unit_diagonal
 from ..values import FloatArray, IntArray
 from .condense import condensed, empty_rows
@@ -171,19 +171,19 @@ def inertial(
             )
         K, M, D = condensed(K, M, D, without, names)
         rows = np.flatnonzero(~without)
-        notes = (f"{int(without.sum())} massless DOFs condensed",)
+        notes = (f"{counted(int(without.sum()), 'massless DOF')} condensed",)
     motions = null_motions(M, digits)
     count = motions.shape[1]
     if count:
         if massless == "refuse":
             at = ", ".join(names(rows[left_out(motions, M)[:6]]))
             raise ModelError(
-                f"{count} motions have no inertia, turning {at} among others: offset "
+                f"{counted(count, 'motion')} without inertia, turning {at} among others: offset "
                 "masses without rotary inertia, or rods that do not resist turning? Condense them, "
                 "which is exact: model(massless='condense'); or give them their inertia."
             )
         left = rows
         K, M, D, kept = projected(K, M, D, motions, lambda some: names(left[some]))
         rows = rows[kept]
-        notes = (*notes, f"{count} motions without inertia condensed")
+        notes = (*notes, f"{counted(count, 'motion')} without inertia condensed")
     return Inertial(K, M, D, rows, notes)

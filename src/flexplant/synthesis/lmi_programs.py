@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import InfeasibleError, SolverError
+from ..errors import InfeasibleError, SolverError, counted
 from ..parallel import interruptible
 from .lmi_plant import Plant, half, null_space
 from .lmi_solution import Matrices, dual_bound, reconstructed
@@ -146,7 +146,7 @@ def solve_program(
         options = {**settings, **attempt}
         raw = interruptible(partial(chain.solve_via_data, problem, data, solver_opts=options))
         status = str(raw.status)
-        how = f"Clarabel: {status} after {raw.iterations} iterations"
+        how = f"Clarabel: {status} after {counted(raw.iterations, 'iteration')}"
         if "PrimalInfeasible" in status:
             raise InfeasibleError(
                 f"the LMIs have no solution ({how}). Does u reach and y see every unstable mode?"
@@ -164,17 +164,17 @@ def solve_program(
     if reached is None and "MaxTime" in status:
         raise SolverError(
             f"the time limit of {settings['time_limit']:.3g} s was reached ({how}, "
-            f"{_order(problem)} states). Raise time_limit, reduce the order of the plant, or use "
-            "StructuredLmi(), which takes a tenth of the time."
+            f"{counted(_order(problem), 'state')}). Raise time_limit, reduce the order of the "
+            "plant, or use StructuredLmi(), which takes a tenth of the time."
         )
     if reached is None:
         raise SolverError(
             f"the LMIs were not solved ({how}, residuals {raw.r_prim:.1e} and {raw.r_dual:.1e}, "
-            f"{_order(problem)} states, {len(ATTEMPTS)} settings tried). Does u reach and y see "
-            "every unstable mode? If so, loosen weights or reduce the order of the plant."
+            f"{counted(_order(problem), 'state')}, {len(ATTEMPTS)} settings tried). Does u reach "
+            "and y see every unstable mode? If so, loosen weights or reduce the order of the plant."
         )
     _unpack(problem, reached, chain, inverse)
-    how = f"Clarabel: {reached.status} after {reached.iterations} iterations"
+    how = f"Clarabel: {reached.status} after {counted(reached.iterations, 'iteration')}"
     for constraint in problem.constraints:
         M = constraint.args[0].value
         if not _is_lmi(constraint):
@@ -211,8 +211,8 @@ def _unpack(problem: Any, raw: Any, chain: Any, inverse: Any) -> None:
     except (Unread, ValueError) as error:
         raise SolverError(
             f"the solver's answer could not be read (Clarabel: {raw.status} after "
-            f"{raw.iterations} iterations, {_order(problem)} states): {error} Loosen weights or "
-            "reduce the order of the plant."
+            f"{counted(raw.iterations, 'iteration')}, {counted(_order(problem), 'state')}): "
+            f"{error} Loosen weights or reduce the order of the plant."
         ) from error
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, FlexplantError, LabelError
+from ..errors import AssumptionError, FlexplantError, LabelError, counted
 from ..loop.broken import sensitivity_size
 from ..lti.grid import resonance_grid
 from ..lti.responses import responses
@@ -103,8 +103,8 @@ def decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
     size = np.linalg.norm(gain, axis=1, keepdims=True)
     if len(axes) != r or np.linalg.matrix_rank(gain / np.where(size > 0, size, 1.0)) < r:
         raise AssumptionError(
-            f"POI {poi.name!r} has axes {axes}, the plant {r} rigid-body modes: the servo needs "
-            "axes that span them, one each (for a plate z, rx, ry). Give the POI these."
+            f"POI {poi.name!r} has axes {axes}, the plant {counted(r, 'rigid-body mode')}: the "
+            "servo needs axes that span them, one each (for a plate z, rx, ry). Give the POI these."
         )
     return np.asarray(frozen(np.linalg.pinv(gain)))
 

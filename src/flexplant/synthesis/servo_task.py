@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, LabelError, ModelError, SolverError
+from ..errors import AssumptionError, LabelError, ModelError, SolverError, counted
 from ..loop import ClosedLoop
 from ..loop.blocks import drives, joined
 from ..lti.interconnection import loop_poles
@@ -241,8 +241,8 @@ def _poi(plant: StandardPlant, name: str | None) -> Poi:
     if name is None and len(ports.z) > 1:
         names = ", ".join(poi.name for poi in ports.z)
         raise LabelError(
-            f"the plant has {len(ports.z)} POIs ({names}): say which one the servo moves, "
-            f"such as poi={ports.z[0].name!r}."
+            f"the plant has {counted(len(ports.z), 'POI')} ({names}): say which one the servo "
+            f"moves, such as poi={ports.z[0].name!r}."
         )
     return ports.poi(name if name is not None else ports.z[0].name)
 

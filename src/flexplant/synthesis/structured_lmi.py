@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ..errors import FlexplantError, SolverError
+from ..errors import FlexplantError, SolverError, counted
 from ..lti.preparation import Prepared
 from ..parallel import Progress
 from ..values import FloatArray, Value
@@ -184,15 +184,17 @@ class StructuredLmi(Value):
         feasible = [one for one in points if _holds(program, one.y)]
         if not feasible and late:
             raise SolverError(
-                f"the time limit of {self.time_limit:.3g} s was reached after {len(points)} steps, "
-                f"before any gamma was found ({program.n} states). Raise time_limit or reduce the "
-                "order of the plant."
+                f"the time limit of {self.time_limit:.3g} s was reached after "
+                f"{counted(len(points), 'step')}, before any gamma was found "
+                f"({counted(program.n, 'state')}). Raise time_limit or reduce the order of the "
+                "plant."
             )
         if not feasible:
             raise SolverError(
-                f"the LMIs were not solved: no point satisfies them after {len(points)} steps "
-                f"(missed by {points[-1].primal_residual:.1e}, {program.n} states). Does u reach "
-                "and y see every unstable mode? If so, loosen weights or reduce the order."
+                "the LMIs were not solved: no point satisfies them after "
+                f"{counted(len(points), 'step')} (missed by {points[-1].primal_residual:.1e}, "
+                f"{counted(program.n, 'state')}). Does u reach and y see every unstable mode? If "
+                "so, loosen weights or reduce the order."
             )
         best = min(feasible, key=lambda one: float(one.y[-1]))
         R, S, value = program.matrices(best.y)

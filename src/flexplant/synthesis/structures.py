@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arguments import function
-from ..errors import FlexplantError, ModelError, ShapeError
+from ..errors import FlexplantError, ModelError, ShapeError, counted
 from ..lti.balancing import balanced
 from ..lti.discretisation import bilinear, tustin
 from ..lti.preparation import Prepared
@@ -131,7 +131,9 @@ class FixedOrder(Value):
         if known is None:
             return entries
         if known.n_states != self.order or known.D.shape != (nu, ny):
-            raise ModelError(f"start is {known!r}: pass {self.order} states, {ny} y and {nu} u.")
+            raise ModelError(
+                f"start is {known!r}: pass {counted(self.order, 'state')}, {ny} y and {nu} u."
+            )
         g = bilinear(known, 1.0 / plant.dt) if plant.dt else known
         return entries.starting(Matrices(g.A, g.B, g.C, g.D))
 
@@ -334,7 +336,7 @@ class Parametrised:
         self.spread = float(real_array(spread, "spread", ()))
 
     def __repr__(self) -> str:
-        return f"Parametrised({self.start.size} parameters)"
+        return f"Parametrised({counted(self.start.size, 'parameter')})"
 
     def family(self, plant: StandardPlant, prepared: Prepared) -> Differenced:
         """Return the structure made ready for a plant.

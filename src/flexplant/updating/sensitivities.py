@@ -176,8 +176,8 @@ def mode_columns(modes: Any, eigen: Eigen) -> list[int]:
         if isinstance(number, bool) or number not in range(1, last + 1):
             raise LabelError(
                 f"no mode {number!r}: the model has {eigen.n_rigid} rigid-body and "
-                f"{eigen.poles.size} oscillating modes, numbered from 1 to {last}. Choose "
-                "among these."
+                f"{counted(eigen.poles.size, 'oscillating mode')}, numbered from 1 to {last}. "
+                "Choose among these."
             )
         if number < first:
             raise LabelError(

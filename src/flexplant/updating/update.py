@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import ModelError, SolverError, warn
+from ..errors import ModelError, SolverError, counted, warn
 from ..progress import Progress
 from ..structure.model import FEModel
 from ..values import FloatArray, Rng, flag, generator, instance, positive, whole
@@ -205,9 +205,9 @@ def update(
     if not best.converged:
         error = best.trail.error
         warn(
-            f"the update did not converge in {len(best.trail.p) - 1} steps: {best.reason}, error "
-            f"{error[-1]:.3g} from {error[0]:.3g}. Look at .history; try other mode numbers, "
-            "start=, starts= or more iterations."
+            f"the update did not converge in {counted(len(best.trail.p) - 1, 'step')}: "
+            f"{best.reason}, error {error[-1]:.3g} from {error[0]:.3g}. Look at .history; try "
+            "other mode numbers, start=, starts= or more iterations."
         )
     fit = _result(model, objective, method, best, begins[0])
     fit = fit.replace(starts=summary(begins, ends), rounds=np.array(estimates))
@@ -263,7 +263,7 @@ def _complaint(fit: UpdateResult, objective: Objective, p: FloatArray) -> str:
     negative = ""
     if fit.negative_masses:
         negative = f"{', '.join(fit.negative_masses)} came out negative. "
-    tried = "" if fit.starts is None else f"{len(fit.starts)} starts were tried. "
+    tried = "" if fit.starts is None else f"{counted(len(fit.starts), 'start')} tried. "
     return (
         f"the updated model leaves more than noise: chi-square {fit.chi2:.4g} for {fit.dof} "
         f"degrees of freedom. It fits worst {worst(objective, objective.at(p))}. {negative}"

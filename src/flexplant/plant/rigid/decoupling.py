@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...errors import AssumptionError, require_known
+from ...errors import AssumptionError, counted, require_known
 from ...lti.statespace import StateSpace
 from ...values import FloatArray, Value, name_list
 from ..standard import StandardPlant, standard_plant
@@ -65,7 +65,7 @@ class Decoupling(Value):
         at = ", ".join(f"{c:.4g}" for c in self.centre)
         return (
             f"<Decoupling {', '.join(self.axes)} at ({at}) m: {len(self.to_actuators.outputs)} "
-            f"actuators, {len(self.to_motions.inputs)} sensors>"
+            f"actuators, {counted(len(self.to_motions.inputs), 'sensor')}>"
         )
 
     @property

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ...errors import ModelError
+from ...errors import ModelError, counted
 from ...labels import Place
 from ...modes import Modes, normal_form
 from ...reduction import ReducedModel
@@ -128,7 +128,7 @@ def suspend(model: Suspended, springs: GroundSpring | Sequence[GroundSpring]) ->
             D=given.D + damping,
             rigid_body=given.rigid_body @ _untouched(rows, given.rigid_body),
             truncated=None if given.truncated is None else _each(given.truncated, listed),
-            method=f"{given.method}, {len(listed)} ground springs",
+            method=f"{given.method}, {counted(len(listed), 'ground spring')}",
         )
     if isinstance(given, Modes):
         return _modes(given, listed)  # type: ignore[return-value]
@@ -179,9 +179,9 @@ def _full(model: FEModel, springs: list[GroundSpring]) -> FEModel:
     if suspended.rigid_body.shape[1] != expected:
         raise ModelError(
             "the springs are so weak that rounding of the structure's matrices exceeds them: "
-            f"{suspended.rigid_body.shape[1]} rigid-body motions are left in them, {expected} by "
-            "geometry. Solve the modes of the free structure first and suspend those: "
-            "suspend(solve_modes(model), springs)."
+            f"they leave {counted(suspended.rigid_body.shape[1], 'rigid-body motion')}, not "
+            f"{expected} as by geometry. Solve the modes of the free structure first and suspend "
+            "those: suspend(solve_modes(model), springs)."
         )
     return suspended
 

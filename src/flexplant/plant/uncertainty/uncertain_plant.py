@@ -10,7 +10,7 @@ from typing import Any, Generic, Literal
 import numpy as np
 import scipy.sparse as sp
 
-from ...errors import FlexplantWarning, ModelError, require_known
+from ...errors import FlexplantWarning, ModelError, counted, require_known
 from ...lti.statespace import StateSpace
 from ...sparse.factor import dense
 from ...structure.rigid import orthonormalised
@@ -217,7 +217,10 @@ class UncertainPlant(Value, Generic[P]):
     def __repr__(self) -> str:
         more = f", {self.neglected!r}" if self.neglected is not None else ""
         lines = [
-            f"<UncertainPlant: {len(self.deltas)} real Deltas at {self.deviations:g} std{more}"
+            (
+                f"<UncertainPlant: {counted(len(self.deltas), 'real Delta')} at "
+                f"{self.deviations:g} std{more}"
+            )
         ]
         for delta in self.deltas[:6]:
             if delta.kind == "parameter":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...certificates import in_words, stability_name
-from ...errors import FlexplantError
+from ...errors import FlexplantError, counted
 from ...loop import ClosedLoop, ErrorBudget, LoopFigures, compare_loops, report_loops
 from ...simulation import ExposureErrors, Verdict
 from ...values import with_unit
@@ -117,7 +117,10 @@ def _stability(loop: ClosedLoop) -> list[Tile]:
     if left.modes:
         beside = left.named_modes
     kind = "good" if left.is_fine else "bad"
-    return [*found, (f"with the modes left out ({left.states} states)", figure, beside, kind)]
+    return [
+        *found,
+        (f"with the modes left out ({counted(left.states, 'state')})", figure, beside, kind),
+    ]
 
 
 def _margins(row: LoopFigures) -> list[Tile]:

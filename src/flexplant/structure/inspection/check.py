@@ -178,7 +178,7 @@ def _pieces(found: Facts) -> list[Line]:
     shown = []
     for piece in range(1, min(count, 4)):
         rows = np.flatnonzero(found.piece == piece)
-        shown.append(f"{rows.size} DOFs with {listed(found.names(rows), most=2)}")
+        shown.append(f"{counted(rows.size, 'DOF')} with {listed(found.names(rows), most=2)}")
     more = f" and {count - 4} more" if count > 4 else ""
     return [
         (

@@ -153,7 +153,7 @@ def zero_rows(found: Facts) -> Iterator[Line]:
             "fail",
             "without inertia",
             (
-                f"{found.without_inertia.size} motions that no mass resists, moving "
+                f"{counted(found.without_inertia.size, 'motion')} that no mass resists, at "
                 f"{listed(found.names(found.without_inertia))}"
             ),
             "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
@@ -178,7 +178,7 @@ def rigid(found: Facts) -> Iterator[Line]:
         yield (
             "note",
             "rigid body",
-            f"{found.n_zero} motions without energy; rigid-body ones are known with DOFs only",
+            f"{counted(found.n_zero, 'motion')} without energy; which are rigid is known with DOFs",
             "with_dofs(DofSet(nodes, directions, xyz))",
         )
         return

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...errors import AssumptionError, FlexplantError, ModelError, SolverError
+from ...errors import AssumptionError, FlexplantError, ModelError, SolverError, counted
 from ...lti.discretisation import tustin
 from ...lti.grid import resonance_grid
 from ...lti.interconnection import series, side_by_side
@@ -132,7 +132,7 @@ def design_mu(
     steps = {f"mu of step {i}": value for i, value in enumerate(found)}
     answer = Controller(
         best.controller,
-        f"D-K iteration, {len(found)} steps",
+        f"D-K iteration, {counted(len(found), 'step')}",
         gamma=best.mu,
         certificate={"mu": best.mu, "at Hz": best.freq} | steps,
     )

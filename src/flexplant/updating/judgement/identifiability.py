@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ...errors import counted
 from ...values import FloatArray, Value
 from ..family import repeated_groups
 from ..parameters.added import Parameter
@@ -82,8 +83,8 @@ class Identifiability(Value):
     def __repr__(self) -> str:
         lines = [
             (
-                f"<Identifiability: {self.rank} of {len(self.parameters)} combinations, singular "
-                f"values {self.singular_values[0]:.3g} to {self.singular_values[-1]:.3g}"
+                f"<Identifiability: {self.rank} of {counted(len(self.parameters), 'combination')}, "
+                f"singular values {self.singular_values[0]:.3g} to {self.singular_values[-1]:.3g}"
             )
         ]
         if self.unseen:

@@ -124,8 +124,8 @@ def localise(
     fits = Subsets(whole, given, len(listed))
     if fits.rows <= len(beside):
         raise ModelError(
-            f"{fits.rows} data do not determine {len(beside)} nuisance parameters, let alone a "
-            "candidate beside them: measure more modes or lines."
+            f"{fits.rows} data do not determine {counted(len(beside), 'nuisance parameter')}, let "
+            "alone a candidate beside them: measure more modes or lines."
         )
     values, score, criterion = _singles(fits, screen, progress)
     ranked = [i for i in np.argsort(-score, kind="stable").tolist() if np.isfinite(criterion[i])]
@@ -154,7 +154,7 @@ def localise(
         warn(
             f"{' and '.join(found.chosen) or 'no change'}, the best that {len(listed)} candidates "
             f"give, {'leave' if len(best) > 1 else 'leaves'} more than noise: chi-square "
-            f"{chi2:.4g} for {dof} degrees of freedom. It fits worst {fits.worst(best)}. "
+            f"{chi2:.4g} for dof = {dof}. It fits worst {fits.worst(best)}. "
             "Something else differs between model and machine, or the noise is understated: give "
             f"{'most= more, ' if full else ''}candidates at other places or of another kind, "
             "or what is wrong everywhere as nuisance=."

@@ -73,9 +73,9 @@ class FrfResidual(Residual):
     --------
     >>> frf = Frf([1.0, 2.0], [[[1.0, 0.5j]]], inputs=["1:z"], outputs=["2:z"])
     >>> FrfResidual(frf, variance=1e-4)
-    <FrfResidual: 1 x 1 channels, 2 of 2 lines, complex, noise known>
+    <FrfResidual: 1 x 1 channel, 2 of 2 lines, complex, noise known>
     >>> FrfResidual(frf, hold=100.0, delay=1)
-    <FrfResidual: 1 x 1 channels, 2 of 2 lines, complex, noise not known, held at 100 Hz, delay 1>
+    <FrfResidual: 1 x 1 channel, 2 of 2 lines, complex, noise not known, held at 100 Hz, delay 1>
     """
 
     measured: Frf
@@ -118,8 +118,9 @@ class FrfResidual(Residual):
         held = "" if self.hold is None else f", held at {self.hold:g} Hz"
         late = f", delay {self.delay:g}" if self.delay else ""
         return (
-            f"<FrfResidual: {len(frf.outputs)} x {len(frf.inputs)} channels, {self.lines.size} of "
-            f"{counted(frf.freq.size, 'line')}, {kind}, noise {known}{held}{late}>"
+            f"<FrfResidual: {len(frf.outputs)} x {counted(len(frf.inputs), 'channel')}, "
+            f"{self.lines.size} of {counted(frf.freq.size, 'line')}, {kind}, noise "
+            f"{known}{held}{late}>"
         )
 
     @property

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ...arguments import positive_array
-from ...errors import ModelError, ShapeError, require_known
+from ...errors import ModelError, ShapeError, counted, require_known
 from ...labels import DIRECTIONS, Place
 from ...values import ComplexArray, FloatArray, positive, real_array
 from ..family import Family
@@ -114,7 +114,7 @@ class _BoundZeros(Bound):
         self.std = std
         self.hold = residual.hold
         self.size = np.tile(np.abs(self.target) / std, 2)
-        self.name = f"{self.target.size} antiresonances"
+        self.name = f"{counted(self.target.size, 'antiresonance')}"
         self._last: tuple[Point, ComplexArray, ComplexArray] | None = None
 
     def row_name(self, row: int) -> str:
@@ -137,7 +137,8 @@ class _BoundZeros(Bound):
 
         if s.size < self.target.size:
             raise ModelError(
-                f"the model has {s.size} antiresonances there, {self.target.size} were measured."
+                f"the model has {counted(s.size, 'antiresonance')} there, {self.target.size} were "
+                "measured."
             )
         return linear_sum_assignment(np.abs(self.target[:, None] - s))[1]
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...arguments import between
-from ...errors import ModelError, SolverError
+from ...errors import ModelError, SolverError, counted
 from ...values import FloatArray
 from ..point_model import Point
 from .objective import Objective
@@ -137,9 +137,10 @@ def _step(
         together = [name for name, part in zip(names, mixed, strict=True) if part > 0.1]
         raise ModelError(
             f"{', '.join(together)} cannot be distinguished by {objective.text} ({r.size} real "
-            f"equations, {len(names)} unknowns, S is singular): some combination of them changes "
-            "nothing. Measure more modes, drop one of them, give priors, begin elsewhere (start=) "
-            "or cut it off, GaussNewton(truncate=1e-3). identifiability(...) shows which."
+            f"equations, {counted(len(names), 'unknown')}, S is singular): some combination of "
+            "them changes nothing. Measure more modes, drop one of them, give priors, begin "
+            "elsewhere (start=) or cut it off, GaussNewton(truncate=1e-3). identifiability(...) "
+            "shows which."
         )
     step = -(Vt[keep].T @ ((U[:, keep].T @ r) / s[keep])) / length
     return step, J @ step
