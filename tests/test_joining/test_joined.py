@@ -350,6 +350,12 @@ def test_a_node_of_a_machine_in_a_machine():
         )
         assert first.dofs.labels == second.dofs.labels
         np.testing.assert_array_equal(first.K.toarray(), second.K.toarray())
+    patch = fx.joined({"m": inner, "c": part}, fx.Joint(fx.Patch("m/b", [2]), "c/1", axes=["x"]))
+    first = fx.joined({"m": inner, "c": part}, fx.Joint("m/b/2", "c/1"))
+    np.testing.assert_allclose(patch.K.toarray(), first.K.toarray(), rtol=1e-12)
+    assert list(patch.joining.patches) == ["joint 1, <Patch of m/b, 1 nodes>"]
+    with pytest.raises(LabelError, match=r"which a, b may share.*Patch\('m/a', nodes\)"):
+        fx.joined({"m": inner, "c": part}, fx.Joint(fx.Patch("m", [2]), "c/1", axes=["x"]))
     with pytest.raises(LabelError, match="no node '2' for the joint at 'm/2'"):
         fx.joined({"m": inner, "c": part}, fx.Joint("m/2", "c/1"))
 

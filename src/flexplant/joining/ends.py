@@ -69,11 +69,9 @@ class JointEnd:
         self, parts: Sequence[Jointed], end: Any, size: float, motions: Sequence[FloatArray]
     ) -> None:
         self.text = repr(end) if isinstance(end, Patch) else str(end)
-        name = end.component if isinstance(end, Patch) else end[0]
-        rest = ""
-        if isinstance(end, str):
-            name, rest = _split(end, [part.name for part in parts])
         names = [part.name for part in parts]
+        text = f"{end.component}/" if isinstance(end, Patch) else end
+        name, rest = split_end(text, names) if isinstance(text, str) else (end[0], "")
         require_known("component", [name], names)
         self.index, self._size = names.index(name), size
         self._dofs, self._motions = parts[self.index].dofs, motions[self.index]
@@ -85,10 +83,10 @@ class JointEnd:
             except LabelError as error:
                 raise LabelError(f"component {name!r}: {error}") from None
             self.point = np.asarray(self._dofs.location(rest))
-        elif rest:
-            self._at_node(rest)
         elif isinstance(end, Patch):
             self._at_patch(end)
+        elif rest:
+            self._at_node(rest)
         else:
             self._at_point(end[1])
         self.axes = tuple(axis for axis in DIRECTIONS if axis in self._rows)
@@ -216,7 +214,8 @@ def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[
     return first.axes
 
 
-def _split(text: str, names: Sequence[str]) -> tuple[str, str]:
+def split_end(text: str, names: Sequence[str]) -> tuple[str, str]:
+    """Return which component a text such as "stage/41:z" begins with, and the rest of it."""
     for name in sorted(names, key=len, reverse=True):
         if text.startswith(f"{name}/"):
             return name, text[len(name) + 1 :]

@@ -31,7 +31,7 @@ class Patch(Value):
     Parameters
     ----------
     component : str
-        Whose nodes.
+        Whose nodes; of a component of a joined machine, "machine/stage".
     nodes : sequence of int, optional
         Which; None: those in the box.
     box : (2, 3) array [m], optional
@@ -93,7 +93,14 @@ class Patch(Value):
 
     def rows(self, dofs: DofSet) -> IntArray:
         """Return the rows (m,) of the displacements of its nodes among the component's DOFs."""
-        chosen = dofs.where(nodes=self.nodes, box=self.box)
+        inner = [name for name in dofs.components if self.component.endswith(f"/{name}")]
+        if self.nodes is not None and dofs.components and not inner:
+            raise LabelError(
+                f"{self!r} names nodes by numbers, which {', '.join(dofs.components)} may share. "
+                f"Say whose: Patch('{self.component}/{dofs.components[0]}', nodes), or give box=."
+            )
+        own = max(inner, key=len, default=None)
+        chosen = dofs.where(self.nodes, box=self.box, component=own)
         rows = dofs.indices(chosen.labels)
         return np.asarray(rows[dofs.kinds[rows] < 3])
 

@@ -15,6 +15,7 @@ from ..modes.shifted import stiffness_factor
 from ..sparse.factor import DENSE_LIMIT
 from ..values import FloatArray
 from .component import Component
+from .ends import split_end
 from .links import Link
 from .patch import Patch
 
@@ -39,7 +40,8 @@ def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str,
         axes = [DIRECTIONS.index(link.axis) for link in links if link.joint is joint]
         for end in (joint.first, joint.second):
             if isinstance(end, Patch):
-                part = next(part for part in parts if part.name == end.component)
+                name = split_end(f"{end.component}/", [part.name for part in parts])[0]
+                part = next(part for part in parts if part.name == name)
                 mean, rigid = compliances(part, end, axes)
                 found[f"joint {number}, {end!r}"] = float(np.max(1.0 - rigid / mean))
     return found

@@ -144,5 +144,6 @@ def _oblique(dofs: DofSet, rows: IntArray, own: IntArray) -> ModelError:
     return ModelError(
         f"node {dofs.nodes[rows[0]]} has only the directions {has}, which this rotation turns out "
         "of x, y and z: its motion would be oblique. Turn by quarter turns, or about the axis that "
-        "keeps them, or use a component with all directions."
+        "keeps them, or use a component with all directions (place those of a machine before "
+        "they are joined)."
     )
