@@ -15,10 +15,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from flexplant.estimation import design_kalman
 from flexplant.lti import StateSpace
 from flexplant.lti.discretisation import bilinear
 from flexplant.plant import reference_errors, stage_weights
-from flexplant.synthesis import Lmi, StructuredLmi, design_hinf
+from flexplant.synthesis import Lmi, StructuredLmi, design_hinf, design_servo
 from oracles_synthesis import brute_norm, closed_loop, split, stability
 from stages import reduced, sampled
 from test_synthesis.test_structured_lmi import flexible
@@ -143,3 +144,49 @@ def test_the_structured_lmis_beside_cvxpy(capsys):
     with capsys.disabled():
         print("\n  n  structured       lower    time   cvxpy, Clarabel   lower    time")
         print("\n".join(rows))
+
+
+def cpu(call, repeats=10):
+    """Return what a call gave, and its least CPU time [ms]."""
+    times = []
+    for _ in range(repeats):
+        start = time.process_time()
+        result = call()
+        times.append(1e3 * (time.process_time() - start))
+    return result, min(times)
+
+
+@pytest.mark.benchmark
+def test_a_servo(capsys):
+    """The plate of 24 modes; python-control finds poles and |S| of the same loop on one grid."""
+    control, model = pytest.importorskip("control"), reduced()
+    plant, others = sampled(model), (sampled(model) for _ in range(10))
+    observer, bandwidths = design_kalman(plant), iter(np.linspace(48.0, 52.0, 10))
+    servo, again = cpu(lambda: design_servo(plant, bandwidth=50.0))
+    rows = [
+        ("first design on a plant", cpu(lambda: design_servo(next(others), bandwidth=50.0))[1]),
+        ("the same again", again),
+        ("other bandwidths", cpu(lambda: design_servo(plant, bandwidth=next(bandwidths)))[1]),
+        (
+            "with its observer",
+            cpu(lambda: design_servo(plant, bandwidth=50.0, observer=observer))[1],
+        ),
+    ]
+    hats = list(servo.system.inputs[1:])
+    poi = plant.system.select([name for name in plant.z if "error" not in name][:3], plant.u)
+    P, K = poi.to_control(), servo.system.select(inputs=hats).to_control()
+    omega = 2 * np.pi * np.geomspace(1.0, 4990.0, 1000)
+
+    def theirs():
+        z = np.exp(1j * omega * plant.dt)
+        L = np.moveaxis(K(z), 2, 0) @ np.moveaxis(P(z), 2, 0)
+        S = np.linalg.inv(np.eye(4) - L)
+        return control.feedback(P, K, sign=1).poles(), np.linalg.norm(S, 2, axis=(1, 2)).max()
+
+    (poles, top), seconds = cpu(theirs, 2)
+    assert np.abs(poles).max() == pytest.approx(servo.certificate["spectral radius"], rel=1e-6)
+    assert 1 / top == pytest.approx(servo.certificate["modulus margin"], rel=1e-2)
+    rows.append(("python-control: the certificate alone", seconds))
+    with capsys.disabled():
+        print("\nservo of the plate, ms of CPU, ratio to the same again")
+        print("\n".join(f"  {name:38s} {ms:8.2f} {ms / again:7.1f}" for name, ms in rows))

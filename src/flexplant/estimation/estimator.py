@@ -90,8 +90,8 @@ class KalmanEstimator(Value):
         share = self.certificate.unresolved
         if share is not None and share > NOTED:
             beyond += (
-                f"; up to {share:.0%} of a variance is from modes with fewer than {NODES:g} nodes "
-                "of the mesh a wavelength: a finer one for larger= would change it"
+                f";\n  up to {share:.0%} of a variance is from modes with fewer than {NODES:g} "
+                "nodes of the mesh a wavelength:\n  a finer one for larger= would change it"
             )
         return (
             f"<KalmanEstimator: {counted(self.system.n_states, 'state')}, "

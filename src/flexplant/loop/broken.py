@@ -136,7 +136,8 @@ def sensitivity_size(L: ComplexArray) -> FloatArray:
     size, acts = 1.0 / (1.0 + gain), gain >= _SMALL
     size[acts] = _bounded(L[acts])
     acts = ~acts & (size.max(initial=0.0) * (1.0 - gain) < 1.0)
-    size[acts] = _bounded(L[acts])
+    if acts.any():
+        size[acts] = _bounded(L[acts])
     return np.asarray(size)
 
 

@@ -13,6 +13,7 @@ from ..errors import AssumptionError, LabelError, ModelError, SolverError, count
 from ..loop import ClosedLoop
 from ..loop.blocks import drives, joined
 from ..lti.interconnection import loop_poles
+from ..lti.joining import stacked
 from ..lti.statespace import StateSpace
 from ..plant import Poi, StandardPlant, larger_plant, standard_plant
 from ..plant.rigid.rigid_motion import RigidModes
@@ -254,12 +255,12 @@ def _joined(plant: StandardPlant, poi: Poi, axis: StateSpace, T_u: FloatArray) -
     hats = [poi.derived(name, "hat") for name in poi.axes]
     errors = -np.eye(len(hats), len(hats) + len(inputs), len(inputs))
     errors[0, : len(inputs)] = 1.0
-    each = np.eye(len(hats))
+    A, B, C, D = (stacked([one] * len(hats)) for one in (axis.A, axis.B, axis.C, axis.D))
     return StateSpace(
-        np.kron(each, axis.A),
-        np.kron(each, axis.B) @ errors,
-        T_u @ np.kron(each, axis.C),
-        T_u @ np.kron(each, axis.D) @ errors,
+        A,
+        B @ errors,
+        T_u @ C,
+        T_u @ D @ errors,
         plant.dt,
         inputs=[*inputs, *hats],
         outputs=plant.u,
