@@ -48,6 +48,7 @@ FIGURES = {
     "(?:looked|to look|looking) at": "examined, used, checked",
     r"aloud|screwed|reseat\w*|lessened|drown\w*|undying|culprits?|deaf|blind": "the plain word",
     "doors?|hands? (?:back|out)|runs? away|goes on and on": "constructor, returns, diverges",
+    r"promis\w*|forgets?|remembers?|nobody": "guarantees, claims, loses, the plain word",
     "(?:route|norm) of (?:its|their) own": "by another computation",
 }
 WORDS = re.compile(rf"\b(?:{'|'.join(FIGURES)})\b".replace(" ", r"\s+"), re.IGNORECASE)

@@ -1,4 +1,4 @@
-"""The base of all values and the checks at the door."""
+"""The base of all values and the checks of arguments."""
 
 import pickle
 from dataclasses import FrozenInstanceError, dataclass

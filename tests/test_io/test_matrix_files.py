@@ -295,7 +295,7 @@ def test_numpy_files(tmp_path):
         fx.io.read_npz(tmp_path / "bad.npz")
 
 
-# one door
+# one function
 
 
 def test_units_and_held_rows_through_the_door(tmp_path):

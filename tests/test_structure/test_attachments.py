@@ -60,7 +60,7 @@ def test_each_part_adds_its_row():
     assert plate.with_parts(Spring("1:z", 1.0)).M is plate.M
     twice = model.with_parts([Damper("7:rx", 2.0)])
     np.testing.assert_allclose(twice.D.toarray(), 2 * D)
-    # the door finds nothing to object to
+    # the constructor accepts them
     FEModel(model.M, model.K, model.D, dofs=model.dofs)
 
 

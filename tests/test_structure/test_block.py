@@ -96,7 +96,7 @@ def test_six_rigid_body_motions():
     np.testing.assert_allclose(R.T @ (model.M @ R), np.eye(6), atol=1e-12)
     assert np.abs(model.K @ R).max() < 1e-12 * np.abs(abs(model.K) @ np.abs(R)).max()
     assert model.mass == pytest.approx(2700 * 0.012, rel=1e-12)
-    # the door finds nothing to object to
+    # the constructor accepts them
     FEModel(model.M, model.K, dofs=model.dofs)
 
 

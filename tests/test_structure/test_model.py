@@ -1,4 +1,4 @@
-"""FEModel: its door, its rigid-body motions, its damping matrix."""
+"""FEModel: its constructor, its rigid-body motions, its damping matrix."""
 
 import pickle
 

@@ -63,7 +63,7 @@ def test_matrices_equal_gauss_quadrature(elements, size):
 def test_matrices_are_symmetric_to_the_bit_and_definite(plate):
     assert abs(plate.M - plate.M.T).max() == 0
     assert abs(plate.K - plate.K.T).max() == 0
-    # the constructor skips the checks of the public door; they must hold all the same
+    # the constructor skips the public checks; they must hold all the same
     FEModel(plate.M, plate.K, dofs=plate.dofs)
 
 

@@ -209,7 +209,7 @@ def machine_error(
         if max(float(np.max(np.abs(part))) for part in missed) > _MISSED:
             raise AssumptionError(
                 "a rigid-body motion (or undamped mode) of a machine is not one of the plant: a "
-                "filter with other gains would lose it, so no finite worst error can be promised. "
+                "filter with other gains would lose it, so that no worst error is finite. "
                 f"The plant is {plant!r}; assemble both with the same ports, sampled alike."
             )
         back, driven = V @ re, V @ G_all[rigid]

@@ -43,7 +43,7 @@ def identify_output_only(
     blocks: int = 20,
     progress: bool | None = None,
 ) -> MeasuredModes:
-    r"""Return poles and shapes from responses alone, to excitation that nobody measured.
+    r"""Return poles and shapes from responses alone, the excitation not measured.
 
     Covariance-driven stochastic subspace identification: with covariances
     :math:`R_k = \frac{1}{N} \sum_t y_{t+k} y_t^T` of responses to white excitation,

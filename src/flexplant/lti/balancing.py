@@ -57,11 +57,11 @@ class BalancedReduction(Value):
 
     def __repr__(self) -> str:
         full = self.hankel.size + self.n_kept
-        promised = f"bound {self.bound:.3g}" if np.isfinite(self.bound) else "no bound (weighted)"
+        limit = f"bound {self.bound:.3g}" if np.isfinite(self.bound) else "no bound (weighted)"
         return (
             f"<BalancedReduction: {full} -> {counted(self.system.n_states, 'state')} "
             f"({self.n_kept} kept "
-            f"exactly), error {self.error:.3g} at {self.error_freq:.4g} Hz, {promised}>"
+            f"exactly), error {self.error:.3g} at {self.error_freq:.4g} Hz, {limit}>"
         )
 
 
@@ -136,7 +136,7 @@ def balanced(
     if (problem := obstacle(reduced)) is not None:
         raise SolverError(
             f"the weighted reduction to {counted(r, 'stable state')} is {problem.reason}: with "
-            "weights on both sides stability is not promised. Take another order or one weight."
+            "weights on both sides stability is not guaranteed. Take another order or one weight."
         )
     error, freq = _error(stable, reduced, before, after)
     weighted = before is not None or after is not None

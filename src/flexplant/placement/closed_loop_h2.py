@@ -106,7 +106,7 @@ class ClosedLoopH2(MotionAndEffort):
     def scorer(self, plant: StandardPlant, candidates: Sequence[Port]) -> Scorer:
         """Return the cost as a function of the candidates alone; all else is computed once.
 
-        A delay of d whole samples costs what nobody can do meanwhile, and the control acts on the
+        A delay of d whole samples costs what cannot be done meanwhile, and the control acts on the
         state predicted d samples ahead, P_d. A fraction of a sample, filters and delays of ports:
         the plant is made anew for each choice.
         """

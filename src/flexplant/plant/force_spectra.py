@@ -132,7 +132,7 @@ class NarrowBand(_Spectrum):
     """Narrow-band noise: hum, an imbalance, a pump.
 
     ``shape = 2 zeta omega s / (s^2 + 2 zeta omega s + omega^2)``, 1 at its frequency; white noise
-    of density asd has the variance ``asd^2 zeta omega / 2`` behind it. The force forgets its phase
+    of density asd has the variance ``asd^2 zeta omega / 2`` behind it. The force loses its phase
     within 1 / (2 pi zeta) periods.
 
     Parameters

@@ -99,7 +99,7 @@ def sampled_physical(
     E, new, old = _moved(held, inputs, h)
     A[states, states] = E
     layout.enter(A, B, states, new, old)
-    layout.remember(A, B)
+    layout.shift_inputs(A, B)
     D_new, D_old = _direct(g.D, inputs, 0.0)
     now = np.zeros((len(g.outputs), layout.size)), np.zeros_like(g.D)
     now[0][:, states] = g.C
@@ -169,7 +169,7 @@ class _Layout:
                 else:
                     A[rows, self.pushed[age, i]] += effect[:, i]
 
-    def remember(self, A: FloatArray, B: FloatArray) -> None:
+    def shift_inputs(self, A: FloatArray, B: FloatArray) -> None:
         """Shift the delay lines of the inputs by one sample."""
         for (age, i), state in self.pushed.items():
             if age == 1:

@@ -61,7 +61,7 @@ def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -
     FlexplantError
         Whatever the method raises.
     CertificateError
-        When the closed loop does not keep the promise.
+        When the closed loop misses the norm that was claimed.
     """
     one = _verified(plant, problem, method, method.solve(problem))
     return one._replace(lower=lower_bound(problem, one.gamma, one.lower))
@@ -97,7 +97,7 @@ class _Search:
         self.plant, self.problem = plant, problem
         self.answers: list[Answer] = []
         self.failures: list[tuple[str, FlexplantError]] = []
-        #: answers whose loop may be stable with a larger norm than the method promised
+        #: answers whose loop may be stable with a larger norm than the method claims
         self.broken: list[tuple[SynthesisMethod, SolvedController]] = []
         self.lower = pointwise_bound(problem)
 
@@ -162,7 +162,7 @@ class _Search:
         """
         for method, found in self.broken if not self.answers else ():
             with suppress(FlexplantError):
-                self.answers.append(self._without_promise(method, found))
+                self.answers.append(self._beyond_claim(method, found))
         if self.answers:
             least = min(one.gamma for one in self.answers)
             one = next(one for one in self.answers if one.gamma <= _SAME * least)
@@ -171,7 +171,7 @@ class _Search:
         said = [f"{name}: {'the same' if str(e) == str(first) else e}" for name, e in others]
         raise type(first)(str(first) + (f" (Tried besides: {' '.join(said)})" if said else ""))
 
-    def _without_promise(self, method: SynthesisMethod, found: SolvedController) -> Answer:
+    def _beyond_claim(self, method: SynthesisMethod, found: SolvedController) -> Answer:
         """Return an answer whose norm is only what was verified, with a note."""
         one = _verified(self.plant, self.problem, method, found._replace(gamma=np.inf))
         note = (

@@ -193,7 +193,7 @@ def stabilising(
     """Return X and F of ``A'X + X A - (X B + S) R^-1 (B'X + S') + Q = 0``, A + B F stable.
 
     R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
-    not need X to be reached from zero, which an indefinite R does not promise.
+    not need X to be reached from zero, which an indefinite R does not guarantee.
 
     Raises
     ------

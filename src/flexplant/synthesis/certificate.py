@@ -28,7 +28,7 @@ def certified_norm(
     loop : StateSpace
         lft(P, K) of the standard plant and its controller, in the user's units.
     claim : float
-        The norm that the synthesis promised.
+        The norm that the synthesis claims.
     respond : function of frequency [Hz], optional
         The loop's response, where it is kept for a second sweep.
 

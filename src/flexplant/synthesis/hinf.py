@@ -83,7 +83,7 @@ def design_hinf(
     InfeasibleError, SolverError
         When no stabilising controller was found.
     CertificateError
-        When the closed loop does not keep the promise.
+        When the closed loop misses the norm that was claimed.
     ModelError
         When the plant or the method is of another type, a sampled plant has a pole at z = -1, or
         `larger` does not go with the plant.

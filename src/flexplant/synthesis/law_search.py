@@ -114,7 +114,7 @@ class LawSearch:
         return self.of.room_of(self.of.gain(numbers, rows), rows) - _SPARE
 
     def _step(self, x: FloatArray, room: FloatArray, radius: float) -> tuple[FloatArray, float]:
-        """Return the step of the linear program, and what it promises to gain."""
+        """Return the step of the linear program, and the gain that it predicts."""
         from scipy.optimize import linprog
 
         rows = _critical(room)

@@ -88,7 +88,7 @@ class Lmi(Value):
         InfeasibleError
             When the solver proves that no stabilising controller exists, or no gamma is smallest.
         SolverError
-            When the solver stops early, or no controller keeps what the LMIs promise.
+            When the solver stops early, or no controller satisfies what the LMIs claim.
         """
         check_size(self, problem)
         with Progress(_STARTS * _ROUNDS, "programs of the LMIs", progress=self.progress) as bar:

@@ -80,7 +80,7 @@ def design_ncf(
     AssumptionError
         When an undamped or unstable mode is not reached or seen, or hidden by the shaping.
     CertificateError
-        When the closed loop does not keep the promise.
+        When the closed loop misses the norm that was claimed.
     ModelError, ShapeError
         When plant, shaping and bandwidth do not go together.
 
@@ -216,7 +216,7 @@ def verified_controller(
     AssumptionError
         When a mode is hidden: the loop is not stable.
     CertificateError
-        When the loop does not keep the promise.
+        When the loop misses the norm that was claimed.
     """
     part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
     K, gamma, least = _robust(part, back_off)

@@ -127,7 +127,7 @@ def shape_loop(
     SolverError
         When no gain brings the crossover to the bandwidth.
     CertificateError
-        When the closed loop does not keep the promise.
+        When the closed loop misses the norm that was claimed.
     ModelError, ShapeError, LabelError
         When plant, transformations, model and names do not go together.
 

@@ -110,7 +110,7 @@ class StructuredLmi(Value):
         InfeasibleError
             When no gamma is smallest.
         SolverError
-            When the method stops early, or no controller keeps what the LMIs promise.
+            When the method stops early, or no controller satisfies what the LMIs claim.
         """
         found = self.smallest(problem)
         try:
@@ -132,7 +132,7 @@ class StructuredLmi(Value):
         Raises
         ------
         SolverError
-            When no controller keeps what the LMIs promise.
+            When no controller satisfies what the LMIs claim.
         """
         candidates = [
             Candidate(f"{target:.6g}", target, partial(_controller_at, found, point))
@@ -320,4 +320,4 @@ def _eliminated(Q: FloatArray, P: FloatArray, C: FloatArray) -> FloatArray:
         factor = la.cho_factor(weight * P @ P.T - Q, lower=True)
         moved = la.cho_solve(factor, C.T)
         return np.asarray(-weight * np.linalg.lstsq(C @ moved, moved.T @ P, rcond=1e-13)[0].T)
-    raise SolverError("rounding hides the controller that the LMIs promise.")
+    raise SolverError("rounding hides the controller of the LMIs.")

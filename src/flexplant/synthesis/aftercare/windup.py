@@ -26,7 +26,7 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     a controller that commanded what was applied, with the poles of A - L C:
 
     Hanus (`recovery` not given): ``L = B D^-1``, which makes ``A - L C`` the zeros of the
-    controller. Observer: L of a steady filter that forgets within the recovery time.
+    controller. Observer: L of a steady filter that settles within the recovery time.
 
     Parameters
     ----------

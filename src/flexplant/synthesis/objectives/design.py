@@ -89,7 +89,7 @@ def design_lmi(
     ModelError, LabelError
         When specifications do not fit the plant.
     SolverError
-        When the solver stops early, or no controller keeps what the LMIs promise.
+        When the solver stops early, or no controller satisfies what the LMIs claim.
 
     Warns
     -----
@@ -148,7 +148,7 @@ def design_lmi(
         )
         return with_left_out(answer, given, larger)
     raise CertificateError(
-        f"the LMIs promise {claim:.6g}, but no controller kept all bounds: {failures[-1]} Loosen "
+        f"the LMIs claim {claim:.6g}, but no controller kept all bounds: {failures[-1]} Loosen "
         "bounds, add a little noise to each sensor, or raise back_off."
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...certificates import stability
-from ...errors import CertificateError, FlexplantError
+from ...errors import CertificateError, FlexplantError, counted
 from ...loop import ClosedLoop, SpillOver
 from ...parallel import one_thread
 from ...plant import StandardPlant, larger_plant
@@ -282,4 +282,4 @@ def _tried(
     if not count:
         return {}
     kind = "largest spectral radius" if loop.dt else "largest real part"
-    return {f"{kind} of {count} machines": worst}
+    return {f"{kind} of {counted(count, 'machine')}": worst}
