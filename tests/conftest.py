@@ -36,6 +36,12 @@ settings.register_profile("nightly", max_examples=1000, deadline=None)
 settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "dev"))
 
 
+def pytest_configure(config):
+    """Hand out files in their order: by the number of tests, the long single ones would be last."""
+    if hasattr(config.option, "loadscopereorder"):
+        config.option.loadscopereorder = False
+
+
 def pytest_ignore_collect(collection_path, config):
     """Leave out benchmarks, and the peers that they import, in a run that does not name them."""
     named = re.search(r"(?<!not )benchmark", config.option.markexpr)

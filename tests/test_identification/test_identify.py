@@ -407,11 +407,11 @@ def test_confidence_covers_the_truth(common, trials):
     variance = np.full(H.shape, deviation**2)
     start = PoleSelection(TRIAL * (1 + 1e-5), PHI[:2, :3])
     distance, blind, z = [], [], []
-    for _ in range(trials):
+    for trial in range(trials):
         e = np.einsum("ab,bif->aif", root, noisy(np.zeros(H.shape), deviation, rng))
         frf = Frf(COARSE, H + e, variance=variance, correlation=correlation)
         for F, scores in ((frf, distance), (frf.replace(correlation=None), blind)):
-            if F is not frf and not common:
+            if F is not frf and not (common and trial < 100):
                 continue
             found = identify_modes(F, start=start, lower=0, upper=2)
             error = found.poles - TRIAL
