@@ -106,6 +106,6 @@ def mean_gap(seeds):
 
 @pytest.mark.slow
 def test_the_gap_of_joshi_and_boyd():
-    mean, least = mean_gap(range(20))
+    mean, least = mean_gap(range(10))
     assert least >= 0.0
     assert mean <= 1.3

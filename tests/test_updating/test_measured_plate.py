@@ -8,7 +8,7 @@ from flexplant.identification import MeasuredModes
 from flexplant.updating import AddedDamping, AddedMass, Eigenvalues, update
 from noisy_plate import Campaign, judged, with_mass
 
-TRIALS = 400
+TRIALS = 200
 
 
 @pytest.mark.slow
