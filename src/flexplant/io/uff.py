@@ -11,7 +11,7 @@ from ..dof_columns import at_nodes
 from ..errors import FlexplantError, LabelError, ModelError, require_known
 from ..identification import MeasuredModes
 from ..labels import DIRECTIONS, DofSet
-from ..lti.frequency import Frf
+from ..lti.frequency import ORDERS, Frf
 from ..structure.units import Units
 from ..values import FloatArray, IntArray, positive
 from .file_shapes import FileShapes, ModesFormat
@@ -21,7 +21,6 @@ from .tables import read_nodes_table
 from .uff_analysis import NORMAL_MODE, AnalysisData, mode_records, responses_of_model
 from .uff_records import (
     KINDS,
-    ORDERS,
     check_complete,
     check_systems,
     coherence_of,

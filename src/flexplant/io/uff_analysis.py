@@ -10,11 +10,11 @@ import numpy as np
 
 from ..errors import FlexplantError
 from ..labels import DIRECTIONS
-from ..lti.frequency import Frf
+from ..lti.frequency import ORDERS, Frf
 from ..values import ComplexArray, FloatArray, IntArray
 from .numbers import spaced_numbers
 from .paths import ONCE, at_zero, damaged, refused, unread
-from .uff_records import KINDS, ORDERS, datasets, whole_entry
+from .uff_records import KINDS, datasets, whole_entry
 
 #: of dataset 2414: lines of records 1 to 13
 _HEAD = 13

@@ -207,7 +207,6 @@ def coherence_of(
 
 #: specific data types of dataset 58
 KINDS = {8: "displacement", 11: "velocity", 12: "acceleration"}
-ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 _LENGTHS = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9, "cm": 1e-2, "in": 0.0254, "ft": 0.3048}
 _ANGLES = {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6}
 _GRAVITY = 9.80665

@@ -10,6 +10,7 @@ import scipy.linalg as la
 
 from ..errors import LabelError, ModelError, unknown_label, warn
 from ..lti import Frf
+from ..lti.frequency import ORDERS
 from ..structure.rigid import rigid_motions
 from ..values import ComplexArray, FloatArray, instance
 from .ends import JointEnd, joint_axes
@@ -17,8 +18,6 @@ from .joint import Joint
 from .measured_channels import Channels
 from .patch import Patch
 
-#: time derivatives in the outputs of a measurement
-ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: a joint that adds less than this part to the others repeats them
 _RANK = 1e-9
 #: part of the motion of a patch beside its mean, at the median frequency, that is warned of

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -287,6 +287,11 @@ def trapezoidal(matrices: Matrices, a: float) -> Matrices:
     root = np.sqrt(2.0 * a)
     plus = a * np.eye(len(A)) + A
     return plus @ inverse, root * inverse @ B, root * C @ inverse, D + C @ inverse @ B
+
+
+def image_freq(omega: Any, dt: float) -> Any:
+    """Return the frequencies [Hz] that those of the bilinear image [rad/s] stand for."""
+    return np.arctan(0.5 * dt * omega) / (np.pi * dt) if dt else omega / (2.0 * np.pi)
 
 
 def bilinear(sys: System, rate: float) -> StateSpace:

@@ -33,6 +33,8 @@ from .line_correlation import checked_correlation, checked_overlap, checked_wind
 from .responses import responses
 from .statespace import System, as_statespace
 
+#: time derivatives of each quantity
+ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: of a motion, by the order of its time derivative
 _PER_TIME = ("", "/s", "/s^2")
 
@@ -240,22 +242,21 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         LabelError
             When `quantity` is another word.
         """
-        orders = {"displacement": 0, "velocity": 1, "acceleration": 2}
-        if quantity not in orders:
-            raise unknown_label("quantity", quantity, orders)
-        if self.quantity not in orders:
+        if quantity not in ORDERS:
+            raise unknown_label("quantity", quantity, ORDERS)
+        if self.quantity not in ORDERS:
             raise ModelError(
                 f"the quantity of this Frf is {self.quantity!r}: state what was measured, "
                 "frf.replace(quantity='acceleration'), before it is converted."
             )
-        order = orders[quantity] - orders[self.quantity]
+        order = ORDERS[quantity] - ORDERS[self.quantity]
         if order < 0 and self.freq.size and self.freq[0] == 0:
             raise ModelError("zero frequency cannot be integrated: leave it out of the Frf.")
         factor = (2j * np.pi * self.freq) ** order
         variance = None if self.variance is None else self.variance * np.abs(factor) ** 2
         units = {name: unit for name, unit in self.units.items() if name not in self.outputs}
         for name in set(self.outputs) & set(self.units):
-            units[name] = self.units[name].partition("/")[0] + _PER_TIME[orders[quantity]]
+            units[name] = self.units[name].partition("/")[0] + _PER_TIME[ORDERS[quantity]]
         return self.replace(
             data=self.data * factor, quantity=quantity, variance=variance, units=units
         )

@@ -16,7 +16,7 @@ import scipy.linalg as la
 
 from ..errors import ModelError, counted
 from ..values import FloatArray, Value
-from .discretisation import bilinear, tustin
+from .discretisation import bilinear, image_freq, tustin
 from .modal import modal_form
 from .scaling import bordered_scale, mean_speed, state_scale
 from .statespace import StateSpace
@@ -126,9 +126,7 @@ class Prepared(Value):
 
     def frequency(self, omega: float) -> float:
         """Return the frequency [Hz] of the original plant that a scaled one [1] stands for."""
-        if self.dt and not self.direct:
-            return float(np.arctan(0.5 * self.dt * self.speed * omega) / (np.pi * self.dt))
-        return self.speed * omega / (2.0 * np.pi)
+        return float(image_freq(self.speed * omega, 0.0 if self.direct else self.dt))
 
     def restored(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> StateSpace:
         """Return the controller of the original plant from that of the scaled problem.

@@ -133,18 +133,16 @@ class _Layout:
 
     def __init__(self, g: StateSpace, inputs: Late, outputs: Late) -> None:
         self.inputs, self.outputs = inputs, outputs
-        ages = [
-            (age, j)
-            for age in range(int(outputs.length.max(initial=0)), 0, -1)
-            for j in np.flatnonzero(outputs.length >= age).tolist()
-        ]
+        ages, lines = (
+            [
+                (age, j)
+                for age in range(int(late.length.max(initial=0)), 0, -1)
+                for j in np.flatnonzero(late.length >= age).tolist()
+            ]
+            for late in (outputs, inputs)
+        )
         self.seen = {key: i for i, key in enumerate(ages)}
         self.first = len(ages)
-        lines = [
-            (age, i)
-            for age in range(int(inputs.length.max(initial=0)), 0, -1)
-            for i in np.flatnonzero(inputs.length >= age).tolist()
-        ]
         start = self.first + g.n_states
         self.pushed = {key: start + i for i, key in enumerate(lines)}
         self.size = start + len(lines)

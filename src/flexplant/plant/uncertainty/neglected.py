@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 
 from ...errors import CertificateError, ModelError, counted
+from ...lti.discretisation import image_freq
 from ...lti.frequency import frequency_response
 from ...lti.interconnection import side_by_side
 from ...lti.splitting import part_of
@@ -320,8 +321,7 @@ def _poles(g: StateSpace) -> ComplexArray:
 
 def _response(g: StateSpace, grid: FloatArray) -> ComplexArray:
     """Return the responses, of a sampled system at bilinear frequencies."""
-    freq = np.arctan(np.pi * g.dt * grid) / (np.pi * g.dt) if g.dt else grid
-    return frequency_response(g, freq).data
+    return frequency_response(g, image_freq(2.0 * np.pi * grid, g.dt)).data
 
 
 def _gap(pair: Pair, grid: FloatArray) -> ComplexArray:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...errors import AssumptionError, ModelError
-from ...lti.discretisation import bilinear
+from ...lti.discretisation import bilinear, image_freq
 from ...lti.stability import obstacle
 from ...lti.statespace import StateSpace, System, as_statespace
 from ...parallel import one_thread
@@ -136,9 +136,6 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     found = covered(image, listed)
     upper = float(np.sqrt(found.level))
 
-    def hertz(omega: Any) -> Any:
-        return np.arctan(0.5 * g.dt * omega) / (np.pi * g.dt) if g.dt else omega / (2 * np.pi)
-
     best = destabilising(image, listed, sought(image, found), upper, chance)
     delta: ComplexArray = np.zeros((len(g.inputs), len(g.outputs)), dtype=np.complex128)
     if best is not None:
@@ -146,9 +143,9 @@ def mu(M: System | ComplexArray, blocks: Sequence[Block], *, rng: Any = 0) -> Mu
     return MuBounds(
         upper,
         0.0 if best is None else min(1.0 / best.size, upper),
-        float(hertz(found.omega)),
+        float(image_freq(found.omega, g.dt)),
         delta,
-        hertz(found.frequencies),
+        image_freq(found.frequencies, g.dt),
         np.sqrt(found.bounds),
         found.intervals,
     )

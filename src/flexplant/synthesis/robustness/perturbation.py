@@ -8,8 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import scipy.linalg as la
 
-from ...lti.statespace import StateSpace
-from ...values import ComplexArray, FloatArray
+from ...lti.statespace import StateSpace, as_statespace
+from ...values import ComplexArray
 from .uncertainty_blocks import Block, FullBlock, Place, places
 
 
@@ -54,22 +54,18 @@ def realised(found: Perturbation, blocks: Sequence[Block]) -> StateSpace:
             continue
         number = complex(next(scalars))
         if p.block.real or not number.imag:
-            parts.append(_static(number.real * np.eye(p.block.size)))
+            parts.append(as_statespace(number.real * np.eye(p.block.size)))
         else:
             one = [_all_pass(number, found.omega) for _ in range(p.block.size)]
             parts.append(_stacked(one))
     return _stacked(parts)
 
 
-def _static(D: FloatArray) -> StateSpace:
-    return StateSpace(np.zeros((0, 0)), np.zeros((0, D.shape[1])), np.zeros((D.shape[0], 0)), D)
-
-
 def _all_pass(number: complex, omega: float) -> StateSpace:
     """Return a real system of gain |number| that is the number at omega [rad/s]."""
     phase, size = float(np.angle(number)), abs(number)
     if abs(np.sin(phase)) < 1e-9 or not omega > 0:
-        return _static(np.array([[size * (1.0 if np.cos(phase) >= 0 else -1.0)]]))
+        return as_statespace(np.array([[size * (1.0 if np.cos(phase) >= 0 else -1.0)]]))
     sign = 1.0 if phase > 0 else -1.0
     turn = phase if phase > 0 else phase + np.pi
     p = omega / np.tan(0.5 * (np.pi - turn))

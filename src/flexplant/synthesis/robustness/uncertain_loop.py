@@ -11,7 +11,7 @@ import numpy as np
 
 from ...errors import AssumptionError, ModelError
 from ...loop import ClosedLoop, close_loop
-from ...lti.discretisation import bilinear
+from ...lti.discretisation import bilinear, image_freq
 from ...lti.interconnection import lft, series, side_by_side
 from ...lti.responses import Responder, responder
 from ...lti.statespace import StateSpace, as_statespace
@@ -70,9 +70,7 @@ class OpenPlant:
 
     def freq(self, omega: float) -> float:
         """Return the frequency [Hz] that one of the image [rad/s] stands for."""
-        if not self.dt:
-            return omega / (2 * np.pi)
-        return float(np.arctan(0.5 * self.dt * omega) / (np.pi * self.dt))
+        return float(image_freq(omega, self.dt))
 
     def heights(self, low: float, high: float) -> FloatArray:
         """Return the largest magnitudes of the columns' weights between two frequencies [rad/s]."""
@@ -152,10 +150,7 @@ def open_plant(
     ModelError
         When `uncertain` is no uncertain plant, or a weight does not fit.
     """
-    if not isinstance(uncertain, UncertainPlant):
-        raise ModelError(
-            f"need an UncertainPlant, got {short(uncertain)}. Make it by plant.uncertain(fit)."
-        )
+    _require_uncertain(uncertain)
     channels = delta_channels(uncertain)
     into, weights_in = _weighted_names(w, "w")
     out, weights_out = _weighted_names(z, "z")
@@ -204,10 +199,7 @@ def uncertain_loop(
     ModelError
         When `uncertain` is no uncertain plant.
     """
-    if not isinstance(uncertain, UncertainPlant):
-        raise ModelError(
-            f"need an UncertainPlant, got {short(uncertain)}. Make it by plant.uncertain(fit)."
-        )
+    _require_uncertain(uncertain)
     loop = close_loop(uncertain.plant, *blocks)
     if loop.obstacle is not None:
         raise AssumptionError(
@@ -227,6 +219,13 @@ def uncertain_loop(
     return UncertainLoop(**{f.name: getattr(plant, f.name) for f in fields(plant)} | {
         "system": M, "loop": loop,
     })  # fmt: skip
+
+
+def _require_uncertain(given: object) -> None:
+    if not isinstance(given, UncertainPlant):
+        raise ModelError(
+            f"need an UncertainPlant, got {short(given)}. Make it by plant.uncertain(fit)."
+        )
 
 
 def _weighted_names(given: Any, side: str) -> tuple[list[str], dict[str, Any]]:

@@ -201,11 +201,15 @@ class Scalings:
         """Return D of each block."""
         return [np.einsum("p,pij->ij", x[own], basis) for own, basis in self.d_ranges]
 
+    @property
+    def ends(self) -> list[int]:
+        """Where D and G of each block end in x."""
+        return [own.start for own, _ in self.d_ranges[1:]] + [self.count]
+
     def scaled(self, x: FloatArray, sizes: FloatArray) -> FloatArray:
         """Return x for D and G of each block times a number."""
         x = x.copy()
-        ends = [own.start for own, _ in self.d_ranges[1:]] + [self.count]
-        for (own, _), end, size in zip(self.d_ranges, ends, sizes, strict=True):
+        for (own, _), end, size in zip(self.d_ranges, self.ends, sizes, strict=True):
             x[own.start : end] *= size
         return x
 

@@ -107,12 +107,12 @@ def _admissible(M: ComplexArray, scalings: Scalings, x: FloatArray) -> FloatArra
     # D of the leveled blocks as small as they need to be beside those of the others
     own = centred(np.vstack([np.eye(plain.w), part]), plain, found.x, 1.0, steps=20)
     x = np.array(x)
-    ends = [own_range.start for own_range, _ in scalings.d_ranges[1:]] + [scalings.count]
-    inner_ends = [own_range.start for own_range, _ in plain.d_ranges[1:]] + [plain.count]
     i = 0
-    for (own_range, _), end, lev in zip(scalings.d_ranges, ends, _levels(scalings), strict=True):
+    for (own_range, _), end, lev in zip(
+        scalings.d_ranges, scalings.ends, _levels(scalings), strict=True
+    ):
         if not lev:
-            x[own_range.start : end] = own[plain.d_ranges[i][0].start : inner_ends[i]]
+            x[own_range.start : end] = own[plain.d_ranges[i][0].start : plain.ends[i]]
             i += 1
     for factor in 10.0 ** np.arange(0, -13, -1.0):
         sizes = np.where(_levels(scalings), factor, 1.0)

@@ -13,14 +13,13 @@ from ...arguments import positive_array
 from ...errors import ModelError, ShapeError, counted, require_known, warn
 from ...labels import DIRECTIONS, Place
 from ...lti import Frf
+from ...lti.frequency import ORDERS
 from ...values import ComplexArray, FloatArray, flag, instance, positive, short
 from ..family import Family
 from ..point_model import Point
 from .residual import Bound, Residual, channel_places, place_rows, split_parts
 from .zero_order_hold import Held
 
-#: time derivatives of each quantity
-ORDERS = {"displacement": 0, "velocity": 1, "acceleration": 2}
 #: lines whose response is below so many standard deviations of the noise are left out
 SIGNAL = 3.0
 #: degrees of freedom of a variance below which chi-square is not to be trusted
