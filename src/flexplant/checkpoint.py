@@ -113,11 +113,6 @@ def fingerprint(items: Iterable[Any]) -> str:
 
 def _append(path: Path, entry: Any) -> None:
     with path.open("ab") as file:
-        file.write(json.dumps(entry, default=_plain).encode() + b"\n")
+        file.write(json.dumps(entry, default=lambda value: value.tolist()).encode() + b"\n")
         file.flush()
         os.fsync(file.fileno())
-
-
-def _plain(value: Any) -> Any:
-    """Return an array or a NumPy number as JSON has it."""
-    return value.tolist()

@@ -257,10 +257,8 @@ class MeasuredPlaces:
 
     def rigid(self, A: FloatArray, dofs: DofSet, rows: Any) -> FloatArray:
         """Return the rigid-body modes (places, r): ``U S U^T`` nearest to A, that of 1/s^2."""
-        centre = dofs.xyz[rows].mean(axis=0)
-        motions = rigid_motions(
-            dofs.select([dofs.labels[i] for i in rows]).replace(xyz=dofs.xyz[rows] - centre)
-        )
+        some = dofs.select([dofs.labels[i] for i in rows])
+        motions = rigid_motions(some, some.xyz.mean(axis=0))
         size = np.linalg.norm(motions, axis=0)
         U = la.orth(motions / np.where(size > 0, size, 1.0), rcond=1e-9)
         r = U.shape[1]

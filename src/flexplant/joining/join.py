@@ -127,7 +127,8 @@ def joined(
     >>> machine.row("frame/1:x").tolist()
     [1.0, 0.0, 0.0]
     """
-    if isinstance(components, Mapping) and _measured(components):
+    listed = components.values() if isinstance(components, Mapping) else ()
+    if any(isinstance(component, Frf) for component in listed):
         if placed is not None or name is not None:
             raise ModelError(
                 "measured responses have no place and no name: leave placed= and name= out."
@@ -142,7 +143,8 @@ def joined(
     soft = [link for link in links if not link.joint.is_rigid]
     B, S = rows_of(rigid, parts), rows_of(soft, parts)
     _check_stiffness(soft, S, parts)
-    done = eliminated(B, _sizes(parts), _owners(parts))
+    owners = np.repeat(np.arange(len(parts)), [part.n for part in parts])
+    done = eliminated(B, _sizes(parts), owners)
     matrices = _matrices(parts, soft, S, done)
     groups, kept = groups_of(links, len(parts)), done.kept
     motions = left_motions(parts, groups, B, matrices["M"], kept, free=False)
@@ -158,10 +160,6 @@ def joined(
     if not any(part.is_reduced for part in parts):
         return _full(parts, done, matrices | common, name)
     return _reduced(parts, done, matrices | common, rigid_body)
-
-
-def _measured(components: Mapping[str, Any]) -> bool:
-    return any(isinstance(component, Frf) for component in components.values())
 
 
 def _check_stiffness(soft: Sequence[Link], S: Any, parts: Sequence[Component]) -> None:
@@ -195,10 +193,6 @@ def _sizes(parts: Sequence[Component]) -> FloatArray:
             found.append(weight)
     size = np.concatenate(found)
     return np.where(size > 0, size, 1.0)
-
-
-def _owners(parts: Sequence[Component]) -> Any:
-    return np.repeat(np.arange(len(parts)), [part.n for part in parts])
 
 
 def _matrices(

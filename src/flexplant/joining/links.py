@@ -75,7 +75,11 @@ def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
     ModelError
         When a rigid joint would hold the machine against the ground.
     """
-    listed = [joints] if isinstance(joints, Joint) else list(_iterated(joints))
+    listed = (
+        [joints]
+        if isinstance(joints, Joint)
+        else list(instance(joints, Iterable, "joints", "Pass Joint(...) in [...]."))
+    )
     size = machine_size(parts)
     motions = [rigid_motions(part.dofs) for part in parts]
     return [link for joint in listed for link in _links(joint, parts, size, motions)]
@@ -85,11 +89,6 @@ def machine_size(parts: Sequence[Component]) -> float:
     """Return the largest extent of a machine [m], 1 when it has none."""
     xyz = np.vstack([part.dofs.xyz for part in parts])
     return float(np.ptp(xyz, axis=0).max()) or 1.0
-
-
-def _iterated(joints: Any) -> Iterable[Any]:
-    found: Iterable[Any] = instance(joints, Iterable, "joints", "Pass Joint(...) in [...].")
-    return found
 
 
 def _links(

@@ -138,7 +138,7 @@ def mean_motions(
     some: DofSet, point: FloatArray, weights: FloatArray
 ) -> tuple[FloatArray, FloatArray, list[str]]:
     """Return the mean motions of some displacements (m,) at a point; see `Patch.mean`."""
-    A = rigid_motions(some.replace(xyz=some.xyz - point, interpolation=None))
+    A = rigid_motions(some, point)
     radius = float(np.abs(A[:, 3:]).max(initial=0.0)) or 1.0
     scale = np.array([1.0] * 3 + [radius] * 3)
     root = np.sqrt(weights)[:, None]

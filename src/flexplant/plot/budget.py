@@ -80,14 +80,9 @@ def budget(found: ErrorBudget, *, most: int = 5, ax: Axes | None = None) -> Axes
         )
         base = base + rows
     ax.set(xscale="log", ylim=(0.0, None))
-    ax.legend(*_reversed(ax), frameon=False, **({"loc": "upper left"} if given else _BESIDE))
+    where = {"loc": "upper left"} if given else _BESIDE
+    ax.legend(reverse=True, frameon=False, **where)  # the uppermost area comes first
     total = f"{found.channel}: {with_unit(found.rms, found.unit)} rms"
     squared = f"({unit})^2" if set(unit) & set(" /") else f"{unit}^2" if unit else ""
     label = named("variance below the frequency", squared)
     return finish(ax, x="frequency [Hz]", y=label, title=total)
-
-
-def _reversed(ax: Axes) -> tuple[list[Any], list[str]]:
-    """Return handles and labels of the legend from the uppermost area down."""
-    handles, labels = ax.get_legend_handles_labels()
-    return handles[::-1], labels[::-1]

@@ -89,7 +89,8 @@ def frf(
     if reference is not None and reference not in found:
         raise unknown_label("response", reference, found)
     given, ax = ax is not None, axes(ax, figsize=(9.0, 4.5))
-    wide = {"linewidth": 3.2, "alpha": 0.5} if len(drawn) > 1 and _names_nothing(drawn[0]) else {}
+    plain = role_of(drawn[0].label) is None and "marker" not in drawn[0].line
+    wide = {"linewidth": 3.2, "alpha": 0.5} if len(drawn) > 1 and plain else {}
     for i, (label, response, line) in enumerate(drawn):
         look = line | wide if i == 0 else line
         ax.semilogx(response.freq, decibel(response[output, input]), label=label, **look)
@@ -105,10 +106,6 @@ def frf(
     legend(ax, given=given)
     gain = known.pop() if known else None
     return finish(ax, x="frequency [Hz]", y=gain_label(output, input, gain))
-
-
-def _names_nothing(curve: Curve) -> bool:
-    return role_of(curve.label) is None and "marker" not in curve.line
 
 
 def _part(curve: Curve, band: tuple[float, float] | None) -> Curve:

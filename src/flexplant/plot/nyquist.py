@@ -82,7 +82,8 @@ def nyquist(
         text = f"|S| up to {size:.1f} dB, at {curve.response.freq[nearest]:.4g} Hz"
         label = f"{curve.label}: {text}" if curve.label else text
         ax.plot(values.real, values.imag, label=label, **curve.line)
-        ax.plot(*_point(values[nearest]), "o", color=curve.line["color"], markersize=5)
+        near = values[nearest]
+        ax.plot(near.real, near.imag, "o", color=curve.line["color"], markersize=5)
     level = 20.0 * np.log10(positive(modulus, "modulus"))
     ax.add_patch(
         Circle(
@@ -121,7 +122,3 @@ def _opened(found: Any, freq: FloatArray | None) -> dict[str, Any]:
             L = 1.0 / S.data[[i]][:, [i]] - 1.0
             gains[f"{label} {name}".strip()] = Frf(S.freq, L, [name], [name])
     return gains
-
-
-def _point(value: complex) -> tuple[float, float]:
-    return float(value.real), float(value.imag)

@@ -64,7 +64,8 @@ def pole_map(systems: Any, *, zeros: bool = False, ax: Axes | None = None) -> Ax
             _draw(ax, _continuous(g.zeros(), g), zero, color, f"{label} zeros".strip())
     ax.set_xscale("log")
     _wide(ax)
-    if _unstable(ax):
+    # a drawn root is on the right of the imaginary axis, or on it
+    if any(np.any(np.asarray(line.get_ydata()) <= 0.0) for line in ax.get_lines()):
         ax.set_yscale("symlog", linthresh=1e-4)
         ax.axhline(0.0, color="0.3", linewidth=0.9)
     else:
@@ -83,11 +84,6 @@ def _wide(ax: Axes) -> None:
     room = np.sqrt(10.0 * low / high)
     if room > 1.0:
         ax.set_xlim(low / room, high * room, auto=True)
-
-
-def _unstable(ax: Axes) -> bool:
-    """Whether a drawn root is on the right of the imaginary axis, or on it."""
-    return any(np.any(np.asarray(line.get_ydata()) <= 0.0) for line in ax.get_lines())
 
 
 def _continuous(roots: ComplexArray, g: StateSpace) -> ComplexArray:

@@ -64,22 +64,19 @@ def report(
     True
     """
     design, gallery = Design(parts), Gallery()
+    runs = design.of(Response).items()
+    noisy = {name: run.seed for name, run in runs if run.seed is not None}
     found = [
         result(design, gallery, channel),
         loops_section(design, gallery),
         *sections(design, gallery),
         certificates(design),
-        _origin({**_drawn_from(design), **(seeds or {})}),
+        _origin({**noisy, **(seeds or {})}),
     ]
     text = page(str(title), str(subtitle), [one for one in found if one is not None])
     with written(path) as file:
         file.write(text.encode("utf-8"))
     return Path(path)
-
-
-def _drawn_from(design: Design) -> dict[str, Any]:
-    """Return the seeds of the runs that have noise."""
-    return {name: run.seed for name, run in design.of(Response).items() if run.seed is not None}
 
 
 def _origin(seeds: Mapping[str, Any]) -> Chapter:

@@ -80,8 +80,7 @@ class Spanned:
 
     def missed_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the relative parts (6,) of the rigid-body motions that T cannot make."""
-        full = self.full_dofs
-        wanted = rigid_motions(full.replace(xyz=full.xyz - list(about), interpolation=None))
+        wanted = rigid_motions(self.full_dofs, list(about))
         return missed(self.T @ self.rigid_motions(about), wanted)
 
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
@@ -99,8 +98,5 @@ class Spanned:
         """
         centre = real_array(list(about), "about", (3,))
         if self.is_physical:
-            dofs = self.dofs
-            return rigid_motions(dofs.replace(xyz=dofs.xyz - centre, interpolation=None))
-        dofs = self.full_dofs
-        wanted = rigid_motions(dofs.replace(xyz=dofs.xyz - centre, interpolation=None))
-        return np.asarray(la.lstsq(self.T, wanted)[0])
+            return rigid_motions(self.dofs, centre)
+        return np.asarray(la.lstsq(self.T, rigid_motions(self.full_dofs, centre))[0])

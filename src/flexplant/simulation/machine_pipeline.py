@@ -150,10 +150,14 @@ class MachinePipeline(Value):
             parameters=tuple(self.parameters),
             rate=positive(self.rate, "rate"),
             delay=whole(self.delay, "delay", minimum=0),
-            modes=None if self.modes is None else tuple(map(_number, np.ravel(self.modes))),
+            modes=None
+            if self.modes is None
+            else tuple(whole(n, "mode") for n in np.ravel(self.modes)),
             measurement=None if self.measurement is None else dict(self.measurement),
             candidates=tuple(self.candidates),
-            bandwidth=tuple(sorted(map(_hertz, np.atleast_1d(self.bandwidth)), reverse=True)),
+            bandwidth=tuple(
+                sorted(positive(f, "bandwidth") for f in np.atleast_1d(self.bandwidth))[::-1]
+            ),
             margin=positive(self.margin, "margin"),
             blocks=None if self.blocks is None else tuple(self.blocks),
             duration=positive(self.duration, "duration"),
@@ -327,11 +331,3 @@ class MachinePipeline(Value):
             row |= {n: found.verdict[n] for n in found.verdict.names if n not in row}
             row["passed"] = found.verdict.passed
         return row
-
-
-def _number(value: Any) -> int:
-    return whole(value, "mode")
-
-
-def _hertz(value: Any) -> float:
-    return positive(value, "bandwidth")

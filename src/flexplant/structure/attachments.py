@@ -236,7 +236,11 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
     ModelError
         When one of them is no part.
     """
-    listed = [parts] if isinstance(parts, Part) else list(_iterated(parts))
+    listed = (
+        [parts]
+        if isinstance(parts, Part)
+        else list(instance(parts, Iterable, "parts", "Pass PointMass(...) in [...]."))
+    )
     rows: dict[str, list[sp.csc_array]] = {}
     signs: dict[str, list[float]] = {}
     for part in listed:
@@ -251,11 +255,6 @@ def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.c
         spread = sp.hstack(columns, format="csc")
         found[name] = sp.csc_array(spread @ sp.diags_array(signs[name]) @ spread.T)
     return found
-
-
-def _iterated(parts: Any) -> Iterable[Any]:
-    given: Iterable[Any] = instance(parts, Iterable, "parts", "Pass PointMass(...) in [...].")
-    return given
 
 
 def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:

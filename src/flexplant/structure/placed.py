@@ -61,7 +61,7 @@ class Placed:
     def rigid_motions(self, about: Iterable[float] = (0.0, 0.0, 0.0)) -> FloatArray:
         """Return the six rigid-body motions (n, 6), rotations about a point [m]."""
         centre = real_array(list(about), "about", (3,))
-        return rigid_motions(self.dofs.replace(xyz=self.dofs.xyz - centre, interpolation=None))
+        return rigid_motions(self.dofs, centre)
 
 
 def missed(made: FloatArray, wanted: FloatArray) -> FloatArray:

@@ -34,14 +34,14 @@ _STEPS = 4
 _ASIDE = 1e-3
 
 
-def rigid_motions(dofs: DofSet) -> FloatArray:
+def rigid_motions(dofs: DofSet, about: Any = (0.0, 0.0, 0.0)) -> FloatArray:
     """Return the six rigid-body motions (n, 6) of the DOFs: x, y, z, rx, ry, rz.
 
-    Rotations are small ones about the origin: rx moves a point by ``y rx`` in z and ``-z rx`` in y,
-    hence a plate's rx = dz/dy and ry = -dz/dx.
+    Rotations are small ones about a point [m], the origin unless given: rx moves a point by
+    ``y rx`` in z and ``-z rx`` in y, hence a plate's rx = dz/dy and ry = -dz/dx.
     """
     n = len(dofs)
-    kind = dofs.kinds
+    kind, xyz = dofs.kinds, dofs.xyz - np.asarray(about)
     motions = np.zeros((n, 6))
     motions[np.arange(n), kind] = 1.0
     for axis in range(3):
@@ -49,7 +49,7 @@ def rigid_motions(dofs: DofSet) -> FloatArray:
         after, before = (axis + 1) % 3, (axis + 2) % 3
         for moved, along, sign in ((after, before, -1.0), (before, after, 1.0)):
             rows = kind == moved
-            motions[rows, 3 + axis] = sign * dofs.xyz[rows, along]
+            motions[rows, 3 + axis] = sign * xyz[rows, along]
     return motions
 
 
@@ -149,7 +149,9 @@ def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     near = right[(values >= _ENERGY_TOLERANCE) & (values < _NEARLY)].T
     if not near.shape[1]:
         return basis
-    nearly = _everywhere_small(K, size_of_K, motions @ (near / scale[:, None]))
+    nearly = motions @ (near / scale[:, None])
+    # those without a large force at any DOF: nothing grounds them
+    nearly = nearly[:, _largest_parts(K, size_of_K, nearly) < _EVERYWHERE]
     return _null_vectors(M, K, size_of_K, motions, basis, nearly) if nearly.shape[1] else basis
 
 
@@ -168,11 +170,6 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
     root = np.sqrt(M.diagonal())[:, None]
     force = np.linalg.norm(np.asarray(K @ motions) / root, axis=0)
     return bool(np.all(force <= _RESIDUAL * float(np.max(K.diagonal() / M.diagonal()))))
-
-
-def _everywhere_small(K: Matrix, size_of_K: Any, motions: FloatArray) -> FloatArray:
-    """Return those of some motions without a large force at any DOF: nothing grounds them."""
-    return motions[:, _largest_parts(K, size_of_K, motions) < _EVERYWHERE]
 
 
 def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:

@@ -89,7 +89,7 @@ def zero_energy(
     their own motions each, and a joined machine those that its joints allow.
     """
     center = dofs.xyz.mean(axis=0) if len(dofs) else np.zeros(3)
-    motions = rigid_motions(dofs.replace(xyz=dofs.xyz - center, interpolation=None))
+    motions = rigid_motions(dofs, center)
     if not located:
         motions = motions[:, :3]
     names = DIRECTIONS[: motions.shape[1]]

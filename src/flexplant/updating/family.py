@@ -84,7 +84,8 @@ class Family:
                 f"ReducedModel do, got {type(model).__name__}. Pass one of them."
             )
         refuse_unstable(model, "updating")
-        M, D, K = (_dense(part, model) for part in (model.M, model.D, model.K))
+        none = np.zeros(model.M.shape)
+        M, D, K = (none if A is None else dense(A) for A in (model.M, model.D, model.K))
         rigid = np.asarray(model.rigid_body, dtype=np.float64)
         self.model = model
         self.parameters = tuple(parameters)
@@ -329,10 +330,6 @@ def repeated_groups(poles: ComplexArray) -> list[list[int]]:
             if len(near) > 1:
                 found.append(near)
     return found
-
-
-def _dense(part: Any, model: Any) -> FloatArray:
-    return np.zeros(model.M.shape) if part is None else dense(part)
 
 
 def _stacked(stack: FloatArray) -> Any:

@@ -313,7 +313,7 @@ def free_axes(motions: ZeroEnergy, dofs: DofSet) -> list[str]:
     moves along it by ``t . w / |w|`` per radian.
     """
     center = dofs.xyz.mean(axis=0)
-    every = rigid_motions(dofs.replace(xyz=dofs.xyz - center, interpolation=None))
+    every = rigid_motions(dofs, center)
     size = float(np.abs(dofs.xyz - center).max()) or 1.0
     unit = np.array([1.0, 1.0, 1.0, 1 / size, 1 / size, 1 / size])
     made = la.lstsq(every * unit, motions.rigid)[0]

@@ -184,6 +184,8 @@ def identifiability(
             mixed.append(group)
     unseen = tuple(n for n, ok in zip(names, seen, strict=True) if not ok)
     poor = list(dict.fromkeys([*unseen, *(n for group in mixed for n in group)]))
+    # combinations of the parameters themselves that change no residual
+    lost = Vt[~clear] / np.where(seen, length, 1.0)
     return Identifiability(
         parameters=names,
         singular_values=s,
@@ -192,13 +194,8 @@ def identifiability(
         correlation=correlation,
         unseen=unseen,
         mixed=tuple(mixed),
-        missing=_missing(objective, point, names, poor, _lost(Vt[~clear], seen, length)),
+        missing=_missing(objective, point, names, poor, lost),
     )
-
-
-def _lost(vectors: FloatArray, seen: Any, length: FloatArray) -> FloatArray:
-    """Return the combinations (n, q) of the parameters themselves that change no residual."""
-    return np.asarray(vectors / np.where(seen, length, 1.0), dtype=np.float64)
 
 
 def _missing(

@@ -260,8 +260,9 @@ def _check_apart(given: Sequence[Residual], kept: Sequence[Residual]) -> None:
             parts, twice = _parts(one), _parts(other)
             common = [part for part in twice if part in parts]
             if _same_data(one, other) and (common or not parts):
+                which = f"parts {', '.join(map(str, common[:6]))}" if common else "all"
                 raise ModelError(
-                    f"{other!r} is not unused: {_named(common)} of it were fitted, and fitting "
+                    f"{other!r} is not unused: {which} of it were fitted, and fitting "
                     "them says nothing of others. Take a measurement apart with split(residual), "
                     "or keep another one back."
                 )
@@ -271,10 +272,6 @@ def _parts(residual: Residual) -> list[int]:
     """Return the modes or lines of a residual."""
     lines = getattr(residual, "lines", None)
     return [int(i) for i in (numbers(residual) if lines is None else lines)]
-
-
-def _named(common: list[int]) -> str:
-    return f"parts {', '.join(map(str, common[:6]))}" if common else "all"
 
 
 def _same_data(one: Any, other: Any) -> bool:
