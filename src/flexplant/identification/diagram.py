@@ -106,9 +106,6 @@ class StabilisationDiagram(Value):
     participation: ComplexArray = field(kw_only=True)
     band: FloatArray = field(kw_only=True)
 
-    def __post_init__(self) -> None:
-        self._set(**self._fields())
-
     def __len__(self) -> int:
         return int(self.poles.size)
 

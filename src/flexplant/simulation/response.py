@@ -142,10 +142,8 @@ class Response(Value, Mapping[str, FloatArray]):
 
         Parameters
         ----------
-        channel : str
-            Its name.
-        start : float [s]
-            Samples before this time are left out: transients.
+        channel, start : str, float [s]
+            As for `rms`.
         level : float
             Of the interval.
 
@@ -184,10 +182,8 @@ class Response(Value, Mapping[str, FloatArray]):
 
         Parameters
         ----------
-        channel : str
-            Its name.
-        start : float [s]
-            Samples before this time are left out.
+        channel, start : str, float [s]
+            As for `rms`.
 
         Returns
         -------
@@ -211,10 +207,8 @@ class Response(Value, Mapping[str, FloatArray]):
 
         Parameters
         ----------
-        channel : str
-            Its name.
-        start : float [s]
-            Samples before this time are left out: transients.
+        channel, start : str, float [s]
+            As for `rms`.
         segment : float [s], optional
             Length of a window, the inverse of the resolution; an eighth of the record when not
             given.
@@ -282,9 +276,7 @@ class Response(Value, Mapping[str, FloatArray]):
 
         Parameters
         ----------
-        channel : str
-            Its name.
-        window : float [s]
+        channel, window : str, float [s]
             As for `moving_average`.
 
         Returns

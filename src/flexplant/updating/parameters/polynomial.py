@@ -40,10 +40,8 @@ class PolynomialParameter(Parameter):
         structure's. None stands for zero.
     unit : str
         Of p.
-    bounds : (lowest, highest), optional
-        The parameter is kept between them.
-    prior : (mean, standard deviation), optional
-        What is known beforehand, a normal distribution.
+    bounds, prior : optional
+        As for `MatrixParameter`.
     missed : float
         Part of the largest change of a matrix that the polynomials were seen to miss.
 
