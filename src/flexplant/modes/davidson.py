@@ -10,6 +10,7 @@ import scipy.linalg as la
 from ..errors import SolverError, counted
 from ..progress import tick
 from ..sparse.factor import by_rows
+from ..sparse.rayleigh_ritz import SPREAD
 from ..values import FloatArray, IntArray, Matrix, Rng
 from .lanczos import STEPS, BlockLanczos, along_basis
 
@@ -83,12 +84,15 @@ class BlockDavidson(BlockLanczos):
                 break
             at = np.flatnonzero(~found[: self._m])[: self._block]
             residual, found[at] = self._residuals(squares, mix, at, needed)
-            if np.all(found[: count - extra]) and np.all(self._left <= _VALUE):
+            # a shape is as good as those of the same value: they may be mixed
+            last = squares[:count][-extra - 1] * (1 + SPREAD)
+            shapes = int(np.searchsorted(squares[:count], last, side="right"))
+            if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
                 # all of them once more: a mode found late moves those above it
                 at = np.arange(count)
                 self._limit[:], self._left[:] = 0.0, np.inf
                 residual, found = self._residuals(squares, mix, at, needed)
-                if np.all(found[: count - extra]) and np.all(self._left <= _VALUE):
+                if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
                     return self._shapes(mix[:, :count])
             unfinished = residual[:, ~found[at]][:, : self._block]
             if not unfinished.shape[1]:
@@ -106,6 +110,8 @@ class BlockDavidson(BlockLanczos):
         moved = self._solve(forces)
         block, self._loaded, _ = self._orthonormal(moved / np.linalg.norm(moved, axis=0))
         width = block.shape[1]
+        if not width:
+            raise SolverError("the corrections of a Davidson iteration bring nothing new.")
         self._append(block)
         along = along_basis(self._V[self._r : self._r + self._m], np.asarray(self._K @ block))
         grown = np.zeros((self._m, self._m))
