@@ -22,7 +22,7 @@ _ENERGY = 1e-4
 _RADIUS = 0.1
 #: random vectors that estimate it, and the part of its largest effect that all may miss: with a
 #: chance of (0.8 _MISSED)^_VECTORS, 1e-13; the largest power that is tried
-_VECTORS, _MISSED, _POWER = 12, 0.1, 4
+_VECTORS, _MISSED, _POWER = 12, 0.1, 10
 
 
 def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> int:
@@ -132,7 +132,7 @@ class SignedFactor:
         for k in range(1, _POWER + 1):
             x -= self.solve(A @ x)
             bound = min(bound, (np.linalg.norm(x, axis=0).max() / _MISSED) ** (1 / k))
-            if bound < _RADIUS:
+            if bound < _RADIUS or (k > 2 and bound > 0.5):
                 break
         return float(bound)
 
