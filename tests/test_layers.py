@@ -139,6 +139,11 @@ def defined_in(modules, dotted, name):
 def ours(tree, package):
     """Yield (dotted module below flexplant, {name here: name there}) of imports from it."""
     for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                base, _, name = alias.name.removeprefix("flexplant.").rpartition(".")
+                if alias.name.startswith("flexplant."):
+                    yield base, {name: name}
         if isinstance(node, ast.ImportFrom):
             names = {alias.asname or alias.name: alias.name for alias in node.names}
             tail = node.module.split(".") if node.module else []
@@ -182,7 +187,7 @@ def test_no_circles_between_modules():
 
 
 def test_circles_are_found(tmp_path):
-    """Through a package's re-export, inside a function, by an absolute import."""
+    """Through a package's re-export, inside a function, by absolute imports, for types alone."""
     (tmp_path / "room").mkdir()
     (tmp_path / "__init__.py").write_text("from .room import a as a\n")
     (tmp_path / "room" / "__init__.py").write_text("from .one import a as a\n")
@@ -190,7 +195,11 @@ def test_circles_are_found(tmp_path):
     (tmp_path / "room" / "two.py").write_text("from ..base import c\nb = 1\n")
     (tmp_path / "base.py").write_text("c = 1\ndef d():\n    from flexplant.room import a\n")
     (tmp_path / "free.py").write_text("from . import room, base\n")
-    assert circles(imports_of(modules_of(tmp_path))) == [{"base", "room.one", "room.two"}]
+    (tmp_path / "left.py").write_text("import flexplant.right\n")
+    typed = "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from .left import e\n"
+    (tmp_path / "right.py").write_text(typed)
+    found = circles(imports_of(modules_of(tmp_path)))
+    assert found == [{"base", "room.one", "room.two"}, {"left", "right"}]
 
 
 def test_the_order_is_checked():
