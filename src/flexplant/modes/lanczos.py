@@ -26,8 +26,6 @@ _STEPS = 12
 _RESTARTS = 60
 #: a block with directions this much shorter than others is orthonormalised again
 _LOST = 1e-3
-#: least of greatest eigenvalue of a block's Gram matrix for one turn to be exact to rounding
-_EVEN = 1e-2
 #: what one orthogonalisation may take away, relative, for rounding to leave nothing of it
 _SMALL = 1e-4
 #: a change of M W, relative, that the later Rayleigh-Ritz step on the modes makes up for
@@ -257,8 +255,6 @@ class BlockLanczos:
                 W, loaded = (mixed(X, turn[:, keep] / root) for X in (W, loaded))
                 over = (turn[:, keep] * root).T @ over
                 poor = poor or bool(size[0] < _LOST**2 * size[-1])
-                if size[0] > _EVEN * size[-1]:
-                    break
             if not poor:
                 break
             loaded = self._M @ W
