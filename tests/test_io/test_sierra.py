@@ -139,7 +139,9 @@ def test_maps_that_are_filled_entry_by_entry(tmp_path):
 
 @pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")
 def test_a_real_map_and_its_list_of_nodes(tmp_path):
-    """630 nodes, three DOFs each."""
+    """630 nodes, three DOFs each; as a matrix it is none."""
+    with pytest.raises(FlexplantError, match="A map of DOFs goes to dof_map="):
+        read_sierra(SHARED / "block_c_ASetMap.m")
     diagonal = "".join(f"{i} {i} 2.0\n" for i in range(1, 1891))
     k = written(tmp_path, f"K = [\n{diagonal}];\n")
     files = {"dof_map": SHARED / "block_c_ASetMap.m", "exodus": SHARED / "block_c_gid.m"}

@@ -129,8 +129,10 @@ def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
     if table is None or not kept or not np.all(np.isfinite(table)):
         at = wrong_line((b" ".join(row) for row in words), width)
         if at is not None:
-            due = f"{counted(width, 'number')} are"
-            raise wrong_line_of(path, first + at, due, lines[at], "Write it again with 'mfile'.")
+            due, do = f"{counted(width, 'number')} are", "Write it again with 'mfile'."
+            if _ZEROS.search(content):
+                do = "A map of DOFs goes to dof_map=, a list of nodes to exodus=."
+            raise wrong_line_of(path, first + at, due, lines[at], do)
         raise FlexplantError(f"{str(path)!r} holds no table of numbers. Write it with 'mfile'.")
     whole = table[:, : width - 1] if width > 1 else table
     wrong = (whole != np.round(whole)) | ((whole < 1) & (width > 1))
