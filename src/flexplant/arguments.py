@@ -71,15 +71,7 @@ def positive_array(
     return array
 
 
-def members(
-    values: Any,
-    kind: Any,
-    name: str,
-    hint: str,
-    *,
-    least: int = 1,
-    error: type[FlexplantError] = ModelError,
-) -> tuple[Any, ...]:
+def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> tuple[Any, ...]:
     """Return several values as a tuple, all of a class.
 
     Parameters
@@ -94,12 +86,10 @@ def members(
         How to make them, a sentence.
     least : int
         How many there must be at least.
-    error : type of FlexplantError
-        What is raised.
 
     Raises
     ------
-    FlexplantError
+    ModelError
         When it is no list, one of them is of another class, or there are too few.
     """
     several = isinstance(values, Iterable) and not isinstance(values, str)
@@ -107,7 +97,7 @@ def members(
     if not several or len(listed) < least or not all(isinstance(one, kind) for one in listed):
         kinds = " or ".join(one.__name__ for one in getattr(kind, "__args__", (kind,)))
         many = "" if not least else "at least one " if least == 1 else f"at least {least} "
-        raise error(f"{name} must be a list of {many}{kinds}, got {short(values)}. {hint}")
+        raise ModelError(f"{name} must be a list of {many}{kinds}, got {short(values)}. {hint}")
     return listed
 
 

@@ -111,10 +111,10 @@ def solid_axes(xyz: FloatArray, ax: Any, *, beyond: float = 0.0) -> Any:
     return ax
 
 
-def legend_below(ax: Axes, columns: int = 3) -> None:
+def legend_below(ax: Axes) -> None:
     """Draw the legend under a view from above."""
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=columns, frameon=False)
+        ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.12), ncols=3, frameon=False)
 
 
 def legend(ax: Axes, *, given: bool) -> None:
