@@ -39,8 +39,7 @@ def test_a_filtered_candidate_is_scored_by_its_own_filter(filtered):
     fast = fx.Sensor("fast", at=(0.3, 0.3, 0.0), asd=NOISE)
     layouts = [["y1", "y2", "y3", name] for name in ("fast", "slow")]
     own = filtered.assembled.ports
-    known, anywhere = [*own.y, slow, fast], [fx.placement.OffPoi(-1)]
-    scores = fx.score_sensors(filtered, layouts, candidates=known, constraints=anywhere)
+    scores = fx.score_sensors(filtered, layouts, candidates=[*own.y, slow, fast])
     value = dict(zip(scores.layouts, scores.values, strict=True))
     rebuilt = filtered.with_ports(own.replace(y=[*own.y[:3], slow]))
     truth = fx.design_kalman(rebuilt).rms("die") ** 2

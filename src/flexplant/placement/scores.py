@@ -19,7 +19,7 @@ from .candidates import Port, Side, checked_plant, known_candidates, with_side
 from .constraint import Constraint
 from .criterion import Criterion, in_words
 from .layouts import layouts_of
-from .zones import all_of
+from .zones import constraints_of
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -139,8 +139,8 @@ def score_sensors(
     candidates : sequence of Sensor
         What names may stand for, besides the plant's own sensors.
     constraints : sequence of Constraint, optional
-        As for `place_sensors`: a layout that breaks one is infeasible. One with a sensor on a POI
-        is, unless OffPoi(-1) is among them.
+        As for `place_sensors`: a layout that breaks one is infeasible. Sensors may lie on a POI
+        here unless OffPoi() is among them: layouts that are named are scored.
     executor : concurrent.futures.Executor, optional
         Computes in chunks; the result is the same to the bit.
     progress : bool, optional
@@ -169,8 +169,11 @@ def score_sensors(
     >>> plant = fx.testbeds.three_masses()
     >>> candidates = [fx.Sensor(f"s{i}", at=f"{i}:x", direction="x", asd=1e-10) for i in (1, 2, 3)]
     >>> scores = fx.score_sensors(plant, [["s1"], ["s2"], ["s3"]], candidates=candidates)
-    >>> scores.layouts, scores.reasons  # the POI is on mass 2
-    ((('s1',), ('s3',), ('s2',)), ('', '', 'against OffPoi(radius=0.0).'))
+    >>> scores.best  # the POI is on mass 2
+    ('s2',)
+    >>> off = [fx.placement.OffPoi()]
+    >>> fx.score_sensors(plant, scores.layouts, candidates=candidates, constraints=off).reasons
+    ('', '', 'against OffPoi(radius=0.0).')
     """
     return _scored(plant, "y", layouts, criterion, candidates, constraints, executor, progress)
 
@@ -262,7 +265,7 @@ def _scored(
     chosen = [tuple(position[name] for name in layout) for layout in names]
     places, values = places_of(plant, ports), np.full(len(chosen), np.inf)
     reasons: dict[int, str] = {}
-    for constraint in all_of(constraints, side):
+    for constraint in constraints_of(constraints):
         held = constraint.rows(places).hold(chosen)
         reasons |= dict.fromkeys(np.flatnonzero(~held).tolist(), f"against {constraint!r}.")
     kept = [i for i in range(len(chosen)) if i not in reasons]

@@ -211,6 +211,13 @@ def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
 
 def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:
     """Return constraints as a tuple, OffPoi() among them for sensors unless one is given."""
+    given = constraints_of(constraints)
+    usual = "y" in side and not any(isinstance(item, OffPoi) for item in given)
+    return (*given, OffPoi()) if usual else given
+
+
+def constraints_of(constraints: Any) -> tuple[Constraint, ...]:
+    """Return a constraint, or several, as a tuple."""
     given = (constraints,) if isinstance(constraints, Constraint) else constraints
     if isinstance(given, str) or not isinstance(given, Sequence):
         raise ModelError(
@@ -223,5 +230,4 @@ def all_of(constraints: Any, side: str) -> tuple[Constraint, ...]:
                 f"a constraint is Excluded(...), MinimumDistance(...) or another such value, got "
                 f"{short(item)}. Write Excluded(Disc((0.3, 0.3), radius=0.05)), say."
             )
-    usual = "y" in side and not any(isinstance(item, OffPoi) for item in given)
-    return (*given, OffPoi()) if usual else tuple(given)
+    return tuple(given)
