@@ -207,7 +207,7 @@ def test_bad_input(make):
     for count in (0, 10, 2.5, True):
         with pytest.raises(ModelError, match="count must be"):
             place_sensors(plant, sensors, count)
-    with pytest.raises(ModelError, match="required, but only 3"):
+    with pytest.raises(ModelError, match="count is 3, and 4 candidates are required"):
         place_sensors(plant, sensors, 3, required=["s0", "s1", "s2", "s3"])
     with pytest.raises(LabelError, match="required candidate 's99'"):
         place_sensors(plant, sensors, 3, required=["s99"])
