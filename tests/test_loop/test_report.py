@@ -114,7 +114,7 @@ def test_what_cannot_be_judged_says_why():
     assert judged(LINES, rigid=1).is_stable is not None
     stated_wrong = judged(LINES, rigid=0)
     assert stated_wrong.is_stable is None
-    assert "slope 2, but 0 rigid-body modes" in stated_wrong.reason
+    assert "slope 2, but rigid=0 was stated" in stated_wrong.reason
     coarse = judged(np.arange(1.0, 400.0, 20.0), rigid=1)
     assert coarse.is_stable is None
     assert "finer resolution" in coarse.reason

@@ -176,7 +176,7 @@ def test_where_all_fail_each_says_why(monkeypatch):
     monkeypatch.setattr(attempts, "_LONG", 1e-3)
     message = (
         r"^these equations were not solved\. \(Tried besides: StructuredLmi\(\): the time limit "
-        r"of 0\.001 s was reached after 1 steps, .* Riccati\(regularised=True\): the same\)$"
+        r"of 0\.001 s was reached after 1 step, .* Riccati\(regularised=True\): the same\)$"
     )
     with pytest.raises(SolverError, match=message):
         solved(*plant)
