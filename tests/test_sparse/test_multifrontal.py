@@ -191,3 +191,9 @@ def test_a_count_in_single_precision(mesh, monkeypatch):
             assert multifrontal_inertia(A, dissection) == k + 1
     assert taken[0::2] == [True, True]
     assert taken[1::2] == [False, False]
+
+
+def test_a_pivot_that_is_zero_in_single_precision_is_counted_in_double(monkeypatch):
+    monkeypatch.setattr(ordering, "_COSTLY", 0.0)
+    A = sp.csc_array(sp.diags_array([2.0, 1e-60, -1.0] * 20))
+    assert multifrontal_inertia(A) == 20
