@@ -23,7 +23,7 @@ from ..values import (
     rebuild,
     signal_names,
 )
-from .channels import chosen_pair
+from .channels import chosen_pair, rows_of
 from .frf_arithmetic import Arithmetic
 from .grid import checked_freq as checked_freq
 from .grid import default_freq as default_freq
@@ -201,8 +201,8 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
         """
         chosen_out = name_list(self.outputs if outputs is None else outputs, "outputs")
         chosen_in = name_list(self.inputs if inputs is None else inputs, "inputs")
-        rows = [_index(self.outputs, name, "output") for name in chosen_out]
-        columns = [_index(self.inputs, name, "input") for name in chosen_in]
+        rows = rows_of(self.outputs, chosen_out, "output", None)
+        columns = rows_of(self.inputs, chosen_in, "input", None)
         picked = np.ix_(rows, columns)
         return self.replace(
             data=self.data[picked],
@@ -343,7 +343,8 @@ class Frf(Arithmetic, Value, Mapping[tuple[str, str], ComplexArray]):
                 f"frf[output, input] is one response, got {len(rows)} outputs and {len(columns)} "
                 "inputs. Use frf.select(outputs, inputs) for several."
             )
-        return _index(self.outputs, rows[0], "output"), _index(self.inputs, columns[0], "input")
+        output = rows_of(self.outputs, rows, "output", None)
+        return int(output[0]), int(rows_of(self.inputs, columns, "input", None)[0])
 
 
 def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
@@ -351,7 +352,7 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
 
     s = 2 pi i f, or exp(2 pi i f dt) when sampled. Where A has 1 x 1 and 2 x 2 diagonal blocks
     each is solved in closed form, so that a frequency costs O(n) when A is block diagonal;
-    otherwise A is brought to Schur form once.
+    otherwise by its poles and residues, or its Schur form where eigenvectors are ill-conditioned.
 
     Parameters
     ----------
@@ -393,9 +394,3 @@ def frequency_response(sys: System, freq: npt.ArrayLike | None = None) -> Frf:
     frf = rebuild(Frf, fields | dict.fromkeys(known) | {"overlap": 0.0, "units": g.units})
     assert isinstance(frf, Frf)  # noqa: S101 - rebuild returns the class it is given
     return frf
-
-
-def _index(known: Sequence[str], name: str, side: str) -> int:
-    if name not in known:
-        raise unknown_label(side, name, known)
-    return list(known).index(name)
