@@ -37,7 +37,7 @@ plate = fx.kirchhoff_plate(
     youngs_modulus=70e9,
     poisson_ratio=0.35,
 )
-whole = fx.solve_modes(plate, count=40, damping=fx.ModalDamping(0.005))
+whole = fx.solve_modes(plate, count=41, damping=fx.ModalDamping(0.005))
 PORTS = fx.Ports(
     w=[fx.Disturbance(f"amp{i}", at=p, asd=1e-3) for i, p in enumerate(INSET, 1)],
     u=[fx.Actuator(f"u{i}", at=p) for i, p in enumerate(INSET, 1)],
