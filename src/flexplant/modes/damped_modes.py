@@ -10,7 +10,7 @@ from ..errors import SolverError, counted, warn
 from ..sparse.factor import by_rows, diagonal
 from ..sparse.orthonormal import beyond
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import absolute
+from ..sparse.rayleigh_ritz import Absolute
 from ..structure import FEModel
 from ..structure.negative_stiffness import signed_square
 from ..values import ComplexArray, FloatArray
@@ -169,7 +169,7 @@ def _rest(
     # an entry of a shape is known to a rounding of its largest ones, as in undamped modes
     moved = np.abs(x)
     moved = moved + _ENTRY * moved.max(axis=0)
-    whole = absolute(K) @ moved + np.abs(poles) * (absolute(D) @ moved)
+    whole = Absolute(K) @ moved + np.abs(poles) * (Absolute(D) @ moved)
     limit = _RESIDUAL[0] * np.linalg.norm(weight * inertia, axis=0)
     # real poles are not among what is returned: their place suffices
     part = np.where(poles.imag == 0, _RESIDUAL[0], _RESIDUAL[1])

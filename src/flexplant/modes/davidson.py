@@ -20,6 +20,8 @@ _FIRST = 10
 _VALUE = 1e-5
 #: residual below which the limit of a shape is computed
 _NEAR = 1e-8
+#: shapes that are improved at a time: a pass over the factor costs little more for more of them
+_IMPROVED = 24
 #: steps before giving up, beyond one for each mode
 _MOST = 40
 #: after so many steps modes must not be lower than this part of -sigma, to converge fast
@@ -82,7 +84,7 @@ class BlockDavidson(BlockLanczos):
             squares, mix = la.eigh(self._T)
             if self.steps > _EARLY and squares[:count][-1] < -_FAR * self._sigma:
                 break
-            at = np.flatnonzero(~found[: self._m])[: self._block]
+            at = np.flatnonzero(~found[: self._m])[:_IMPROVED]
             residual, found[at] = self._residuals(squares, mix, at, needed)
             # a shape is as good as those of the same value: they may be mixed
             last = squares[:count][-extra - 1] * (1 + SPREAD)
@@ -94,10 +96,10 @@ class BlockDavidson(BlockLanczos):
                 residual, found = self._residuals(squares, mix, at, needed)
                 if np.all(found[:shapes]) and np.all(self._left <= _VALUE):
                     return self._shapes(mix[:, :count])
-            unfinished = residual[:, ~found[at]][:, : self._block]
+            unfinished = residual[:, ~found[at]][:, :_IMPROVED]
             if not unfinished.shape[1]:
                 continue
-            if self._r + self._m + 2 * self._block > self._capacity:
+            if self._r + self._m + _IMPROVED > self._capacity:
                 self._restart(squares, mix, max(count + self._block, 2 * self._m // 3))
             self._extend(unfinished)
         raise SolverError(

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..errors import SolverError
 from ..sparse.factor import by_rows, diagonal
-from ..sparse.rayleigh_ritz import absolute, column_groups
+from ..sparse.rayleigh_ritz import Absolute, column_groups
 from ..structure import FEModel
 from ..structure.negative_stiffness import signed_square
 from ..values import FloatArray
@@ -58,10 +58,10 @@ def _measured(model: FEModel, omega: FloatArray, phi: FloatArray) -> tuple[Float
     residuals relative to ``||K phi||``, and the relative errors of the frequencies by rounding.
     """
     M, K = by_rows(model.M), by_rows(model.K)
-    size_of_K, stiff = absolute(K), diagonal(model.K)
+    size_of_K, stiff = Absolute(K), diagonal(model.K)
     # by stiffness: displacements and rotations compare, and DOFs without inertia weigh no more
     weight = 1 / np.sqrt(np.where(stiff > 0, stiff, stiff.max(initial=0.0) or 1.0))[:, None]
-    rows = np.asarray(size_of_K.sum(axis=1))[:, None]
+    rows = size_of_K @ np.ones((stiff.size, 1))
     gram = np.eye(omega.size)
     size, limit, left, rounding = np.zeros((4, omega.size))
     elastic = omega != 0

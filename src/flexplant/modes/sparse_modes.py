@@ -11,7 +11,7 @@ from ..errors import ModelError, SolverError
 from ..parallel import one_thread
 from ..sparse.factor import by_rows
 from ..sparse.pardiso import Pardiso
-from ..sparse.rayleigh_ritz import absolute, column_groups, rayleigh_ritz, rounding_of
+from ..sparse.rayleigh_ritz import Absolute, column_groups, rayleigh_ritz, rounding_of
 from ..structure.eigen import check_stiffness
 from ..structure.model import FEModel
 from ..structure.negative_stiffness import are_rigid
@@ -226,7 +226,7 @@ def _excess(
     K: Any, M: Any, squares: FloatArray, phi: FloatArray, least: FloatArray | float
 ) -> float:
     """Return the largest residual of the first shapes, relative to what is let pass or `least`."""
-    left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), absolute(K)
+    left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), Absolute(K)
     for at in column_groups(squares.size):
         force, limit = _let_pass(K, size_of_K, phi[:, at])
         limit = np.maximum(limit, least[at]) * np.linalg.norm(force, axis=0)
@@ -237,13 +237,13 @@ def _excess(
 
 def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
     """Return the relative error of each shape at which `part` of its residual is let pass."""
-    size_of_K, limit = absolute(K), np.zeros(phi.shape[1])
+    size_of_K, limit = Absolute(K), np.zeros(phi.shape[1])
     for at in column_groups(limit.size):
         limit[at] = part * _let_pass(K, size_of_K, phi[:, at])[1]
     return limit
 
 
-def _let_pass(K: Any, size_of_K: Any, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _let_pass(K: Any, size_of_K: Absolute, phi: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return forces ``K phi`` and, relative to each, the residual that is let pass."""
     force = np.asarray(K @ phi)
     rounding = np.finfo(np.float64).eps * np.linalg.norm(size_of_K @ np.abs(phi), axis=0)

@@ -19,7 +19,7 @@ from .ordering import Dissection, Front, dissect
 #: rounding let pass in the energies that accompany a count
 _ENERGY = 1e-4
 #: spectral radius of the error of a factor, relative to it, up to which its inertia is accepted
-_RADIUS = 0.1
+_RADIUS = 0.5
 #: random vectors that estimate it, and the part of its largest effect that all may miss: with a
 #: chance of (0.8 _MISSED)^_VECTORS, 1e-13; the largest power that is tried
 _VECTORS, _MISSED, _POWER = 12, 0.1, 10
@@ -133,13 +133,15 @@ class SignedFactor:
         """
         A = by_rows(matrix)
         x = np.random.default_rng(0).standard_normal((A.shape[0], _VECTORS))
-        bound = np.inf
+        size, bound = np.inf, np.inf
         for k in range(1, _POWER + 1):
+            before = size
             x -= self.solve(A @ x)
-            bound = min(bound, (np.linalg.norm(x, axis=0).max() / _MISSED) ** (1 / k))
-            if bound < _RADIUS or (k > 2 and bound > 0.5):
+            size = float(np.linalg.norm(x, axis=0).max())
+            bound = min(bound, (size / _MISSED) ** (1 / k))
+            if bound < _RADIUS or (k > 2 and size > _RADIUS * before):
                 break
-        return float(bound)
+        return bound
 
 
 def _eliminated(lower: Any, dissection: Dissection) -> Iterator[tuple[Front, _Pivots, FloatArray]]:

@@ -16,7 +16,7 @@ from .factor import by_rows
 SPREAD = 1e-6
 #: a group of soft modes ends below this part of the largest eigenvalue, at the widest gap
 _END = 1e-3
-#: rows that are mixed at a time
+#: rows that are worked on at a time
 _ROWS = 65536
 #: shapes that are multiplied at a time: a product of all at once is memory at its peak
 _COLUMNS = 16
@@ -57,10 +57,10 @@ def rounding_of(K: Any, phi: FloatArray) -> FloatArray:
     By so much the eigenvalue of a shape may change when the entries of K are rounded to double
     precision: no method finds it closer to that of the structure.
     """
-    size_of_K, found = absolute(by_rows(K)), np.zeros(phi.shape[1])
+    size_of_K, found = Absolute(K), np.zeros(phi.shape[1])
     for at in column_groups(phi.shape[1]):
         size = np.abs(phi[:, at])
-        found[at] = _EPS * np.einsum("ij,ij->j", size, np.asarray(size_of_K @ size))
+        found[at] = _EPS * np.einsum("ij,ij->j", size, size_of_K @ size)
     return found
 
 
@@ -71,12 +71,26 @@ def column_groups(count: int, most: int = _COLUMNS) -> Iterator[slice]:
         yield slice(k * count // groups, (k + 1) * count // groups)
 
 
-def absolute(K: Any) -> Any:
-    """Return ``|K|``, entry by entry."""
-    given: Any = K
-    if not sp.issparse(K):
-        return np.abs(given)
-    return sp.csr_array((np.abs(given.data), given.indices, given.indptr), shape=given.shape)
+class Absolute:
+    """``|K|``, entry by entry, for products: a copy of a large matrix is memory at its peak."""
+
+    def __init__(self, K: Any) -> None:
+        self._K = by_rows(K)
+
+    def __matmul__(self, X: FloatArray) -> FloatArray:
+        K = self._K
+        if not sp.issparse(K):
+            return np.asarray(np.abs(K) @ X)
+        found = np.empty((K.shape[0], *X.shape[1:]))
+        for begin in range(0, K.shape[0], _ROWS):
+            pointer = K.indptr[begin : begin + _ROWS + 1]
+            at = slice(int(pointer[0]), int(pointer[-1]))
+            rows = sp.csr_array(
+                (np.abs(K.data[at]), K.indices[at], pointer - pointer[0]),
+                shape=(pointer.size - 1, K.shape[1]),
+            )
+            found[begin : begin + _ROWS] = rows @ X
+        return found
 
 
 def mixed(X: FloatArray, mix: FloatArray) -> FloatArray:

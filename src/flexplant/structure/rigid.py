@@ -15,7 +15,7 @@ from ..errors import ModelError, SolverError
 from ..labels import DIRECTIONS, DofSet, Place
 from ..sparse.factor import by_rows
 from ..sparse.lowest import ROUNDING, definite_solver
-from ..sparse.rayleigh_ritz import absolute
+from ..sparse.rayleigh_ritz import Absolute
 from ..values import FloatArray, IntArray, Matrix
 from .components import bodies
 from .soft_springs import unheld
@@ -130,8 +130,8 @@ def _free(M: Matrix, K: Matrix, motions: FloatArray) -> FloatArray:
     """Return the M-orthonormal motions of one body that cost no energy."""
     # K r and |K| |r|, row by row: forces of rounding size say that no energy is stored
     K = by_rows(K)
-    size_of_K = absolute(K)
-    scale = np.linalg.norm(np.asarray(size_of_K @ np.abs(motions)), axis=0)
+    size_of_K = Absolute(K)
+    scale = np.linalg.norm(size_of_K @ np.abs(motions), axis=0)
     scale = np.where(scale > 0, scale, 1.0)
     force = np.asarray(K @ motions) / scale
     free = np.linalg.norm(force, axis=0) < _ENERGY_TOLERANCE
@@ -175,21 +175,21 @@ def force_free(M: Matrix, K: Matrix, motions: FloatArray) -> bool:
 def force_parts(K: Matrix, motions: FloatArray) -> FloatArray:
     """Return the largest force of each motion (r,), of the largest that its parts make anywhere."""
     rows = by_rows(K)
-    return _largest_parts(rows, absolute(rows), motions)
+    return _largest_parts(rows, Absolute(rows), motions)
 
 
-def _largest_parts(K: Matrix, size_of_K: Any, motions: FloatArray) -> FloatArray:
+def _largest_parts(K: Matrix, size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     entries: Any = K.diagonal()
     weight = 1 / np.sqrt(np.where(entries > 0, entries, 1.0))[:, None]
     force = np.abs(weight * np.asarray(K @ motions)).max(axis=0)
-    most = (weight * np.asarray(size_of_K @ np.abs(motions))).max(axis=0)
+    most = (weight * (size_of_K @ np.abs(motions))).max(axis=0)
     return np.asarray(force / np.where(most > 0, most, 1.0))
 
 
 def _null_vectors(
     M: Matrix,
     K: Matrix,
-    size_of_K: Any,
+    size_of_K: Absolute,
     motions: FloatArray,
     basis: FloatArray,
     nearly: FloatArray,

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
-from ..sparse.rayleigh_ritz import absolute
+from ..sparse.rayleigh_ritz import Absolute
 from ..values import FloatArray, Matrix
 
 #: relative error of an entry in double precision
@@ -42,14 +42,14 @@ def unheld(K: Matrix, motions: FloatArray, rounding: float = PRECISION) -> Float
     mix = np.eye(motions.shape[1])
     if not motions.size:
         return mix
-    size_of_K = absolute(K)
+    size_of_K = Absolute(K)
     for free in (_beside_few_springs, _beside_many_springs):
         if mix.shape[1]:
             mix = mix @ free(K, size_of_K, motions @ mix, rounding)
     return mix
 
 
-def _beside_few_springs(K: Any, size_of_K: Any, motions: FloatArray, rounding: float) -> FloatArray:
+def _beside_few_springs(K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float) -> FloatArray:
     """Return the combinations (r, m) without outliers among the forces."""
     n, r = motions.shape
     force, most = np.abs(np.asarray(K @ motions)), _sizes(size_of_K, motions)
@@ -68,11 +68,11 @@ def _beside_few_springs(K: Any, size_of_K: Any, motions: FloatArray, rounding: f
 
 
 def _beside_many_springs(
-    K: Any, size_of_K: Any, motions: FloatArray, rounding: float
+    K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float
 ) -> FloatArray:
     """Return the combinations (r, m) without an energy that is more than rounding."""
     moved = np.abs(motions)
-    most = np.sqrt(np.einsum("ij,ij->j", moved, np.asarray(size_of_K @ moved)))
+    most = np.sqrt(np.einsum("ij,ij->j", moved, size_of_K @ moved))
     most = np.where(most > 0, most, 1.0)
     energy, mix = la.eigh(motions.T @ np.asarray(K @ motions) / most / most[:, None])
     mix = mix / most[:, None]
@@ -95,11 +95,10 @@ def _in_their_order(null: FloatArray, untouched: Any) -> FloatArray:
     return null
 
 
-def _sizes(size_of_K: Any, motions: FloatArray) -> FloatArray:
+def _sizes(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     """Return the forces (n, r) that do not cancel, each DOF moving as far as the farthest.
 
     So that rounding is seen in proportion also where a motion passes through zero.
     """
     most = np.abs(motions).max(axis=0, initial=0.0)
-    whole: FloatArray = np.asarray(size_of_K.sum(axis=1), dtype=np.float64).reshape(-1, 1)
-    return np.asarray(whole * most)
+    return (size_of_K @ np.ones((motions.shape[0], 1))) * most
