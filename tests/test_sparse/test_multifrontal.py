@@ -186,7 +186,7 @@ def test_a_count_in_single_precision(mesh, monkeypatch):
             bound = factor.error_radius(A)
             error = np.eye(len(nodes)) - factor.solve(A.toarray())
             assert np.abs(la.eigvals(error)).max() < bound
-            taken.append(bool(bound < 0.1))
+            taken.append(bool(bound < 0.5))
             assert factor.negative == k + 1 or not taken[-1]
             assert multifrontal_inertia(A, dissection) == k + 1
     assert taken[0::2] == [True, True]

@@ -49,7 +49,9 @@ def unheld(K: Matrix, motions: FloatArray, rounding: float = PRECISION) -> Float
     return mix
 
 
-def _beside_few_springs(K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float) -> FloatArray:
+def _beside_few_springs(
+    K: Any, size_of_K: Absolute, motions: FloatArray, rounding: float
+) -> FloatArray:
     """Return the combinations (r, m) without outliers among the forces."""
     n, r = motions.shape
     force, most = np.abs(np.asarray(K @ motions)), _sizes(size_of_K, motions)
