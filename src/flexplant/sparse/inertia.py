@@ -13,7 +13,7 @@ from ..errors import SolverError
 from ..parallel import one_thread
 from ..values import FloatArray, IntArray
 from .factor import by_rows
-from .multifrontal import assembled
+from .multifrontal import assembled, in_single
 from .ordering import Dissection, Front, dissect
 
 #: rounding let pass in the energies that accompany a count
@@ -96,7 +96,7 @@ class SignedFactor:
     def __init__(self, matrix: Any, dissection: Dissection) -> None:
         self._order = dissection.order
         self._scale = float(np.abs(matrix.data).max(initial=0.0)) or 1.0
-        lower = sp.csc_array((matrix / self._scale).astype(np.float32))
+        lower = in_single(matrix, self._scale)
         with one_thread():
             self._blocks = list(_eliminated(lower, dissection))
 

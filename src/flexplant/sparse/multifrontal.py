@@ -54,7 +54,7 @@ class MultifrontalCholesky:
         self._single = single
         self._scale = float(np.abs(lower.data).max(initial=0.0)) if single else 1.0
         if single:
-            lower = sp.csc_array((lower / self._scale).astype(np.float32))
+            lower = in_single(lower, self._scale)
         potrf, trtri, self._trsm, syrk = _kernels(lower.dtype)
         self.dissection = dissect(lower) if dissection is None else dissection
         self._blocks: list[tuple[FloatArray | None, FloatArray]] = []
@@ -119,6 +119,12 @@ class MultifrontalCholesky:
         answer = np.empty(x.shape)
         answer[order] = x if scale is None else x / scale
         return answer.reshape(right.shape)
+
+
+def in_single(matrix: Any, scale: float) -> Any:
+    """Return a sparse matrix over `scale` in single precision."""
+    data = np.divide(matrix.data, scale, dtype=np.float32, casting="same_kind")
+    return sp.csc_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
 def _kernels(dtype: Any) -> tuple[Any, Any, Any, Any]:

@@ -105,15 +105,16 @@ def dissect(
 
 def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_array:
     """Return the graph of nodes (without loops) of a matrix of DOFs."""
+    member = member.astype(np.int32)
     columns = np.repeat(member, np.diff(matrix.indptr))
     rows = member[matrix.indices]
-    off = rows != columns
-    graph: Any = sp.csr_array(
-        (np.ones(np.count_nonzero(off), dtype=np.int8), (rows[off], columns[off])),
+    below = rows > columns
+    edges: Any = sp.csr_array(
+        (np.ones(np.count_nonzero(below), dtype=np.int8), (rows[below], columns[below])),
         shape=(count, count),
     )
-    graph.data = np.ones(graph.indices.size, dtype=np.int8)
-    return sp.csr_array(graph)
+    edges.data = np.ones(edges.indices.size, dtype=np.int8)
+    return sp.csr_array(edges + edges.T)
 
 
 def graph_coordinates(graph: sp.csr_array) -> FloatArray:
