@@ -180,7 +180,7 @@ def test_a_count_in_single_precision(mesh, monkeypatch):
     taken = []
     for first in (6, 60):
         k = first + int(np.argmax(np.diff(squares[first : first + 6])))
-        for part in (0.5, 1e-6):
+        for part in (0.5, 1e-8):
             A = sp.csc_array(K - (squares[k] + part * (squares[k + 1] - squares[k])) * M)
             factor = SignedFactor(A, dissection)
             bound = factor.error_radius(A)

@@ -123,7 +123,8 @@ class MultifrontalCholesky:
 
 def in_single(matrix: Any, scale: float) -> Any:
     """Return a sparse matrix over `scale` in single precision."""
-    data = np.divide(matrix.data, scale, dtype=np.float32, casting="same_kind")
+    data = np.empty(matrix.data.shape, np.float32)
+    np.divide(matrix.data, scale, out=data, casting="same_kind")
     return sp.csc_array((data, matrix.indices, matrix.indptr), shape=matrix.shape)
 
 
