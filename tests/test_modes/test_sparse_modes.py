@@ -93,11 +93,19 @@ def test_what_a_search_missed_is_found_by_the_count(structure, monkeypatch):
     assert certificate["counted"] == certificate["found"]
 
 
-def test_below_a_frequency(structure):
+@pytest.mark.parametrize("single", [False, True])
+def test_below_a_frequency(structure, monkeypatch, single):
+    """Bulky structures are counted and searched with one factor, in single precision."""
     model, expected = structure
+    model = FEModel(model.M, model.K, dofs=model.dofs)  # without a factor in use
     i = 9 + int(np.argmax(np.diff(expected[9:14])))
     top = 0.5 * (expected[i] + expected[i + 1])
+    made, new = [], counted.search_factor
+    monkeypatch.setattr(counted, "search_factor", lambda *args: made.append(1) or new(*args))
+    if single:
+        monkeypatch.setattr(ordering, "_COSTLY", 0.0)
     squares, phi, certificate = counted_modes(model, 10**6, top)
+    assert bool(made) != single
     assert squares.size == np.count_nonzero(expected < top)
     assert certificate["counted"] == squares.size + model.rigid_body.shape[1]
     np.testing.assert_allclose(certificate["shift"], np.sqrt(top) / (2 * np.pi))
@@ -133,7 +141,7 @@ def test_one_factor_serves_while_it_is_held(structure):
     assert "GB" in repr(factor)
 
 
-def test_negative_stiffness_is_counted():
+def test_negative_stiffness_is_counted(monkeypatch):
     mesh = meshes.plate(8)
     pull = sp.csc_array(([-1e7, -1e7], ([0, 30], [0, 30])), shape=mesh[1].shape)
     model = FEModel(mesh[0], mesh[1] + sp.csc_array(1e3 * mesh[0]), dofs=meshes.dofs_of(mesh))
@@ -141,6 +149,9 @@ def test_negative_stiffness_is_counted():
     expected = np.count_nonzero(la.eigvalsh(model.K.toarray()) < 0)
     with pytest.raises(ModelError, match=f"{expected} negative eigenvalue"):
         counted_modes(model, 5)
+    monkeypatch.setattr(ordering, "_COSTLY", 0.0)  # counted and searched with one factor
+    with pytest.raises(ModelError, match="negative"):
+        counted_modes(model, 5, 1e6)
 
 
 @pytest.mark.parametrize("soft", [0.0, 1e-4])

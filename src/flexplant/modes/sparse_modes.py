@@ -18,7 +18,14 @@ from ..structure.negative_stiffness import are_rigid
 from ..values import FloatArray, Rng
 from .davidson import BlockDavidson
 from .lanczos import REACHED, BlockLanczos
-from .shifted import StiffnessFactor, modes_below, search_factor, stiffness_factor
+from .shifted import (
+    CountingFactor,
+    StiffnessFactor,
+    counting_factor,
+    modes_below,
+    search_factor,
+    stiffness_factor,
+)
 
 #: modes beyond the last wanted one among which a gap is searched
 _EXTRA = 4
@@ -82,12 +89,15 @@ def _counted(
 ) -> tuple[FloatArray, FloatArray, dict[str, float]]:
     n, r = model.rigid_body.shape
     new = search_factor
-    factor: StiffnessFactor | None = new(model, method)
+    factor: StiffnessFactor | CountingFactor | None = None
     below = None
     if np.isfinite(top):
-        below = modes_below(model, top) - r
+        factor = counting_factor(model, top) if method is None else None
+        below = (modes_below(model, top) if factor is None else factor.below) - r
         if not below:
             return np.zeros(0), np.zeros((n, 0)), _certificate(top, r, r)
+        if count < below:
+            factor = None  # its shift is far above the last mode that is wanted
         count = min(count, below)
         if count > _MOST:
             raise ModelError(
@@ -156,7 +166,11 @@ def _beside(
 
 
 def _search(
-    model: FEModel, factor: StiffnessFactor, locked: FloatArray, want: int, rng: Rng
+    model: FEModel,
+    factor: StiffnessFactor | CountingFactor,
+    locked: FloatArray,
+    want: int,
+    rng: Rng,
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes (n, want) beside the locked ones, residuals down to rounding.
 
@@ -176,7 +190,7 @@ def _search(
 
 def _searched(
     model: FEModel,
-    factor: StiffnessFactor,
+    factor: StiffnessFactor | CountingFactor,
     locked: FloatArray,
     want: int,
     rng: Rng,

@@ -41,9 +41,9 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
     lower = sp.csc_array(matrix)
     chosen = dissect(lower) if dissection is None else dissection
     if chosen.is_costly:
-        in_single = _counted_in_single(lower, chosen)
-        if in_single is not None:
-            return in_single
+        factor = signed_factor(lower, chosen)
+        if factor is not None:
+            return factor.negative
     x = np.random.default_rng(0).standard_normal((lower.shape[0], 3))
     b = np.asarray(lower @ x)
     wanted, size = np.sum(x * b, axis=0), np.sum(np.abs(x * b), axis=0)
@@ -66,13 +66,13 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
     return negative
 
 
-def _counted_in_single(lower: Any, dissection: Dissection) -> int | None:
-    """Return the count by a factor in single precision; None where rounding may change a sign."""
+def signed_factor(matrix: Any, dissection: Dissection) -> SignedFactor | None:
+    """Return a factor in single precision that counts; None where rounding may change a sign."""
     try:
-        factor = SignedFactor(lower, dissection)
+        factor = SignedFactor(matrix, dissection)
     except SolverError:
         return None
-    return factor.negative if factor.error_radius(lower) < _RADIUS else None
+    return factor if factor.error_radius(matrix) < _RADIUS else None
 
 
 class SignedFactor:
