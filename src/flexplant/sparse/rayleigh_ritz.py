@@ -78,9 +78,9 @@ class Absolute:
         self._K = by_rows(K)
 
     def __matmul__(self, X: FloatArray) -> FloatArray:
-        K = self._K
-        if not sp.issparse(K):
-            return np.asarray(np.abs(K) @ X)
+        if not sp.issparse(self._K):
+            return np.asarray(np.abs(self._K) @ X)
+        K: Any = self._K
         found = np.empty((K.shape[0], *X.shape[1:]))
         for begin in range(0, K.shape[0], _ROWS):
             pointer = K.indptr[begin : begin + _ROWS + 1]

@@ -103,4 +103,4 @@ def _sizes(size_of_K: Absolute, motions: FloatArray) -> FloatArray:
     So that rounding is seen in proportion also where a motion passes through zero.
     """
     most = np.abs(motions).max(axis=0, initial=0.0)
-    return (size_of_K @ np.ones((motions.shape[0], 1))) * most
+    return np.asarray((size_of_K @ np.ones((motions.shape[0], 1))) * most)
