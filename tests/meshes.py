@@ -15,9 +15,11 @@ CORNERS = np.array(
 def assembled(places, element, n):
     """Sum equal element matrices (m, m) at the DOFs `places` (elements, m)."""
     m = element.shape[0]
+    places = places.astype(np.int32)
     rows, columns = np.repeat(places, m, axis=1).ravel(), np.tile(places, (1, m)).ravel()
     entries = np.tile(element.ravel(), places.shape[0])
-    return sp.csc_array(sp.coo_array((entries, (rows, columns)), shape=(n, n)))
+    # a copy: what is summed keeps the memory of all terms
+    return sp.csc_array(sp.coo_array((entries, (rows, columns)), shape=(n, n))).copy()
 
 
 def plate(n, size=0.6):

@@ -146,8 +146,8 @@ class BlockLanczos:
                 self._restart(theta, mix, keep)
                 self._over = self._over @ mix[-self._over.shape[1] :, :keep]
             if done:
-                # the memory of the others is needed
-                self._V = self._V[: self._r + keep].copy()
+                # the memory of the others is needed; a copy would need more first
+                self._V.resize((self._r + keep, n), refcheck=False)
                 return theta[:wanted], np.ascontiguousarray(self._V[self._r :][:wanted].T)
             # a step brings no more than a block of new ones, usually half of it
             check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)

@@ -14,6 +14,7 @@ from ..sparse.multifrontal import MultifrontalCholesky
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
+from ..structure.definite import same_pattern
 from ..structure.model import FEModel
 from ..structure.negative_stiffness import unstable_stiffness
 from ..values import FloatArray
@@ -221,7 +222,7 @@ def dissection_of(model: FEModel) -> Dissection:
     if found is None:
         M, K = sp.csc_array(model.M), sp.csc_array(model.K)
         # of both matrices: entries that cancel in one stay in the other
-        pattern = K if _alike(K, M) else sp.csc_array(abs(K) + abs(M))
+        pattern = K if same_pattern(K, M) else sp.csc_array(abs(K) + abs(M))
         found = dissect(pattern, model.dofs.node_index, model.dofs.xyz)
         _dissected[model] = found
     return found
@@ -240,14 +241,9 @@ def modes_below(model: FEModel, square: float) -> int:
 
 def _shifted(K: Any, M: Any, square: float) -> Any:
     """Return ``K - square M``, its indices those of K where both have the same."""
-    if not _alike(K, M):
+    if not same_pattern(K, M):
         return sp.csc_array(K - square * M)
     return sp.csc_array((K.data - square * M.data, K.indices, K.indptr), shape=K.shape)
-
-
-def _alike(K: Any, M: Any) -> bool:
-    """Return whether the same entries of two matrices are stored."""
-    return np.array_equal(M.indptr, K.indptr) and np.array_equal(M.indices, K.indices)
 
 
 _held = weakref.WeakKeyDictionary()

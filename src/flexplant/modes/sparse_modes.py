@@ -41,6 +41,8 @@ _RESIDUAL = 1e-11
 _ROUNDINGS = 10.0
 #: errors of Ritz vectors, in terms of the residuals let pass, that Lanczos is stopped at
 _PARTS = (1.0, 0.03)
+#: shapes that are judged at a time, while the memory is at its peak
+_JUDGED = 8
 #: shapes that are solved for at a time: each time, the whole factor is read
 _SOLVED = 32
 
@@ -241,7 +243,7 @@ def _excess(
 ) -> float:
     """Return the largest residual of the first shapes, relative to what is let pass or `least`."""
     left, least, size_of_K = 0.0, np.broadcast_to(least, squares.shape), Absolute(K)
-    for at in column_groups(squares.size):
+    for at in column_groups(squares.size, _JUDGED):
         force, limit = _let_pass(K, size_of_K, phi[:, at])
         limit = np.maximum(limit, least[at]) * np.linalg.norm(force, axis=0)
         force -= (M @ phi[:, at]) * squares[at]
@@ -252,7 +254,7 @@ def _excess(
 def _tolerance(K: Any, part: float, phi: FloatArray) -> FloatArray:
     """Return the relative error of each shape at which `part` of its residual is let pass."""
     size_of_K, limit = Absolute(K), np.zeros(phi.shape[1])
-    for at in column_groups(limit.size):
+    for at in column_groups(limit.size, _JUDGED):
         limit[at] = part * _let_pass(K, size_of_K, phi[:, at])[1]
     return limit
 

@@ -71,6 +71,24 @@ def symmetric(given: Any, name: str, n: int) -> Matrix:
     return cast(Matrix, matrix)
 
 
+def same_pattern(given: Any, other: Any) -> bool:
+    """Return whether the same entries of two sparse matrices are stored."""
+    return all(
+        getattr(given, part) is getattr(other, part)
+        or np.array_equal(getattr(given, part), getattr(other, part))
+        for part in ("indptr", "indices")
+    )
+
+
+def with_pattern_of(given: Matrix, other: Matrix) -> Matrix:
+    """Return a matrix that has the index arrays of another, where both store the same entries."""
+    matrix: Any = given
+    beside: Any = other
+    if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
+        return given
+    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=matrix.shape)
+
+
 def _mirrored(matrix: Any) -> bool:
     """Return whether a sparse matrix equals its transpose to the bit, entry by entry."""
     matrix.sum_duplicates()

@@ -17,7 +17,14 @@ from ..sparse.factor import is_positive_definite
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, summed
 from .damping import Damping, Rayleigh, damping_matrix
-from .definite import MatrixLike, check_semidefinite, slow, symmetric, without_inertia
+from .definite import (
+    MatrixLike,
+    check_semidefinite,
+    slow,
+    symmetric,
+    with_pattern_of,
+    without_inertia,
+)
 from .eigen import has_negative_springs
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
@@ -109,7 +116,8 @@ class FEModel(Placed, Value):
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         digits = digits_of(self.K)
         M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
-        D = None if self.D is None else symmetric(self.D, "D", n)
+        M = with_pattern_of(M, K)
+        D = None if self.D is None else with_pattern_of(symmetric(self.D, "D", n), K)
         if not is_positive_definite(M):
             raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)
