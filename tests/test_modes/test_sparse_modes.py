@@ -100,17 +100,21 @@ def test_below_a_frequency(structure, monkeypatch, single):
     model = FEModel(model.M, model.K, dofs=model.dofs)  # without a factor in use
     i = 9 + int(np.argmax(np.diff(expected[9:14])))
     top = 0.5 * (expected[i] + expected[i + 1])
-    made, new = [], counted.search_factor
-    monkeypatch.setattr(counted, "search_factor", lambda *args: made.append(1) or new(*args))
+    made, solve = [], shifted.StiffnessFactor.solve
+    monkeypatch.setattr(
+        shifted.StiffnessFactor, "solve", lambda *args: made.append(1) or solve(*args)
+    )
     if single:
         monkeypatch.setattr(ordering, "_COSTLY", 0.0)
     squares, phi, certificate = counted_modes(model, 10**6, top)
-    assert bool(made) != single
+    # the plate's modes are lost in single precision
+    assert bool(made) != (single and model.rigid_body.shape[1] == 6)
     assert squares.size == np.count_nonzero(expected < top)
     assert certificate["counted"] == squares.size + model.rigid_body.shape[1]
     np.testing.assert_allclose(certificate["shift"], np.sqrt(top) / (2 * np.pi))
     assert_modes_of(model, squares, phi, expected)
-    assert counted_modes(model, 5, 1e-3 * expected[0])[0].size == 0
+    for low in (1e-3 * expected[0], 1e-12):  # the other below the rounding of rigid-body modes
+        assert counted_modes(model, 5, low)[0].size == 0
     assert modes_below(model, top) == squares.size + model.rigid_body.shape[1]
 
 

@@ -167,6 +167,18 @@ def test_given_sparse_matrices_stay_as_they_are():
     assert np.array_equal(K.toarray(), K3)
 
 
+def test_matrices_with_one_pattern_share_it(plate):
+    """So that a large model has it once; nobody can write to it."""
+    D = sp.csc_array((1e-5 * plate.K.data, plate.K.indices, plate.K.indptr), shape=plate.K.shape)
+    free = FEModel(plate.M, plate.K, D, dofs=plate.dofs)
+    for model in (free, free.replace(name="other")):
+        for matrix in (model.M, model.D):
+            assert np.shares_memory(matrix.indices, model.K.indices)
+            assert not matrix.indices.flags.writeable
+    other = FEModel(sp.diags_array(plate.M.diagonal()), plate.K, dofs=plate.dofs)
+    assert other.M.nnz == plate.n_dof
+
+
 def test_values_are_frozen_and_travel(plate, tmp_path):
     model = plate.with_damping(ModalDamping(0.01))
     with pytest.raises(ValueError, match="read-only"):

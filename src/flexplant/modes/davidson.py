@@ -24,7 +24,8 @@ _NEAR = 1e-8
 _IMPROVED = 24
 #: steps before giving up, beyond one for each mode
 _MOST = 40
-#: after so many steps modes must not be lower than this part of -sigma, to converge fast
+#: after so many steps modes must not be lower than this part of -sigma (where it is below zero),
+#: to converge fast
 _EARLY, _FAR = 12, 0.1
 
 
@@ -41,7 +42,7 @@ class BlockDavidson(BlockLanczos):
     K, M : (n, n) matrix
         Stiffness and mass, M positive definite.
     sigma : float [rad^2/s^2]
-        The shift, negative.
+        The shift: below zero, or above the modes that are wanted.
     locked, want, rng, start
         As those of `BlockLanczos`.
     """

@@ -148,7 +148,7 @@ class BlockLanczos:
             if done:
                 # the memory of the others is needed; a copy would need more first
                 self._V.resize((self._r + keep, n), refcheck=False)
-                return theta[:wanted], np.ascontiguousarray(self._V[self._r :][:wanted].T)
+                return theta[:wanted], self._V[self._r :][:wanted].T.copy()
             # a step brings no more than a block of new ones, usually half of it
             check_at = self.steps + max(left, wanted - theta.size) // (2 * self._block)
         raise SolverError(

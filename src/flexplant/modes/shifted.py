@@ -228,15 +228,18 @@ def dissection_of(model: FEModel) -> Dissection:
     return found
 
 
-def modes_below(model: FEModel, square: float) -> int:
+def modes_below(model: FEModel, square: float, *, single: bool = True) -> int:
     """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm).
+
+    Without `single`, single precision is not tried: it was refused before.
 
     Raises
     ------
     SolverError
         When `square` is so close to a mode that the count is not sure.
     """
-    return multifrontal_inertia(_shifted(model.K, model.M, square), dissection_of(model))
+    shifted = _shifted(model.K, model.M, square)
+    return multifrontal_inertia(shifted, dissection_of(model), single=single)
 
 
 def _shifted(K: Any, M: Any, square: float) -> Any:

@@ -94,9 +94,11 @@ def _counted(
     factor: StiffnessFactor | CountingFactor | None = None
     below = None
     if np.isfinite(top):
-        factor = counting_factor(model, top) if method is None else None
-        below = (modes_below(model, top) if factor is None else factor.below) - r
-        if not below:
+        tried = method is None
+        factor = counting_factor(model, top) if tried else None
+        below = modes_below(model, top, single=not tried) if factor is None else factor.below
+        below -= r
+        if below <= 0:
             return np.zeros(0), np.zeros((n, 0)), _certificate(top, r, r)
         if count < below:
             factor = None  # its shift is far above the last mode that is wanted

@@ -25,13 +25,15 @@ _RADIUS = 0.5
 _VECTORS, _MISSED, _POWER = 12, 0.1, 10
 
 
-def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> int:
+def multifrontal_inertia(
+    matrix: Any, dissection: Dissection | None = None, *, single: bool = True
+) -> int:
     """Return how many eigenvalues of a sparse symmetric matrix are negative.
 
-    Where the factorisation is most of the work, it is tried in single precision first, and taken
-    if refinement shows that its rounding changes no sign. In double precision the factor is not
-    kept. A random ``b = A x`` is eliminated along: ``x^T A x = y^T D^-1 y`` with ``L y = b`` shows
-    whether pivots restricted to the blocks were stable.
+    With `single`, and where the factorisation is most of the work, it is tried in single precision
+    first, and taken if refinement shows that its rounding changes no sign. In double precision the
+    factor is not kept. A random ``b = A x`` is eliminated along: ``x^T A x = y^T D^-1 y`` with
+    ``L y = b`` shows whether pivots restricted to the blocks were stable.
 
     Raises
     ------
@@ -40,7 +42,7 @@ def multifrontal_inertia(matrix: Any, dissection: Dissection | None = None) -> i
     """
     lower = sp.csc_array(matrix)
     chosen = dissect(lower) if dissection is None else dissection
-    if chosen.is_costly:
+    if single and chosen.is_costly:
         factor = signed_factor(lower, chosen)
         if factor is not None:
             return factor.negative

@@ -108,9 +108,10 @@ def _node_graph(matrix: sp.csc_array, member: IntArray, count: int) -> sp.csr_ar
     member = member.astype(np.int32)
     columns = np.repeat(member, np.diff(matrix.indptr))
     rows = member[matrix.indices]
-    below = rows > columns
+    off = rows != columns
+    rows, columns = rows[off], columns[off]
     edges: Any = sp.csr_array(
-        (np.ones(np.count_nonzero(below), dtype=np.int8), (rows[below], columns[below])),
+        (np.ones(rows.size, dtype=np.int8), (np.maximum(rows, columns), np.minimum(rows, columns))),
         shape=(count, count),
     )
     edges.data = np.ones(edges.indices.size, dtype=np.int8)

@@ -75,11 +75,11 @@ class Absolute:
     """``|K|``, entry by entry, for products: a copy of a large matrix is memory at its peak."""
 
     def __init__(self, K: Any) -> None:
-        self._K = by_rows(K)
+        self._K: Any = by_rows(K) if sp.issparse(K) else np.abs(K)
 
     def __matmul__(self, X: FloatArray) -> FloatArray:
         if not sp.issparse(self._K):
-            return np.asarray(np.abs(self._K) @ X)
+            return np.asarray(self._K @ X)
         K: Any = self._K
         found = np.empty((K.shape[0], *X.shape[1:]))
         for begin in range(0, K.shape[0], _ROWS):

@@ -115,9 +115,11 @@ class FEModel(Placed, Value):
         if not n:
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         digits = digits_of(self.K)
-        M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
+        M, K = frozen(symmetric(self.M, "M", n)), frozen(symmetric(self.K, "K", n))
         M = with_pattern_of(M, K)
-        D = None if self.D is None else with_pattern_of(symmetric(self.D, "D", n), K)
+        D = None
+        if self.D is not None:
+            D = with_pattern_of(frozen(symmetric(self.D, "D", n)), K)
         if not is_positive_definite(M):
             raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)

@@ -71,8 +71,9 @@ def anti_windup_form(controller: Any, *, recovery: float | None = None) -> State
     # Tustin's rule puts zeros at exactly -1, several at once, which rounding moves by its root
     if not growth < -(1e-7 if K.dt else 1e-9 * np.max(size, initial=0.0)):
         raise AssumptionError(
-            "the zeros of the controller, which Hanus' form has as poles, are not all stable: its "
-            "states would run off while an actuator saturates. Give a recovery time."
+            "the zeros of the controller, which Hanus' form has as poles, are not all stable, or "
+            "not clearly: its states would run off while an actuator saturates. Give a recovery "
+            "time."
         )
     n_u = len(K.outputs)
     return K.replace(
