@@ -91,32 +91,15 @@ def frozen(value: Any) -> Any:
         value.flags.writeable = False
     elif sp.issparse(value):
         sparse: Any = value
-        known = sparse.format == "csc" and all(map(_is_frozen, _parts(sparse)))
-        if known and sparse.has_canonical_format:
-            return sp.csc_array(_parts(sparse), shape=sparse.shape)
         value = sp.csc_array(sparse, copy=True)
         value.sum_duplicates()
-        for part in _parts(value):
-            _owner(part).flags.writeable = part.flags.writeable = False
+        for part in (value.data, value.indices, value.indptr):
+            part.flags.writeable = False
     elif type(value) is tuple and value and isinstance(value[0], np.ndarray):
         value = tuple(frozen(item) for item in value)
     elif isinstance(value, Mapping) and not isinstance(value, MappingProxyType | Value):
         value = MappingProxyType({key: frozen(item) for key, item in value.items()})
     return value
-
-
-def _parts(matrix: Any) -> tuple[Any, ...]:
-    return matrix.data, matrix.indices, matrix.indptr
-
-
-def _is_frozen(part: Any) -> bool:
-    owner = _owner(part)
-    return owner.base is None and not (part.flags.writeable or owner.flags.writeable)
-
-
-def _owner(part: Any) -> Any:
-    """Return the array whose memory an array shows."""
-    return part.base if isinstance(part.base, np.ndarray) else part
 
 
 def save(value: Value, path: str | Path) -> None:

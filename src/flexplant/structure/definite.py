@@ -81,13 +81,13 @@ def _same_memory(a: IntArray, b: IntArray) -> bool:
     return a.dtype == b.dtype and a.ctypes.data == b.ctypes.data
 
 
-def with_pattern_of(given: Matrix, other: Matrix) -> Matrix:
+def with_pattern_of(given: Any, other: Matrix) -> Any:
     """Return a matrix that shares the index arrays of another where both store the same entries."""
     matrix: Any = given
     beside: Any = other
     if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
         return given
-    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=matrix.shape)
+    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=beside.shape)
 
 
 def _mirrored(matrix: Any) -> bool:

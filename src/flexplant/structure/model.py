@@ -115,14 +115,15 @@ class FEModel(Placed, Value):
         if not n:
             raise ModelError("the DofSet holds no DOF: there is no structure. Check the table.")
         digits = digits_of(self.K)
-        M, K = frozen(symmetric(self.M, "M", n)), frozen(symmetric(self.K, "K", n))
-        M = with_pattern_of(M, K)
-        D = None
-        if self.D is not None:
-            D = with_pattern_of(frozen(symmetric(self.D, "D", n)), K)
+        M, K = symmetric(self.M, "M", n), symmetric(self.K, "K", n)
+        D = None if self.D is None else symmetric(self.D, "D", n)
         if not is_positive_definite(M):
             raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)
+        # a pattern that they have in common lies in memory once
+        M, K, D = with_pattern_of(self.M, self.K), self.K, with_pattern_of(self.D, self.K)
+        object.__setattr__(self, "M", M)
+        object.__setattr__(self, "D", D)
         try:
             check_semidefinite(K, "K")
         except ModelError as error:
