@@ -9,12 +9,12 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError, counted
+from ..sparse.factor import same_pattern
 from ..sparse.inertia import SignedFactor, multifrontal_inertia, signed_factor
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..sparse.ordering import Dissection, dissect
 from ..sparse.pardiso import Pardiso, PardisoCholesky
 from ..sparse.rayleigh_ritz import rounding_of
-from ..structure.definite import same_pattern
 from ..structure.model import FEModel
 from ..structure.negative_stiffness import unstable_stiffness
 from ..values import FloatArray

@@ -46,6 +46,25 @@ def by_rows(matrix: Any) -> Any:
     return sp.csr_array((stored.data, stored.indices, stored.indptr), shape=stored.shape)
 
 
+def same_pattern(given: Any, other: Any) -> bool:
+    """Return whether the same entries of two sparse matrices are stored."""
+    pairs = ((given.indptr, other.indptr), (given.indices, other.indices))
+    return all(a.size == b.size and (_same_memory(a, b) or np.array_equal(a, b)) for a, b in pairs)
+
+
+def _same_memory(a: IntArray, b: IntArray) -> bool:
+    return a.dtype == b.dtype and a.ctypes.data == b.ctypes.data
+
+
+def with_pattern_of(given: Any, other: Matrix) -> Any:
+    """Return a matrix that shares the index arrays of another where both store the same entries."""
+    matrix: Any = given
+    beside: Any = other
+    if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
+        return given
+    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=beside.shape)
+
+
 def without_zeros(matrix: Any) -> Any:
     """Return a sparse matrix without stored zeros, a copy where there are many."""
     given: Any = matrix

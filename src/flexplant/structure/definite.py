@@ -11,7 +11,7 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
 from ..sparse.factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
-from ..values import IntArray, Matrix, real_array
+from ..values import Matrix, real_array
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"
@@ -69,25 +69,6 @@ def symmetric(given: Any, name: str, n: int) -> Matrix:
             f"0.5 * ({name} + {name}.T), when the difference is only rounding."
         )
     return cast(Matrix, matrix)
-
-
-def same_pattern(given: Any, other: Any) -> bool:
-    """Return whether the same entries of two sparse matrices are stored."""
-    pairs = ((given.indptr, other.indptr), (given.indices, other.indices))
-    return all(a.size == b.size and (_same_memory(a, b) or np.array_equal(a, b)) for a, b in pairs)
-
-
-def _same_memory(a: IntArray, b: IntArray) -> bool:
-    return a.dtype == b.dtype and a.ctypes.data == b.ctypes.data
-
-
-def with_pattern_of(given: Any, other: Matrix) -> Any:
-    """Return a matrix that shares the index arrays of another where both store the same entries."""
-    matrix: Any = given
-    beside: Any = other
-    if not sp.issparse(given) or not sp.issparse(other) or not same_pattern(given, other):
-        return given
-    return sp.csc_array((matrix.data, beside.indices, beside.indptr), shape=beside.shape)
 
 
 def _mirrored(matrix: Any) -> bool:

@@ -13,18 +13,11 @@ import scipy.sparse as sp
 
 from ..errors import ModelError, counted, warn
 from ..labels import DofSet
-from ..sparse.factor import is_positive_definite
+from ..sparse.factor import is_positive_definite, with_pattern_of
 from ..values import FloatArray, Matrix, Value, frozen, instance, real_array
 from .attachments import HeldShape, Part, added_matrices, summed
 from .damping import Damping, Rayleigh, damping_matrix
-from .definite import (
-    MatrixLike,
-    check_semidefinite,
-    slow,
-    symmetric,
-    with_pattern_of,
-    without_inertia,
-)
+from .definite import MatrixLike, check_semidefinite, slow, symmetric, without_inertia
 from .eigen import has_negative_springs
 from .negative_stiffness import unstable_stiffness
 from .placed import Placed
@@ -121,9 +114,7 @@ class FEModel(Placed, Value):
             raise ModelError(f"M is not positive definite: {without_inertia(M, K)}")
         self._set(M=M, K=K, D=D)
         # a pattern that they have in common lies in memory once
-        M, K, D = with_pattern_of(self.M, self.K), self.K, with_pattern_of(self.D, self.K)
-        object.__setattr__(self, "M", M)
-        object.__setattr__(self, "D", D)
+        self.__dict__.update(M=with_pattern_of(self.M, self.K), D=with_pattern_of(self.D, self.K))
         try:
             check_semidefinite(K, "K")
         except ModelError as error:
