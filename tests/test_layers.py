@@ -54,7 +54,7 @@ FIGURES = {
 WORDS = re.compile(rf"\b(?:{'|'.join(FIGURES)})\b".replace(" ", r"\s+"), re.IGNORECASE)
 HEAVY = {"matplotlib", "control", "cvxpy", "clarabel", "filterpy", "tqdm"}
 MODULES = sorted(ROOT.rglob("*.py"))
-LONGEST = 500
+LONGEST = 600
 
 
 @cache
