@@ -14,7 +14,16 @@ ROOT = Path(flexplant.__file__).parent
 #: in import order; the first entry is the foundation, whose modules may use each other
 ROOMS = (
     (
-        *("errors", "values", "arguments", "notebook", "store", "certificates", "versions"),
+        *(
+            "errors",
+            "rooms",
+            "values",
+            "arguments",
+            "notebook",
+            "store",
+            "certificates",
+            "versions",
+        ),
         *("surviving", "progress", "parallel", "checkpoint", "work"),
         *("places", "dof_columns", "dof_index", "labels", "bibliography", "foreign_names"),
     ),
@@ -251,7 +260,7 @@ def only_exports(node, *, root):
         or lazy
         or checking
         or isinstance(node, ast.Import | ast.ImportFrom)
-        or names in (["__version__"], ["__all__"])
+        or names in (["__version__"], ["__all__"], ["__dir__"])
     )
 
 

@@ -106,6 +106,15 @@ def test_the_front_is_small():
         _ = flexplant.Tustin
 
 
+@pytest.mark.parametrize("name", sorted(ROOMS - {"errors"}))
+def test_a_room_shows_what_it_is_for(name):
+    """Completion offers public names, not the modules behind them."""
+    room = getattr(flexplant, name)
+    shown = {n for n, item in vars(room).items() if not isinstance(item, ModuleType)}
+    assert set(dir(room)) == {n for n in shown if not n.startswith("_")}
+    assert dir(room)
+
+
 def test_dir_of_a_value_shows_what_it_is_for():
     frf = flexplant.Frf([1.0], [[[1.0]]])
     shown = dir(frf)

@@ -1,5 +1,6 @@
 """Estimation: the motion at a point of interest from sensors elsewhere."""
 
+from ..rooms import public_names as _public_names
 from .bias import check_bias as check_bias
 from .consistency import Consistency as Consistency
 from .consistency import consistency as consistency
@@ -36,3 +37,5 @@ from .static import design_static as design_static
 from .unknown_inputs import Augmented as Augmented
 from .unknown_inputs import Unbiased as Unbiased
 from .unknown_inputs import design_input_estimator as design_input_estimator
+
+__dir__ = _public_names(__name__)

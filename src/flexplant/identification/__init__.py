@@ -1,5 +1,6 @@
 """What was measured: frequency responses, measured poles and mode shapes."""
 
+from ..rooms import public_names as _public_names
 from .average import average_frfs as average_frfs
 from .diagram import PoleSelection as PoleSelection
 from .diagram import StabilisationDiagram as StabilisationDiagram
@@ -17,3 +18,5 @@ from .spectra import H1Estimator as H1Estimator
 from .spectra import H2Estimator as H2Estimator
 from .spectra import HvEstimator as HvEstimator
 from .structural import structural_modes as structural_modes
+
+__dir__ = _public_names(__name__)

@@ -24,6 +24,7 @@ values for MATLAB     read_mat, write_mat   .mat: systems, plants, reduced model
 ====================  ====================  =======================================================
 """
 
+from ..rooms import public_names as _public_names
 from .abaqus import read_abaqus as read_abaqus
 from .ansys import read_ansys as read_ansys
 from .dmig import read_dmig as read_dmig
@@ -49,3 +50,5 @@ from .tables import read_dofs as read_dofs
 from .uff import read_frf_uff as read_frf_uff
 from .uff import read_modes_uff as read_modes_uff
 from .uff import read_nodes_uff as read_nodes_uff
+
+__dir__ = _public_names(__name__)

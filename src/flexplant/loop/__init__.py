@@ -1,5 +1,6 @@
 """Closing the loop by names, its sensitivities and margins."""
 
+from ..rooms import public_names as _public_names
 from .axes import in_axes as in_axes
 from .budget import ErrorBudget as ErrorBudget
 from .closed import ClosedLoop as ClosedLoop
@@ -18,3 +19,5 @@ from .sensitivity import loop_gain as loop_gain
 from .sensitivity import sensitivity as sensitivity
 from .spectrum import Spectrum as Spectrum
 from .spill_over import SpillOver as SpillOver
+
+__dir__ = _public_names(__name__)

@@ -1,5 +1,6 @@
 """Linear time-invariant systems: the control side's one type and its methods."""
 
+from ..rooms import public_names as _public_names
 from .balancing import BalancedReduction as BalancedReduction
 from .balancing import balanced as balanced
 from .discretisation import discretized as discretized
@@ -46,3 +47,5 @@ from .weights import leadlag as leadlag
 from .weights import lowpass as lowpass
 from .weights import notch as notch
 from .weights import pade as pade
+
+__dir__ = _public_names(__name__)

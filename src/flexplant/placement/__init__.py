@@ -1,5 +1,6 @@
 """Where sensors and actuators go: criteria, scores, search and bounds."""
 
+from ..rooms import public_names as _public_names
 from .auto_mac import AutoMac as AutoMac
 from .branch_and_bound import BranchAndBound as BranchAndBound
 from .by_rows import ByRows as ByRows
@@ -48,3 +49,5 @@ from .zones import Excluded as Excluded
 from .zones import MinimumDistance as MinimumDistance
 from .zones import OffPoi as OffPoi
 from .zones import Within as Within
+
+__dir__ = _public_names(__name__)

@@ -1,5 +1,6 @@
 """Ports and the standard plant: the one bridge from (M, D, K) to (A, B, C, D)."""
 
+from ..rooms import public_names as _public_names
 from .assembly import assemble_plant as assemble_plant
 from .assumption import Assumption as Assumption
 from .assumptions import AssumptionReport as AssumptionReport
@@ -42,3 +43,5 @@ from .uncertainty.neglected import neglected_modes as neglected_modes
 from .uncertainty.uncertain_plant import Delta as Delta
 from .uncertainty.uncertain_plant import UncertainPlant as UncertainPlant
 from .visibility import ModeVisibility as ModeVisibility
+
+__dir__ = _public_names(__name__)

@@ -6,6 +6,7 @@ follow `CYCLE`. Axes carry SI units with the prefix that brings the largest valu
 what is drawn into them later keeps it. Frequencies are in Hz, gains in dB with what 0 dB is.
 """
 
+from ..rooms import public_names as _public_names
 from ._style import CYCLE as CYCLE
 from ._style import STYLES as STYLES
 from .bode import bode as bode
@@ -20,6 +21,7 @@ from .exposures import exposures as exposures
 from .frequency import frf as frf
 from .identification import identified as identified
 from .identification import stabilisation as stabilisation
+from .layout import layout as layout
 from .localisation import localisation as localisation
 from .mode_shapes import animate_mode as animate_mode
 from .mode_shapes import mode_shape as mode_shape
@@ -34,8 +36,9 @@ from .sensitivity import sensitivities as sensitivities
 from .sensitivity import sensitivity as sensitivity
 from .spectra import spectra as spectra
 from .step import step as step
-from .structure import layout as layout
 from .update_summary import update as update
 from .updating import eigenvalues as eigenvalues
 from .updating import parameters as parameters
 from .updating import residual as residual
+
+__dir__ = _public_names(__name__)

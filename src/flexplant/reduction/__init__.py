@@ -1,5 +1,6 @@
 """Fewer degrees of freedom, same input-output behaviour: reductions, their bounds and quality."""
 
+from ..rooms import public_names as _public_names
 from .bounds import ErrorBound as ErrorBound
 from .component_modes import CraigBampton as CraigBampton
 from .component_modes import MacNeal as MacNeal
@@ -23,3 +24,5 @@ from .selection import DofSelection as DofSelection
 from .selection import select_dofs as select_dofs
 from .truncation import ModalBalanced as ModalBalanced
 from .truncation import ModalTruncation as ModalTruncation
+
+__dir__ = _public_names(__name__)

@@ -1,5 +1,6 @@
 """Set-points, sampled-data runs of a closed loop, and what they say of the error."""
 
+from ..rooms import public_names as _public_names
 from .error_map import ErrorMap as ErrorMap
 from .error_map import error_map as error_map
 from .estimator_comparison import EstimatorComparison as EstimatorComparison
@@ -28,3 +29,5 @@ from .specification import Specification as Specification
 from .specification import Verdict as Verdict
 from .study import study as study
 from .study_table import StudyTable as StudyTable
+
+__dir__ = _public_names(__name__)

@@ -1,5 +1,6 @@
 """What the machine is: finite-element matrices with labelled degrees of freedom, and damping."""
 
+from ..rooms import public_names as _public_names
 from .attachments import Damper as Damper
 from .attachments import HeldShape as HeldShape
 from .attachments import PointMass as PointMass
@@ -25,3 +26,5 @@ from .mesh.shapes import BeamShape as BeamShape
 from .mesh.shapes import BlockShape as BlockShape
 from .mesh.shapes import PlateShape as PlateShape
 from .model import FEModel as FEModel
+
+__dir__ = _public_names(__name__)

@@ -1,5 +1,6 @@
 """Controllers: the servo on the estimated point of interest, H2 and H-infinity."""
 
+from ..rooms import public_names as _public_names
 from .aftercare.c_code import write_c as write_c
 from .aftercare.controller_sampling import discretise_controller as discretise_controller
 from .aftercare.filter_sections import second_order_sections as second_order_sections
@@ -44,3 +45,5 @@ from .structures import ObserverGains as ObserverGains
 from .structures import Parametrised as Parametrised
 from .tune import tune_loops as tune_loops
 from .tuned_laws import TunedLaws as TunedLaws
+
+__dir__ = _public_names(__name__)

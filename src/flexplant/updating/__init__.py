@@ -1,5 +1,6 @@
 """Model updating: parameters, residuals, sensitivities, searches and their judgement."""
 
+from ..rooms import public_names as _public_names
 from .judgement.correlation import Correlation as Correlation
 from .judgement.correlation import correlate as correlate
 from .judgement.correlation import fdac as fdac
@@ -39,3 +40,5 @@ from .update import update as update
 from .update_result import History as History
 from .update_result import Starts as Starts
 from .update_result import UpdateResult as UpdateResult
+
+__dir__ = _public_names(__name__)
