@@ -1,10 +1,14 @@
 """Similarity, modal blocks, the split into stable part and rest, minimal realisations."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import scipy.linalg as la
+import scipy.sparse as sp
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.io import loadmat
 
 from flexplant.errors import LabelError, ModelError, ShapeError
 from flexplant.lti import StateSpace, minimal, modal_form, parallel, series, split_stable
@@ -13,6 +17,7 @@ from flexplant.lti.scaling import balanced_matrix, state_scale
 from oracles_lti import sweep
 from systems_lti import machine, system
 
+CD_PLAYER = Path(__file__).parents[3] / "shared" / "data" / "norms" / "CDplayer.mat"
 FREQ = np.geomspace(1.0, 4900.0, 120)
 
 
@@ -233,6 +238,74 @@ def test_minimal_cancels_a_pole_and_a_zero():
     for bad in (0.0, 1.0, -1.0):
         with pytest.raises(ModelError, match="tol"):
             minimal(lag, tol=bad)
+
+
+def masses(*pairs):
+    """Equal masses on springs side by side: positions of modes (frequency [Hz], damping)."""
+    A, B, C = [], [], []
+    for freq, zeta in pairs:
+        w = 2 * np.pi * freq
+        A.append([[0.0, 1.0], [-(w**2), -2 * zeta * w]])
+        B.append([[0.0], [1.0]])
+        C.append([[1.0, 0.0]])
+    blocks = [2] * len(pairs)
+    return StateSpace(la.block_diag(*A), np.vstack(B), np.hstack(C), [[0.0]], blocks=blocks)
+
+
+WIDE = {
+    "suspension": [(0.03, 0.05), (3000.0, 0.01)],
+    "pendulum": [(1e-4, 0.05), (1e4, 0.01)],
+    "free mass": [(0.0, 0.0), (0.03, 0.05), (100.0, 1e-5), (3000.0, 0.01)],
+}
+
+
+@pytest.mark.parametrize(
+    ("form", "dt"), [("blocks", 0), ("dense", 0), ("mixed", 0), ("blocks", 2e-5), ("dense", 2e-5)]
+)
+@pytest.mark.parametrize("pairs", WIDE.values(), ids=WIDE)
+def test_minimal_judges_each_mode_at_its_own_frequency(pairs, form, dt):
+    """Nine decades of response lie between the modes: all are reached and seen, copies are not."""
+
+    def formed(pairs):
+        g = masses(*pairs)
+        g = discretized(g, 1.0 / dt) if dt else g
+        g = g if form == "blocks" else g.replace(blocks=None)
+        return mixed(g) if form == "mixed" and not modal_form(g).reason else g
+
+    g = formed(pairs)
+    assert minimal(g) is g
+    found = minimal(parallel(g, g))
+    assert found.n_states == g.n_states
+    freq = np.array([1.01 * freq for freq, _ in pairs if freq])
+    assert error(found, parallel(g, g), freq) < 1e-6
+    # what is not reached, and what is not seen, goes, wherever the others are
+    for other in (g, formed([(1.3 * freq, zeta) for freq, zeta in pairs])):
+        for hidden in (other.replace(B=0 * other.B), other.replace(C=0 * other.C)):
+            found = minimal(parallel(g, hidden))
+            assert found.n_states == g.n_states
+            assert error(found, g, freq) < 1e-6
+
+
+def test_minimal_keeps_all_modes_of_a_cd_player():
+    """120 modes from 0.4 Hz to 7 kHz, light and heavy: the smallest is 1e-9 of the largest."""
+    if not CD_PLAYER.exists():
+        pytest.skip("example data is not in the repository")
+    data = loadmat(CD_PLAYER)
+    A, B, C = (np.asarray(sp.csc_array(data[k]).todense(), dtype=float) for k in "ABC")
+    g = StateSpace(A, B, C, np.zeros((2, 2)))
+    assert minimal(g) is g
+
+
+@pytest.mark.parametrize("freq", [1e-5, 1e-4, 1e-2])
+@pytest.mark.parametrize("dt", [0.0, 2e-5])
+def test_modal_form_of_a_slow_mode_beside_fast_ones(freq, dt):
+    """A slow stable pair is no rigid-body mode, however fast the others."""
+    g = masses((freq, 0.05), (1e4, 0.01))
+    g = discretized(g, 1.0 / dt) if dt else g
+    poles = modal_form(g.replace(blocks=None), largest_condition=1e12).system.poles()
+    speed = np.log(poles) / dt if dt else poles
+    assert np.sort(np.abs(speed))[:2] == pytest.approx(2 * np.pi * freq, rel=1e-6, abs=0)
+    assert np.all(speed.real < 0)
 
 
 def test_scale_of_a_triangular_matrix_stays_moderate():

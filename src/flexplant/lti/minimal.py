@@ -2,44 +2,68 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
+import scipy.linalg as la
+from scipy.sparse import csgraph
 
 from ..arguments import between
-from ..values import FloatArray
+from ..values import ComplexArray, FloatArray
 from .factors import controllability_factor, observability_factor
-from .interconnection import parallel
-from .joining import is_block_diagonal
+from .joining import is_block_diagonal, joined_blocks, stacked
 from .modal import modal_form
+from .responses import responses
 from .scaling import reciprocal, state_scale
-from .splitting import split_stable
+from .splitting import part_of, split_stable
+from .stability import DOUBLE, eigenvalues_with_error
 from .statespace import StateSpace, System, as_statespace
 
-#: Hankel singular values below this of the sizes of the two factors are rounding: a part that is
-#: not reached where it is seen has no others
+#: shares and Hankel singular values below this of what they are computed from are rounding
 NOISE = 1e-13
+#: poles this close together, relative to their size, are judged together: copies of one mode lose
+#: a state, whose share is the square of their distance beside their damping
+SAME = 1e-6
+#: conditions of a pole above which they say nothing more: two poles in one that rounding leaves,
+#: then any number
+DEFECTIVE = (DOUBLE, 1e12)
+#: condition of the bases of the modes above which the modes are not judged one by one
+LARGEST = 1e6
+#: part of a frequency by which a point lies beside the imaginary axis: wide enough for no resonance
+#: and no zero to be met
+BESIDE = 0.1
+#: the same, so near that all but undamped poles have their whole peak
+NEAR = 1e-9
+#: distance from the frequency of a mode, relative, at which the result is compared: undamped modes
+#: are infinite at their own
+OFF = 0.01
+#: largest accepted change of a response, relative: beyond rounding in bases of condition LARGEST
+AGREEMENT = 1e-6
 
 
 def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     """Return the system without states that are not both reached and seen.
 
-    The stable part is balanced and loses the states with Hankel singular values below `tol` of
-    the largest; channels are scaled to one size first, so that metres beside newtons do not decide
-    what is small. Rigid-body and unstable modes are judged in the same way after a shift of the
-    axis, which changes neither reachability nor observability.
+    Each mode is judged at its own frequency: it is left out where its peak is below `tol` of what
+    the whole system does around there, however much larger responses elsewhere are. Modes of equal
+    poles are judged together: of their balanced states those with Hankel singular values below
+    `tol` of their largest are left out. Channels are scaled to one size, so that metres beside
+    newtons do not decide what is small. The responses at the frequencies of all modes that are kept
+    are compared with those of `sys`, which is returned as it is when they do not agree.
 
     Parameters
     ----------
     sys : StateSpace or control.StateSpace
         Continuous or sampled.
     tol : float
-        Relative; below it rounding decides. A state of this size changes no frequency response by
-        more than twice `tol` of the largest.
+        Relative; below it rounding decides.
 
     Returns
     -------
     StateSpace
-        The same channels; `sys` itself when nothing is to be left out, and blocks are found again
-        when it had any.
+        The same channels; `sys` itself when nothing is to be left out, or nothing can be without
+        changing its responses. Blocks are found again when it had any.
 
     Raises
     ------
@@ -62,32 +86,171 @@ def minimal(sys: System, *, tol: float = 1e-10) -> StateSpace:
     tol = between(tol, "tol", 0.0, 1.0, "Try 1e-9.")
     if not g.n_states:
         return g
-    split = split_stable(g)
-    stable, rest = split.stable, split.rest
-    if not is_block_diagonal(g):  # what a part has of B or C may be what splitting left of zero
-        stable, rest = _cleaned(stable, rest), _cleaned(rest, stable)
-    stable, rest = _less(stable, tol), _less(rest, tol)
-    n = stable.n_states + rest.n_states
+    groups = _groups(g)
+    kept = [_Group(_less(group.part, tol), group.omega) for group in _visible(groups, g.dt, tol)]
+    kept = [group for group in kept if group.part.n_states]
+    n = sum(group.part.n_states for group in kept)
     if n == g.n_states:
         return g
-    both = parallel(stable, rest)
-    blocks = both.blocks if g.blocks is not None else None
-    return both.replace(
-        states=[f"x{i}" for i in range(1, n + 1)], name=g.name, blocks=blocks or None
+    parts = [group.part for group in kept]
+    found = g.replace(
+        A=stacked([part.A for part in parts]),
+        B=np.vstack([g.B[:0], *(part.B for part in parts)]),
+        C=np.hstack([g.C[:, :0], *(part.C for part in parts)]),
+        states=[f"x{i}" for i in range(1, n + 1)],
+        blocks=(joined_blocks(parts) or None) if g.blocks is not None else None,
     )
+    return found if _agree(found, g, _frequencies(kept)) else g
 
 
-def _cleaned(part: StateSpace, other: StateSpace) -> StateSpace:
-    """Return a part with B and C set to zero where they are rounding beside those of the other."""
-    idle = np.linalg.norm(part.B) <= NOISE * np.linalg.norm(other.B)
-    unseen = np.linalg.norm(part.C) <= NOISE * np.linalg.norm(other.C)
-    return part.replace(B=0 * part.B, C=0 * part.C) if idle or unseen else part
+@dataclass(frozen=True)
+class _Group:
+    """Modes of equal poles as a system of their own, without feedthrough, and where they act."""
+
+    part: StateSpace
+    omega: FloatArray  # [rad/s], 0 for a rigid-body mode or an integrator
+
+
+def _groups(g: StateSpace) -> list[_Group]:
+    """Return the system, but for its feedthrough, as a sum of groups of modes of equal poles."""
+    if not is_block_diagonal(g):
+        return _dense_groups(g)
+    poles = g.poles()
+    owner = np.repeat(np.arange(len(g.blocks or ())), g.blocks or ())
+    label = _labels(poles, SAME * np.abs(poles), owner[:, None] == owner)
+    plain = g.replace(D=0 * g.D)
+    return [
+        _Group(part_of(plain, label == k), _omega(poles[label == k], g.dt))
+        for k in range(label.max() + 1)
+    ]
+
+
+def _dense_groups(g: StateSpace) -> list[_Group]:
+    """Return the groups of any A; its stable part and the rest where its modes are too mixed."""
+    d = state_scale(g.A, g.B, g.C)
+    A, B, C = g.A * d / d[:, None], g.B / d[:, None], g.C * d
+    for largest in DEFECTIVE:
+        poles, vectors, error = eigenvalues_with_error(A, largest)
+        same = SAME * np.abs(poles)
+        conjugate = np.abs(poles[:, None] - poles.conj()) <= same
+        label = _labels(poles, np.maximum(same, error), conjugate)
+        bases = _bases(A, poles, vectors, error, label)
+        V = np.hstack(bases)
+        units = np.linalg.norm(V, axis=1)  # those in which what a cascade amplifies is of one size
+        V = V / units[:, None]
+        apart = V.shape == A.shape and float(np.linalg.cond(V)) <= LARGEST
+        if apart:
+            break
+    centre = 1.0 if g.dt else 0.0
+    omega = _omega(np.where(np.abs(poles - centre) <= error, centre, poles), g.dt)
+    if not apart:
+        split = split_stable(g)
+        parts = [split.stable.replace(D=0 * g.D), split.rest]
+        return [_Group(part, omega) for part in parts if part.n_states]
+    V_inverse = np.linalg.inv(V)
+    A, B = V_inverse @ (A * units / units[:, None]) @ V, V_inverse @ (B / units[:, None])
+    C = (C * units) @ V
+    groups, start = [], 0
+    for k, basis in enumerate(bases):
+        at = slice(start, start + basis.shape[1])
+        start = at.stop
+        part = g.replace(A=A[at, at], B=B[at], C=C[:, at], D=0 * g.D, states=(), blocks=None)
+        groups.append(_Group(part, omega[label == k]))
+    return groups
+
+
+def _labels(poles: ComplexArray, radius: FloatArray, together: Any) -> Any:
+    """Return the number of the group of each pole: discs that touch, and those that must be."""
+    reach = radius[:, None] + radius
+    gap = np.minimum(abs(poles[:, None] - poles), abs(poles[:, None] - poles.conj()))
+    return csgraph.connected_components((gap <= reach) | together, directed=False)[1]
+
+
+def _bases(
+    A: FloatArray, poles: ComplexArray, vectors: ComplexArray, error: FloatArray, label: Any
+) -> list[FloatArray]:
+    """Return a real basis of unit columns of the invariant subspace of each group of poles."""
+    bases: list[FloatArray] = []
+    schur: tuple[FloatArray, FloatArray, Any] | None = None
+    for k in range(label.max() + 1):
+        group = np.flatnonzero(label == k)
+        v: ComplexArray = vectors[:, group[0]]
+        if group.size == 1:
+            bases.append(v.real[:, None])
+        elif group.size == 2 and abs(poles[group[0]].imag) > error[group[0]]:
+            # the phase that makes real and imaginary part orthogonal: the best conditioned pair
+            v = v * np.exp(-0.5j * np.angle(np.sum(v**2)))
+            bases.append(np.sqrt(2.0) * np.stack([v.real, v.imag], axis=1))
+        else:  # eigenvectors of equal poles are parallel: their subspace by an ordered Schur form
+            if schur is None:
+                T, Z = la.schur(A)
+                real, imag = la.lapack.dtrsen(np.zeros(len(T)), T, Z, job="N")[2:4]
+                found = (real + 1j * imag)[:, None]
+                schur = T, Z, label[np.argmin(abs(found - poles), axis=1)]
+            T, Z, owner = schur
+            bases.append(la.lapack.dtrsen(owner == k, T, Z, job="N")[1][:, : group.size])
+    return bases
+
+
+def _omega(poles: ComplexArray, dt: float) -> FloatArray:
+    """Return the frequencies [rad/s] at which modes act: the sizes of their continuous poles."""
+    if not dt:
+        return np.asarray(np.abs(poles))
+    logs = np.log(np.where(poles == 0, 1e-300, poles))
+    return np.asarray(np.minimum(np.abs(logs), np.pi) / dt)
+
+
+def _frequencies(groups: list[_Group]) -> FloatArray:
+    """Return all frequencies [rad/s] of groups; a rigid body acts where the slowest mode does."""
+    omega = np.unique(np.concatenate([np.zeros(0), *(group.omega for group in groups)]))
+    moving = omega[omega > 0]
+    return moving if moving.size else np.ones(1)
+
+
+def _visible(groups: list[_Group], dt: float, tol: float) -> list[_Group]:
+    """Return the groups whose share of the response around their own frequency is no rounding."""
+    slowest = _frequencies(groups)[0]
+    omega = [np.maximum(np.unique(group.omega), slowest) for group in groups]
+    whole = sum(_gains(group.part, np.concatenate(omega), BESIDE) for group in groups)
+    size = _equalisers(np.abs(np.asarray(whole)))
+    last = np.cumsum([len(w) for w in omega])
+    kept = []
+    for group, w, end in zip(groups, omega, last, strict=True):
+        unit = size[end - len(w) : end]
+        beside, near = (np.abs(_gains(group.part, w, off)) * unit for off in (BESIDE, NEAR))
+        if np.max(beside) > NOISE and np.max(near) > tol:
+            kept.append(group)
+    return kept
+
+
+def _gains(g: StateSpace, omega: FloatArray, beside: float) -> ComplexArray:
+    """Return the gains (n, p, m) at points ``(beside + j) omega``, right of the stability limit."""
+    s = (beside + 1j) * omega
+    s = np.exp(s * g.dt) if g.dt else s
+    shifted = s[:, None, None] * np.eye(g.n_states) - g.A
+    return np.asarray(g.C @ np.linalg.solve(shifted, np.broadcast_to(g.B, (s.size, *g.B.shape))))
+
+
+def _equalisers(gains: FloatArray) -> FloatArray:
+    """Return what makes the largest gain of each input, then of each output, 1 (n, p, m)."""
+    columns = reciprocal(np.max(gains, axis=1, keepdims=True, initial=0.0))
+    rows = reciprocal(np.max(gains * columns, axis=2, keepdims=True, initial=0.0))
+    return np.asarray(rows * columns)
+
+
+def _agree(found: StateSpace, g: StateSpace, omega: FloatArray) -> bool:
+    """Return whether two systems have the same responses beside the frequencies of modes."""
+    omega = (1.0 - OFF) * omega
+    ours, wanted = (responses(s, omega / (2.0 * np.pi)).transpose(2, 0, 1) for s in (found, g))
+    unit = _equalisers(np.abs(wanted))
+    return bool(np.max(np.abs(ours - wanted) * unit, initial=0.0) <= AGREEMENT)
 
 
 def _less(g: StateSpace, tol: float) -> StateSpace:
+    """Return a system without the balanced states of Hankel singular values below `tol`."""
     n = g.n_states
-    if not n:
-        return g
+    if n == 1 or (n == 2 and np.iscomplexobj(np.linalg.eigvals(g.A))):
+        return g  # one mode: all of it or nothing
     judged = _stabilised(g)
     # one size for all channels: what reaches the states from each input, what each output sees
     seen = observability_factor(judged)

@@ -11,9 +11,10 @@ from ..errors import counted
 from ..values import ComplexArray, FloatArray, Value, positive
 from .joining import is_block_diagonal
 from .scaling import state_scale
+from .stability import eigenvalues_with_error
 from .statespace import StateSpace, System, as_statespace
 
-#: poles this close to an integrator, relative to A, are tried as rigid-body modes
+#: speed of a rigid-body pair, relative to A, below which there is none
 RIGID = 1e-6
 #: largest accepted distance of the transformed A from the blocks, relative to A
 RESIDUAL = 1e-9
@@ -122,9 +123,9 @@ def modal_form(sys: System, *, largest_condition: float = 1e6) -> ModalForm:
 def _basis(A: FloatArray, centre: float) -> tuple[FloatArray, FloatArray, list[int]]:
     """Return real eigenvectors (n, n), the block-diagonal A and its blocks, slow poles first."""
     eye = np.eye(A.shape[0])
-    values, vectors = la.eig(A)
-    values = np.asarray(values, dtype=np.complex128)
-    near = np.abs(values - centre) <= RIGID * np.linalg.norm(A)
+    # a slow mode is no rigid-body one, however fast the others: rounding says which may be
+    values, vectors, error = eigenvalues_with_error(A)
+    near = np.abs(values - centre) <= error
     columns, parts = [np.zeros((A.shape[0], 0))], []
     chain = _chains(A - centre * eye, int(near.sum())) if near.sum() > 1 else None
     if chain is not None:

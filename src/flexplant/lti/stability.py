@@ -8,13 +8,15 @@ import numpy as np
 import scipy.linalg as la
 
 from ..values import ComplexArray, FloatArray
-from .scaling import state_scale
+from .scaling import even_scale, state_scale
 from .statespace import StateSpace
 
 #: poles this close to the axis, relative to the size of A, are examined with their condition
 NEAR = 1e-6
 #: roundings of A that a pole is allowed to have suffered
 ROUNDINGS = 4.0
+#: largest condition of a pole: two in one are moved by the root of rounding
+DOUBLE = 1.0 / float(np.sqrt(np.finfo(float).eps))
 
 
 class Obstacle(NamedTuple):
@@ -74,8 +76,26 @@ def uncertain_poles(
     error = np.finfo(float).eps * size * np.ones(poles.size)
     if not np.any(gap <= NEAR * size):
         return poles, error
+    poles, _, error = eigenvalues_with_error(A)
+    return poles, error
+
+
+def eigenvalues_with_error(
+    A: FloatArray, largest: float = DOUBLE
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return eigenvalues, eigenvectors and how far rounding may have moved each eigenvalue.
+
+    In the units that LAPACK takes for A itself, in which the blocks of unlike speed that do not act
+    on each other do not spoil each other. Conditions count up to `largest`.
+    """
     found: Any = la.eig(A, left=True, right=True)
     values, left, right = found
-    aligned = np.abs(np.einsum("ij,ij->j", left.conj(), right))
-    condition = 1.0 / np.maximum(aligned, np.sqrt(np.finfo(float).eps))
-    return np.asarray(values, dtype=np.complex128), ROUNDINGS * error * condition
+    d = even_scale(A)[:, None]
+    size = np.linalg.norm(left * d, axis=0) * np.linalg.norm(right / d, axis=0)
+    condition = size / np.maximum(np.abs(np.sum(left.conj() * right, axis=0)), size / largest)
+    rounding = ROUNDINGS * np.finfo(float).eps * float(np.linalg.norm(A * d.T / d, 2))
+    return (
+        np.asarray(values, dtype=np.complex128),
+        right.astype(np.complex128),
+        rounding * condition,
+    )
