@@ -136,8 +136,15 @@ def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) ->
     Raises
     ------
     LabelError
-        When one is not there.
+        When one is not there, or is there twice.
     """
+    numbers, count = np.unique(known, return_counts=True)
+    if numbers.size < known.size:
+        first, again = np.flatnonzero(known == numbers[np.argmax(count > 1)])[:2] + 1
+        raise LabelError(
+            f"{source!r} defines node {int(known[again - 1])} twice, as its nodes {first} and "
+            f"{again}: which place holds is not known. Remove the one of another model."
+        )
     missing = np.setdiff1d(wanted, known)
     if missing.size:
         raise LabelError(

@@ -138,6 +138,13 @@ def test_bad_lines_are_named(tmp_path, old, new, error, match):
         ("*ELEMENT", "*TRANSFORM, NSET=ALL", ModelError, "line 7.*coordinate system"),
         ("*ELEMENT", "*INCLUDE, INPUT=x", ModelError, "line 7.*flattened"),
         ("NSET=ALL", "SYSTEM=C", ModelError, "line 4.*coordinate system"),
+        ("12, 3.5", "1, 3.5", FlexplantError, "node 1 is defined twice, in line 5 and in line 6"),
+        (
+            "*ELEMENT",
+            "*ASSEMBLY\n*NODE\n12, 3.5\n*E",
+            FlexplantError,
+            r"12 is defined twice, in line 6 and in line 9 \(\*assembly\).*flattened",
+        ),
         ("*ELEMENT", "*INSTANCE, NAME=a\n*INSTANCE, NAME=b", ModelError, "several instances"),
         ("*ELEMENT", "*INSTANCE, NAME=a\n1.0, 0.0, 0.0\n*E", ModelError, "instance that is moved"),
     ],

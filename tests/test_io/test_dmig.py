@@ -331,6 +331,31 @@ def test_included_files_are_followed_or_named(tmp_path):
         read_nodes(tmp_path / "x.bdf")
 
 
+def test_the_deck_ends_with_enddata(tmp_path):
+    """What stands behind it is of another run: nodes, and files that are not there."""
+    for end in ("ENDDATA", "enddata  $ done", " ENDDATA"):
+        text = f"GRID,1,,1.,0.,0.\n{end}\nGRID,1,,9.,0.,0.\nGRID,2,,2.,0.,0.\nINCLUDE 'gone'\n"
+        assert list(read_nodes(written(tmp_path, text, "a.bdf")).xyz) == [1]
+        above = written(tmp_path, "INCLUDE 'a.bdf'\nGRID,3,,3.,0.,0.\n", "b.bdf")
+        assert list(read_nodes(above).xyz) == [1]
+
+
+@pytest.mark.parametrize(
+    ("card", "what"),
+    [
+        ("GRID,7,,1.,0.,0.", "GRID 7"),
+        ("GRDSET,,,,,,,6", "GRDSET"),
+        ("CORD2R,7,,0.,0.,0.,0.,0.,1.,\n,1.,0.,0.", "coordinate system 7"),
+    ],
+)
+def test_what_is_defined_twice_is_named_in_both_places(tmp_path, card, what):
+    written(tmp_path, f"$ a part\n{card}\n", "part.blk")
+    deck = written(tmp_path, f"{card}\nINCLUDE 'part.blk'\nGRID,8,,1.,0.,0.\n", "deck.bdf")
+    places = r"in line 1 of '.*deck\.bdf' and in line 2 of '.*part\.blk'"
+    with pytest.raises(FlexplantError, match=f"^{what} is defined twice, {places}"):
+        read_nodes(deck)
+
+
 @needs_data
 def test_nodes_of_a_real_run_are_in_the_file_it_includes():
     nodes = read_nodes(SHARED / "results" / "beam_modes.dat")

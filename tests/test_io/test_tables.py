@@ -36,6 +36,13 @@ def test_coordinates_in_a_second_table(tmp_path, head):
     np.testing.assert_allclose(dofs.xyz, XYZ)
 
 
+def test_a_table_places_each_node_once(tmp_path):
+    (tmp_path / "dofs.csv").write_text("node,direction\n7,z\n")
+    (tmp_path / "nodes.csv").write_text("1,9,9,9\n7,500,0,0\n7,0,0,0\n")
+    with pytest.raises(LabelError, match="node 7 twice, as its nodes 2 and 3"):
+        fx.io.read_dofs(tmp_path / "dofs.csv", nodes=tmp_path / "nodes.csv")
+
+
 def test_the_same_directions_at_every_node(tmp_path):
     (tmp_path / "nodes.csv").write_text("node,x,y,z\n3,1,0,0\n1,2,0,0\n")
     dofs = fx.io.read_dofs(tmp_path / "nodes.csv", directions=("z", "rx"))

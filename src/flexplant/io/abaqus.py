@@ -18,7 +18,15 @@ from ..values import FloatArray, IntArray
 from .assembled import from_triplets
 from .formats import Format
 from .numbers import decimal, printed_digits, rows_of_numbers, wrong_line
-from .paths import check_size, check_whole, file_path, no_motion, unread, wrong_line_of
+from .paths import (
+    check_size,
+    check_whole,
+    defined_twice,
+    file_path,
+    no_motion,
+    unread,
+    wrong_line_of,
+)
 
 #: what Abaqus writes on the diagonal of a degree of freedom that a boundary condition holds
 _HELD = 1e35
@@ -218,6 +226,8 @@ def _dofs(order: IntArray, inp: str | Path | None) -> DofSet:
 def _nodes(path: str | Path) -> dict[int, list[float]]:
     """Return the coordinates of an input file's nodes."""
     places: dict[int, list[float]] = {}
+    defined: dict[int, str] = {}
+    part = ""
     inside, instances, in_instance = False, 0, False
     for number, raw in enumerate(
         file_path(path, "inp").read_text(encoding="latin-1").splitlines(), 1
@@ -239,15 +249,24 @@ def _nodes(path: str | Path) -> dict[int, list[float]]:
             if instances > 1:
                 raise unread(path, f"{at}: several instances, whose nodes get new numbers", _FLAT)
             inside = word == "*NODE"
+            if word in ("*PART", "*ASSEMBLY"):
+                part = f" ({word.lower()})"
+            elif word in ("*END PART", "*END ASSEMBLY"):
+                part = ""
         elif in_instance:
             raise unread(path, f"{at}: an instance that is moved", _FLAT)
         elif inside:
             try:
-                node, *xyz = [part.strip() for part in line.rstrip(",").split(",")]
-                places[int(node)] = ([decimal(part or "0") for part in xyz[:3]] + [0.0] * 3)[:3]
+                node, *xyz = [word.strip() for word in line.rstrip(",").split(",")]
+                place = ([decimal(word or "0") for word in xyz[:3]] + [0.0] * 3)[:3]
+                key = int(node)
             except ValueError:
                 due = "a node and its coordinates are"
                 raise wrong_line_of(path, number, due, line, "Correct the line.") from None
+            if key in defined:
+                again = f"line {number}{part}"
+                raise defined_twice(f"{str(path)!r}: node {key}", defined[key], again, _FLAT)
+            places[key], defined[key] = place, f"line {number}{part}"
     return places
 
 

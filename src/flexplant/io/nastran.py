@@ -13,12 +13,15 @@ import numpy as np
 from ..errors import FlexplantError, LabelError, ModelError
 from ..values import FloatArray
 from .numbers import decimal
-from .paths import file_path
+from .paths import defined_twice, file_path
 
 _KINDS = ("GRID", "GRDSET", "CORD2R", "CORD2C", "CORD2S")
 _INCLUDE = re.compile(r"\s*INCLUDE\s+(?:'([^']*)'|\"([^\"]*)\"|([^\s$]+))", re.IGNORECASE)
+_END = re.compile(r"\s*ENDDATA\b", re.IGNORECASE)
 #: files within files, at most
 _DEEP = 20
+#: what to do with two cards of one number
+_DEFINED_ONCE = "Remove the card that is not of this run."
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ def read_nodes(path: str | Path) -> Nodes:
     """Return the nodes of a Nastran bulk data file.
 
     GRID, GRDSET and CORD2R, CORD2C, CORD2S in free, small or large fields, also in files that it
-    INCLUDEs; all other cards are passed over.
+    INCLUDEs, up to ENDDATA; all other cards are passed over.
 
     Parameters
     ----------
@@ -43,7 +46,8 @@ def read_nodes(path: str | Path) -> Nodes:
     Raises
     ------
     FlexplantError
-        When a card cannot be read, or an INCLUDEd file is not there; the line is named.
+        When a card cannot be read, a node or a system is defined twice, or an INCLUDEd file is not
+        there; the lines are named.
     LabelError
         When a coordinate system is not there.
     FileNotFoundError
@@ -53,18 +57,24 @@ def read_nodes(path: str | Path) -> Nodes:
     grids: dict[int, list[str]] = {}
     systems: dict[int, tuple[str, list[str]]] = {}
     default = ["", ""]
+    defined: dict[str, str] = {}
     for number, kind, fields in cards((line for _, _, line in lines), _KINDS):
         fields = fields + [""] * 12
+        file, line, _ = lines[number - 1]
         try:
-            if kind == "GRID":
-                grids[int(fields[0])] = fields
-            elif kind == "GRDSET":
-                default = [fields[1], fields[5]]
-            else:
-                systems[int(fields[0])] = (kind, fields)
+            key = 0 if kind == "GRDSET" else int(fields[0])
         except ValueError as error:
-            file, line, _ = lines[number - 1]
             raise FlexplantError(f"{file!r}, line {line}: {kind} {fields[:8]}: {error}.") from None
+        what = {"GRID": f"GRID {key}", "GRDSET": kind}.get(kind, f"coordinate system {key}")
+        if what in defined:
+            raise defined_twice(what, defined[what], f"line {line} of {file!r}", _DEFINED_ONCE)
+        defined[what] = f"line {line} of {file!r}"
+        if kind == "GRID":
+            grids[key] = fields
+        elif kind == "GRDSET":
+            default = [fields[1], fields[5]]
+        else:
+            systems[key] = (kind, fields)
     parsed: dict[int, list[Any]] = {}
     for node, fields in grids.items():
         try:
@@ -108,7 +118,10 @@ def nodes_of(
 
 
 def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str]]:
-    """Return (file, line number, text) of all lines, those of INCLUDEd files in their place."""
+    """Return (file, line number, text) of all lines, those of INCLUDEd files in their place.
+
+    ENDDATA, in whatever file, ends all of them.
+    """
     found = []
     continued = ""
     for number, line in enumerate(path.read_text(encoding="latin-1").splitlines(), 1):
@@ -119,6 +132,8 @@ def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str
         if match is None:
             if not continued:
                 found.append((str(path), number, joined))
+            if _END.match(joined):
+                break
             continue
         name = (match[1] or match[2] or match[3] or "").strip()
         # in the folder of the file that names it, or of the first one
@@ -131,6 +146,8 @@ def _lines(path: Path, above: tuple[Path, ...] = ()) -> list[tuple[str, int, str
                 "be missing. Put it beside, or give the file that holds the GRID cards."
             )
         found += _lines(file, (*above, path))
+        if found and _END.match(found[-1][2]):
+            break
     return found
 
 

@@ -14,7 +14,7 @@ from ..values import FloatArray, IntArray
 from .file_shapes import FileShapes, ModesFormat
 from .nastran import Nodes, nodes_of
 from .nastran_shapes import shapes_at
-from .paths import damaged
+from .paths import damaged, defined_twice
 
 
 @dataclass(frozen=True)
@@ -242,7 +242,10 @@ def _nodes(found: list[Block], path: str) -> Nodes | None:
             for integers, numbers in zip(whole, real, strict=True):
                 if kind == "GRID":
                     node, into, *_ = integers
-                    grids[node] = [into, numbers[2:5], integers[5]]
+                    entry = [into, numbers[2:5], integers[5]]
+                    if grids.setdefault(node, entry) != entry:  # superelements repeat their nodes
+                        places = [f"{g[1]} of system {g[0]}" for g in (grids[node], entry)]
+                        raise defined_twice(f"{path!r}: GRID {node}", *places, "Write one run.")
                 else:
                     texts = [repr(number) for number in numbers[4:]]
                     systems[integers[0]] = (kind, [str(integers[0]), str(integers[3]), *texts])

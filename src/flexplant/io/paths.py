@@ -49,6 +49,14 @@ def wrong_line_of(
     )
 
 
+def defined_twice(what: str, first: str, again: str, do: str) -> FlexplantError:
+    """Return the error of an identifier with two definitions, both of which are named."""
+    return FlexplantError(
+        f"{what} is defined twice, in {first} and in {again}: which of the two the numbers belong "
+        f"to is not known. {do}"
+    )
+
+
 def refused(path: object, what: str, do: str) -> FlexplantError:
     """Return the error of a file that holds another thing than what is read of it."""
     return FlexplantError(f"{str(path)!r} {what}. {do}")
