@@ -244,8 +244,9 @@ def _nodes(found: list[Block], path: str) -> Nodes | None:
                     node, into, *_ = integers
                     entry = [into, numbers[2:5], integers[5]]
                     if grids.setdefault(node, entry) != entry:  # superelements repeat their nodes
-                        places = [f"{g[1]} of system {g[0]}" for g in (grids[node], entry)]
-                        raise defined_twice(f"{path!r}: GRID {node}", *places, "Write one run.")
+                        first, again = (f"{g[1]} of system {g[0]}" for g in (grids[node], entry))
+                        what = f"{path!r}: GRID {node}"
+                        raise defined_twice(what, first, again, "Write one run to it.")
                 else:
                     texts = [repr(number) for number in numbers[4:]]
                     systems[integers[0]] = (kind, [str(integers[0]), str(integers[3]), *texts])
