@@ -36,7 +36,12 @@ def measured(name, quantity="displacement"):
     parts = [A.toarray() for A in (model.M, model.D, model.K)]
     data = [oracles.receptance(*parts, none, FREQ, out, load) for load in out]
     frf = fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), channels, channels, "displacement")
-    return frf.converted(quantity)
+    return exact(frf.converted(quantity))
+
+
+def exact(frf):
+    """Responses that are known to have no errors."""
+    return frf.replace(variance=np.zeros(frf.data.shape))
 
 
 def machine():
@@ -55,7 +60,7 @@ def machine():
     channels = [f"{name}/{label}" for name, listed in CHANNELS.items() for label in listed]
     out = np.array([row[name] for name in channels])
     data = [oracles.receptance(M, D, K, B, FREQ, out, load) for load in out]
-    return fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), channels, channels, "displacement")
+    return exact(fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), channels, channels, "displacement"))
 
 
 @pytest.mark.parametrize("quantity", ["displacement", "velocity", "acceleration"])
@@ -85,6 +90,70 @@ def test_a_component_is_taken_out_again():
     np.testing.assert_allclose(rest.data, stage.data, rtol=1e-5)
 
 
+def perturbed(frf, factor):
+    """The responses with one independent error after the other, each of unit variance."""
+    for k in range(frf.data.shape[1]):
+        for column in factor.T:
+            error = np.zeros(frf.data.shape)
+            error[:, k] = 1e-6 * np.abs(frf.data[:, k]) * column[:, None]
+            yield frf.replace(data=frf.data + error)
+
+
+def stated(frf, factor):
+    """The responses with the variance, 1e-6 of their size, and correlation of these errors."""
+    between = np.repeat((factor @ factor.T)[:, :, None], frf.freq.size, axis=2)
+    return frf.replace(variance=(1e-6 * frf.mag) ** 2, correlation=between)
+
+
+@pytest.mark.parametrize("part", [0.0, 0.8])
+def test_variances_of_responses_give_that_of_the_machine(part):
+    """Errors of outputs under one force are independent, or share a part."""
+    parts = {name: measured(name) for name in CHANNELS}
+    factor = {
+        name: la.cholesky((1.0 - part) * np.eye(n) + part * np.ones((n, n)), lower=True)
+        for name, n in (("stage", 3), ("frame", 4), ("", 7))
+    }
+    whole = fx.joined(parts, JOINTS)
+    found = fx.joined({name: stated(frf, factor[name]) for name, frf in parts.items()}, JOINTS)
+    wanted = sum(
+        np.abs(fx.joined({**parts, name: frf}, JOINTS).data - whole.data) ** 2
+        for name in parts
+        for frf in perturbed(parts[name], factor[name])
+    )
+    np.testing.assert_allclose(found.variance, wanted, rtol=1e-4)
+    held = fx.joined({"frame": parts["frame"]}, JOINTS[2])
+    known = {"frame": held.replace(inputs=parts["frame"].inputs, outputs=parts["frame"].outputs)}
+    found = fx.uncoupled(stated(whole, factor[""]), known, JOINTS[:2])
+    left = fx.uncoupled(whole, known, JOINTS[:2])
+    wanted = sum(
+        np.abs(fx.uncoupled(frf, known, JOINTS[:2]).data - left.data) ** 2
+        for frf in perturbed(whole, factor[""])
+    )
+    np.testing.assert_allclose(found.variance, wanted, rtol=1e-3)
+
+
+def test_a_difference_below_its_errors_is_warned_of():
+    """A stage of 1 kg on a frame of 1000: its response is lost in 1 % of the others'."""
+    free = lambda m: -1 / (m * (2 * np.pi * FREQ) ** 2)[None, None]  # noqa: E731
+    machine = fx.Frf(FREQ, free(1001.0), ["stage/1:x"], ["stage/1:x"])
+    frame, joint = fx.Frf(FREQ, free(1000.0), ["1:x"], ["1:x"]), fx.Joint("stage/1:x", "frame/1:x")
+    with pytest.warns(
+        FlexplantWarning, match="of 1 % in each response exceed the answer at 4 of 4"
+    ):
+        found = fx.uncoupled(machine, {"frame": frame}, joint)
+    assert found.variance is None
+    for part in (0.01, 1e-6):
+        known = frame.replace(variance=(part * frame.mag) ** 2)
+        if part == 0.01:
+            with pytest.warns(FlexplantWarning, match="by their variances exceed the answer"):
+                found = fx.uncoupled(machine, {"frame": known}, joint)
+        else:
+            found = fx.uncoupled(machine, {"frame": known}, joint)
+        # 1 / G = 1 / G_machine - 1 / G_frame
+        wanted = np.abs(found.data / frame.data) ** 4 * known.variance
+        np.testing.assert_allclose(found.variance, wanted, rtol=1e-6)
+
+
 def placed_parts():
     """A stage above a frame, their DOFs where they stand."""
     found = models()
@@ -99,7 +168,7 @@ def response_of(model, outputs, inputs):
     out, into = (np.array([model.row(x) for x in names]) for names in (outputs, inputs))
     data = np.array([oracles.receptance(*parts, none, FREQ, out, load) for load in into])
     names = [f"u {name}" for name in inputs]
-    return fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), names, outputs, "displacement")
+    return exact(fx.Frf(FREQ, np.transpose(data, (2, 0, 1)), names, outputs, "displacement"))
 
 
 def mean_rows(nodes, dofs, point):

@@ -11,7 +11,8 @@ from ..arguments import mapping
 from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
-from ..values import ComplexArray, FloatArray, instance
+from ..values import ComplexArray, FloatArray, IntArray, instance
+from .frf_errors import Side, side_by_side, variance_of, warn_of_errors
 from .frf_joints import (
     FrfLink,
     channel_rows,
@@ -52,22 +53,22 @@ def joined_frfs(
     parts, listed = parts_of(frfs, dofs), _listed(joints)
     links = frf_links(listed, parts)
     warn_of_bending(listed, parts, frfs)
-    outputs = [f"{name}/{channel}" for name, frf in frfs.items() for channel in frf.outputs]
-    inputs = [f"{name}/{channel}" for name, frf in frfs.items() for channel in frf.inputs]
     first = next(iter(frfs.values()))
-    Y = np.zeros((len(outputs), len(inputs), first.freq.size), dtype=np.complex128)
-    row = column = 0
-    for frf in frfs.values():
-        rows, columns = len(frf.outputs), len(frf.inputs)
-        Y[row : row + rows, column : column + columns] = frf.data
-        row, column = row + rows, column + columns
-    coupled = _coupled(Y, outputs, inputs, links, first.freq, first.quantity)
+    prefixed = {f"{name}/": frf for name, frf in frfs.items()}
+    Y = side_by_side(prefixed, dict.fromkeys(prefixed, 1.0))
+    every = np.arange(len(Y.outputs)), np.arange(len(Y.inputs))
+    data, error = _coupled(Y, links, first.freq, first.quantity, every)
+    variance = None if Y.variance is None else error
+    if variance is not None:
+        done = "the joints take nearly all of a component's motion away"
+        warn_of_errors(data, variance, first.freq, known=True, done=done)
     units = {
         f"{name}/{channel}": unit
         for name, frf in frfs.items()
         for channel, unit in frf.units.items()
     }
-    return Frf(first.freq, coupled, inputs, outputs, first.quantity, units=units)
+    inputs, outputs = Y.inputs, Y.outputs
+    return Frf(first.freq, data, inputs, outputs, first.quantity, variance=variance, units=units)
 
 
 def uncoupled(
@@ -82,6 +83,11 @@ def uncoupled(
     The negative of a known component is coupled to the machine where its joints are: what is left
     answers as if it had never been joined (LM-FBS decoupling). Of a component on springs, the
     springs stay at the rest, with loose ends.
+
+    What is left is a difference: where the component rules the machine, errors of 1 % in the
+    responses may be larger than the answer. Variances of the responses, whose errors are taken to
+    be independent of each other, give the variance of the answer to first order; without any, an
+    error of 1 % in each is what is warned of (state ``variance`` 0 of exact responses).
 
     Parameters
     ----------
@@ -112,7 +118,7 @@ def uncoupled(
     -----
     FlexplantWarning
         When the interface is so badly conditioned that errors of a measurement would hide the
-        answer.
+        answer, or errors exceed the answer at some lines.
 
     References
     ----------
@@ -133,16 +139,6 @@ def uncoupled(
     mapping(whose, "known", "Pass responses by component: {'frame': frf}.", least=1)
     _same_lines({"the machine": machine, **known})
     links = _taken_out(machine, known, _listed(joints), dofs)
-    outputs = [*machine.outputs, *(f"{_KNOWN}{n}/{c}" for n in known for c in known[n].outputs)]
-    inputs = [*machine.inputs, *(f"{_KNOWN}{n}/{c}" for n in known for c in known[n].inputs)]
-    Y = np.zeros((len(outputs), len(inputs), machine.freq.size), dtype=np.complex128)
-    row, column = len(machine.outputs), len(machine.inputs)
-    Y[:row, :column] = machine.data
-    for frf in known.values():
-        rows, columns = len(frf.outputs), len(frf.inputs)
-        Y[row : row + rows, column : column + columns] = -frf.data
-        row, column = row + rows, column + columns
-    coupled = _coupled(Y, outputs, inputs, links, machine.freq, machine.quantity)
     kept_out = [i for i, name in enumerate(machine.outputs) if name.partition("/")[0] not in known]
     kept_in = [i for i, name in enumerate(machine.inputs) if name.partition("/")[0] not in known]
     if not kept_out or not kept_in:
@@ -153,8 +149,15 @@ def uncoupled(
     rest_in = [machine.inputs[i] for i in kept_in]
     rest_out = [machine.outputs[i] for i in kept_out]
     units = {name: unit for name, unit in machine.units.items() if name in {*rest_in, *rest_out}}
-    data = coupled[np.ix_(kept_out, kept_in)]
-    return Frf(machine.freq, data, rest_in, rest_out, machine.quantity, units=units)
+    whole = {"": machine, **{f"{_KNOWN}{name}/": frf for name, frf in known.items()}}
+    Y = side_by_side(whole, {name: -1.0 if name else 1.0 for name in whole})
+    kept = np.array(kept_out), np.array(kept_in)
+    data, error = _coupled(Y, links, machine.freq, machine.quantity, kept)
+    variance = None if Y.variance is None else error
+    done = "the answer is a small difference of the machine and what is taken out"
+    warn_of_errors(data, error, machine.freq, known=variance is not None, done=done)
+    quantity = machine.quantity
+    return Frf(machine.freq, data, rest_in, rest_out, quantity, variance=variance, units=units)
 
 
 def _taken_out(
@@ -205,24 +208,31 @@ def _taken_out(
 
 
 def _coupled(
-    Y: ComplexArray,
-    outputs: Sequence[str],
-    inputs: Sequence[str],
+    parts: Side,
     links: Sequence[FrfLink],
     freq: FloatArray,
     quantity: str | None,
-) -> ComplexArray:
-    """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` (n_out, n_in, n_freq), line by line."""
+    kept: tuple[IntArray, IntArray],
+) -> tuple[ComplexArray, FloatArray]:
+    """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` between kept channels, and its variance.
+
+    To first order an error dY of the parts becomes ``(I - Y B_f^T S^-1 B) dY (I - B_f^T S^-1 B Y)``
+    with S the inverted matrix. Where no variance is known, |dY| is as large as Y.
+    """
+    Y, outputs, inputs = parts.data, parts.outputs, parts.inputs
+    size_of_error = np.abs(Y) ** 2 if parts.variance is None else parts.variance
+    rows, columns = kept
     if not links:
-        return Y
+        picked = np.ix_(rows, columns)
+        return Y[picked], size_of_error[picked]
     B_out = channel_rows(links, outputs, "outputs")
     B_in = channel_rows(links, inputs, "inputs")
     Z = softness(links, freq, quantity)
-    kept = independent(B_out, links)
-    B_out, B_in, Z = B_out[kept], B_in[kept], Z[kept]
+    chosen = independent(B_out, links)
+    B_out, B_in, Z = B_out[chosen], B_in[chosen], Z[chosen]
     lines = np.moveaxis(Y, 2, 0)
     gap, load = B_out @ lines, lines @ B_in.T
-    stretch = gap @ B_in.T + Z.T[:, :, None] * np.eye(len(kept))
+    stretch = gap @ B_in.T + Z.T[:, :, None] * np.eye(len(chosen))
     # of unlike units: displacements and rotations
     size = np.sqrt(np.abs(np.einsum("fii->fi", stretch)))
     size = np.where(size > 0, size, 1.0)
@@ -248,7 +258,12 @@ def _coupled(
             f"the coupled responses leave a gap of {float((left / most).max()):.2g} in a joint "
             f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
         )
-    return np.asarray(np.moveaxis(found, 0, 2))
+    pushed = np.swapaxes(load[:, rows] / size[:, None, :], 1, 2)
+    motions = np.swapaxes(np.linalg.solve(np.swapaxes(scaled, 1, 2), pushed), 1, 2)
+    left_of = np.eye(len(outputs))[rows] - (motions / size[:, None, :]) @ B_out
+    right_of = np.eye(len(inputs))[:, columns] - B_in.T @ forces[:, :, columns]
+    error = variance_of(size_of_error, parts.correlation, left_of, right_of)
+    return np.moveaxis(found, 0, 2)[np.ix_(rows, columns)], error
 
 
 def _listed(joints: Any) -> list[Any]:

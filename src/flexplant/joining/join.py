@@ -94,7 +94,8 @@ def joined(
         follow others stay known by their labels, as places. `joining` holds the checks: gaps,
         balance of forces, inertia, rigid-body motions, errors of patches. The modes that a
         reduction of a component left out are not kept. Of responses, ``Y - Y B^T (B Y B^T +
-        Z)^-1 B Y``, Z being what springs and dampers give way (LM-FBS).
+        Z)^-1 B Y``, Z being what springs and dampers give way (LM-FBS); variances of independent
+        responses give those of the machine to first order.
 
     Raises
     ------
@@ -110,8 +111,8 @@ def joined(
     -----
     FlexplantWarning
         When springs and dampers hold the machine against the ground, a reduced component has no
-        static shape for the load of a joint, joints nearly repeat each other, or a component has
-        no damping where others have.
+        static shape for the load of a joint, joints nearly repeat each other, a component has no
+        damping where others have, or errors of responses exceed those of the machine.
 
     References
     ----------
