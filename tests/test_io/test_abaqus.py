@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant.errors import FlexplantError, LabelError, ModelError, ShapeError
 from flexplant.io.abaqus import read_abaqus
+from flexplant.io.dmig import read_dmig
+from flexplant.io.sierra import read_sierra
 from flexplant.labels import DofSet
 
 K = np.array(
@@ -67,6 +70,35 @@ def test_a_triangle_with_labels(tmp_path, order):
     assert found.digits == 16
     assert found.located
     assert not read_abaqus(k).located
+
+
+@pytest.mark.parametrize("form", ["{:g}.", "{:.1f}", "{:.9e}", "{:.15e}"])
+@pytest.mark.parametrize("kind", ["mtx", "pch", "m"])
+def test_small_numbers_written_by_hand_are_exact(tmp_path, form, kind):
+    """diag(1, 2) is regular, with however few digits it is written."""
+    matrices = {"K": [300.0, 500.0], "M": [1.0, 2.0]}
+    if kind == "pch":
+        cards = "".join(
+            f"DMIG    {name}AAX    0       6       2       0\n"
+            + "".join(f"DMIG,{name}AAX,{i},1,,{i},1,{form.format(v)}\n" for i, v in enumerate(d, 1))
+            for name, d in matrices.items()
+        )
+        found = read_dmig(written(tmp_path, cards, "run.pch"))
+    else:
+        line = "{i},1, {i},1, {v}\n" if kind == "mtx" else "{i} {i} {v}\n"
+        files = [
+            written(
+                tmp_path,
+                "".join(line.format(i=i, v=form.format(v)) for i, v in enumerate(d, 1)),
+                f"{name}.{kind}",
+            )
+            for name, d in matrices.items()
+        ]
+        read = read_abaqus if kind == "mtx" else read_sierra
+        found = read(files[0], mass=files[1])
+    model = found.with_dofs(DofSet([1, 2], ["x"] * 2, np.eye(2, 3))).model()
+    assert fx.solve_modes(model, count=2).omega == pytest.approx(np.sqrt([250.0, 300.0]))
+    assert found.digits == {"{:.9e}": 10, "{:.15e}": 16}.get(form)
 
 
 def test_both_triangles_and_a_keyword_line(tmp_path):

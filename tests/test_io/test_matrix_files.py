@@ -67,11 +67,16 @@ def test_numbers_count_from_one_and_their_digits_are_counted(tmp_path):
     path = tmp_path / "K.mtx"
     path.write_text(
         "%%MatrixMarket matrix coordinate real symmetric\n% a comment\n\n2 2 3\n"
-        "1 1  1.234567890E+03\n2 1 -1.0D0\n2 2  2.5\n".replace("D", "E")
+        "1 1  1.234567890E+03\n2 1 -1.000000000E0\n2 2  2.500000000E0\n"
     )
     found = fx.io.read_matrix_market(path)
     same(found, [[1234.56789, -1.0], [-1.0, 2.5]])
     assert found.digits == 10
+    # among numbers of any length, no program has rounded them to the longest
+    path.write_text(
+        path.read_text().replace("1.000000000E0", "1.0").replace("2.500000000E0", "2.5")
+    )
+    assert fx.io.read_matrix_market(path).digits is None
     path.write_text("%%MatrixMarket matrix coordinate real symmetric\n2 2 2\n1 1 5.\n2 2 -2.5\n")
     assert fx.io.read_matrix_market(path).digits is None  # short numbers were not rounded
     path.write_text("%%MatrixMarket matrix coordinate integer general\n1 1 1\n1 1 123456789\n")

@@ -120,7 +120,7 @@ def read_abaqus(
         M,
         D,
         dofs=dofs,
-        digits=max(part.digits for part in there),
+        digits=max(part.digits or 0 for part in there) or None,
         source=str(stiffness),
         located=located,
     )
@@ -145,7 +145,7 @@ class _Triplets:
     rows: IntArray
     columns: IntArray
     values: FloatArray
-    digits: int
+    digits: int | None
 
     def matrix(self, order: IntArray) -> sp.csc_array:
         i, j = np.searchsorted(order, self.rows), np.searchsorted(order, self.columns)

@@ -17,7 +17,6 @@ from ..structure.precision import digits_of
 from ..values import FloatArray, IntArray
 from .foreign_parsers import sound
 from .formats import USUAL
-from .numbers import printed_digits
 from .paths import damaged, file_path, parsing
 from .tables import read_dofs
 
@@ -27,8 +26,6 @@ USUAL_NAMES: Mapping[str, tuple[str, ...]] = {
     "M": ("m", "m0", "maa", "mgg", "maax", "mmat", "mass", "mff", "mred"),
     "D": ("d", "c", "d0", "c0", "baa", "bgg", "b", "baax", "cmat", "damping", "damp"),
 }
-#: numbers shorter than this may be exact, 5 or 2.5; longer ones were rounded to so many digits
-_ROUNDED = 6
 
 
 def assembled(
@@ -155,20 +152,6 @@ def chosen(
             "which it is: stiffness='...', mass='...'."
         )
     return found
-
-
-def text_digits(words: Iterable[bytes]) -> int | None:
-    """Return the significant digits a text was written with; None when its numbers are short.
-
-    Numbers such as 5 or 2.5 throughout were not rounded.
-
-    Examples
-    --------
-    >>> text_digits([b"3.245226567D+06", b"1.5"]), text_digits([b"5", b"-2.5"])
-    (10, None)
-    """
-    digits = printed_digits(list(words))
-    return digits if digits >= _ROUNDED else None
 
 
 def missing_extra(package: str, extra: str, what: str) -> FlexplantError:

@@ -113,7 +113,7 @@ def read_dmig(
         None if M is None else M.matrix(order, str(path)),
         None if D is None else D.matrix(order, str(path)),
         dofs=dofs,
-        digits=max(part.digits for part in given),
+        digits=max(part.digits or 0 for part in given) or None,
         source=str(path),
         located=nodes is not None,
         notes=_rows_missing(given, order.size),
@@ -147,7 +147,7 @@ class _Block:
     rows: IntArray
     columns: IntArray
     values: FloatArray
-    digits: int
+    digits: int | None
 
     def matrix(self, order: IntArray, path: str) -> sp.csc_array:
         if self.kind > 2 or self.form not in (1, 6):

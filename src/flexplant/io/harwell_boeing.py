@@ -12,10 +12,10 @@ import scipy.sparse as sp
 from ..errors import FlexplantError
 from ..labels import DofSet
 from ..structure import FEMatrices
-from .assembled import one_matrix_each, text_digits
+from .assembled import one_matrix_each
 from .foreign_parsers import sound
 from .formats import Format
-from .numbers import fixed_numbers, spaced_numbers
+from .numbers import fixed_numbers, printed_digits, spaced_numbers
 from .paths import check_size, check_whole, parsing, refused, unread
 
 #: lines whose digits are counted
@@ -119,7 +119,7 @@ def _harwell_boeing(path: Path) -> tuple[Any, int | None]:
     sample = lines[start : start + _SAMPLE // max(per_line, 1) + 1]
     words = [line[i : i + width] for line in sample for i in range(0, len(line.rstrip()), width)]
     check_whole(content, words, path)
-    return matrix, text_digits(words)
+    return matrix, printed_digits(words)
 
 
 def _form(text: str) -> tuple[int, int]:

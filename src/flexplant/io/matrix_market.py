@@ -17,9 +17,9 @@ from ..errors import FlexplantError, ShapeError
 from ..labels import DofSet
 from ..structure import FEMatrices
 from ..values import FloatArray
-from .assembled import one_matrix_each, text_digits
+from .assembled import one_matrix_each
 from .formats import Format
-from .numbers import rows_of_numbers, wrong_line
+from .numbers import printed_digits, rows_of_numbers, wrong_line
 from .paths import check_size, check_whole, damaged, unread, wrong_line_of
 
 #: lines whose digits are counted
@@ -106,7 +106,7 @@ def _matrix_market(path: Path) -> tuple[Any, int | None]:
     lines = body[: 80 * _SAMPLE].splitlines()[:_SAMPLE]
     words = [line.split()[-1] for line in lines if line.strip()]
     check_whole(content, words, path)
-    return matrix, text_digits(words)
+    return matrix, printed_digits(words)
 
 
 def _numbers(body: bytes, head: _Header, path: Path) -> FloatArray:

@@ -13,6 +13,14 @@ from ..values import FloatArray
 
 #: characters of a number that a program printed, at least; shorter ones may be typed by hand
 _PRINTED = 12
+#: numbers of fewer digits may be exact; longer ones were rounded to so many digits
+_ROUNDED = 6
+#: digits that a sign and one more digit of the exponent take from a number in a fixed field
+_FIELD = 2
+#: part of the numbers that have all digits: fewer end in several zeros by chance
+_ALIKE = 0.6
+#: a number of so many digits was printed in double precision, however short the others are
+_DOUBLE = 15
 #: an exponent without its letter: 1.5-100, 3.+7
 _BARE = re.compile(rb"([\d.])([+-]\d)")
 _DECIMAL = re.compile(r"([+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+))(?:[eEdDqQ]([+-]?[0-9]+)|([+-][0-9]+))?")
@@ -155,26 +163,35 @@ def _parsed(text: bytes) -> FloatArray | None:
             return None
 
 
-def printed_digits(words: list[bytes]) -> int:
-    """Return how many significant digits the longest of some printed numbers has.
+def printed_digits(words: Iterable[bytes]) -> int | None:
+    """Return with how many significant digits numbers were printed; None where that does not show.
+
+    A program that rounds prints all numbers alike: in a fixed field, up to the places that sign and
+    exponent take, or with as many digits, less the zeros at the end. Numbers of a few digits, such
+    as 5 or 2.5, and some long ones among them, may be exact.
 
     Parameters
     ----------
-    words : list of bytes
-        Numbers as printed.
+    words : iterable of bytes
+        Numbers as printed; zeros do not count.
 
     Examples
     --------
-    >>> printed_digits([b"1.5", b"-3.245226567D+06"])
+    >>> printed_digits([b"1.500000000D+00", b"-3.245226567D+06"])
     10
+    >>> printed_digits([b"1.", b"-2."]), printed_digits([b"1.", b"2.5", b"1234.5678"])
+    (None, None)
     """
-    found = 0
+    found = []
     for word in words:
         match = _DIGITS.match(word.strip())
         if match:
             whole, part = match[1], match[2]
-            found = max(found, len(whole) + len(part if whole else part.lstrip(b"0")))
-    return found
+            found.append(len(whole) + len(part if whole else part.lstrip(b"0")))
+    counts = [count for count in found if count]
+    most = max(counts, default=0)
+    alike = sum(count >= most - _FIELD for count in counts) >= _ALIKE * len(counts)
+    return most if most >= _DOUBLE or (most >= _ROUNDED and alike) else None
 
 
 def cut_short(content: bytes, words: Iterable[bytes]) -> bool:

@@ -104,13 +104,13 @@ def read_sierra(
         matrix(mass),
         matrix(damping),
         dofs=dofs,
-        digits=max(digits for _, digits in tables.values()),
+        digits=max(digits or 0 for _, digits in tables.values()) or None,
         source=str(stiffness),
         located=located,
     )
 
 
-def _table(path: str | Path, width: int) -> tuple[FloatArray, int]:
+def _table(path: str | Path, width: int) -> tuple[FloatArray, int | None]:
     """Return the numbers of the first bracketed table (m, width), and the digits printed."""
     content = file_path(path).read_bytes()
     start, stop = content.find(b"["), content.find(b"]")

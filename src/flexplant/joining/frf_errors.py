@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -53,7 +53,7 @@ def side_by_side(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> Side:
 
 
 def variance_of(
-    variance: FloatArray, correlation: ComplexArray | None, left: ComplexArray, right: ComplexArray
+    variance: FloatArray, correlation: ComplexArray | None, left: Any, right: Any
 ) -> FloatArray:
     """Return E|L dY R|^2 (n_out, n_in, n_freq), dY of independent columns.
 
