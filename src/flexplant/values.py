@@ -380,6 +380,14 @@ def name_list(names: Any, what: str) -> tuple[str, ...]:
     return tuple(str(name) for name in listed)
 
 
+def inner_names(names: Iterable[str], taken: Iterable[str]) -> tuple[str, ...]:
+    """Return names of our own, lengthened by '|' until none equals one that a user has taken."""
+    found, known = tuple(names), set(taken)
+    while not known.isdisjoint(found):
+        found = tuple(f"{name}|" for name in found)
+    return found
+
+
 def check_names(names: Sequence[str], side: str) -> None:
     """Raise LabelError unless the names are unique and of the allowed form."""
     text = "\n".join(["", *names, ""])

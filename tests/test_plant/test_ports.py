@@ -132,7 +132,7 @@ def test_ports_refuse_strangers_and_doubles():
         Ports(z="die")
     with pytest.raises(LabelError, match=r"inputs w and u hold \['u'\] more than once"):
         Ports(w=[Disturbance("u", at=P)], u=[u])
-    with pytest.raises(LabelError, match=r"outputs y hold \['y'\] more than once"):
+    with pytest.raises(LabelError, match=r"ports w and y hold \['y'\] more than once"):
         Ports(y=[y, y])
     with pytest.raises(LabelError, match="POIs hold"):
         Ports(z=[die, die])

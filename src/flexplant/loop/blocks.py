@@ -12,7 +12,7 @@ from ..lti.interconnection import connect
 from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
-from ..values import ComplexArray, FloatArray
+from ..values import ComplexArray, FloatArray, inner_names
 
 
 def joined(
@@ -30,7 +30,9 @@ def joined(
     """
     read = [name for name in plant.u if any(name in sys.inputs for sys in systems)]
     silent = [name for name in read if name not in driven]
-    outer = {name: f"{name}|applied" for name in driven} if applied else {}
+    used = [name for sys in systems for name in (*sys.inputs, *sys.outputs)]
+    apart = inner_names((f"{name}|applied" for name in driven), [*plant.y, *plant.u, *used])
+    outer = dict(zip(driven, apart, strict=True)) if applied else {}
     if outer:
         systems = [
             sys.renamed(inputs={name: outer[name] for name in sys.inputs if name in outer})

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
+from ..values import inner_names
 
 
 def tapped(
@@ -45,7 +46,7 @@ def tapped(
         D,
         g.dt,
         inputs=[*plant.w, *taps],
-        outputs=[*shown, *(f"{name}|loop" for name in plant.y)],
+        outputs=[*shown, *inner_names((f"{name}|loop" for name in plant.y), shown)],
         states=g.states,
         name=g.name,
         units=units,

@@ -9,7 +9,7 @@ import scipy.linalg as la
 from scipy.sparse import csgraph
 
 from ..errors import LabelError, ModelError, ShapeError, require_known
-from ..values import ComplexArray, FloatArray, name_list
+from ..values import ComplexArray, FloatArray, inner_names, name_list
 from .joining import Matrices, common_dt, common_fields, joined_units, stacked, state_names
 from .scaling import balanced_matrix
 from .statespace import StateSpace, System, as_statespace
@@ -231,8 +231,8 @@ def feedback(forward: System, back: System | None = None, *, sign: int = -1) -> 
     if sign not in (-1, 1):
         raise ModelError(f"sign must be -1 or +1, got {sign!r}.")
     # G with its inputs and outputs twice: once open, once for the loop
-    inner_in = [f"{name}|loop" for name in g.inputs]
-    inner_out = [f"{name}|loop" for name in g.outputs]
+    inner_in = inner_names((f"{name}|loop" for name in g.inputs), g.inputs)
+    inner_out = inner_names((f"{name}|loop" for name in g.outputs), g.outputs)
     doubled = StateSpace(
         g.A,
         np.hstack([g.B, g.B]),

@@ -15,7 +15,7 @@ import numpy as np
 import scipy.linalg as la
 
 from ..errors import ModelError, counted
-from ..values import FloatArray, Value
+from ..values import FloatArray, Value, inner_names
 from .discretisation import bilinear, image_freq, tustin
 from .modal import modal_form
 from .scaling import bordered_scale, mean_speed, state_scale
@@ -85,13 +85,15 @@ class Prepared(Value):
     @property
     def system(self) -> StateSpace:
         """The scaled problem as one system, inputs w1.., u and outputs z1.., y."""
+        w = inner_names((f"w{i}" for i in range(1, self.B1.shape[1] + 1)), self.u)
+        z = inner_names((f"z{i}" for i in range(1, self.C1.shape[0] + 1)), self.y)
         return StateSpace(
             self.A,
             np.hstack([self.B1, self.B2]),
             np.vstack([self.C1, self.C2]),
             np.block([[self.D11, self.D12], [self.D21, np.zeros_like(self.D22)]]),
-            inputs=[f"w{i}" for i in range(1, self.B1.shape[1] + 1)] + list(self.u),
-            outputs=[f"z{i}" for i in range(1, self.C1.shape[0] + 1)] + list(self.y),
+            inputs=[*w, *self.u],
+            outputs=[*z, *self.y],
             dt=self.dt if self.direct else 0.0,
         )
 

@@ -226,12 +226,8 @@ def _factors(K: StateSpace) -> tuple[StateSpace, FloatArray]:
     solve = control_dare if K.dt else control_care
     found = solve(K.A, K.B, Q=K.C.T @ K.C, R=R, S=K.C.T @ K.D)
     F = -found.gain
-    factors = StateSpace(
-        K.A + K.B @ F, K.B, np.vstack([K.C + K.D @ F, F]), np.vstack([K.D, np.eye(m)]), K.dt,
-        inputs=[f"v:{name}" for name in K.inputs],
-        outputs=[*K.outputs, *(f"m:{name}" for name in K.inputs)],
-    )  # fmt: skip
-    return factors, F
+    C, D = np.vstack([K.C + K.D @ F, F]), np.vstack([K.D, np.eye(m)])
+    return StateSpace(K.A + K.B @ F, K.B, C, D, K.dt), F
 
 
 def _weight(
