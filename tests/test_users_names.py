@@ -54,9 +54,8 @@ class Case:
         self.h2 = fx.design_h2(self.weighted)
         self.g = self.plant.Gyu.select(outputs=[self.y1, self.y2])
         free = [n for n in ("w2", "p2", "x1") if n not in names]
-        self.sensors = [
-            fx.Sensor(n, at=f"{i}:x", asd=1e-10, direction="x") for i, n in enumerate(free, 1)
-        ]
+        at = {n: {"at": f"{i}:x", "direction": "x"} for i, n in enumerate(free, 1)}
+        self.sensors = [fx.Sensor(n, **place, asd=1e-10) for n, place in at.items()]
         self.actuators = [fx.Actuator(n, **place) for n, place in at.items()]
 
     def stage(self):
