@@ -82,7 +82,11 @@ class AxisLaw:
 
     def gain(self, numbers: FloatArray, rows: IntArray | slice = slice(None)) -> ComplexArray:
         """Return the response of `law` at some of the points, without making its elements."""
-        return self._scale(numbers) * product(self.sections(numbers), self.s[rows])
+        return self.response(numbers, self.s[rows])
+
+    def response(self, numbers: FloatArray, s: ComplexArray) -> ComplexArray:
+        """Return the response of `law` at any s, by Tustin's rule where it is sampled."""
+        return self._scale(numbers) * product(self.sections(numbers), s)
 
     def _scale(self, numbers: FloatArray) -> float:
         """Return the gain with which the loop of the rigid body crosses 1 at the bandwidth."""

@@ -149,7 +149,7 @@ class LawSearch:
 
         At the points closest to the critical point, at modes and above the bandwidth.
         """
-        close = self.of.axis.points[0][_lowest_of(self.of.room(found.law))[:_TRIED]]
+        close = self.of.axis.points[0][lowest_of(self.of.room(found.law))[:_TRIED]]
         above = found.bandwidth * np.array(_ABOVE)
         trials = []
         for f in [*close.tolist(), *self.of.axis.resonances[:_TRIED].tolist(), *above.tolist()]:
@@ -196,7 +196,7 @@ class LawSearch:
         )
 
 
-def _lowest_of(room: FloatArray) -> IntArray:
+def lowest_of(room: FloatArray) -> IntArray:
     """Return the local minima, the lowest first."""
     wide = np.concatenate([[np.inf], room, [np.inf]])
     places = np.flatnonzero((room <= wide[:-2]) & (room <= wide[2:]))
@@ -205,7 +205,7 @@ def _lowest_of(room: FloatArray) -> IntArray:
 
 def _critical(room: FloatArray) -> IntArray:
     """Return the points that count in a step: local minima, and the valleys about the lowest."""
-    least = _lowest_of(room)[:_POINTS]
+    least = lowest_of(room)[:_POINTS]
     least = least[room[least] < room[least[0]] + _REACH]
     near = (least[:, None] + np.array([-1, 0, 1])).ravel()
     valley = np.flatnonzero(room < room[least[0]] + 0.5 * _REACH)

@@ -2,32 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from ..arguments import between
-from ..errors import SolverError
-from ..loop import report_loops
-from ..lti.frequency import Frf, frequency_response
+from ..errors import SolverError, warn
+from ..loop import in_axes
+from ..lti.frequency import Frf
 from ..lti.grid import resonance_grid
-from ..lti.statespace import StateSpace, System
+from ..lti.interconnection import series
+from ..lti.statespace import StateSpace, System, as_statespace
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import StandardPlant, larger_plant
 from ..progress import Progress
 from ..values import FloatArray, whole
 from .axis_law import AxisLaw
-from .law import Law
+from .joint_plant import JointPlant, Worst
+from .joint_search import JointLaws, JointSearch
 from .law_search import FoundLaw, LawSearch
-from .loop_design import Axes, LoopDesign, axes_controller, axes_of, made
+from .loop_design import Axes, LoopDesign, axes_of, made
 from .measured_axis import MeasuredAxis
 from .servo_loop import TARGET
 
-#: steps down, and their factor, while the axes disturb each other a little; margin, beside that
-#: needed, below which that is no cure; rounds in which each adapts to the others, to a peak so
-#: much lower
-_STEPS, _SLOWER, _FAR, _ROUNDS, _STRICTER = 4, 0.99, 0.95, 4, 0.97
 #: distance of a pole from zero frequency, beside the farthest, that counts as none
 _ZERO = 1e-6
 
@@ -107,25 +106,53 @@ def tune_loops(
         rigid = len(axes.names) if measured else _free_modes(axes.plant)
     rigid = whole(rigid, "rigid", minimum=0)
     most = whole(notches, "notches", minimum=0)
-    frf = axes.plant if measured else _response(axes.plant)
-    tuner = _Tuner(axes, frf, float(peak), rigid, most)
+    plants = _plants(plant, axes, rigid, larger, {"rate": rate, "delay": delay, "hold": hold})
+    tuner = _Tuner(axes, _response(plants[-1], axes), float(peak), rigid, most)
     with Progress(len(axes.names), "axes", progress=progress) as bar:
-        reached = tuner.together(tuner.each_alone(bar)) or tuner.settled(tuner.one_by_one())
-    if reached is None:
+        alone = tuner.each_alone(bar)
+    reached = _together(alone, plants, float(peak))
+    laws = dict(zip(axes.names, reached.laws([law for law, _ in alone]), strict=True))
+    design = made(axes, laws, rigid, 0, None, larger)
+    notes = [
+        note for (law, _), x in zip(alone, reached.numbers, strict=True) for note in law.notes(x)
+    ]
+    if reached.worst.size > peak:
+        notes.append(_missed(reached.worst, float(peak)))
+        warn(notes[-1])
+    return design.replace(notes=(*design.notes, *notes))
+
+
+def _together(
+    alone: Sequence[tuple[AxisLaw, FoundLaw]], plants: Sequence[JointPlant], peak: float
+) -> JointLaws:
+    """Return laws that hold the peak together, or come closest to it.
+
+    Raises
+    ------
+    SolverError
+        When none that were found are stable together.
+    """
+    of = [law for law, _ in alone]
+    search = JointSearch(of, plants, peak, [one.numbers for _, one in alone])
+    found = search.checked([one.numbers for _, one in alone])
+    if found is None or found.worst.size > peak:
+        found = search.best()
+    if found is None:
         raise SolverError(
-            f"each axis alone holds |S| below {peak:g}, all together do not: they disturb each "
-            "other. Decouple the axes better (before=, after=), or close them one after the other "
-            "with design_loops."
+            f"each axis alone holds |S| below {peak:g}, but all together are unstable at every "
+            f"bandwidth down to {', '.join(f'{law.lowest:.3g}' for law in of)} Hz. Decouple the "
+            "axes better (before=, after=), or close them one after the other with design_loops."
         )
-    design = made(axes, reached.laws, rigid, 0, None, larger)
-    return design.replace(notes=(*design.notes, *reached.notes))
+    return found
 
 
-class _Reached(NamedTuple):
-    """Laws that hold the peak in all axes together, and what to say of them."""
-
-    laws: dict[str, Law]
-    notes: list[str]
+def _missed(worst: Worst, peak: float) -> str:
+    return (
+        f"|S| below {20.0 * np.log10(peak):.3g} dB was not reached: |S| {worst.place} is "
+        f"{20.0 * np.log10(worst.size):.3g} dB at {worst.freq:.4g} Hz, which ended the search. "
+        "Allow a higher peak, decouple the axes better (before=, after=), or move actuators or "
+        "sensors to where they excite or see less of what resonates there"
+    )
 
 
 @dataclass(frozen=True)
@@ -142,65 +169,36 @@ class _Tuner:
         """Return the best law of each axis, the others open."""
         found = []
         for i in range(len(self.axes.names)):
-            found.append(self._tuned(i, {}))
+            law = AxisLaw(self._axis(i), self.peak)
+            found.append((law, LawSearch(law, self.notches).best()))
             bar.advance()
         return found
 
-    def one_by_one(self) -> list[tuple[AxisLaw, FoundLaw]]:
-        """Return the best law of each axis, those before it closed."""
-        found: list[tuple[AxisLaw, FoundLaw]] = []
-        for i in range(len(self.axes.names)):
-            found.append(self._tuned(i, {k: one.law for k, (_, one) in enumerate(found)}))
-        return found
-
-    def settled(self, found: list[tuple[AxisLaw, FoundLaw]]) -> _Reached | None:
-        """Return laws that hold the peak together, each adapted in turn to all the others."""
-        for _ in range(_ROUNDS):
-            reached = self.together(found)
-            if reached is not None:
-                return reached
-            for i in range(len(found)):
-                others = {k: one.law for k, (_, one) in enumerate(found) if k != i}
-                law = AxisLaw(self._axis(i, others), _STRICTER * self.peak)
-                again = LawSearch(law, self.notches).raised(found[i][1].numbers)
-                found[i] = (law, again) if again else found[i]
-        return self.together(found)
-
-    def _tuned(self, i: int, closed: dict[int, Law]) -> tuple[AxisLaw, FoundLaw]:
-        law = AxisLaw(self._axis(i, closed), self.peak)
-        return law, LawSearch(law, self.notches).best()
-
-    def _axis(self, i: int, closed: dict[int, Law]) -> MeasuredAxis:
-        """Return one axis with others closed.
-
-        ``G_i - G_iJ C_J (I + G_JJ C_J)^-1 G_Ji`` is what its law acts on, J the others.
-        """
-        P, J = np.moveaxis(self.frf.data, -1, 0), list(closed)
-        G = P[:, i, i]
-        if J:
-            C = np.stack([law.response(self.frf.freq) for law in closed.values()], axis=-1)
-            inner = np.eye(len(J)) + P[:, J][:, :, J] * C[:, None, :]
-            reached = np.linalg.solve(inner, P[:, J, i, None])[..., 0]
-            G = G - np.sum(P[:, i, J] * C * reached, axis=-1)
+    def _axis(self, i: int) -> MeasuredAxis:
         variance = None if self.frf.variance is None else self.frf.variance[i, i]
-        name, free = self.axes.names[i], self.rigid > 0
-        return MeasuredAxis(name, self.frf.freq, G, self.axes.rate, free, variance)
+        G, free = self.frf.data[i, i], self.rigid > 0
+        return MeasuredAxis(self.axes.names[i], self.frf.freq, G, self.axes.rate, free, variance)
 
-    def together(self, found: list[tuple[AxisLaw, FoundLaw]]) -> _Reached | None:
-        """Return the laws if they hold the peak in all axes together, or do so a little slower."""
-        for step in range(_STEPS):
-            each = [law.slower(one.numbers, _SLOWER**step) for law, one in found]
-            laws = dict(zip(self.axes.names, each, strict=True))
-            inner = axes_controller(self.axes, laws)
-            report = report_loops((self.axes.plant, inner), at="y", rigid=self.rigid)
-            margins = [one.modulus_margin for one in report.loops]
-            if report.is_stable and min(margins) >= 1.0 / self.peak:
-                return _Reached(
-                    laws, [note for law, one in found for note in law.notes(one.numbers)]
-                )
-            if not report.is_stable or min(margins) < _FAR / self.peak:
-                return None
-        return None
+
+def _plants(
+    plant: Any, axes: Axes, rigid: int, larger: Any, measured: Mapping[str, Any]
+) -> list[JointPlant]:
+    """Return the plant in its own channels, and the one with the modes left out where known."""
+    u, y, static = axes.before.outputs, axes.after.inputs, (axes.before.D, axes.after.D)
+    if isinstance(axes.plant, Frf):
+        given = plant if isinstance(plant, Frf) else Frf.from_control(plant)
+        return [JointPlant(in_axes(given.select(y, u), **measured), *static, axes.names, rigid)]
+    own = as_statespace(plant if axes.given is None else axes.given.Gyu)
+    found = [JointPlant(own.select(y, u), *static, axes.names, rigid)]
+    more = None if axes.given is None else larger_plant(axes.given, larger)
+    if axes.given is not None and more is not None:
+        reading, G = axes.given.origin.reading, more.system.select(more.y, more.u)
+        if reading is not None:
+            read = [name for name in reading.inputs if name in more.y]
+            G = series(G.select(read), reading.select(inputs=read))
+        kind = " with the modes left out"
+        found.append(JointPlant(G.select(y, u), *static, axes.names, rigid, kind))
+    return found
 
 
 def _free_modes(plant: StateSpace) -> int:
@@ -209,8 +207,13 @@ def _free_modes(plant: StateSpace) -> int:
     return int(np.count_nonzero(distance <= _ZERO * np.max(distance, initial=0.0))) // 2
 
 
-def _response(plant: StateSpace) -> Frf:
-    """Return the response over a grid through the resonances of a model."""
-    grid = resonance_grid(plant.poles(), plant.dt, points=1000)
-    frf = frequency_response(plant, grid[grid < 0.4999 / plant.dt] if plant.dt else grid)
-    return frf.replace(variance=np.zeros(frf.data.shape))
+def _response(plant: JointPlant, axes: Axes) -> Frf:
+    """Return the response in the axes: that measured, or of a model through its resonances."""
+    if isinstance(axes.plant, Frf):
+        return axes.plant
+    assert isinstance(plant.plant, StateSpace)  # noqa: S101 - the axes are of a model
+    dt = plant.plant.dt
+    grid = resonance_grid(plant.plant.poles(), dt, points=1000)
+    freq = grid[grid < 0.4999 / dt] if dt else grid
+    data = np.moveaxis(plant.coupling(freq).inner, 0, -1)
+    return Frf(freq, data, axes.before.inputs, axes.names, variance=np.zeros(data.shape))

@@ -1,0 +1,243 @@
+"""The laws of all axes together: steps of linear programs that keep |S| on all plants."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+import scipy.linalg as la
+
+from ..values import ComplexArray, FloatArray, IntArray
+from .axis_law import AxisLaw
+from .joint_plant import Coupling, JointPlant, Worst
+from .law import Law, tustin_s
+from .law_search import lowest_of
+
+#: slower starts, as a factor, until the loops are stable with |S| below so much
+_SLOWER, _STARTS, _WILD = 0.8, 30, 10.0
+#: steps between two checks, and checks at which frequencies are added
+_STEPS, _ROUNDS = 30, 4
+#: radii [e-folds], penalty on what is violated, step of differences
+_RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 1e-3, 20.0, 1e-6
+#: points of one place that count in a step, at most and as far above the bound
+_POINTS, _REACH = 12, 0.3
+#: distance kept beyond what is needed, to end with no less
+_SPARE = 2e-3
+#: steps down, and their factor, where the grid missed the very top of a peak
+_DOWN, _LITTLE = 5, 0.99
+#: part of the bound on |S| from which on a frequency of the closed loop is added
+_NEAR = 0.9
+
+
+class JointLaws(NamedTuple):
+    """Numbers of all axes, and the largest |S| that they reach."""
+
+    numbers: list[FloatArray]
+    worst: Worst
+
+    def laws(self, of: Sequence[AxisLaw]) -> list[Law]:
+        """Return the laws."""
+        return [law.law(x) for law, x in zip(of, self.numbers, strict=True)]
+
+
+@dataclass(frozen=True)
+class JointSearch:
+    """The search for laws of the highest mean bandwidth that hold |S| on some plants.
+
+    Parameters
+    ----------
+    of : sequence of AxisLaw
+        The axes.
+    plants : sequence of JointPlant
+        Where |S| counts.
+    peak : float
+        Bound on |S|.
+    given : sequence of (n,) arrays
+        Numbers of each axis from which the search begins, such as those found alone.
+    """
+
+    of: Sequence[AxisLaw]
+    plants: Sequence[JointPlant]
+    peak: float
+    given: Sequence[FloatArray]
+
+    def checked(self, numbers: list[FloatArray]) -> JointLaws | None:
+        """Return laws with their largest |S| on all plants; None when unstable on one."""
+        laws = [law.law(x) for law, x in zip(self.of, numbers, strict=True)]
+        if not all(plant.is_stable(laws) for plant in self.plants):
+            return None
+        return JointLaws(numbers, max(plant.worst(laws) for plant in self.plants))
+
+    def best(self) -> JointLaws | None:
+        """Return the best laws that were found; None where none are stable.
+
+        They hold the peak, or come as close to it as any that were found.
+        """
+        found = self._start()
+        if found is None:
+            return None
+        known, added = found, np.empty(0)
+        for _ in range(_ROUNDS):
+            again = self.checked(self._raised(found.numbers, added))
+            if again is None:
+                break
+            found = again
+            if found.worst.size <= self.peak:
+                return found
+            known = min(known, found, key=lambda one: one.worst.size)
+            near = found.worst.freq * (1.0 + 1e-4 * np.arange(-3, 4))
+            added = np.union1d(added, near)
+        for step in range(1, _DOWN + 1):
+            slower = self.checked(self._slowed(known.numbers, _LITTLE**step))
+            if slower is not None and slower.worst.size <= self.peak:
+                return slower
+        return known
+
+    def _slowed(self, numbers: Sequence[FloatArray], factor: float) -> list[FloatArray]:
+        """Return the numbers with bandwidths times a factor, none below the lowest."""
+        least = [np.log(law.lowest) for law in self.of]
+        return [
+            np.append(max(x[0] + np.log(factor), min(x[0], low)), x[1:])
+            for x, low in zip(numbers, least, strict=True)
+        ]
+
+    def _start(self) -> JointLaws | None:
+        """Return the fastest of ever slower laws that are stable, |S| not wild if possible."""
+        wild = None
+        for step in range(_STARTS):
+            found = self.checked(self._slowed(self.given, _SLOWER**step))
+            if found is not None and found.worst.size < _WILD:
+                return found
+            wild = wild or found
+        return wild
+
+    def _raised(self, numbers: list[FloatArray], added: FloatArray) -> list[FloatArray]:
+        """Return what steps from stable laws lead to.
+
+        Each step is the best of the linearised problem within a radius, with an exact penalty on
+        what is violated ([Fletcher1987]_, chapter 14). ``det(I + P C)`` turns as often as before,
+        so that the loop stays stable.
+        """
+        couplings = []
+        for plant in self.plants:
+            model = hasattr(plant.plant, "poles")
+            inside = added[(added > plant.grid[0]) & (added < plant.grid[-1])]
+            grid = np.union1d(plant.grid, inside) if model else plant.grid
+            couplings.append(plant.coupling(grid))
+        x, radius = np.concatenate(numbers), _RADIUS
+        gains = self._gains(x, couplings)
+        rooms = self._rooms(gains, couplings)
+        least = min(float(room.min()) for room in rooms)
+        for _ in range(_STEPS):
+            step, expected = self._step(x, gains, rooms, couplings, radius)
+            if radius < _SMALLEST or expected < _SMALLEST:
+                break
+            there = self._gains(x + step, couplings)
+            found = self._rooms(there, couplings)
+            low = min(float(room.min()) for room in found)
+            gained = self._mean(step) + _PENALTY * (min(low, 0.0) - min(least, 0.0))
+            if gained > 0.1 * expected and all(map(_alike, couplings, gains, there)):
+                x, gains, rooms, least = x + step, there, found, low
+                radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
+            else:
+                radius *= 0.4
+        return self._split(x)
+
+    def _gains(self, x: FloatArray, couplings: Sequence[Coupling]) -> list[ComplexArray]:
+        """Return the laws C (n_freq, axes) on each plant."""
+        numbers = self._split(x)
+        found = []
+        for one in couplings:
+            s = tustin_s(one.freq, self.of[0].axis.rate)
+            each = [law.response(own, s) for law, own in zip(self.of, numbers, strict=True)]
+            found.append(np.stack(each, axis=-1))
+        return found
+
+    def _rooms(
+        self, gains: Sequence[ComplexArray], couplings: Sequence[Coupling]
+    ) -> list[FloatArray]:
+        """Return what the distances to the critical point have to spare (places, n_freq)."""
+        least = 1.0 / self.peak + _SPARE
+        return [one.distances(C) - least for one, C in zip(couplings, gains, strict=True)]
+
+    def _step(
+        self,
+        x: FloatArray,
+        gains: Sequence[ComplexArray],
+        rooms: Sequence[FloatArray],
+        couplings: Sequence[Coupling],
+        radius: float,
+    ) -> tuple[FloatArray, float]:
+        """Return the step of the linear program, and the gain that it predicts."""
+        from scipy.optimize import linprog
+
+        slopes, spare = [], []
+        for one, C, room in zip(couplings, gains, rooms, strict=True):
+            for place, own in enumerate(room):
+                rows = _critical(own)
+                if rows.size:
+                    some = Coupling(*(part[rows] for part in one[:4]), one.of)
+                    slopes.append(self._by_numbers(x, some, some.slopes(C[rows], place)))
+                    spare.append(own[rows])
+        room = np.concatenate([*spare, [np.inf]])
+        limits = [law.limits(own) for law, own in zip(self.of, self._split(x), strict=True)]
+        low, high = (np.concatenate([one[i] for one in limits]) for i in (0, 1))
+        bound, most = la.block_diag(*(one[2] for one in limits)), [one[3] for one in limits]
+        slack = np.maximum(np.concatenate(most) - bound @ x, 0.0)
+        aim = np.zeros(x.size + 1)
+        aim[self._places], aim[-1] = -1.0 / len(self.of), _PENALTY
+        rows = np.vstack([*slopes, np.empty((0, x.size))])
+        answer = linprog(
+            aim,
+            A_ub=np.block([
+                [-rows, -np.ones((len(rows), 1))],
+                [bound, np.zeros((slack.size, 1))],
+            ]),
+            b_ub=np.concatenate([room[:-1], slack]),
+            bounds=np.vstack(
+                [np.clip([low - x, high - x], -radius, radius).T, [0.0, np.inf]]
+            ).tolist(),
+        )  # fmt: skip
+        if answer.x is None or answer.fun is None:
+            return np.zeros(x.size), 0.0
+        return answer.x[:-1], float(-answer.fun) - _PENALTY * min(float(room.min()), 0.0)
+
+    def _by_numbers(self, x: FloatArray, some: Coupling, slopes: ComplexArray) -> FloatArray:
+        """Return the derivatives by the numbers from those by the laws, by differences."""
+        s = tustin_s(some.freq, self.of[0].axis.rate)
+        found = []
+        for i, (law, own) in enumerate(zip(self.of, self._split(x), strict=True)):
+            here = law.response(own, s)
+            for k in range(own.size):
+                moved = own.copy()
+                moved[k] += _DIFFERENCE
+                change = (law.response(moved, s) - here) / _DIFFERENCE
+                found.append((slopes[:, i] * change).real)
+        return np.array(found).T
+
+    def _mean(self, step: FloatArray) -> float:
+        return float(np.mean(step[self._places]))
+
+    @property
+    def _places(self) -> IntArray:
+        """Where the bandwidths are among the numbers of all axes."""
+        return np.cumsum([0, *(one.size for one in self.given[:-1])])
+
+    def _split(self, x: FloatArray) -> list[FloatArray]:
+        return np.split(x, self._places[1:])
+
+
+def _critical(room: FloatArray) -> IntArray:
+    """Return the points of one place that count in a step: its lowest minima, and about them."""
+    least = lowest_of(room)[:_POINTS]
+    least = least[room[least] < _REACH]
+    near = (least[:, None] + np.array([-1, 0, 1])).ravel()
+    return np.unique(near[(near >= 0) & (near < room.size)])
+
+
+def _alike(one: Coupling, before: ComplexArray, after: ComplexArray) -> bool:
+    """Return whether ``det(I + P C)`` of two laws with the same unstable poles turns as often."""
+    ratio = one.turns(after) / one.turns(before)
+    return bool(abs(np.sum(np.angle(ratio[1:] / ratio[:-1]))) < 0.5 * np.pi)
