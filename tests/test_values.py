@@ -135,6 +135,15 @@ def test_good_arrays():
         real_array([[0, 0], [np.nan, 0]], "x")
 
 
+def test_masked_entries_are_no_data():
+    """Alone, in lists, of any kind of numbers: what lies under a mask is never read."""
+    masked = np.ma.masked_array([1.0, 2.0], [False, True])
+    for given in (masked, [masked, [3.0, 4.0]], (masked, masked), masked.astype(int)):
+        with pytest.raises(ModelError, match="x has a masked entry, the first at index"):
+            real_array(given, "x")
+    assert real_array(np.ma.masked_array([1, 2]), "x").tolist() == [1, 2]
+
+
 @pytest.mark.parametrize(
     ("value", "shape", "text"),
     [

@@ -63,9 +63,9 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = Non
     ShapeError
         When the shape differs.
     ModelError
-        When entries are no numbers, complex, NaN or infinite.
+        When entries are no numbers, complex, NaN, masked or infinite.
     """
-    array = _floats(value, name, shape)
+    array = np.array(floats(value, name, shape))
     if shape is not None and (
         array.ndim != len(shape)
         or any(
@@ -81,19 +81,29 @@ def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = Non
                 "Pass a finite number."
             )
         where = ", ".join(str(int(i)) for i in np.argwhere(~np.isfinite(array))[0])
+        kind = "masked" if _masks(value) else "NaN or infinite"
         raise ModelError(
-            f"{name} has a NaN or infinite entry, the first at index ({where}): "
+            f"{name} has a {kind} entry, the first at index ({where}): "
             "no result could be trusted. Remove it at its source."
         )
     return array
 
 
-def _floats(value: Any, name: str, shape: tuple[int | None, ...] | None) -> FloatArray:
-    """Return a float64 copy, of any shape and finite or not."""
+def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:
+    """Return real numbers as float64, of any shape, finite or not; masked entries are NaN.
+
+    An array of float64 comes back itself, not a copy.
+
+    Raises
+    ------
+    ModelError
+        When entries are no numbers, or complex.
+    """
     if type(value) is np.ndarray and value.dtype == np.float64:
-        return np.array(value)
+        return value
     try:
-        array = np.asarray(value)
+        # asarray would hand over what lies under a mask as if it were data
+        array = np.ma.asarray(value) if _masks(value) else np.asarray(value)
     except (TypeError, ValueError) as error:  # rows of different lengths
         raise ModelError(
             f"{name} must be an array of numbers, got {short(value)}: its rows have different "
@@ -106,9 +116,18 @@ def _floats(value: Any, name: str, shape: tuple[int | None, ...] | None) -> Floa
     if array.dtype.kind not in "biufO" or (array.dtype.kind == "O" and _holds_none(array)):
         raise _no_numbers(value, name, shape)
     try:
-        return np.array(array, dtype=np.float64)
+        if isinstance(array, np.ma.MaskedArray):
+            return np.asarray(array.astype(np.float64).filled(np.nan))
+        return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise _no_numbers(value, name, shape) from error
+
+
+def _masks(value: Any) -> bool:
+    """Return whether a value is a masked array, or a list or tuple with one in it."""
+    if isinstance(value, list | tuple):
+        return any(isinstance(part, np.ma.MaskedArray) for part in value)
+    return isinstance(value, np.ma.MaskedArray)
 
 
 def _holds_none(array: npt.NDArray[Any]) -> bool:
@@ -163,9 +182,11 @@ def with_unit(value: float, unit: str | None) -> str:
     return f"{value / factor:.3g} {shown}".rstrip()
 
 
-def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str]) -> str:
-    """Return sizes of channels in words: `die:z 0.527 nm, die:rx 3.1 nrad`."""
-    return ", ".join(f"{name} {with_unit(size, units.get(name))}" for name, size in sizes.items())
+def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4) -> str:
+    """Return sizes of channels in words, `die:z 0.527 nm, die:rx 3.1 nrad`, and how many more."""
+    shown = [f"{name} {with_unit(size, units.get(name))}" for name, size in sizes.items()]
+    more = [f"... ({len(shown) - most} more)"] if len(shown) > most else []
+    return ", ".join(shown[:most] + more)
 
 
 def positive(value: Any, name: str, *, zero: bool = False) -> float:

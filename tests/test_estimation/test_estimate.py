@@ -279,6 +279,25 @@ def test_what_counts_as_a_record_and_what_comes_out(tmp_path):
         want["die:hat"][0] = 0.0
 
 
+def test_masked_samples_are_missing_ones():
+    """Whatever lies under the mask, in any kind of numbers: the estimate is that with NaN."""
+    kalman = observer()
+    y, u, _ = run(kalman.model, 300, seed=7)
+    channels = records(kalman.model, y, u)
+    gone = (np.arange(300) > 100) & (np.arange(300) < 120)
+    want = kalman.estimate(channels | {"y2": np.where(gone, np.nan, channels["y2"])})
+    whole = np.round(1e12 * channels["y2"]).astype(np.int64)  # integers hold no NaN
+    for under in (1e-3, np.nan, np.inf):
+        masked = np.ma.masked_array(np.where(gone, under, channels["y2"]), gone)
+        found = kalman.estimate(channels | {"y2": masked})
+        np.testing.assert_array_equal(found["die:hat"], want["die:hat"])
+    found = kalman.estimate(channels | {"y2": np.ma.masked_array(whole, gone)}).innovations[1]
+    np.testing.assert_array_equal(np.isnan(found), np.isnan(want.innovations[1]))
+    # nothing masked is as no mask
+    found = kalman.estimate({name: np.ma.masked_array(part) for name, part in channels.items()})
+    np.testing.assert_array_equal(found["die:hat"], kalman.estimate(channels)["die:hat"])
+
+
 def test_bad_records_are_refused():
     kalman = observer()
     model = kalman.model
@@ -287,6 +306,10 @@ def test_bad_records_are_refused():
         ({"y1": np.zeros(19)}, ShapeError, "one length"),
         ({"y1": np.zeros((2, 20))}, ShapeError, "one run"),
         ({"u1": np.full(20, np.nan)}, ModelError, "channel 'u1' has a NaN"),
+        ({"u1": np.ma.masked_array(np.zeros(20), [True] * 20)}, ModelError, "'u1' has a masked"),
+        ({"y1": np.zeros(20, dtype=complex)}, ModelError, "channel 'y1' must be real"),
+        ({"u1": np.zeros(20) + 1j}, ModelError, "channel 'u1' must be real"),
+        ({"y1": np.ma.masked_array(np.zeros(20) + 1j)}, ModelError, "'y1' must be real"),
         ({"y2": np.full(20, np.inf)}, ModelError, "channel 'y2' has a NaN or infinite"),
         ({"y2": ["a"] * 20}, ModelError, "must hold numbers"),
         ({"time": np.arange(20.0)}, ModelError, "at the rate of the record"),
@@ -324,6 +347,7 @@ def test_step_is_the_stationary_filter_sample_by_sample():
         ((y[0], u[0], np.zeros(3)), ShapeError, "state must have shape"),
         ((np.array([np.nan, 0.0]), u[0]), ModelError, "NaN"),
         ((["a", "b"], u[0]), ModelError, "y must hold numbers"),
+        ((np.ma.masked_array(y[0], [True, False]), u[0]), ModelError, "y has a masked entry"),
     ):
         with pytest.raises(error, match=match):
             kalman.step(*wrong)

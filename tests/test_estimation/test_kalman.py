@@ -284,6 +284,17 @@ def test_names():
     assert "truncation is not in these numbers" in text
 
 
+def test_the_repr_says_how_many_axes_it_leaves_out():
+    every = ("x", "y", "z", "rx", "ry", "rz")
+    pois = [Poi("die", at=(0.31, 0.26, 0.0), axes=every[2:5]), Poi("edge", at=CORNERS[0], axes="z")]
+    for chosen, ending in (
+        (pois, "rad, edge:z"),
+        ([*pois, pois[1].replace(name="b")], "(1 more) ("),
+    ):
+        plant = assemble_plant(modes(1e-2, 9), ports(z=chosen)).discretized(1e4, delay=1)
+        assert ending in repr(design_kalman(plant))
+
+
 def test_saves_and_loads(tmp_path):
     from flexplant.store import load
 

@@ -78,7 +78,7 @@ class KalmanEstimator(Value):
 
     def __repr__(self) -> str:
         channels = poi_channels(self.plant)
-        rms = sizes_of({name: self.rms(name) for name in channels[:4]}, self.plant.units)
+        rms = sizes_of({name: self.rms(name) for name in channels}, self.plant.units)
         count = self.certificate.left_out
         beyond = (
             "modes left out are not known: truncation is not in these numbers"
@@ -183,7 +183,7 @@ class KalmanEstimator(Value):
         ----------
         records : Response, mapping {channel: (N,) array} or data frame
             All sensors and the commands u as the controller gave them (delays are in the filter);
-            NaN are missing samples of a sensor. Other channels are left aside.
+            NaN and masked entries are missing samples of a sensor. Other channels are left aside.
         lag : Predictor, Filter, FixedLag or Smoother, optional
             When the estimates are known; Filter() when not given.
         start : (n,) array, optional
@@ -263,7 +263,7 @@ class KalmanEstimator(Value):
         parts = [x, y, u]
         for i, name in enumerate(("state", "y", "u")):
             part = parts[i]
-            if not (isinstance(part, np.ndarray) and part.dtype == np.float64):
+            if not (type(part) is np.ndarray and part.dtype == np.float64):
                 part = parts[i] = real_array(part, name)
             if part.shape != (sizes[i],):
                 raise ShapeError(

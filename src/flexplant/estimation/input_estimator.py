@@ -88,7 +88,7 @@ class InputEstimator(Value):
 
     def __repr__(self) -> str:
         names = [*poi_channels(self.plant), *self.inputs]
-        rms = sizes_of({name: self.rms(name) for name in names[:6]}, self.plant.units)
+        rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
         late = "in their own sample" if not self.delay else f"{self.delay} sample late"
         return (
             f"<InputEstimator: {counted(self.system.n_states, 'state')}, inputs {late}, spectral "

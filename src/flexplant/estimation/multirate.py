@@ -91,8 +91,7 @@ class PeriodicEstimator(Value):
     certificate: PeriodicCertificate
 
     def __repr__(self) -> str:
-        names = poi_channels(self.plant)[:4]
-        rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
+        rms = sizes_of({n: self.rms(n) for n in poi_channels(self.plant)}, self.plant.units)
         return (
             f"<PeriodicEstimator: {counted(self.gains.shape[1], 'state')}, "
             f"{counted(len(self.sensors), 'sensor')}, "

@@ -1,4 +1,4 @@
-"""Recorded data: measurements and commands by channel name, missing samples as NaN."""
+"""Recorded data: measurements and commands by channel name, missing samples NaN or masked."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
-from ..values import FloatArray, real_array, short
+from ..values import FloatArray, floats, real_array, short
 from .filter_model import FilterModel
 
 #: samples that are copied together
@@ -42,8 +42,8 @@ def recorded(records: Any, model: FilterModel) -> Recorded:
     Parameters
     ----------
     records : Response, mapping {channel: (N,) array} or data frame
-        All sensors and commands by name; other channels are left aside. NaN are samples of a
-        sensor that are missing. Times are its `time`, as an attribute or a channel; without any
+        All sensors and commands by name; other channels are left aside. NaN and masked entries
+        are samples of a sensor that are missing. Times are its `time`, as an attribute or a channel; without any
         the record starts at 0.
     model : FilterModel
         Whose channels are wanted.
@@ -55,7 +55,8 @@ def recorded(records: Any, model: FilterModel) -> Recorded:
     ShapeError
         When channels are not of one length, or hold several runs.
     ModelError
-        When it is no record, a command is not finite, or the times are not the model's samples.
+        When it is no record, a channel is complex, a command is not finite or masked, or the times
+        are not the model's samples.
     """
     if not hasattr(records, "keys") or not hasattr(records, "__getitem__"):
         raise ModelError(
@@ -94,12 +95,7 @@ def recorded(records: Any, model: FilterModel) -> Recorded:
 
 
 def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
-    try:
-        array = np.asarray(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise ModelError(
-            f"channel {name!r} must hold numbers, got {short(values)}. Pass an array over time."
-        ) from error
+    array = floats(values, f"channel {name!r}")
     if array.ndim != 1:
         raise ShapeError(
             f"channel {name!r} must be (N,), one run over time, got {array.shape}. Of several runs "
@@ -107,7 +103,7 @@ def _channel(values: Any, name: str, *, missing: bool = False) -> FloatArray:
         )
     if missing and not np.any(np.isinf(array)):
         return array
-    return real_array(array, f"channel {name!r}")
+    return real_array(values, f"channel {name!r}")
 
 
 def _time(records: Any, known: list[str], count: int, dt: float) -> FloatArray:

@@ -125,8 +125,7 @@ class RobustFilter(Value):
     certificate: HinfFilterCertificate | MinimaxCertificate
 
     def __repr__(self) -> str:
-        names = poi_channels(self.plant)[:4]
-        rms = sizes_of({name: self.rms(name) for name in names}, self.plant.units)
+        rms = sizes_of({n: self.rms(n) for n in poi_channels(self.plant)}, self.plant.units)
         return (
             f"<RobustFilter: {counted(self.system.n_states, 'state')}, "
             f"{counted(len(sensors(self.plant)), 'sensor')};\n"
