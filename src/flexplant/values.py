@@ -21,6 +21,7 @@ T = TypeVar("T")
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 ComplexArray: TypeAlias = npt.NDArray[np.complex128]
 IntArray: TypeAlias = npt.NDArray[np.int64]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
 #: what seeds chance
 Rng: TypeAlias = int | np.random.SeedSequence | np.random.Generator | None
 #: a (n, n) matrix, dense or sparse
@@ -117,7 +118,7 @@ def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -
         raise _no_numbers(value, name, shape)
     try:
         if isinstance(array, np.ma.MaskedArray):
-            return np.asarray(array.astype(np.float64).filled(np.nan))
+            return np.asarray(np.ma.filled(np.ma.asarray(array, dtype=np.float64), np.nan))
         return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise _no_numbers(value, name, shape) from error

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from test_kalman import modes, plate_plant
 
-from flexplant.errors import LabelError, ModelError, ShapeError
+from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
 from flexplant.estimation import Filter, FixedLag, Predictor, Smoother, design_kalman, design_static
 from flexplant.estimation.estimate import estimated
 from flexplant.estimation.passage import _Walk
@@ -277,6 +277,40 @@ def test_what_counts_as_a_record_and_what_comes_out(tmp_path):
         want["die"]
     with pytest.raises(ValueError, match="read-only"):
         want["die:hat"][0] = 0.0
+
+
+@pytest.mark.parametrize("method", [row[0] for row in LAGS.values()], ids=list(LAGS))
+def test_a_gate_makes_outliers_missing_samples(method):
+    """Alone, in two sensors, one after the other, while the filter starts: the NaN estimate."""
+    kalman = observer()
+    model = kalman.model
+    y, u, _ = run(model, 3000, seed=8)
+    placed = [(60, 0), (700, 1), (701, 1), (702, 0), (1500, 0), (1500, 1), (2999, 1)]
+    bad, gone = y.copy(), y.copy()
+    for k, i in placed:
+        bad[k, i] += 1e-3
+        gone[k, i] = np.nan
+    want = kalman.estimate(records(model, gone, u), method)
+    found = kalman.estimate(records(model, bad, u), method, gate=7)
+    assert sorted((k, i) for i, k in np.argwhere(found.gated).tolist()) == placed
+    off = (found["die:hat"] - want["die:hat"]) / want.deviation("die:hat")
+    assert np.nanmax(np.abs(off)) < 1e-6
+    np.testing.assert_allclose(found.whitened, want.whitened, rtol=0, atol=1e-5)
+    assert "7 samples beyond 7 deviations treated as missing: 3 of y1, 4 of y2" in repr(found)
+    blind = kalman.estimate(records(model, bad, u), method)
+    off = (blind["die:hat"] - want["die:hat"]) / want.deviation("die:hat")
+    assert np.nanmax(np.abs(off)) > 50  # unless a gate is given all samples count
+    assert not blind.gated.size and "beyond" not in repr(blind)
+
+
+def test_a_gate_that_silences_a_sensor_warns():
+    kalman = observer()
+    y, u, _ = run(kalman.model, 1000, seed=8)
+    y[500:, 0] += 1e-3  # no outlier: the sensor has jumped
+    with pytest.warns(FlexplantWarning, match="samples of y1: not outliers"):
+        kalman.estimate(records(kalman.model, y, u), gate=6.0)
+    with pytest.raises(ModelError, match="gate must be positive"):
+        kalman.estimate(records(kalman.model, y, u), gate=0)
 
 
 def test_masked_samples_are_missing_ones():

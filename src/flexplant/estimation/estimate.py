@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import erfc
 from typing import Any
 
 import numpy as np
 
-from ..errors import LabelError, counted, unknown_label
+from ..errors import LabelError, counted, unknown_label, warn
 from ..lti.lyapunov import scale_of
 from ..parallel import one_thread
-from ..values import FloatArray, Value, instance, known_units, real_array, sizes_of
+from ..values import BoolArray, FloatArray, Value, instance, known_units, real_array, sizes_of
 from .estimator_channels import estimates
 from .filter_model import FilterModel
 from .lags import Filter, FixedLag, Lag, Predictor, Smoother
@@ -21,6 +22,9 @@ from .sight import Sight
 from .smoothing import lagged, smoothed
 from .start import Start, stationary_start
 from .steady import Steady
+
+#: part of a sensor's samples above which those beyond a gate are no outliers
+_MOST = 0.1
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -57,6 +61,11 @@ class Estimate(Value, Mapping[str, FloatArray]):
         x[N|N-1], from which `estimate(..., start=)` goes on with the next record.
     units : mapping {channel: unit}
         SI units.
+    gate : float
+        Deviations beyond which an innovation made its sample a missing one; infinite without a
+        gate.
+    gated : (ny, N) array of bool
+        Which samples these are; (ny, 0) without a gate.
 
     Examples
     --------
@@ -79,6 +88,8 @@ class Estimate(Value, Mapping[str, FloatArray]):
     lag: Lag
     state: FloatArray
     units: Mapping[str, str] = field(default_factory=dict)
+    gate: float = np.inf
+    gated: BoolArray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     # values are compared by identity; Mapping's == would compare arrays
     __eq__ = object.__eq__
@@ -94,7 +105,22 @@ class Estimate(Value, Mapping[str, FloatArray]):
         last = sizes_of(dict(zip(self.names, self._typical(), strict=True)), self.units)
         return (
             f"<Estimate by {self.lag!r}: {counted(self.time.size, 'sample')}{gaps};\n"
-            f"  median deviation {last}>"
+            f"  {self._gated()}median deviation {last}>"
+        )
+
+    def _gated(self) -> str:
+        """Return in words how many samples the gate made missing, and how many chance would."""
+        if not np.isfinite(self.gate):
+            return ""
+        listed = [
+            f"{int(count)} of {name}"
+            for name, count in zip(self.sensors, self.gated.sum(axis=1), strict=True)
+            if count
+        ]
+        chance = erfc(self.gate / np.sqrt(2.0)) * self.innovations.size
+        return (
+            f"{counted(int(self.gated.sum()), 'sample')} beyond {self.gate:g} deviations treated "
+            f"as missing{': ' if listed else ''}{', '.join(listed)} ({chance:.2g} by chance);\n  "
         )
 
     def _typical(self) -> list[float]:
@@ -110,6 +136,18 @@ class Estimate(Value, Mapping[str, FloatArray]):
 
     def __len__(self) -> int:
         return len(self.names) + len(self.sensors)
+
+    def warn_of_gate(self) -> None:
+        """Warn of a sensor that the gate silences: what it leaves out then are not outliers."""
+        share = self.gated.mean(axis=1) if self.gated.size else np.zeros(len(self.sensors))
+        worst = int(np.argmax(share))
+        if share[worst] > max(_MOST, 10 * erfc(self.gate / np.sqrt(2.0))):
+            warn(
+                f"the gate of {self.gate:g} deviations leaves out {share[worst]:.0%} of the "
+                f"samples of {self.sensors[worst]}: not outliers, but a model or noise densities "
+                "that are not the machine's, or a sensor with an offset. Judge the record without "
+                "a gate: flexplant.estimation.consistency."
+            )
 
     @property
     def dt(self) -> float:
@@ -158,6 +196,7 @@ def estimated(
     start: Any,
     place: Callable[[int], Sight] | None,
     units: Mapping[str, str],
+    gate: float = np.inf,
 ) -> Estimate:
     """Return the estimate of a record by the filter of a model with stationary covariance P.
 
@@ -185,6 +224,7 @@ def estimated(
         first,
         predict=isinstance(lag, Predictor),
         keep=later,
+        gate=gate,
     )
     hat, variance = _by(passage, sight, lag)
     return Estimate(
@@ -200,6 +240,8 @@ def estimated(
         passage.state * d,
         known_units(units, estimates(model.channels))
         | {f"{name}:innovation": units[name] for name in model.sensors if name in units},
+        gate,
+        passage.gated.T,
     )
 
 

@@ -14,7 +14,7 @@ from ..errors import ModelError, ShapeError, counted
 from ..loop import ClosedLoop
 from ..lti.statespace import StateSpace, System
 from ..plant import StandardPlant
-from ..values import FloatArray, Value, real_array, sizes_of
+from ..values import FloatArray, Value, positive, real_array, sizes_of
 from .error import error_variances
 from .estimate import Estimate, estimated, in_unit_states
 from .estimator_channels import poi_channels, row_of, same_pois, sensors
@@ -169,6 +169,7 @@ class KalmanEstimator(Value):
         *,
         start: npt.ArrayLike | None = None,
         path: npt.ArrayLike | Mapping[str, npt.ArrayLike] | None = None,
+        gate: float | None = None,
     ) -> Estimate:
         """Return the motions at the POIs from recorded measurements and commands.
 
@@ -193,6 +194,10 @@ class KalmanEstimator(Value):
             no prior at all), and u was 0 before the record.
         path : (N, 3) array [m] or mapping {name: (N, 3) array}, optional
             Where a POI is at each sample, when it moves; by name when there are several.
+        gate : float, optional
+            Innovations beyond so many of their deviations are outliers: such a sample of a sensor
+            is treated as missing. 5 or 6 leave out next to none by chance (6e-7 or 2e-9 of all).
+            The estimate lists them (`gated`) and says how many there are. None: all samples count.
 
         Returns
         -------
@@ -206,8 +211,13 @@ class KalmanEstimator(Value):
         ShapeError
             When channels differ in length, or `start` is no state.
         ModelError
-            When `records` hold no channels, infinite values, or times of another rate, or `lag`
-            is none.
+            When `records` hold no channels, infinite values, or times of another rate, `lag` is
+            none, or `gate` is not positive.
+
+        Warns
+        -----
+        FlexplantWarning
+            When the gate leaves out more than a tenth of a sensor's samples.
 
         References
         ----------
@@ -216,7 +226,7 @@ class KalmanEstimator(Value):
         place = None
         if path is not None:
             place = partial(moving_sight, self.plant, self.left_out, self.model, path)
-        return estimated(
+        found = estimated(
             self.model,
             self.predicted_covariance,
             records,
@@ -224,7 +234,10 @@ class KalmanEstimator(Value):
             start,
             place,
             self.plant.units,
+            np.inf if gate is None else positive(gate, "gate"),
         )
+        found.warn_of_gate()
+        return found
 
     def step(
         self, y: FloatArray, u: FloatArray, state: FloatArray | None = None

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..lti.recursion import Recursion
-from ..values import FloatArray
+from ..values import BoolArray, FloatArray
 from . import fading
 from .recorded import Recorded
 from .sight import Sight
@@ -49,6 +49,7 @@ class Passage(NamedTuple):
     stretches: list[tuple[int, int, bool]]  # (first, last + 1, stationary)
     found: KnownParameters | None
     state: FloatArray  # (n,), x[N|N-1]
+    gated: BoolArray  # (N, ny), samples that the gate made missing
 
     def whole(self) -> Iterator[tuple[int, int, bool]]:
         """Yield the stretches from the last to the first."""
@@ -64,6 +65,7 @@ def passed(
     *,
     predict: bool = False,
     keep: bool = False,
+    gate: float = np.inf,
 ) -> Passage:
     """Return the filter's way through a record.
 
@@ -83,8 +85,10 @@ def passed(
         Whether the estimates are those before the measurement.
     keep : bool
         Whether a later pass needs the moments at which the gain was not stationary.
+    gate : float
+        Deviations beyond which an innovation makes its sample a missing one.
     """
-    return _Walk(steady, record, s, sight, predict=predict, keep=keep).done(start)
+    return _Walk(steady, record, s, sight, predict=predict, keep=keep, gate=gate).done(start)
 
 
 class _Walk:
@@ -99,18 +103,19 @@ class _Walk:
         *,
         predict: bool,
         keep: bool,
+        gate: float,
     ) -> None:
-        self.s = s
+        self.s, self.gate = s, gate
         self.steady, self.model, self.sight = steady, steady.model, sight
         self.predict, self.keep = predict, keep
         both = record.both
-        self.there = np.broadcast_to(True, record.y.shape)
+        self.there = np.ones(record.y.shape, dtype=bool)
         if not record.complete:
             self.there, both = np.asarray(np.isfinite(record.y)), both.copy()
             both[:, : record.ny][~self.there] = 0.0
-        self.whole = (
-            self.there[:, 0] if record.complete else np.sum(self.there, axis=1) == record.ny
-        )
+        self.gated = np.zeros(record.y.shape if gate < np.inf else (0, record.ny), dtype=bool)
+        self.whole = np.asarray(np.all(self.there, axis=1))
+        self.gaps = np.flatnonzero(~self.whole)
         self.both, self.y, self.u = both, both[:, : record.ny], record.u
         (N, ny), nz = record.y.shape, sight.c.shape[1]
         # channel by channel in memory: so the estimate takes them
@@ -124,7 +129,6 @@ class _Walk:
     def done(self, start: Start | FloatArray) -> Passage:
         """Filter from a start to the end of the record."""
         N, whole = self.y.shape[0], self.whole
-        gaps = np.flatnonzero(~whole)
         stretches: list[tuple[int, int, bool]] = []
         if isinstance(start, Start):
             x, P, Z = np.zeros(start.P.shape[0]), start.P, start.Z
@@ -136,10 +140,10 @@ class _Walk:
         while k < N:
             first = k
             if settled and whole[k]:
-                later = np.searchsorted(gaps, k)
-                k = int(gaps[later]) if later < gaps.size else N
-                x, P = self._steadily(first, k, x), self.steady.P
-                stretches.append((first, k, True))
+                k, x = self._screened(first, self._until(k), x)
+                P = self.steady.P
+                if k > first:
+                    stretches.append((first, k, True))
                 continue
             settled = False
             while k < N and not settled:
@@ -151,33 +155,71 @@ class _Walk:
                     if Y is not None:
                         x = x + Z @ self.found.value if Z.shape[1] and self.found else x
                         Z = Z[:, :0]
-                        later = np.searchsorted(gaps, k)
-                        until = int(gaps[later]) if later < gaps.size else N
-                        k, x, P, settled = self._fading(k, until, x, Y)
+                        k, x, P, settled = self._fading(k, self._until(k), x, Y)
             stretches.append((first, k, False))
         if Z.shape[1] and self.found is not None:
             x = x + Z @ self.found.value
         return Passage(
             self.steady, self.hat, self.variance, self.white, self.innovations, self.deviation,
-            self.whitened, self.moments, stretches, self.found, x,
+            self.whitened, self.moments, stretches, self.found, x, self.gated,
         )  # fmt: skip
+
+    def _until(self, k: int) -> int:
+        """Return the first sample from k on in which one is missing, or the end."""
+        later = np.searchsorted(self.gaps, k)
+        return int(self.gaps[later]) if later < self.gaps.size else self.whole.size
+
+    def _drop(self, k: int, beyond: BoolArray) -> None:
+        """Treat samples of some sensors as missing from now on."""
+        self.gated[k] |= beyond
+        self.there[k] &= ~beyond
+        self.whole[k] = False
+        self.gaps = np.union1d(self.gaps, [k])
+
+    def _dropped(self, first: int, last: int) -> int:
+        """Return the first of some samples that the gate makes missing, or their end."""
+        if not np.isfinite(self.gate):
+            return last
+        at = slice(first, last)
+        beyond = np.abs(self.innovations[at]) > self.gate * self.deviation[at]
+        hit = np.flatnonzero(np.any(beyond, axis=1))
+        if not hit.size:
+            return last
+        self._drop(first + int(hit[0]), beyond[hit[0]])
+        return first + int(hit[0])
+
+    def _screened(self, k: int, until: int, x: FloatArray) -> tuple[int, FloatArray]:
+        """Run the stationary filter up to a sample, or to the first that the gate drops.
+
+        Later samples count with their innovations after it is dropped: they are filtered again.
+        """
+        length = until - k if not np.isfinite(self.gate) else fading.LONGEST
+        while k < until:
+            end = min(k + length, until)
+            after = self._steadily(k, end, x)
+            cut = self._dropped(k, end)
+            if cut < end:
+                return cut, self._steadily(k, cut, x) if cut > k else x
+            k, x = end, after
+        return k, x
 
     def _step(
         self, k: int, x: FloatArray, P: FloatArray, Z: FloatArray, unknowns: Unknowns
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        m, there = self.model, self.there[k]
+        m, C = self.model, self.model.C2 @ Z
+        before = self.found if Z.shape[1] else None
+        e = self.y[k] / self.s - m.C2 @ x - m.D2 @ self.u[k]
+        self._innovate(k, e, m.innovation(P), C, before)
+        there = self.there[k]
+        e = np.where(there, e, 0.0)
         g = gains(m, P, there)
         here = self.sight.part(slice(k, k + 1))
         c = here.c[0]
-        e = np.where(there, self.y[k] / self.s - m.C2 @ x - m.D2 @ self.u[k], 0.0)
         enter = self.steady.entering(g, predict=self.predict)
         n = x.size
         hat = c[:, :n] @ x + c @ (enter @ e) + here.D1[0] @ self.u[k]
         variance = self.steady.variances(here, P, g, predict=self.predict)[0]
         white = g.W @ e
-        C = m.C2 @ Z
-        before = self.found if Z.shape[1] else None
-        self._innovate(k, e, m.innovation(P), C, before)
         if self.keep:
             self.white[k] = white
         shown, seen = g.W @ C, c[:, :n] @ Z - c @ (enter @ (C * there[:, None]))
@@ -207,23 +249,28 @@ class _Walk:
     def _innovate(
         self, k: int, e: FloatArray, S: FloatArray, C: FloatArray, found: KnownParameters | None
     ) -> None:
-        """Record the innovation with what is known of delta before the measurement."""
-        there = np.flatnonzero(self.there[k])
+        """Record the innovation with what is known of delta before the measurement; gate it."""
+        there = self.there[k]
         self.innovations[k] = self.deviation[k] = self.whitened[k] = np.nan
         if C.shape[1]:
             if found is None:
                 return
-            extra = found.added(C)
+            known = there & np.isfinite(found.added(C))
             e = e - C @ found.value
-            known = there[np.isfinite(extra[there])]
             S = S + (C @ found.X) @ (C @ found.X).T
         else:
-            known = there
+            known = there.copy()
+        size = np.sqrt(S.diagonal())
+        beyond = known & (np.abs(e) > self.gate * size)
+        if np.any(beyond):
+            self._drop(k, beyond)  # from `there` as well
+            known &= ~beyond
         self.innovations[k, known] = (self.s * e)[known]
-        self.deviation[k, known] = (self.s * np.sqrt(S.diagonal()))[known]
-        if known.size == there.size and there.size:
-            root = np.linalg.cholesky(S[np.ix_(there, there)])
-            self.whitened[k, there] = np.linalg.solve(root, e[there])
+        self.deviation[k, known] = (self.s * size)[known]
+        if np.any(known) and np.all(known == there):
+            at = np.flatnonzero(known)
+            root = np.linalg.cholesky(S[np.ix_(at, at)])
+            self.whitened[k, at] = np.linalg.solve(root, e[at])
 
     def _settled(
         self, x: FloatArray, P: FloatArray, Z: FloatArray
@@ -263,7 +310,7 @@ class _Walk:
         length = fading.FIRST
         while k < until and Y.shape[1]:
             at = slice(k, min(k + length, until))
-            count = at.stop - k
+            count, first = at.stop - k, x
             x = self._steadily(at.start, at.stop, x)
             moved = fading.faded(self.steady.F, Y, count)
             C = m.C2 @ moved[:-1]
@@ -280,6 +327,10 @@ class _Walk:
             self.innovations[at] = e * self.s
             self.deviation[at] = self.s * np.sqrt(np.diagonal(S, axis1=1, axis2=2))
             self.whitened[at] = np.linalg.solve(np.linalg.cholesky(S), e[:, :, None])[:, :, 0]
+            cut = self._dropped(k, at.stop)
+            if cut < at.stop:  # the block up to there again; none when it is its first sample
+                x, until = first, cut
+                continue
             x = x + moved[-1] @ found.value[-1]
             Y = moved[-1] @ np.linalg.cholesky(found.covariance[-1])
             Y = fading.kept(self._weight[0], Y)

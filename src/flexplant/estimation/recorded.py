@@ -43,8 +43,8 @@ def recorded(records: Any, model: FilterModel) -> Recorded:
     ----------
     records : Response, mapping {channel: (N,) array} or data frame
         All sensors and commands by name; other channels are left aside. NaN and masked entries
-        are samples of a sensor that are missing. Times are its `time`, as an attribute or a channel; without any
-        the record starts at 0.
+        are samples of a sensor that are missing. Times are its `time`, as an attribute or a
+        channel; without any the record starts at 0.
     model : FilterModel
         Whose channels are wanted.
 
