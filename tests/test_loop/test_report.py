@@ -75,6 +75,23 @@ def machine(rng, springs):
     return num, den
 
 
+def test_the_margin_of_all_loops_is_that_of_the_side_where_they_are_broken():
+    """Two first-order loops, one coupled 20 times into the other: far apart at u and at y."""
+    G = StateSpace(-0.01 * np.eye(2), np.eye(2), [[1.0, 20.0], [0.0, 1.0]], np.zeros((2, 2)),
+                   inputs=["a", "b"], outputs=["p", "q"])  # fmt: skip
+    K = StateSpace([], [], [], -np.diag([1.0, 0.1]), inputs=["p", "q"], outputs=["a", "b"])
+    freq = np.geomspace(1e-4, 10.0, 4001)
+    response = frequency_response(G, freq)
+    P = np.moveaxis(response.data, 2, 0)
+    found = {}
+    for at, L in (("u", K.D @ P), ("y", P @ K.D)):
+        wanted = 1.0 / np.linalg.norm(np.linalg.inv(np.eye(2) - L), 2, axis=(1, 2)).max()
+        for plant in (G, response):
+            found[at] = report_loops((plant, K), at=at).modulus_margin
+            assert found[at] == pytest.approx(wanted, rel=1e-5)
+    assert found["y"] > 8.0 * found["u"]
+
+
 @pytest.mark.parametrize("springs", [0.0, (2 * np.pi * 2.0) ** 2, -((2 * np.pi * 2.0) ** 2)])
 def test_the_count_is_that_of_the_characteristic_polynomial(springs):
     """PID of many gains on machines with light modes; unstable ones among them."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -95,20 +95,26 @@ class BrokenLoop:
         return bool(np.max(edge, initial=-1.0) >= 0)
 
     @cached_property
-    def worst(self) -> tuple[float, float]:
-        """The largest sigma_max(S_u) and its frequency [Hz], over a grid refined at its peaks."""
+    def worst(self) -> Callable[[Side], tuple[float, float]]:
+        """The function of a side that gives the largest sigma_max(S) there, its frequency [Hz].
+
+        Over a grid refined at the peaks.
+        """
+        return cache(self._worst)
+
+    def _worst(self, at: Side) -> tuple[float, float]:
         if self.measured is not None:
-            return highest(self._size, self.measured, 0)
+            return highest(lambda freq: self.size(freq, at), self.measured, 0)
         grid = resonance_grid(self.poles(), self.dt, points=_POINTS, around=SOUGHT)
-        return highest(self._size, grid, 6)
+        return highest(lambda freq: self.size(freq, at), grid, 6)
 
-    def _size(self, freq: FloatArray) -> FloatArray:
-        return sensitivity_size(self.gain(freq))
+    def size(self, freq: FloatArray, at: Side = "u") -> FloatArray:
+        """Return sigma_max(S) at frequencies [Hz], a lower bound where it is not high."""
+        return sensitivity_size(self.gain(freq, at))
 
-    @property
-    def modulus_margin(self) -> float:
-        """``1 / max_f sigma_max(S_u)``; 0 when unstable."""
-        return 0.0 if self.is_unstable else 1.0 / self.worst[0]
+    def margin(self, at: Side = "u") -> float:
+        """Return ``1 / max_f sigma_max(S)``; 0 when unstable."""
+        return 0.0 if self.is_unstable else 1.0 / self.worst(at)[0]
 
 
 def inverted(L: ComplexArray) -> ComplexArray:

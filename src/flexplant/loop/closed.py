@@ -278,7 +278,7 @@ class ClosedLoop(Value):
         if not whole.is_stable:
             found = growing_modes(whole.monitored, states)
         else:
-            peak = whole.broken.worst[1]
+            peak = whole.broken.worst("u")[1]
             if high(margin, without):
                 found = growing_modes(whole.monitored, states, near=peak)
         sampled = bool(self.plant.dt)
@@ -291,7 +291,7 @@ class ClosedLoop(Value):
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
         loop's resonances. An unstable loop has none: 0.
         """
-        return self.broken.modulus_margin
+        return self.broken.margin()
 
     def rms(self, channel: str) -> float:
         """Return the stationary rms of a signal under all white noises, in closed form.

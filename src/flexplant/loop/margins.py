@@ -42,7 +42,7 @@ def modulus_margin(loop: Loop) -> float:
     >>> round(fx.modulus_margin(fx.close_loop(plant, observer, servo)), 2)
     0.57
     """
-    return taken_apart(loop).modulus_margin
+    return taken_apart(loop).margin()
 
 
 def bandwidth(loop: Loop) -> float:

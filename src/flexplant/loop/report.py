@@ -87,7 +87,7 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     loops : tuple of LoopMargins
         Of each channel where the loops are broken.
     modulus_margin : float
-        Of all together, ``1 / max sigma_max(S)``; 0 when unstable.
+        Of all together, ``1 / max sigma_max(S)`` with S where they are broken; 0 when unstable.
     unstable : int, optional
         Poles of the closed loop outside the stability region; None where that is not known.
     reason : str
@@ -202,7 +202,7 @@ def report_loops(
 
         return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
 
-    margin = 0.0 if count.unstable else 1.0 / parts.worst[0]
+    margin = 0.0 if count.unstable else 1.0 / parts.worst(at)[0]
     loops = tuple(one(i) for i in range(len(names)))
     return LoopReport(loops, margin, count.unstable, count.reason)
 
