@@ -168,10 +168,11 @@ def servo_bandwidth(
     """Return the largest bandwidth [Hz] at which `design_servo` keeps |S| at u below a peak.
 
     Plant and observer are swept once over a grid through their resonances; each bandwidth then
-    costs the closed form of the axis and small inverses, all frequencies at once. What is found is
-    stable by its eigenvalues and holds the peak by `modulus_margin`, with the modes left out too
-    where they are known. Bandwidths are tried in steps of 9 %, from the top down, then between the
-    first that holds and the one above it.
+    costs the closed form of the axis and small inverses, all frequencies at once. The loop is
+    broken at the plant's input, where `modulus_margin` breaks it: what the observer reads of u
+    stays closed. What holds there is accepted when it is stable by its eigenvalues and holds the
+    peak by `modulus_margin`, with the modes left out too where they are known. Bandwidths are tried
+    in steps of 9 %, from the top down, then between the first that holds and the one above it.
 
     Parameters
     ----------
@@ -189,7 +190,7 @@ def servo_bandwidth(
     AssumptionError, LabelError, ModelError
         As `design_servo`; ModelError when peak is not above 1.
     SolverError
-        When no bandwidth holds it.
+        When no bandwidth holds it; the message says what comes nearest, and what limits it.
 
     Examples
     --------

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import AssumptionError, FlexplantError, LabelError, counted
-from ..loop.broken import sensitivity_size
+from ..loop.broken import BrokenLoop, inverted
 from ..lti.grid import resonance_grid
 from ..lti.responses import responses
 from ..lti.statespace import StateSpace
@@ -31,32 +31,57 @@ _QUIET = 0.3
 
 @dataclass(frozen=True)
 class ServoLoop:
-    """``S_u = (I + c(f) T_u G(f))^-1``: c of an axis, G from u to the estimates, T_u decoupling.
+    """The loop of a servo over frequency, broken where `ClosedLoop.broken` breaks it.
+
+    ``u = -c (T_u E_y y + T_u E_u u)``: c of an axis, E of the observer, which may read u too; T_u
+    decouples. The plant moves y, so that only the path through y is broken, the other stays closed.
 
     Parameters
     ----------
     freq : (n_freq,) array [Hz]
         A grid through the resonances.
-    through : (n_freq, m, m) complex array
-        T_u G at these frequencies.
+    moved, own : (n_freq, m, m) complex array
+        ``T_u E_y P`` and ``T_u E_u`` there; own is None of an observer that does not read u.
     modes : (k,) array [Hz]
         Elastic modes of the plant at which a notch may be placed.
+    plant : StandardPlant
+        Of which u and their units are taken.
     """
 
     freq: FloatArray
-    through: ComplexArray
+    moved: ComplexArray
+    own: ComplexArray | None
     modes: FloatArray
+    plant: StandardPlant
 
-    def peak(self, axis: Axis) -> float:
-        """Return max_f sigma_max(S_u) over the grid; of an unstable loop too, so check that."""
-        gain = axis.response(self.freq)
-        return float(sensitivity_size(-gain[:, None, None] * self.through).max())
+    def broken(self, axis: Axis) -> BrokenLoop:
+        """Return the loop of an axis on the grid, y seen as the u that it calls for."""
+        u = self.plant.u
+
+        def act(freq: FloatArray) -> ComplexArray:
+            c = axis.response(freq)[:, None, None]
+            if self.own is None:
+                return np.asarray((-c * np.eye(len(u))).transpose(1, 2, 0))
+            return np.asarray((-c * inverted(-c * self.own)).transpose(1, 2, 0))
+
+        return BrokenLoop(
+            u, u, act, lambda freq: self.moved.transpose(1, 2, 0),
+            lambda: np.zeros(0, dtype=complex), self.plant.dt, self.freq, self.plant.units,
+        )  # fmt: skip
+
+    def peak(self, axis: Axis) -> tuple[float, float]:
+        """Return max_f sigma_max(S_u) over the grid and its frequency [Hz].
+
+        Of an unstable loop too, so check that.
+        """
+        return self.broken(axis).worst("u")
 
     @cached_property
     def _near(self) -> FloatArray:
-        """Size of T_u G beside each mode (n_freq, k), elsewhere 0."""
+        """Size of T_u E beside each mode (n_freq, k), elsewhere 0."""
         near = np.abs(self.freq[:, None] - self.modes) <= 0.02 * self.modes
-        return np.asarray(near * np.linalg.norm(self.through, axis=(1, 2))[:, None])
+        through = self.moved if self.own is None else self.moved + self.own
+        return np.asarray(near * np.linalg.norm(through, axis=(1, 2))[:, None])
 
     def resonant(self, axis: Axis) -> FloatArray:
         """Return the modes [Hz] whose resonances have loop gain, the largest first."""
@@ -72,7 +97,7 @@ class ServoLoop:
         largest gain the one whose notch lowers the peak most. In a stable loop a notch that gains
         nothing is not placed.
         """
-        peak = self.peak(axis)
+        peak = self.peak(axis)[0]
         for _ in range(_NOTCHES):
             if peak <= TARGET and stable(axis):
                 break
@@ -80,7 +105,7 @@ class ServoLoop:
             tried = [axis.with_notch(freq) for freq in left]
             if not tried:
                 break
-            peaks = [self.peak(one) for one in tried]
+            peaks = [self.peak(one)[0] for one in tried]
             best = 0 if peak <= TARGET else int(np.argmin(peaks))
             if TARGET < peak < peaks[best] / _GAIN and stable(axis):
                 break
@@ -117,26 +142,24 @@ def servo_loop(
 
     It is decoupled, and has notches, by what is known to the design: a plant of fewer modes.
     """
-    hats = [poi.derived(axis, "hat") for axis in poi.axes]
-    rate = 1.0 / plant.dt
+    hats = tuple(poi.derived(axis, "hat") for axis in poi.axes)
     poles = plant.system.poles()
     if observer is not None:
         poles = np.concatenate([poles, observer.poles()])
     grid = resonance_grid(poles, plant.dt, points=300)
-    grid = grid[grid < 0.5 * rate * (1.0 - 1e-6)]
+    grid = grid[grid < 0.5 / plant.dt * (1.0 - 1e-6)]
+    T_u = decoupling(known, poi)
     if observer is None:
         seen = [poi.channel(axis) for axis in poi.axes]
-        G = _stacked(plant.system.select(seen, plant.u), grid)
-    else:
-        read = [name for name in observer.inputs if name in plant.y]
-        given = [name for name in observer.inputs if name in plant.u]
-        estimate = _stacked(observer.select(hats), grid)
-        P = _stacked(plant.system.select(read, plant.u), grid)
-        places = [observer.inputs.index(name) for name in read]
-        G = estimate[:, :, places] @ P
-        columns = [plant.u.index(name) for name in given]
-        G[:, :, columns] += estimate[:, :, [observer.inputs.index(name) for name in given]]
-    return ServoLoop(grid, decoupling(known, poi) @ G, elastic(known))
+        P = _stacked(plant.system.select(seen, plant.u), grid)
+        return ServoLoop(grid, T_u @ P, None, elastic(known), plant)
+    read = [name for name in observer.inputs if name in plant.y]
+    given = [name for name in observer.inputs if name in plant.u]
+    estimate = T_u @ _stacked(observer.select(hats, [*read, *given]), grid)
+    moved = estimate[:, :, : len(read)] @ _stacked(plant.system.select(read, plant.u), grid)
+    own = np.zeros_like(moved)
+    own[:, :, [plant.u.index(name) for name in given]] = estimate[:, :, len(read) :]
+    return ServoLoop(grid, moved, own if given else None, elastic(known), plant)
 
 
 def _stacked(system: StateSpace, grid: FloatArray) -> ComplexArray:
