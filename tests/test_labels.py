@@ -253,3 +253,20 @@ def test_the_caller_s_arrays_stay_the_caller_s():
     nodes[0], xyz[0, 0] = 9, 9
     assert dofs.labels == ("1:z",)
     assert dofs.xyz[0, 0] == 0
+
+
+@pytest.mark.parametrize("count", [8, 3000])
+def test_rotations_of_a_solid_are_those_of_its_points(count):
+    """Displacements alone: a rotation that is named leads to where it can be had."""
+    nodes = np.repeat(np.arange(1, count + 1), 3)
+    dofs = DofSet(nodes, ["x", "y", "z"] * count, np.zeros((3 * count, 3)))
+    for asked in (
+        lambda: dofs.index("5:rx"),
+        lambda: dofs.row((0.0, 0.0, 0.0), "ry"),
+        lambda: dofs.where(directions="rz"),
+    ):
+        with pytest.raises(LabelError, match=r"no DOF .* displacements.*flexplant\.interpolated"):
+            asked()
+    with pytest.raises(LabelError, match="no DOF") as found:
+        dofs.index("999999:rx")
+    assert "interpolated" not in str(found.value)

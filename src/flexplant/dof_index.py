@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -15,6 +15,7 @@ from .values import FloatArray, IntArray
 
 #: of so many labels the closest are found by comparing each with the one that is unknown
 _COMPARABLE = 2000
+_ROTATIONS = frozenset(DIRECTIONS[3:])
 
 
 class DofIndex:
@@ -81,14 +82,31 @@ class DofIndex:
 
 def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) -> LabelError:
     """Return the error for a label that is not there, without comparing it with a million."""
+    number = re.match(r"-?\d{1,15}", str(label).rpartition("/")[2])
+    if number is not None:
+        own = [label_of(row) for row in np.flatnonzero(nodes == int(number.group())).tolist()]
+        asked = str(label).rpartition(":")[2]
+        if hint := rotation_hint([asked], [name.rpartition(":")[2] for name in own]):
+            return LabelError(f"no DOF {label!r}, at its node there are {', '.join(own)}. {hint}")
     if nodes.size <= _COMPARABLE:
         return unknown_label("DOF", label, [label_of(row) for row in range(nodes.size)])
-    number = re.match(r"-?\d{1,15}", str(label).rpartition("/")[2])
     near = int(number.group()) if number else int(nodes[0])
     rows = np.argsort(np.abs(nodes - near), kind="stable")[:6].tolist()
     listed = ", ".join(repr(label_of(row)) for row in rows)
     return LabelError(
         f"no DOF {label!r} ({nodes.size} known). At the nodes next to it there are: {listed}."
+    )
+
+
+def rotation_hint(wanted: Iterable[str], there: Iterable[str]) -> str:
+    """Return where rotations are had of nodes that only have displacements, as of solids."""
+    present = set(there)
+    if not present or present & _ROTATIONS or not set(wanted) & _ROTATIONS:
+        return ""
+    turn = min(set(wanted) & _ROTATIONS)
+    return (
+        "Its nodes only have displacements, as those of solids do: the rotation of a point, "
+        f"at=(x, y, z) along {turn!r}, is that of flexplant.interpolated(model)."
     )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from .dof_columns import columns_of, component_columns, direction_names, listed, node_numbers
-from .dof_index import DofIndex, in_box, unknown_dof
+from .dof_index import DofIndex, in_box, rotation_hint, unknown_dof
 from .errors import LabelError, ShapeError, counted, require_known, unknown_label
 from .places import DIRECTIONS as DIRECTIONS
 from .places import Interpolation as Interpolation
@@ -269,7 +269,8 @@ class DofSet(Value):
             absent = sorted(str(d) for d in named - set(self.directions))
             if absent:
                 raise LabelError(
-                    f"no DOF in directions {absent}: {self!r}. Use those that are there."
+                    f"no DOF in directions {absent}: {self!r}. "
+                    + (rotation_hint(absent, self.directions) or "Use those that are there.")
                 )
             keep &= np.isin(self.kinds, [DIRECTIONS.index(direction) for direction in named])
         if box is not None:
@@ -309,7 +310,8 @@ class DofSet(Value):
         rows = np.flatnonzero((self.kinds == kind) & self._owned(component))
         if not rows.size:
             raise LabelError(
-                f"no DOF in direction {direction!r}: {self!r}. Choose one that is there."
+                f"no DOF in direction {direction!r}: {self!r}. "
+                + (rotation_hint([direction], self.directions) or "Choose one that is there.")
             )
         point = real_array(xyz, "xyz", (3,))
         distance = np.linalg.norm(self.xyz[rows] - point, axis=1)

@@ -1,5 +1,6 @@
 """Universal files: written by pyuff and by hand, with signs, units, gaps and damage."""
 
+import re
 import sys
 import warnings
 from pathlib import Path
@@ -296,6 +297,23 @@ def test_modes_that_do_not_belong_together(tmp_path):
         read_modes_uff(written(tmp_path, [shape(1), shape(1)]))
     with pytest.raises(FlexplantError, match="no mode shapes"):
         read_modes_uff(written(tmp_path, [units()]))
+
+
+@pytest.mark.parametrize("binary", [0, 1])
+def test_a_file_cut_within_a_dataset_says_so(tmp_path, binary):
+    """Wherever it was cut: pyuff reads the datasets before it as if there were no others."""
+    some = [units(), nodes(15), nodes(2411, node_nums=[4, 9]), shape(1), shape(2)]
+    some.append(record((2, 3), (2, 3), DATA[(2, 3), (2, 3)], binary=binary))
+    path = written(tmp_path, some)
+    content, whole = path.read_bytes(), len(read_modes_uff(path))
+    assert whole == 2
+    ends = [found.end() for found in re.finditer(rb"    -1\r?\n", content)][1::2]
+    for end, start in zip(ends, [0, *ends], strict=False):
+        for cut in np.linspace(start + 8, end - 2, 7).astype(int):
+            path.write_bytes(content[:cut])
+            for read in (read_modes_uff, read_nodes_uff, read_frf_uff):
+                with pytest.raises(FlexplantError, match=r"is cut off: dataset .* has no end"):
+                    read(path)
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="needs the data of /work/shared")

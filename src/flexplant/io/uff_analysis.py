@@ -163,8 +163,6 @@ def _blocks(path: Path) -> Iterator[tuple[int, list[bytes]]]:
             if lines and lines[0].strip() == b"2414":
                 yield place, lines[1:]
             lines = None
-    if lines and lines[0].strip() == b"2414":
-        raise damaged(path, f"dataset {place} (type 2414) has no end", "Export it again.")
 
 
 def _parsed(lines: list[bytes], place: int, path: Path) -> AnalysisData | None:

@@ -52,6 +52,7 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
     if start.split()[:1] != [b"-1"]:
         what = f"is no universal file: it begins with {start[:20]!r}, not with -1"
         raise refused(path, what, "Export it as one, .uff or .unv.")
+    _check_end(file_path(path))
     found = []
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # NumPy's of what pyuff calls
@@ -71,6 +72,26 @@ def datasets(path: str | Path, kinds: tuple[int, ...]) -> list[dict[str, Any]]:
                 _check_58(part, path, place)
             found.append(part)
     return found
+
+
+def _check_end(path: Path) -> None:
+    """Refuse a file that ends within a dataset: pyuff passes over what has no end.
+
+    Lines of -1, in columns 5 and 6, begin and end each dataset, right behind the bytes of a binary
+    one (58b); its type stands in the second line.
+    """
+    place, inside, kind = 0, False, ""
+    with path.open("rb") as file:
+        for line in file:
+            text = line.rstrip()
+            if text != b"    -1" and not (kind.endswith("b") and text.endswith(b"    -1")):
+                continue
+            inside = not inside
+            kind = file.readline().strip().decode("latin-1").partition(" ")[0] if inside else ""
+            place += inside
+    if inside:
+        which = f"dataset {place} of type {short(kind)}" if kind else f"dataset {place}"
+        raise refused(path, f"is cut off: {which} has no end", "Export it, or copy it, again.")
 
 
 def _damaged(path: str | Path, what: str, error: object) -> FlexplantError:
