@@ -154,6 +154,29 @@ def test_the_report_can_fail(plate):
     assert shifted.frf_error.max() == pytest.approx(0.5, rel=0.01)
 
 
+@pytest.mark.parametrize("method", [ModalTruncation(24, inputs=KEPT), ModalBalanced(24, KEPT)])
+def test_a_bound_of_some_modes_says_so(plate, method):
+    """Of 24 modes solved none is left out: the bound of what is, 0, says nothing of the others."""
+    modes = solve_modes(plate, count=24, damping=LOW)
+    model = reduce(modes, method)
+    assert (model.bound.value, model.bound.covers) == (0.0, 24)
+    assert "of the 24 modes solved alone" in repr(model.bound)
+    found = model.quality(plate, band=BAND)
+    assert found.true_error > 1e-12
+    assert not found.bounded
+    assert found.holds
+    assert "of the 24 modes solved: others add to the error" in repr(found)
+    assert "BROKEN" not in repr(found)
+    among = model.quality(modes, band=BAND)
+    assert among.bounded
+    assert reduce(solve_modes(plate, damping=LOW), method).bound.covers is None
+    # beside these modes it is a bound, which a wrong model breaks
+    fewer = reduce(modes, method.replace(count=9))
+    assert fewer.quality(modes, band=BAND).holds
+    wrong = fewer.replace(M=fewer.M * 2.0, K=fewer.K * 2.0).quality(modes, band=BAND)
+    assert "BROKEN" in repr(wrong)
+
+
 def test_modes_without_a_partner_are_said(plate):
     model = reduce(plate, ModalBalanced(8, "13:z", damping=LOW))  # torsion is not seen there
     found = model.quality(plate, band=BAND)

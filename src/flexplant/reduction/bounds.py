@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..errors import counted
-from ..values import FloatArray, Value, name_list, positive, real_array
+from ..values import FloatArray, Value, name_list, positive, real_array, whole
 from .ranking import peak_gains
 
 
@@ -29,6 +29,9 @@ class ErrorBound(Value):
         by mode; they make the bound below a frequency.
     static : float [m/N], optional
         What is missed at 0 Hz, exactly.
+    covers : int, optional
+        How many modes of the structure it covers, where only some were solved: the error of a
+        reduction of these. What others add is not in it. None: all modes.
 
     Examples
     --------
@@ -46,6 +49,7 @@ class ErrorBound(Value):
     rule: str
     terms: FloatArray | None = field(default=None, kw_only=True)
     static: float | None = field(default=None, kw_only=True)
+    covers: int | None = field(default=None, kw_only=True)
 
     def __post_init__(self) -> None:
         self._set(
@@ -54,13 +58,17 @@ class ErrorBound(Value):
             outputs=name_list(self.outputs, "outputs"),
             terms=None if self.terms is None else real_array(self.terms, "terms", (None, 3)),
             static=None if self.static is None else positive(self.static, "static", zero=True),
+            covers=None if self.covers is None else whole(self.covers, "covers"),
         )
 
     def __repr__(self) -> str:
+        some = (
+            "" if self.covers is None else f", of the {counted(self.covers, 'mode')} solved alone"
+        )
         return (
             f"<ErrorBound {self.value:.4g} m/N, {counted(len(self.inputs), 'input')} to "
             f"{len(self.outputs)} "
-            f"outputs: {self.rule}>"
+            f"outputs: {self.rule}{some}>"
         )
 
     def below(self, freq: float) -> float:

@@ -102,6 +102,8 @@ def quality_of(
         full_error=np.nan if responses.check is None else responses.check.worst,
         route=str(responses),
         bound=bound,
+        bounded=bound is not None
+        and (bound.covers is None or (isinstance(full, Modes) and full.n_modes <= bound.covers)),
     )
 
 

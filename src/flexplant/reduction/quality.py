@@ -58,6 +58,9 @@ class ReductionQuality(Value):
         against Modes.
     bound : ErrorBound, optional
         The a-priori bound of the method, when it is of these channels.
+    bounded : bool
+        Whether the bound covers all modes that were compared with: that of a reduction of some
+        modes says nothing of the others of a model.
 
     Examples
     --------
@@ -88,6 +91,7 @@ class ReductionQuality(Value):
     route: str
     full_error: float = np.nan
     bound: ErrorBound | None = None
+    bounded: bool = True
 
     @property
     def alike(self) -> tuple[tuple[int, ...], ...]:
@@ -106,8 +110,11 @@ class ReductionQuality(Value):
 
     @property
     def holds(self) -> bool:
-        """Whether the true error at the check frequencies is within the bound, if there is one."""
-        limit = self.band_bound
+        """Whether the true error at the check frequencies is within the bound, if there is one.
+
+        A bound that does not cover all modes that were compared with is none (`bounded`).
+        """
+        limit = self.band_bound if self.bounded else None
         return limit is None or self.true_error <= limit * (1 + 1e-9)
 
     def __repr__(self) -> str:
@@ -141,6 +148,10 @@ class ReductionQuality(Value):
                     f"{self.check_freq[-1]:.4g} Hz ({self.bound.value:.3g} at all)"
                     + ("" if self.holds else ": BROKEN")
                 )
+                if not self.bounded:
+                    lines[-1] += (
+                        f", of the {self.bound.covers} modes solved: others add to the error"
+                    )
             lines.append(f"by {self.route}")
         return "\n  ".join(lines) + ">"
 

@@ -56,7 +56,8 @@ class ModalTruncation(ReductionMethod):
     -----
     From `Modes`, what is truncated is what is left of them (their attachment vectors included),
     and the bound is the sum over it of ``||c|| ||b|| / (2 zeta sqrt(1 - zeta^2) omega^2)``, each
-    mode's own peak. From an FEModel with one damping ratio for all, it covers all modes of the
+    mode's own peak: it covers the modes that were solved (`ErrorBound.covers`), what the others add
+    is not in it. From an FEModel with one damping ratio for all, it covers all modes of the
     structure unseen: by Cauchy-Schwarz the sum is at most ``sqrt(tr(C G C') tr(B' G B)) / (2 zeta
     sqrt(1 - zeta^2))``, G the residual flexibility of one static solution. With `static_at`, the
     peaks of the vectors are added. Over a band, modes above it are far from their peaks:
@@ -203,8 +204,9 @@ class ModalBalanced(ReductionMethod):
 
     Notes
     -----
-    The bound is the sum of the neglected modes' own peaks, exact for one neglected mode; over a
-    band `ErrorBound.below(freq)` is tighter. Twice the
+    The bound is the sum of the neglected modes' own peaks, exact for one neglected mode, of those
+    that were solved (`ErrorBound.covers`: with `among`, or from `Modes`, not all); over a band
+    `ErrorBound.below(freq)` is tighter. Twice the
     sum of neglected Hankel values [Glover1984]_ bounds the truncation of the exactly balanced
     model (`flexplant.balanced`), which is no second-order model; `rank_modes(...).exact` has them.
 
@@ -299,7 +301,8 @@ def truncated(
         terms = np.vstack([terms, vectors])
         value = _peaks(terms)
         if np.isfinite(value):
-            bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest)
+            covers = modes.n_modes if modes.n_modes < len(modes.dofs) else None
+            bound = ErrorBound(value, into, out, _SUM, terms=terms, static=at_rest, covers=covers)
     found = _diagonal(kept, [f"mode {i}" for i in numbers], method, bound)
     return found.replace(truncated=_left_out(modes, columns))
 
