@@ -132,6 +132,29 @@ def test_variances_of_responses_give_that_of_the_machine(part):
     np.testing.assert_allclose(found.variance, wanted, rtol=1e-3)
 
 
+def test_an_extended_interface_uses_all_channels_of_what_is_known():
+    """Inner channels of the frame say what goes through its joints, also without pairs."""
+    parts = {name: measured(name) for name in CHANNELS}
+    whole = fx.joined(parts, JOINTS[:2])
+    rest = fx.uncoupled(whole, {"frame": parts["frame"]}, JOINTS[:2], extended=True)
+    plain = fx.uncoupled(whole, {"frame": parts["frame"]}, JOINTS[:2])
+    np.testing.assert_allclose(rest.data, parts["stage"].data, rtol=1e-5)
+    np.testing.assert_allclose(plain.data, parts["stage"].data, rtol=1e-5)
+    uneven = whole.select(outputs=[name for name in whole.outputs if name != "frame/12:z"])
+    rest = fx.uncoupled(uneven, {"frame": parts["frame"]}, JOINTS[:2], extended=True)
+    np.testing.assert_allclose(rest.data, parts["stage"].data, rtol=1e-5)
+    # the variance is that of the errors, to first order, of least squares too
+    factor = np.eye(len(whole.outputs))
+    known = {"frame": parts["frame"]}
+    found = fx.uncoupled(stated(whole, factor), known, JOINTS[:2], extended=True)
+    left = fx.uncoupled(whole, known, JOINTS[:2], extended=True)
+    wanted = sum(
+        np.abs(fx.uncoupled(frf, known, JOINTS[:2], extended=True).data - left.data) ** 2
+        for frf in perturbed(whole, factor)
+    )
+    np.testing.assert_allclose(found.variance, wanted, rtol=1e-2)
+
+
 def test_a_difference_below_its_errors_is_warned_of():
     """A stage of 1 kg on a frame of 1000: its response is lost in 1 % of the others'."""
     free = lambda m: -1 / (m * (2 * np.pi * FREQ) ** 2)[None, None]  # noqa: E731

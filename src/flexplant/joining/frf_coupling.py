@@ -77,6 +77,7 @@ def uncoupled(
     joints: Iterable[Joint] | Joint,
     *,
     dofs: Mapping[str, DofSet] | None = None,
+    extended: bool = False,
 ) -> Frf:
     """Return the responses of a machine without some of its components.
 
@@ -101,6 +102,10 @@ def uncoupled(
         How they are joined to the rest.
     dofs : mapping {str: DofSet}, optional
         Where the channels of components are, known or not: for patches and lever arms.
+    extended : bool
+        Extend the interface to all channels of the known components that the machine has too, as
+        outputs or inputs: more equations, solved by least squares of the rank of the joints. They
+        help where the joints alone hardly say what goes through them, and need no matched pairs.
 
     Returns
     -------
@@ -122,7 +127,7 @@ def uncoupled(
 
     References
     ----------
-    [VoormeerenRixen2012]_.
+    [VoormeerenRixen2012]_, extended interfaces too.
 
     Examples
     --------
@@ -152,7 +157,8 @@ def uncoupled(
     whole = {"": machine, **{f"{_KNOWN}{name}/": frf for name, frf in known.items()}}
     Y = side_by_side(whole, {name: -1.0 if name else 1.0 for name in whole})
     kept = np.array(kept_out), np.array(kept_in)
-    data, error = _coupled(Y, links, machine.freq, machine.quantity, kept)
+    more = _shared(Y, known) if extended else None
+    data, error = _coupled(Y, links, machine.freq, machine.quantity, kept, more)
     variance = None if Y.variance is None else error
     done = "the answer is a small difference of the machine and what is taken out"
     warn_of_errors(data, error, machine.freq, known=variance is not None, done=done)
@@ -213,8 +219,11 @@ def _coupled(
     freq: FloatArray,
     quantity: str | None,
     kept: tuple[IntArray, IntArray],
+    more: tuple[FloatArray, FloatArray] | None = None,
 ) -> tuple[ComplexArray, FloatArray]:
     """Return ``Y - Y B_f^T (B Y B_f^T + Z)^-1 B Y`` between kept channels, and its variance.
+
+    With `more` rows of B and B_f, of rigid joints alone, the inverse is that of the rank of these.
 
     To first order an error dY of the parts becomes ``(I - Y B_f^T S^-1 B) dY (I - B_f^T S^-1 B Y)``
     with S the inverted matrix. Where no variance is known, |dY| is as large as Y.
@@ -230,14 +239,27 @@ def _coupled(
     Z = softness(links, freq, quantity)
     chosen = independent(B_out, links)
     B_out, B_in, Z = B_out[chosen], B_in[chosen], Z[chosen]
+    rank = len(chosen)
+    give = Z.T[:, :, None] * np.eye(rank)
+    if more is not None:
+        B_out, B_in = np.vstack([B_out, more[0]]), np.vstack([B_in, more[1]])
+        give = np.zeros((freq.size, len(B_out), len(B_in)))
     lines = np.moveaxis(Y, 2, 0)
     gap, load = B_out @ lines, lines @ B_in.T
-    stretch = gap @ B_in.T + Z.T[:, :, None] * np.eye(len(chosen))
+    stretch = gap @ B_in.T + give
     # of unlike units: displacements and rotations
-    size = np.sqrt(np.abs(np.einsum("fii->fi", stretch)))
-    size = np.where(size > 0, size, 1.0)
-    scaled = stretch / size[:, :, None] / size[:, None, :]
-    condition = np.linalg.cond(scaled)
+    if more is None:
+        above = below = np.sqrt(np.abs(np.einsum("fii->fi", stretch)))
+    else:  # a channel that the joints hardly move is rounding: what it does itself is its size
+        own = np.abs(B_out) @ np.abs(lines) @ np.abs(B_in.T)
+        most_of = np.sqrt(own.max(axis=(1, 2)))[:, None]
+        above, below = own.max(axis=2) / most_of, own.max(axis=1) / most_of
+    above, below = (np.where(size > 0, size, 1.0) for size in (above, below))
+    scaled = stretch / above[:, :, None] / below[:, None, :]
+    left_part, values, right_part = np.linalg.svd(scaled, full_matrices=False)
+    left_part, values, right_part = left_part[:, :, :rank], values[:, :rank], right_part[:, :rank]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        condition = np.nan_to_num(values[:, 0] / values[:, -1], nan=np.inf)
     worst = int(np.argmax(condition))
     if not condition[worst] < _CONDITION:
         said = (
@@ -248,9 +270,28 @@ def _coupled(
         if not condition[worst] < _SINGULAR:
             raise ModelError(said)
         warn(said)
-    forces = np.linalg.solve(scaled, gap / size[:, :, None]) / size[:, :, None]
+    turned, back = (np.swapaxes(part, 1, 2).conj() for part in (right_part, left_part))
+    inverse = (turned / values[:, None]) @ back / below[:, :, None] / above[:, None, :]
+    forces = inverse @ gap
     found = lines - load @ forces
-    # what opens is what springs and dampers give way, and nothing of rigid joints
+    if more is None:
+        _check_gap(B_out, lines, load, found, forces, Z)
+    motions = load[:, rows] @ inverse
+    left_of = np.eye(len(outputs))[rows] - motions @ B_out
+    right_of = np.eye(len(inputs))[:, columns] - B_in.T @ forces[:, :, columns]
+    error = variance_of(size_of_error, parts.correlation, left_of, right_of)
+    return np.moveaxis(found, 0, 2)[np.ix_(rows, columns)], error
+
+
+def _check_gap(
+    B_out: FloatArray,
+    lines: ComplexArray,
+    load: ComplexArray,
+    found: ComplexArray,
+    forces: ComplexArray,
+    Z: ComplexArray,
+) -> None:
+    """Refuse joints that stay open: what opens is what springs and dampers give way."""
     left = np.abs(B_out @ found - Z.T[:, :, None] * forces)
     most = np.abs(B_out) @ (np.abs(lines) + np.abs(load) @ np.abs(forces))
     if not np.all(left <= _GAP * most):
@@ -258,12 +299,21 @@ def _coupled(
             f"the coupled responses leave a gap of {float((left / most).max()):.2g} in a joint "
             f"(limit {_GAP:g}): the interface is too badly conditioned. Join fewer channels."
         )
-    pushed = np.swapaxes(load[:, rows] / size[:, None, :], 1, 2)
-    motions = np.swapaxes(np.linalg.solve(np.swapaxes(scaled, 1, 2), pushed), 1, 2)
-    left_of = np.eye(len(outputs))[rows] - (motions / size[:, None, :]) @ B_out
-    right_of = np.eye(len(inputs))[:, columns] - B_in.T @ forces[:, :, columns]
-    error = variance_of(size_of_error, parts.correlation, left_of, right_of)
-    return np.moveaxis(found, 0, 2)[np.ix_(rows, columns)], error
+
+
+def _shared(Y: Side, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
+    """Return rows over outputs and over inputs for channels that the machine and its parts have."""
+    found = []
+    for names in (Y.outputs, Y.inputs):
+        rows = []
+        for i, name in enumerate(names):
+            own = f"{_KNOWN}{name}"
+            if name.partition("/")[0] in known and own in names:
+                row = np.zeros(len(names))
+                row[i], row[names.index(own)] = 1.0, -1.0
+                rows.append(row)
+        found.append(np.array(rows).reshape(-1, len(names)))
+    return found[0], found[1]
 
 
 def _listed(joints: Any) -> list[Any]:
