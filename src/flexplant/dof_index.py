@@ -85,8 +85,8 @@ def unknown_dof(label: object, nodes: IntArray, label_of: Callable[[int], str]) 
     number = re.match(r"-?\d{1,15}", str(label).rpartition("/")[2])
     if number is not None:
         own = [label_of(row) for row in np.flatnonzero(nodes == int(number.group())).tolist()]
-        asked = str(label).rpartition(":")[2]
-        if hint := rotation_hint([asked], [name.rpartition(":")[2] for name in own]):
+        wanted = str(label).rpartition(":")[2]
+        if hint := rotation_hint([wanted], [name.rpartition(":")[2] for name in own]):
             return LabelError(f"no DOF {label!r}, at its node there are {', '.join(own)}. {hint}")
     if nodes.size <= _COMPARABLE:
         return unknown_label("DOF", label, [label_of(row) for row in range(nodes.size)])

@@ -12,7 +12,7 @@ from ..errors import CertificateError, LabelError, ModelError, warn
 from ..labels import DofSet
 from ..lti import Frf
 from ..values import ComplexArray, FloatArray, IntArray, instance
-from .frf_errors import Side, side_by_side, variance_of, warn_of_errors
+from .frf_errors import MeasuredParts, side_by_side, variance_of, warn_of_errors
 from .frf_joints import (
     FrfLink,
     channel_rows,
@@ -214,7 +214,7 @@ def _taken_out(
 
 
 def _coupled(
-    parts: Side,
+    parts: MeasuredParts,
     links: Sequence[FrfLink],
     freq: FloatArray,
     quantity: str | None,
@@ -240,10 +240,10 @@ def _coupled(
     chosen = independent(B_out, links)
     B_out, B_in, Z = B_out[chosen], B_in[chosen], Z[chosen]
     rank = len(chosen)
-    give = Z.T[:, :, None] * np.eye(rank)
+    give: Any = Z.T[:, :, None] * np.eye(rank)
     if more is not None:
         B_out, B_in = np.vstack([B_out, more[0]]), np.vstack([B_in, more[1]])
-        give = np.zeros((freq.size, len(B_out), len(B_in)))
+        give = 0.0
     lines = np.moveaxis(Y, 2, 0)
     gap, load = B_out @ lines, lines @ B_in.T
     stretch = gap @ B_in.T + give
@@ -301,7 +301,7 @@ def _check_gap(
         )
 
 
-def _shared(Y: Side, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
+def _shared(Y: MeasuredParts, known: Mapping[str, Frf]) -> tuple[FloatArray, FloatArray]:
     """Return rows over outputs and over inputs for channels that the machine and its parts have."""
     found = []
     for names in (Y.outputs, Y.inputs):

@@ -15,7 +15,7 @@ from ..values import ComplexArray, FloatArray
 _USUAL = 0.01
 
 
-class Side(NamedTuple):
+class MeasuredParts(NamedTuple):
     """Responses side by side, block-diagonal: with their signs, errors and names of channels."""
 
     data: ComplexArray
@@ -25,7 +25,7 @@ class Side(NamedTuple):
     inputs: list[str]
 
 
-def side_by_side(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> Side:
+def side_by_side(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> MeasuredParts:
     """Return responses in one matrix, channels behind the prefixes that name them.
 
     A response without a variance has none: computed ones have no errors.
@@ -47,7 +47,7 @@ def side_by_side(frfs: Mapping[str, Frf], signs: Mapping[str, float]) -> Side:
         row, column = rows.stop, columns.stop
     measured = any(frf.variance is not None for frf in frfs.values())
     correlated = measured and any(frf.correlation is not None for frf in frfs.values())
-    return Side(
+    return MeasuredParts(
         data, variance if measured else None, correlation if correlated else None, outputs, inputs
     )
 
