@@ -85,7 +85,8 @@ def counted(number: int, noun: str) -> str:
 def warn(said: str) -> None:
     """Warn with a FlexplantWarning, at the line outside this package that led there."""
     level, frame = 2, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(__package__):
+    inner = (__package__, "contextlib")  # that of decorators
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").startswith(inner):
         level, frame = level + 1, frame.f_back
     warnings.warn(said, FlexplantWarning, level)
 

@@ -11,6 +11,7 @@ from test_robust import one_state
 
 from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import consistency, design_kalman
+from flexplant.estimation.innovation_spectrum import parts_of
 from flexplant.estimation.whiteness import cumulative_periodogram, ljung_box, spectrum_of
 from flexplant.plant import assemble_plant
 from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
@@ -44,10 +45,16 @@ def recorded(truth, steps=20000, seed=1):
     return channels | {u: np.zeros(steps) for u in truth.u}, motions
 
 
-def judged(design, truth, **options):
-    observer = design_kalman(design, larger=design)
+def judged(design, truth, larger=None, **options):
+    observer = design_kalman(design, larger=design if larger is None else larger)
     records, motions = recorded(truth, **options)
     return consistency(observer, observer.estimate(records), truth=motions)
+
+
+def quiet_plant(chosen):
+    """Some of 40 modes, with sensors that see those above half the rate."""
+    own = ports(asd=1e-3, sensor_asd=3e-12)
+    return assemble_plant(modes(3e-3, 40).select(chosen), own).discretized(RATE, delay=1)
 
 
 @pytest.mark.slow
@@ -109,6 +116,94 @@ def test_a_truncated_model_is_named():
     assert found.cause == "truncation"
     assert "above all modes" in found.text
     assert found.peaks[0][0] == pytest.approx(modes(1e-2, 9).freq[8], rel=0.03, abs=0)
+
+
+@pytest.mark.parametrize("more", [2, pytest.param(15, marks=pytest.mark.slow)])
+def test_modes_left_out_beside_a_kept_one_are_no_change_of_it(more):
+    """Modes 9 and 10 are a pair, mode 11 lies 1 % above: what shows is near mode 9, kept."""
+    blind = judged(machine(), plant(count=9 + more))
+    assert blind.causes == ("truncation",)
+    assert "near mode 9" not in blind.text or "no change of" in blind.text
+    known = judged(machine(), plant(count=9 + more), larger=modes(1e-2, 9 + more))
+    assert known.causes == ("truncation",)
+    assert f"the plant is right, they are coloured by the {more} modes left out" in known.text
+    assert "its predicted errors hold" in known.text
+
+
+def test_a_folded_mode_beside_a_kept_one_is_named():
+    """Modes at 4456 Hz appear at 456 Hz, beside mode 6 at 463 Hz."""
+    kept = list(range(9))
+    whole, design = [*kept, 28, 29], quiet_plant(kept)
+    observer = design_kalman(design, larger=design)
+    estimate = observer.estimate(recorded(quiet_plant(whole))[0])
+    blind = consistency(observer, estimate)
+    assert blind.causes == ("folding",)
+    assert "no change of mode 6 (463.1 Hz" in blind.text
+    known = consistency(observer, estimate, larger=modes(3e-3, 40).select(whole))
+    assert known.causes == ("folding",)
+    assert "the plant is right" in known.text and "(4456 Hz in the larger model)" in known.text
+
+
+@pytest.mark.parametrize(
+    ("mode", "kind", "amount"), [(7, "freq", 0.04), (11, "freq", 0.05), (4, "damping", -0.8)]
+)
+def test_a_changed_mode_is_no_other_mode(mode, kind, amount):
+    moved = with_changes(plant(count=12), [(Delta("change", mode, kind, 1.0), amount)])
+    found = judged(plant(count=12), moved)
+    assert found.causes == ("frequency",)
+    assert f"near mode {mode} " in found.text
+
+
+@pytest.mark.parametrize(("sensor", "size"), [("y1", 20e-9), ("y3", -5e-9), ("y2", 1e-6)])
+def test_an_offset_of_a_sensor_is_named_with_its_size(sensor, size):
+    records, _ = recorded(machine())
+    observer = design_kalman(machine(), larger=machine())
+    found = consistency(observer, observer.estimate(records | {sensor: records[sensor] + size}))
+    assert found.causes == ("offset",)
+    value, unit = re.search(rf"{sensor} by (-?[\d.e+]+) (\S*m)", found.text).groups()
+    scale = {"nm": 1e-9, "\N{MICRO SIGN}m": 1e-6}[unit]
+    assert float(value) * scale == pytest.approx(size, rel=0.1, abs=0)
+
+
+@pytest.mark.parametrize("count", [1, 30])
+def test_outliers_are_named_and_gated(count):
+    records, _ = recorded(machine())
+    observer = design_kalman(machine(), larger=machine())
+    rng, bad = np.random.default_rng(3), {name: part.copy() for name, part in records.items()}
+    for k in rng.choice(np.arange(200, 19000), count, replace=False):
+        bad[f"y{rng.integers(1, 5)}"][k] += rng.choice([-1.0, 1.0]) * rng.uniform(3e-8, 1e-6)
+    found = consistency(observer, observer.estimate(bad))
+    assert found.causes == ("outliers",)
+    assert f"{count} single sample" in found.text and "gate=" in found.text
+    gated = observer.estimate(bad, gate=7)
+    assert gated.gated.sum() == count
+    assert consistency(observer, gated).holds
+    # beside another cause both are named
+    bad["y2"] += 20e-9
+    assert consistency(observer, observer.estimate(bad)).causes == ("outliers", "offset")
+
+
+def test_a_blow_that_a_mode_left_out_rings_from_is_no_outlier():
+    records, _ = recorded(machine())
+    ringing = np.zeros(20000)
+    k = np.arange(400)
+    ringing[8000:8400] = 1e-7 * np.exp(-0.01 * k) * np.sin(2 * np.pi * 0.4 * k)
+    bad = {name: part + (ringing if name[0] == "y" else 0.0) for name, part in records.items()}
+    observer = design_kalman(machine(), larger=machine())
+    found = consistency(observer, observer.estimate(bad))
+    assert not found.holds
+    assert "outliers" not in found.causes and "offset" not in found.causes
+
+
+def test_the_innovations_on_its_own_plant_have_unit_density():
+    """By way of the plant's noises and the open plant, rigid-body modes among it."""
+    observer = design_kalman(machine(), larger=machine())
+    freq = np.geomspace(1e-4, 0.499, 300)
+    for other in (machine(), None):
+        parts = parts_of(observer, other, freq)
+        np.testing.assert_allclose(parts.both, np.broadcast_to(np.eye(4), (300, 4, 4)), atol=1e-6)
+    own, filtered = parts_of(observer, machine(), freq), parts_of(observer, None, freq)
+    np.testing.assert_allclose(own.pooled, filtered.pooled, atol=1e-6)
 
 
 def test_statistics_by_direct_sums():

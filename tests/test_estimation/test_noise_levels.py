@@ -1,5 +1,7 @@
 """Noise levels from records: known ones, their stated uncertainty, exact likelihood, refusals."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy.optimize import minimize
@@ -9,10 +11,16 @@ from test_consistency import machine, plant, recorded
 from test_kalman import INSET
 from test_robust import one_state
 
-from flexplant.errors import AssumptionError, ModelError
+from flexplant.errors import AssumptionError, FlexplantWarning, ModelError
 from flexplant.estimation import consistency, design_kalman, estimate_noise
 from flexplant.estimation import noise_from_records as inner
-from flexplant.plant import Disturbance
+from flexplant.loop import close_loop
+from flexplant.modes import solve_modes
+from flexplant.plant import Disturbance, Sensor, assemble_plant
+from flexplant.simulation import simulate
+from flexplant.structure import ModalDamping, chain
+from flexplant.synthesis import design_servo
+from flexplant.testbeds import three_masses
 from oracles_estimation import scalar_likelihood
 
 
@@ -99,6 +107,67 @@ def test_a_level_that_is_zero_goes_to_zero():
     found = estimate_noise(one_state(0.9, q=0.5, r=1.0), records)
     assert found.ratios[0] < 0.15
     assert found.ratios[1] == pytest.approx(np.sqrt(2.0), rel=0.05, abs=0)
+
+
+def chain_record(count, rate, seed, duration=4.0):
+    """A chain of masses held by a servo, all its modes in truth: its plant, modes and record."""
+    masses = chain(masses=[1.0] * count, stiffnesses=[4e5] * (count - 1))
+    every = solve_modes(masses, count=count, damping=ModalDamping(0.01))
+    own = three_masses().assembled.ports
+    sensors = [
+        Sensor("y1", at="1:x", asd=1e-12),
+        Sensor("y2", at=f"{count}:x", asd=3e-12),
+    ]
+    truth = assemble_plant(every, own.replace(y=sensors)).discretized(rate, delay=1)
+    observer = design_kalman(truth, larger=truth)
+    servo = design_servo(truth, bandwidth=20.0, observer=observer)
+    run = simulate(close_loop(truth, observer, servo), duration=duration, rng=seed)
+    return truth, every, run
+
+
+@pytest.mark.parametrize(
+    ("count", "kept", "rate", "kind"),
+    [(5, 3, 2e3, "modes"), pytest.param(8, 4, 1e4, "plant", marks=pytest.mark.slow)],
+)
+def test_modes_left_out_are_no_noise_of_the_sensors(count, kept, rate, kind):
+    """Given the true densities: without larger= sensors would be 100 times noisier, +- 0.3 %."""
+    truth, every, run = chain_record(count, rate, seed=1)
+    small = every.select(range(kept))
+    design = assemble_plant(small, truth.assembled.ports).discretized(rate, delay=1)
+    found = estimate_noise(design, run, larger=every if kind == "modes" else truth)
+    t = found.ratios**2
+    stated = 2 * t * list(found.relative.values())
+    assert np.all(np.abs(t - 1) < 4 * stated)
+    assert stated[0] < 0.05 and stated[2] < 0.05
+    assert found.plant.system.n_states == design.system.n_states
+    assert found.nis == pytest.approx(1.0, abs=0.03)
+    assert "white" in found.verdict
+
+
+@pytest.mark.slow
+def test_levels_that_stand_for_modes_left_out_are_warned_of():
+    with pytest.warns(FlexplantWarning, match="do not explain the record.*Pass larger="):
+        blind = estimate_noise(plant(), recorded(plant(count=12))[0])
+    assert "a mode left out" in blind.verdict
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_level_that_nothing_shows_has_a_bound(seed):
+    """True levels given: the first sensor's noise is far below its motion within a sample."""
+    truth, _, run = chain_record(3, 2e3, seed)
+    found = estimate_noise(truth, run)
+    assert np.all(np.abs(found.ratios[[0, 2]] - 1) < 0.05)
+    text = repr(found)
+    bound = float(re.search(r"y1:noise at most ([\d.]+) times", text).group(1))
+    assert 1.0 < bound < 20.0
+    assert "y2:noise at most" not in text
+
+
+def test_outliers_are_left_out_by_a_gate():
+    records = scalar_record(11, 6000)
+    records["y1"][3000] += 1e3
+    found = estimate_noise(one_state(0.9), records, gate=8)
+    assert np.all(np.abs(found.ratios - [1.0, 1.0]) < 0.6)
 
 
 def test_refusals():

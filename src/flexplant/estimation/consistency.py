@@ -4,35 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..arguments import between
 from ..errors import ModelError, ShapeError
-from ..lti.frequency import frequency_response
-from ..lti.statespace import StateSpace
-from ..plant import StandardPlant
+from ..plant import StandardPlant, larger_plant
+from ..plant.realisation import Structure
 from ..values import FloatArray, Value, instance, real_array, short
+from .causes import (
+    Cause,
+    Verdict,
+    known_verdict,
+    left_modes,
+    offset,
+    outlier_text,
+    outliers,
+    peak_verdict,
+    settling,
+)
 from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .estimator_channels import poi_channels, row_of
-from .whiteness import (
-    ExcessPeak,
-    PooledSpectrum,
-    Statistic,
-    cumulative_periodogram,
-    level_test,
-    ljung_box,
-    peaks,
-    spectrum_of,
-)
+from .estimator_channels import poi_channels, read_alike, row_of
+from .innovation_spectrum import Lines, Parts, expected, lines_of, parts_of
+from .left_out import left_out
+from .whiteness import ExcessPeak, Statistic, cumulative_periodogram, level_test, ljung_box, peaks
 
-Cause = Literal["none", "noise level", "noise ratio", "frequency", "truncation"]
 #: fewest samples for a verdict
 _FEWEST = 200
-#: a peak this close to a mode, relative, belongs to it
-_NEAR = 0.06
+#: tests that share the level
+_TESTS = 5
+#: the innovations are those of the larger plant unless it is this unlikely: they fail as those of
+#: the plant already, so that a failure by chance would name a cause that is none
+_AGREES = 1e-4
 #: steps of the fit of two noise levels, and what keeps it regular where one of them is not seen
 _SCORING, _RIDGE = 40, 1e-9
 
@@ -56,8 +61,9 @@ class Consistency(Value):
     peaks : tuple of (float, float)
         Frequencies [Hz] at which the innovations exceed the density that the best levels of
         process and sensor noise explain, and how much, the most significant first.
-    cause : {"none", "noise level", "noise ratio", "frequency", "truncation"}
-        The likely cause.
+    causes : tuple of str
+        The likely causes: "none", or of "outliers", "offset", "noise level", "noise ratio",
+        "frequency", "truncation", "folding".
     text : str
         The verdict in words.
     level : float
@@ -81,7 +87,7 @@ class Consistency(Value):
     sensor_ratios: Mapping[str, float]
     nees: Mapping[str, tuple[float, float, float]]
     peaks: tuple[tuple[float, float], ...]
-    cause: Cause
+    causes: tuple[Cause, ...]
     text: str
     level: float = field(default=0.95)
 
@@ -94,6 +100,11 @@ class Consistency(Value):
         )
 
     @property
+    def cause(self) -> Cause:
+        """The first of the causes."""
+        return self.causes[0]
+
+    @property
     def holds(self) -> bool:
         """Whether no test rejects the model of the innovations."""
         return self.cause == "none"
@@ -103,28 +114,43 @@ def consistency(
     observer: KalmanEstimator,
     estimate: Estimate,
     *,
+    larger: StandardPlant | Structure | None = None,
     truth: Any = None,
     level: float = 0.95,
 ) -> Consistency:
     """Return whether a record agrees with the model of its estimator, and if not, why.
 
-    With a right model the whitened innovations are white noise of unit variance. Three tests share
-    the level (each at ``level^(1/3)``): the mean of their squares (NIS, chi-square), their
-    correlations over lags (Ljung-Box, all sensors), their cumulative periodogram (Bartlett). The
-    likely cause follows from what fails:
+    With a right model the whitened innovations are white noise of unit variance. Five tests share
+    the level (each at ``level^(1/5)``): the mean of their squares (NIS, chi-square), their
+    correlations over lags (Ljung-Box, all sensors), their cumulative periodogram (Bartlett), their
+    largest one and their mean. The likely causes follow from what fails:
 
+    - single samples of a sensor beyond what noise makes, whose effect on the filter is that of one
+      sample: *outliers*;
+    - a mean beside the density at the lowest lines: the *offset* of a sensor.
+
+    What these make is taken away, the rest has one more cause:
+
+    - coloured as on the larger plant, where modes left out are known: the plant is right and its
+      *truncation*, or the *folding* of modes above half the rate, is what shows;
     - white, NIS off: the *noise level*; the sensors whose innovations are too large are named;
     - coloured, but no more than other levels of process and sensor noise explain (two levels,
       fitted to the spectrum): the *noise ratio*;
-    - a peak beyond that near a mode: the *frequency* or damping of that mode;
-    - a peak where the plant has no mode: *truncation*, or a disturbance that it lacks.
+    - a peak beyond that, which the change of a mode near it explains better than one more mode
+      (the model's own mode is missing then, and the direction is its own): the *frequency* or
+      damping of that mode;
+    - any other peak: *truncation*, where it lies above all modes or a mode left out is known there;
+      *folding*, where the plant has modes above it, or the mode left out lies above half the rate;
+      or a disturbance that the plant lacks.
 
     Parameters
     ----------
     observer : KalmanEstimator
         That made the estimate.
     estimate : Estimate
-        Of `observer.estimate(records)`.
+        Of `observer.estimate(records)`; samples that its gate left out are missing ones.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        With the modes left out, as in `design_kalman`. None: what the observer was designed with.
     truth : mapping {channel: (N,) array}, optional
         True motions at POIs, of a simulation or a reference instrument, for the NEES; its interval
         allows for the correlation of the errors over time.
@@ -165,7 +191,7 @@ def consistency(
             "observer and observer.estimate(records)."
         )
     share = between(level, "level", 0.5, 1.0, "Pass 0.95.", ends="[")
-    alpha = 1 - share ** (1 / 3)
+    alpha = 1 - share ** (1 / _TESTS)
     white = estimate.whitened.T
     there = np.isfinite(white).all(axis=1)
     count = int(there.sum())
@@ -174,38 +200,49 @@ def consistency(
             f"a verdict needs at least {_FEWEST} samples with all innovations, got {count}. Pass "
             "a longer record."
         )
-    nis = level_test(float(np.sum(white[there] ** 2)), count * white.shape[1])
-    box = ljung_box(white, min(100, count // 20))
-    spectrum = spectrum_of(white)
-    bartlett = cumulative_periodogram(spectrum)
-    normal = (estimate.innovations / estimate.innovation_deviations).T[there]
-    ratios = np.sqrt(np.mean(normal**2, axis=0))
-    levels, expected = _levels(observer, spectrum)
-    found = peaks(spectrum._replace(density=spectrum.density / expected), alpha)
-    verdict = _verdict(
-        observer.plant,
-        _Facts(nis, box, bartlett, found, levels, ratios, count, alpha),
-        estimate.sensors,
-    )
+    normal = (estimate.innovations / estimate.innovation_deviations).T
+    raw = _tested(observer, white, normal, None, alpha)
+    said, rest = [], raw
+    single = outliers(observer, white, normal, alpha)
+    if single is not None:
+        said.append(Verdict("outliers", outlier_text(single, observer, estimate.time)))
+        white = single.white
+    settled = white.copy()
+    settled[: min(settling(observer), len(white) // 4)] = np.nan
+    constant = offset(observer, settled, alpha)
+    if constant is not None:
+        said.append(Verdict("offset", constant.text))
+        white = settled - constant.mean  # what an offset does at first is no constant
+    whole = _whole(observer, larger)
+    if said or whole is not None:
+        rest = _tested(observer, white, normal, whole, alpha)
+    verdict = _verdict(observer, rest, whole, estimate.sensors)
+    if not said or verdict.cause != "none":
+        said.append(verdict)
     rate = 1.0 / observer.plant.dt
     return Consistency(
-        nis.statistic,
-        nis.p_value,
-        box.p_value,
-        bartlett.p_value,
-        dict(zip(estimate.sensors, ratios.tolist(), strict=True)),
+        raw.nis.statistic,
+        raw.nis.p_value,
+        raw.box.p_value,
+        raw.bartlett.p_value,
+        dict(zip(estimate.sensors, raw.ratios.tolist(), strict=True)),
         _nees(observer, estimate, truth, share),
-        tuple((one.freq * rate, one.height) for one in found[:6]),
-        *verdict,
+        tuple((one.freq * rate, one.height) for one in rest.peaks[:6]),
+        tuple(one.cause for one in said),
+        " ".join(one.text for one in said),
         share,
     )
 
 
 class _Facts(NamedTuple):
+    """Tests of innovations against their filter's model, and beside the best levels of noise."""
+
     nis: Statistic
     box: Statistic
     bartlett: Statistic
     peaks: list[ExcessPeak]
+    lines: Lines
+    parts: Parts
     levels: FloatArray
     ratios: FloatArray
     samples: int
@@ -215,20 +252,84 @@ class _Facts(NamedTuple):
     def white(self) -> bool:
         return min(self.box.p_value, self.bartlett.p_value) >= self.alpha
 
+    @property
+    def expected(self) -> FloatArray:
+        """The pooled density with the best levels."""
+        return np.asarray(self.levels @ self.parts.pooled)
 
-def _verdict(plant: StandardPlant, facts: _Facts, names: Any) -> tuple[Cause, str]:
+    @property
+    def explained(self) -> bool:
+        """Whether the lines have the density of the plant with the levels stated."""
+        beside = self.lines.beside(self.parts.both)
+        count = 2 * beside.density.size * beside.channels
+        total = level_test(count * float(np.mean(beside.density)), count)
+        p = min(total.p_value, cumulative_periodogram(beside).p_value)
+        return p >= _AGREES and not peaks(beside, _AGREES)
+
+
+def _tested(
+    observer: KalmanEstimator,
+    white: FloatArray,
+    normal: FloatArray,
+    whole: StandardPlant | None,
+    alpha: float,
+) -> _Facts:
+    """Return the tests of whitened innovations (N, p)."""
+    there = np.isfinite(white).all(axis=1)
+    count = int(there.sum())
+    nis = level_test(float(np.sum(white[there] ** 2)), count * white.shape[1])
+    box = ljung_box(white, min(100, count // 20))
+    lines = lines_of(white)
+    pooled = lines.pooled
+    parts = (
+        parts_of(observer, None, lines.freq)
+        if whole is None
+        else expected(observer, whole, lines.samples)
+    )
+    levels = _levels(parts.pooled, pooled.density)
+    found = peaks(pooled._replace(density=pooled.density / (levels @ parts.pooled)), alpha)
+    ratios = np.sqrt(np.mean(normal[there] ** 2, axis=0))
+    return _Facts(
+        nis, box, cumulative_periodogram(pooled), found, lines, parts, levels, ratios, count, alpha
+    )
+
+
+def _whole(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
+    """Return the plant with the modes left out, read like the observer's, or None."""
+    plant = observer.plant
+    if larger is None:
+        found = None if observer.left_out is None else observer.left_out.larger
+    else:
+        found = None if larger is plant else larger_plant(plant, larger)
+    return None if found is None else read_alike(plant, found)
+
+
+def _verdict(
+    observer: KalmanEstimator, facts: _Facts, whole: StandardPlant | None, names: Any
+) -> Verdict:
     """Return the likely cause and the verdict in words."""
     if facts.white and facts.nis.p_value >= facts.alpha:
-        return "none", "the innovations are white and of the predicted size."
+        return Verdict("none", "the innovations are white and of the predicted size.")
+    numbers = None
+    if whole is not None and whole.is_assembled:
+        missed = observer.left_out if observer.left_out is not None else left_out(
+            observer.plant.unweighted, whole.unweighted
+        )  # fmt: skip
+        numbers = None if missed is None else missed.modes
+    if whole is not None and numbers is not None and facts.explained:
+        left = left_modes(whole, numbers)
+        return known_verdict(observer, left, facts.parts, facts.lines.freq)
     if facts.white:
-        return "noise level", _level_text(facts, names)
+        return Verdict("noise level", _level_text(facts, names))
     if facts.peaks:
-        return _peak_verdict(plant, facts.peaks)
+        known = None if whole is None or numbers is None else (whole, numbers)
+        return peak_verdict(observer, facts.lines, facts.expected, facts.peaks, known)
     process, sensor = np.sqrt(facts.levels)
-    return "noise ratio", (
+    return Verdict(
+        "noise ratio",
         "the innovations are coloured as with other noises: the process noise is about "
         f"{process:.3g} times and that of the sensors {sensor:.3g} times the stated one. Estimate "
-        "both from the record."
+        "both from the record.",
     )
 
 
@@ -246,68 +347,20 @@ def _level_text(facts: _Facts, names: Any) -> str:
     return f"{text}. Scale the densities by this, or estimate them from the record."
 
 
-def _peak_verdict(plant: StandardPlant, found: list[ExcessPeak]) -> tuple[Cause, str]:
-    """Return the verdict for coloured innovations with peaks."""
-    freq, first = _mode_freq(plant)
-    rate = 1.0 / plant.dt
-    strongest = max(found, key=lambda one: one.height)
-    at = strongest.freq * rate
-    near = _near(freq, at)
-    if near is None:
-        above = freq.size and at > np.max(freq[freq < 0.5 * rate], initial=0.0)
-        where = "above all modes of the plant" if above else "where the plant has no mode"
-        return "truncation", (
-            f"the innovations have {strongest.height:.3g} times the density that noise explains at "
-            f"{at:.4g} Hz, {where}: a mode left out (above {0.5 * rate:.4g} Hz it appears folded), "
-            "or a disturbance that the plant lacks. Keep more modes, or add the disturbance."
-        )
-    return "frequency", (
-        f"the innovations have {strongest.height:.3g} times the density that noise explains at "
-        f"{at:.4g} Hz, near mode {first + near} ({freq[near]:.4g} Hz in the plant): its frequency "
-        "or damping is not the machine's. Update the model."
-    )
+def _levels(parts: FloatArray, density: FloatArray) -> FloatArray:
+    """Return the levels (process, sensors) of the parts (2, m) that explain a density best.
 
-
-def _mode_freq(plant: StandardPlant) -> tuple[FloatArray, int]:
-    """Return the frequencies [Hz] of the elastic modes, and the number of the first one."""
-    if plant.is_assembled:
-        omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
-        return np.asarray(omega / (2 * np.pi)), plant.n_rigid + 1
-    poles = np.linalg.eigvals(plant.system.A)
-    swinging = poles[(poles.imag > 0) & (np.abs(poles) > 0.1)]
-    return np.sort(np.angle(swinging)) / (2 * np.pi * plant.dt), 1
-
-
-def _near(freq: FloatArray, at: float) -> int | None:
-    if not freq.size:
-        return None
-    best = int(np.argmin(np.abs(freq - at)))
-    return best if abs(freq[best] - at) <= _NEAR * freq[best] else None
-
-
-def _levels(observer: KalmanEstimator, found: PooledSpectrum) -> tuple[FloatArray, FloatArray]:
-    """Return the levels (process, sensors) that explain a spectrum best, and what they predict.
-
-    The sensors' noise reaches the whitened innovations by
-    ``W (I - C (z I - A + K C)^-1 K) R^(1/2)``; its part s of the density and that of the process,
-    1 - s, add up to 1. Levels a, b that scale them are fitted by Whittle's likelihood,
-    ``sum log m + I / m`` with m = a (1 - s) + b s, by scoring.
+    By Whittle's likelihood, ``sum log m + I / m`` with m the sum of both at their levels, by
+    scoring.
     """
-    m, K = observer.model, observer.predictor_gain
-    unit = np.linalg.cholesky(m.innovation(observer.predicted_covariance))
-    noise = np.linalg.cholesky(m.R)
-    g = StateSpace(m.A - K @ m.C2, K, -m.C2, np.eye(len(K.T)), m.dt)
-    response = np.moveaxis(frequency_response(g, found.freq / m.dt).data, 2, 0)
-    reached = np.linalg.solve(unit, response @ noise)
-    part = np.clip(np.mean(np.sum(np.abs(reached) ** 2, axis=2), axis=1), 0.0, 1.0)
-    parts, levels = np.stack([1 - part, part]), np.full(2, found.density.mean())
+    parts = np.maximum(parts, 0.0)
+    levels = np.full(2, density.mean() / parts.sum(axis=0).mean())
     for _ in range(_SCORING):
-        expected = levels @ parts
-        weighted = parts / expected**2
+        weighted = parts / (levels @ parts) ** 2
         information = weighted @ parts.T + _RIDGE * np.eye(2) * np.trace(weighted @ parts.T)
-        step = np.linalg.solve(information, weighted @ (found.density - expected))
+        step = np.linalg.solve(information, weighted @ (density - levels @ parts))
         levels = np.clip(levels + step, 0.1 * levels, 10 * levels)
-    return levels, levels @ parts
+    return levels
 
 
 def _nees(

@@ -6,22 +6,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..errors import AssumptionError, ModelError, SolverError
-from ..lti.frequency import frequency_response
-from ..lti.statespace import StateSpace, System
+from ..errors import AssumptionError, ModelError, SolverError, warn
+from ..lti.statespace import System
 from ..parallel import one_thread
-from ..plant import StandardPlant
+from ..plant import StandardPlant, larger_plant
+from ..plant.realisation import Structure
 from ..values import ComplexArray, FloatArray
+from .causes import settling
+from .consistency import consistency
+from .estimate import Estimate
 from .estimator import KalmanEstimator
-from .estimator_channels import checked_plant, sensors
+from .estimator_channels import checked_plant, read_alike, sensors
+from .innovation_spectrum import seen_from_states
 from .kalman import design_kalman
 from .noise_levels import PROCESS, NoiseLevels, with_densities
-from .whiteness import level_test
 
 #: designs of the filter whose innovations are used, and the change of all ratios that ends them
 _PASSES, _SETTLED = 6, 1e-3
 #: scoring steps, and the slope beside its deviation at which they end
 _STEPS, _FLAT = 60, 1e-4
+#: share of right models of whose levels nothing is said
+_LEVEL = 0.999
+_LARGER = " Pass larger= with the modes left out, if that is what it lacks."
 #: lags of the autocovariances of the start
 _LAGS = 40
 #: smallest eigenvalue of the information of unit size, below which levels cannot be separated
@@ -33,7 +39,13 @@ _LOW, _HIGH = 1e-6, 1e6
 
 
 @one_thread()
-def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
+def estimate_noise(
+    plant: StandardPlant | System,
+    records: Any,
+    *,
+    larger: StandardPlant | Structure | None = None,
+    gate: float | None = None,
+) -> NoiseLevels:
     """Return the densities of all disturbances and sensor noises that explain a record best.
 
     The innovations e of a fixed filter are stationary whatever the levels are, rigid-body motion
@@ -58,6 +70,14 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
         what has none stays without.
     records : Response, mapping {channel: (N,) array} or data frame
         All sensors and commands; the longest stretch without gaps is used.
+    larger : Modes, FEModel, ReducedModel or StandardPlant, optional
+        The structure with the modes that the plant leaves out, as in `design_kalman`: the record
+        is explained with these, so that what they do is no noise of the sensors. It counts whole:
+        its modes are to be those of the machine, `fit.applied_to(model)`. None: the modes of the
+        plant's reduced model beyond those it kept; where it has none, the sensors' noises stand for
+        the modes left out. The plant itself: none are left out.
+    gate : float, optional
+        As in `KalmanEstimator.estimate`: outliers are gaps.
 
     Returns
     -------
@@ -73,7 +93,13 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
     ModelError
         When fewer than 1000 samples are left without gaps and start-up.
     SolverError
-        When the search does not settle.
+        When the search does not settle; the message says what the record tells of the plant.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the innovations with these levels are still not white: the model is another one than
+        the machine's, and the stated deviations do not hold.
 
     References
     ----------
@@ -91,12 +117,13 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
     True
     """
     plant = checked_plant(plant)
-    channels = _channels(plant)
+    channels, whole = _channels(plant), _whole(plant, larger)
     ratios, first = np.ones(len(channels)), np.zeros(0)
     for _ in range(_PASSES):
-        now = _levels(plant, channels, ratios)
+        now = _levels(whole, channels, ratios)
         observer = design_kalman(now, larger=now)
-        innovations = _steady(observer, records)
+        estimate = observer.estimate(records, gate=gate)
+        innovations = _steady(observer, estimate)
         spectrum = _spectrum(observer, _sources(now, channels), innovations)
         if not first.size:
             begin = _least_squares(spectrum)
@@ -107,20 +134,48 @@ def estimate_noise(plant: StandardPlant | System, records: Any) -> NoiseLevels:
         found = _scored(spectrum, begin, np.minimum(_LOW / ratios**2, 1.0))
         ratios = ratios * np.sqrt(found.variances)
         covariance = _covariance(found, channels)
+        # of a variance, which is known to this even where it may be 0 and its logarithm is not
+        deviation = 2 * found.variances * np.sqrt(covariance.diagonal())
         # what is known to a few percent only is settled well within that
-        known = np.maximum(2 * _SETTLED, 0.1 * np.sqrt(covariance.diagonal()))
-        if np.all(np.abs(np.log(found.variances)) < known):
+        if np.all(np.abs(found.variances - 1.0) < np.maximum(2 * _SETTLED, 0.1 * deviation)):
             break
     else:
         raise SolverError(
-            f"the noise levels still change after {_PASSES} designs of the filter. Pass a plant "
-            "with densities nearer to the true ones, or a longer record."
+            f"the noise levels still change after {_PASSES} designs of the filter, the last one "
+            f"by {np.max(np.abs(np.sqrt(found.variances) - 1.0)):.2g}. "
+            f"{_cure(observer, estimate, larger)}"
         )
-    final = _levels(plant, channels, ratios)
+    now = _levels(whole, channels, ratios)
+    final = design_kalman(now, larger=now)
+    verdict = consistency(final, final.estimate(records, gate=gate), level=_LEVEL)
+    if not verdict.holds:
+        warn(
+            "the noise levels do not explain the record: "
+            f"{verdict.text} The levels stand for what the model lacks, and their deviations hold "
+            f"for a right model only.{_LARGER if whole is plant else ''}"
+        )
     return NoiseLevels(
-        plant, channels, ratios, covariance, first, found.slope,
-        _nis(design_kalman(final, larger=final), records), len(innovations),
+        plant, channels, ratios, covariance, first, found.slope, verdict.nis, len(innovations),
+        verdict.text,
     )  # fmt: skip
+
+
+def _whole(plant: StandardPlant, larger: Any) -> StandardPlant:
+    """Return the plant with the modes left out, with the densities of the given one."""
+    found = None if larger is plant else larger_plant(plant, larger)
+    if found is None:
+        return plant
+    if found.is_assembled and plant.is_assembled:
+        found = found.with_ports(plant.unweighted.assembled.ports)
+    return read_alike(plant, found)
+
+
+def _cure(observer: KalmanEstimator, estimate: Estimate, larger: Any) -> str:
+    """Return what the record says of the plant where its levels are not found, and what to do."""
+    said = consistency(observer, estimate, level=_LEVEL)
+    if said.cause in ("none", "noise level", "noise ratio"):
+        return "Pass a plant with densities nearer to the true ones, or a longer record."
+    return f"With the last ones {said.text}{_LARGER if larger is None else ''}"
 
 
 def _channels(plant: StandardPlant) -> tuple[str, ...]:
@@ -143,42 +198,38 @@ def _levels(plant: StandardPlant, channels: tuple[str, ...], ratios: FloatArray)
 
 
 class _Source(NamedTuple):
-    """``x+ += G xi``, ``y += H xi``, by the covariances of both."""
+    """``x+ += G xi``, ``y += H xi``, xi white of unit variance."""
 
-    Q: FloatArray
-    S: FloatArray
-    R: FloatArray
+    G: FloatArray
+    H: FloatArray
 
 
 def _sources(plant: StandardPlant, channels: tuple[str, ...]) -> list[_Source]:
     """Return what each channel adds per sample, at its present level."""
     rows = [plant.y.index(name) for name in sensors(plant)]
-    n, ny, found = plant.system.n_states, len(rows), []
+    n, found = plant.system.n_states, []
+    forces = [other for other in channels if other.removesuffix(":noise") not in plant.y]
     for name in channels:
         sensor = name.removesuffix(":noise")
         if sensor in plant.y:
+            H = np.zeros((len(rows), 1))
             at = plant.y.index(sensor)
-            R = np.zeros((ny, ny))
-            R[rows.index(at), rows.index(at)] = plant.sensor_noise[at, at]
-            found.append(_Source(np.zeros((n, n)), np.zeros((n, ny)), R))
+            H[rows.index(at)] = np.sqrt(plant.sensor_noise[at, at])
+            found.append(_Source(np.zeros((n, 1)), H))
             continue
-        forces = [other for other in channels if other.removesuffix(":noise") not in plant.y]
         still = {other: 0.0 for other in forces if other != name}
         alone = plant if name == PROCESS else with_densities(plant, still)
-        G, H = alone.noise_factor, alone.noise_direct[rows]
-        found.append(_Source(G @ G.T, G @ H.T, H @ H.T))
+        found.append(_Source(alone.noise_factor, alone.noise_direct[rows]))
     return found
 
 
-def _steady(observer: KalmanEstimator, records: Any) -> FloatArray:
+def _steady(observer: KalmanEstimator, estimate: Estimate) -> FloatArray:
     """Return the longest stretch (N, ny) of innovations without gaps, its start-up left out."""
-    e = observer.estimate(records).innovations.T
+    e = estimate.innovations.T
     there = np.concatenate([[False], np.all(np.isfinite(e), axis=1), [False]])
     edges = np.flatnonzero(np.diff(there.astype(int))).reshape(-1, 2)
     start, end = edges[np.argmax(edges[:, 1] - edges[:, 0])] if len(edges) else (0, 0)
-    radius = observer.certificate.spectral_radius
-    settling = int(np.ceil(np.log(1e-3) / np.log(radius))) if 0 < radius < 1 else 1
-    start = start + min(settling, (end - start) // 4)
+    start = start + min(settling(observer), (end - start) // 4)
     if end - start < _FEWEST:
         raise ModelError(
             f"noise levels need at least {_FEWEST} samples in one stretch after the start-up, got "
@@ -203,23 +254,17 @@ def _spectrum(
     size = np.sqrt(m.innovation(observer.predicted_covariance).diagonal())
     line = slice(1, (count - 1) // 2 + 1)
     X = np.fft.rfft(innovations / size, axis=0)[line] / np.sqrt(count)
-    freq = np.fft.rfftfreq(count, m.dt)[line].astype(np.float64)
-    n, ny = m.C2.T.shape
+    freq = np.fft.rfftfreq(count)[line].astype(np.float64)
+    ny = len(size)
     d = np.sqrt(np.maximum(observer.predicted_covariance.diagonal(), 1e-300))
     closed = (m.A - K @ m.C2) * d / d[:, None]
-    g = StateSpace(closed, np.eye(n), m.C2 * d / size[:, None], np.zeros((ny, n)), m.dt)
     parts = np.empty((len(sources), freq.size, ny, ny), dtype=np.complex128)
     for start in range(0, freq.size, _LINES):
         piece = slice(start, start + _LINES)
-        to = np.moveaxis(frequency_response(g, freq[piece]).data, 2, 0)  # C (z I - A_c)^-1
-        back = np.conj(np.swapaxes(to, 1, 2))
+        to = seen_from_states(closed, m.C2 * d / size[:, None], freq[piece])  # C (z I - A_c)^-1
         for i, one in enumerate(sources):
-            mixed = one.S - K @ one.R
-            Q = one.Q - one.S @ K.T - K @ one.S.T + K @ one.R @ K.T
-            cross = to @ (mixed / d[:, None] / size)
-            own = one.R / size / size[:, None]
-            parts[i, piece] = to @ (Q / d / d[:, None]) @ back
-            parts[i, piece] += cross + np.conj(np.swapaxes(cross, 1, 2)) + own
+            T = to @ ((one.G - K @ one.H) / d[:, None]) + one.H / size[:, None]
+            parts[i, piece] = T @ np.conj(np.swapaxes(T, 1, 2))
     return _LevelSpectrum(X[:, :, None] * X.conj()[:, None, :], parts)
 
 
@@ -271,8 +316,9 @@ def _scored(spectrum: _LevelSpectrum, start: FloatArray, lowest: FloatArray) -> 
         else:
             damping = max(10 * damping, 1e-3)
     raise SolverError(
-        f"the likelihood of the noise levels did not settle in {_STEPS} steps. Pass a plant with "
-        "densities nearer to the true ones, or a longer record."
+        f"the likelihood of the noise levels did not settle in {_STEPS} steps: the spectrum of the "
+        "innovations is far from any that these channels make. Judge the record with "
+        "flexplant.estimation.consistency, and pass larger= with the modes left out."
     )
 
 
@@ -313,9 +359,3 @@ def _covariance(found: _Scored, channels: tuple[str, ...]) -> FloatArray:
         )
     inverse = np.linalg.inv(scaled / np.outer(size, size))
     return np.asarray(0.25 * inverse / np.outer(size, size))
-
-
-def _nis(observer: KalmanEstimator, records: Any) -> float:
-    white = observer.estimate(records).whitened.T
-    white = white[np.all(np.isfinite(white), axis=1)]
-    return level_test(float(np.sum(white**2)), white.size).statistic

@@ -14,6 +14,8 @@ from ..values import FloatArray, Value
 
 #: channel that stands for all disturbances of a plant made elsewhere
 PROCESS = "process"
+#: relative deviation of a density from which its variance less two deviations is below 0
+_BOUND = 0.25
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -40,6 +42,8 @@ class NoiseLevels(Value):
         record itself: 1 when the model explains it.
     samples : int
         Used.
+    verdict : str
+        Of `consistency`, on the record with these levels.
 
     Examples
     --------
@@ -60,15 +64,23 @@ class NoiseLevels(Value):
     slope: float
     nis: float
     samples: int
+    verdict: str = ""
 
     def __repr__(self) -> str:
-        shown = [
-            f"  {name} {ratio:.4g} times the given density, +- {100 * self.relative[name]:.2g} %"
-            for name, ratio in zip(self.channels[:5], self.ratios, strict=False)
-        ]
+        shown = [f"  {name} {self._shown(i)}" for i, name in enumerate(self.channels[:5])]
         more = [f"  ... and {len(self.channels) - 5} more"] if len(self.channels) > 5 else []
         first = f"<NoiseLevels from {counted(self.samples, 'sample')}, NIS {self.nis:.4g}"
         return "\n".join([first, *shown, *more]) + ">"
+
+    def _shown(self, i: int) -> str:
+        """Return a level in words: a bound where it may be 0 just as well (two deviations).
+
+        The variance t of a ratio has the deviation 2 t times that of the density's logarithm.
+        """
+        ratio, off = float(self.ratios[i]), self.relative[self.channels[i]]
+        if off > _BOUND:
+            return f"at most {ratio * np.sqrt(1.0 + 4.0 * off):.2g} times the given density"
+        return f"{ratio:.4g} times the given density, +- {100 * off:.2g} %"
 
     @property
     def asd(self) -> Mapping[str, float]:

@@ -1,0 +1,362 @@
+"""Causes of innovations that are not those of the model: outliers, offsets, modes left out."""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from ..errors import counted
+from ..plant import StandardPlant
+from ..plant.uncertainty.uncertain_plant import Delta, with_changes
+from ..values import ComplexArray, FloatArray, IntArray, with_unit
+from .estimator import KalmanEstimator
+from .innovation_spectrum import Lines, Parts, impulse, parts_of, steady_gain
+from .whiteness import ExcessPeak
+
+Cause = Literal[
+    "none", "noise level", "noise ratio", "frequency", "truncation", "folding", "offset", "outliers"
+]
+#: a peak this close to a mode, relative, may belong to it
+_NEAR = 0.06
+#: largest part of the samples that are outliers, and how many a short record may have
+_RARE, _FEW = 0.01, 20
+#: samples of one burst of motion that follow each other, and part of all that makes them one
+_APART, _BURST = 5, 0.5
+#: samples after an outlier that it is followed for at most
+_FOLLOWED = 2000
+#: lines next to 0 that an offset is compared with
+_LOWEST = 8
+#: lines of a band at most, evaluations of the search for a mode's change, and widths of a new mode
+_BAND, _SEARCH, _WIDTHS = 600, 60, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+
+
+class Verdict(NamedTuple):
+    """A likely cause, and in words."""
+
+    cause: Cause
+    text: str
+
+
+class Outliers(NamedTuple):
+    """Samples (k, sensor) that are off, by how much, and the innovations without them."""
+
+    places: list[tuple[int, int]]
+    sizes: list[float]
+    white: FloatArray
+
+
+def outliers(
+    observer: KalmanEstimator, white: FloatArray, normal: FloatArray, alpha: float
+) -> Outliers | None:
+    """Return single samples of sensors that are off, or None.
+
+    One is found by an innovation beyond what chance makes of Gaussian ones of their own size
+    (median); its effect on all later ones, the filter's response to one sample, is taken away
+    before the next is looked for. Many in a row are no outliers but a motion of the machine.
+    """
+    from scipy.stats import norm
+
+    count = int(np.isfinite(normal).sum())
+    spread = np.nanmedian(np.abs(normal), axis=0) / norm.ppf(0.75)
+    # the median of n samples is known within 1.2 / sqrt(n): twice that on top
+    limit = norm.isf(0.5 * alpha / count) * (1.0 + 2.4 / np.sqrt(len(normal)))
+    bound = limit * np.maximum(spread, 1e-300)
+    if not np.any(np.abs(normal) > bound):
+        return None
+    left, plain = white.copy(), normal.copy()
+    length = min(_FOLLOWED, settling(observer), len(white))
+    response = impulse(observer, length)
+    model = observer.model
+    S = model.innovation(observer.predicted_covariance)
+    root, size = np.linalg.cholesky(0.5 * (S + S.T)), np.sqrt(S.diagonal())
+    places: list[tuple[int, int]] = []
+    sizes: list[float] = []
+    while np.any(late := np.abs(plain) > bound):
+        if len(places) >= max(_FEW, int(_RARE * len(white))):
+            return None
+        # the first one: later ones may be its effect
+        k = int(np.flatnonzero(np.any(late, axis=1))[0])
+        i = int(np.argmax(np.where(late[k], np.abs(plain[k]) / bound, 0.0)))
+        own = response[: len(white) - k, :, i]
+        if (k, i) in places:
+            plain[k, i] = 0.0
+            continue
+        seen = np.all(np.isfinite(left[k : k + len(own)]), axis=1)
+        there = left[k : k + len(own)][seen]
+        amount = float(np.sum(own[seen] * there) / np.sum(own[seen] ** 2)) if seen.any() else 0.0
+        if not seen[0]:
+            plain[k, i] = 0.0
+            continue
+        left[k : k + len(own)] -= amount * own
+        plain[k : k + len(own)] -= amount * own @ root.T / size
+        places.append((k, i))
+        sizes.append(amount)
+    at = np.array(sorted(k for k, _ in places))
+    near = np.diff(at) <= _APART
+    if not places or (at.size > _APART and np.mean(near) > _BURST):
+        return None
+    return Outliers(places, sizes, left)
+
+
+def outlier_text(found: Outliers, observer: KalmanEstimator, time: FloatArray) -> str:
+    """Return the outliers in words."""
+    units = observer.plant.units
+    listed = [
+        f"{with_unit(size, units.get(observer.sensors[i]))} of {observer.sensors[i]} at "
+        f"{time[k]:.6g} s"
+        for (k, i), size in list(zip(found.places, found.sizes, strict=True))[:3]
+    ]
+    more = len(found.places) - len(listed)
+    return (
+        f"{counted(len(found.places), 'single sample')} beyond what noise makes: "
+        f"{', '.join(listed)}{f' and {more} more' if more else ''}: outliers. Leave them out: "
+        "observer.estimate(records, gate=6)."
+    )
+
+
+class Offset(NamedTuple):
+    """Mean of the whitened innovations, and the verdict in words."""
+
+    mean: FloatArray
+    text: str
+
+
+def offset(observer: KalmanEstimator, white: FloatArray, alpha: float) -> Offset | None:
+    """Return a constant part of the innovations beyond the density at the lowest lines, or None."""
+    from scipy.stats import chi2, f
+
+    there = np.all(np.isfinite(white), axis=1)
+    n, p = int(there.sum()), white.shape[1]
+    x = np.where(there[:, None], white, 0.0)
+    mean = x.sum(axis=0) / n
+    low = np.fft.rfft(x - np.where(there[:, None], mean, 0.0), axis=0)[1 : _LOWEST + 1]
+    around = max(float(np.mean(np.abs(low) ** 2)) / n, 1e-300)
+    power = n * float(mean @ mean) / p
+    if f.sf(power / around, p, 2 * p * _LOWEST) >= alpha or chi2.sf(power * p, p) >= alpha:
+        return None
+    gain, units = steady_gain(observer), observer.plant.units
+    along = np.sum(gain**2, axis=0)
+    sizes = gain.T @ mean / np.where(along > 0, along, 1.0)
+    rest = n * (mean @ mean - sizes**2 * along) / around
+    possible = [i for i in np.argsort(rest) if rest[i] < chi2.isf(alpha, max(p - 1, 1)) or p == 1]
+    if not possible:
+        named = "sensors have offsets"
+    else:
+        each = [
+            f"{observer.sensors[i]} by {with_unit(float(sizes[i]), units.get(observer.sensors[i]))}"
+            for i in possible[:4]
+        ]
+        named = f"a sensor has an offset ({' or '.join(each)})"
+    return Offset(
+        mean,
+        f"the innovations have a mean, {np.sqrt(mean @ mean):.3g} of their deviation: {named}, or "
+        "a constant force acts that the records lack. Take it off the record.",
+    )
+
+
+def settling(observer: KalmanEstimator) -> int:
+    """Return after how many samples an error of the filter has faded to a thousandth."""
+    radius = observer.certificate.spectral_radius
+    return int(np.ceil(np.log(1e-3) / np.log(radius))) if 0 < radius < 1 else 1
+
+
+class Modes(NamedTuple):
+    """Elastic modes of a plant: their numbers, from 1, and frequencies [Hz]."""
+
+    numbers: IntArray
+    freq: FloatArray
+
+    def named(self, i: int) -> str:
+        """Return a mode in words."""
+        return f"mode {self.numbers[i]} ({self.freq[i]:.4g} Hz"
+
+
+def modes_of(plant: StandardPlant) -> Modes:
+    """Return the elastic modes of a plant."""
+    if plant.is_assembled:
+        omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
+        return Modes(plant.n_rigid + 1 + np.arange(omega.size), omega / (2 * np.pi))
+    poles = np.linalg.eigvals(plant.system.A)
+    swinging = poles[(poles.imag > 0) & (np.abs(poles) > 0.1)]
+    freq = np.sort(np.angle(swinging)) / (2 * np.pi * plant.dt)
+    return Modes(1 + np.arange(freq.size), freq)
+
+
+def folded(freq: FloatArray, rate: float) -> FloatArray:
+    """Return where frequencies appear when sampled."""
+    return np.asarray(np.abs(freq - rate * np.round(freq / rate)))
+
+
+def peak_verdict(
+    observer: KalmanEstimator,
+    lines: Lines,
+    level: FloatArray,
+    peaks: list[ExcessPeak],
+    whole: tuple[StandardPlant, IntArray] | None,
+) -> Verdict:
+    """Return the verdict of peaks beyond the pooled `level` (m,).
+
+    `whole` is the larger plant with the numbers of the modes left out, where it is known.
+    """
+    plant, rate = observer.plant, 1.0 / observer.plant.dt
+    kept = modes_of(plant)
+    seen = folded(kept.freq, rate)
+    top = np.max(kept.freq[kept.freq < 0.5 * rate], initial=0.0)
+    highest = max(peaks, key=lambda one: one.height)
+    at = highest.freq * rate
+    near = np.flatnonzero(np.abs(seen - at) <= _NEAR * np.maximum(seen, 1e-300))
+    changed = [int(i) for i in near if _changed(observer, lines, level, at, kept, int(i))]
+    if changed:
+        i = min(changed, key=lambda j: float(abs(seen[j] - at)))
+        return Verdict(
+            "frequency",
+            f"{_said(highest, rate)}, near {kept.named(i)} in the plant): its frequency or damping "
+            "is not the machine's. Update the model.",
+        )
+    found = None if whole is None else _named(observer, left_modes(*whole), at)
+    if found is not None:
+        return Verdict(found.cause, f"{_said(highest, rate)}: {found.text}")
+    # modes left out above those of the plant make peaks among these too: their compliance lacks
+    above = [one for one in peaks if one.freq * rate > top]
+    shown = max(above, key=lambda one: one.height, default=highest)
+    nyquist = f"{0.5 * rate:.5g} Hz"
+    where = "above all modes of the plant" if above else "where the plant has no mode"
+    if near.size and shown is highest:
+        where = f"which no change of {kept.named(int(near[0]))} in the plant) explains"
+    lacks = "or a disturbance that the plant lacks. Keep more modes, or add the disturbance."
+    if above:
+        out = f"a mode left out (above {nyquist} it appears folded)"
+        return Verdict("truncation", f"{_said(shown, rate)}, {where}: {out}, {lacks}")
+    return Verdict(
+        "folding",
+        f"{_said(shown, rate)}, {where}; it has modes up to {top:.4g} Hz: one left out that lies "
+        f"above {nyquist} and appears folded (from {rate - at:.5g} or {rate + at:.5g} Hz, say), "
+        + lacks,
+    )
+
+
+def _said(peak: ExcessPeak, rate: float) -> str:
+    return (
+        f"the innovations have {peak.height:.3g} times the density that noise explains at "
+        f"{peak.freq * rate:.4g} Hz"
+    )
+
+
+def left_modes(whole: StandardPlant, numbers: IntArray) -> Modes:
+    """Return the modes left out of a larger plant."""
+    every = modes_of(whole)
+    at = np.flatnonzero(np.isin(every.numbers, numbers))
+    return Modes(every.numbers[at], every.freq[at])
+
+
+def _named(observer: KalmanEstimator, left: Modes, at: float) -> Verdict | None:
+    """Return which mode left out appears at a frequency [Hz], or None."""
+    rate = 1.0 / observer.plant.dt
+    seen = folded(left.freq, rate)
+    i = int(np.argmin(np.abs(seen - at)))
+    if abs(seen[i] - at) > _NEAR * at:
+        return None
+    name = f"{left.named(i)} in the larger model), which the plant leaves out"
+    cure = (
+        "give design_kalman(larger=), so that it counts as noise"
+        if observer.left_out is None
+        else "leave it: it counts as white noise in this filter"
+    )
+    if left.freq[i] > 0.5 * rate:
+        text = f"{name}, appears folded at {seen[i]:.4g} Hz. Keep it, filter before sampling, or"
+        return Verdict("folding", f"{text} {cure}.")
+    return Verdict("truncation", f"{name}. Keep it, or {cure}.")
+
+
+def known_verdict(
+    observer: KalmanEstimator, left: Modes, parts: Parts, freq: FloatArray
+) -> Verdict:
+    """Return the verdict of innovations that are those of the larger plant, as they should be."""
+    rate = 1.0 / observer.plant.dt
+    at = float(freq[np.argmax(parts.pooled.sum(axis=0))]) * rate
+    i = int(np.argmin(np.abs(folded(left.freq, rate) - at)))
+    end = (
+        "Keep more modes, or give design_kalman(larger=), so that they count as noise."
+        if observer.left_out is None
+        else "These count as white noise in this filter: its predicted errors hold."
+    )
+    return Verdict(
+        "folding" if left.freq[i] > 0.5 * rate else "truncation",
+        "the innovations are those of the larger model: the plant is right, they are coloured by "
+        f"the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
+        f"{left.named(i)} in the larger model)). {end}",
+    )
+
+
+def _changed(
+    observer: KalmanEstimator, lines: Lines, level: FloatArray, at: float, kept: Modes, i: int
+) -> bool:
+    """Return whether another frequency or damping of a mode explains a peak better than a new mode.
+
+    Both are fitted to the lines around by Whittle's likelihood, the mode's change as the density
+    of the innovations on the changed plant, the new mode as ``h v v* g^2 / ((f - f_0)^2 + g^2)``
+    with any direction v; each parameter costs half the logarithm of the number of lines. A changed
+    mode is missing where the model has it, and shows itself in its own direction.
+    """
+    from scipy.optimize import minimize
+
+    plant = observer.plant
+    if not plant.is_assembled:
+        return True  # its modes cannot be changed one by one
+    rate, mode = 1.0 / plant.dt, float(kept.freq[i])
+    seen = float(folded(np.array([mode]), rate)[0])
+    sign = 1.0 if abs(mode - rate * np.round(mode / rate) - seen) <= 1e-9 * rate else -1.0
+    reach = 3.0 * abs(at - seen) + 0.02 * at
+    freq = lines.freq * rate
+    band = np.flatnonzero(np.abs(freq - 0.5 * (at + seen)) <= reach)
+    band = band[:: max(1, band.size // _BAND)]
+    X, base, p = lines.X[band], level[band], lines.X.shape[1]
+    number = int(kept.numbers[i])
+    own = np.eye(p)[None]
+    usual = parts_of(observer, plant, lines.freq[band]).both
+
+    def cost(change: FloatArray) -> float:
+        moved = mode + sign * (at - seen) * change[0]
+        amounts = [
+            (Delta("freq", number, "freq", 1.0), float((moved / mode) ** 2 - 1.0)),
+            (Delta("damping", number, "damping", 1.0), float(np.exp(change[1]) - 1.0)),
+        ]
+        machine = with_changes(plant, amounts)
+        S = parts_of(observer, machine, lines.freq[band]).both - usual + own
+        return _whittle(S * base[:, None, None], X)
+
+    first = np.array([[1.0, 0.0], [0.8, 0.3], [1.2, -0.3]])
+    with np.errstate(all="ignore"):
+        best = minimize(
+            cost, first[0], method="Nelder-Mead",
+            options={"maxfev": _SEARCH, "initial_simplex": first, "xatol": 1e-2, "fatol": 0.5},
+        ).fun  # fmt: skip
+    new = min(_new_mode(X, base, freq[band], at, width * at) for width in _WIDTHS)
+    price = 0.5 * np.log(band.size)
+    return bool(best + 2 * price <= new + (2 * p + 1) * price)
+
+
+def _new_mode(
+    X: ComplexArray, base: FloatArray, freq: FloatArray, at: float, width: float
+) -> float:
+    """Return the cost of a mode of some width in any one direction."""
+    shape = width**2 / ((freq - at) ** 2 + width**2)
+    unit = X / np.sqrt(base)[:, None]
+    v = np.linalg.eigh(np.einsum("k,ki,kj->ij", shape, unit, unit.conj()))[1][:, -1]
+    seen = np.abs(unit @ v.conj()) ** 2
+    rest = np.sum(np.abs(unit) ** 2) - np.sum(seen) + X.shape[1] * np.sum(np.log(base))
+    heights = np.geomspace(0.1, 1e6, 60)[:, None]
+    m = 1.0 + heights * shape
+    return float(np.min(np.sum(np.log(m) + seen / m, axis=1)) + rest)
+
+
+def _whittle(S: ComplexArray, X: ComplexArray) -> float:
+    """Return ``sum log det S + X* S^-1 X``, infinite where S is no density."""
+    try:
+        root = np.linalg.cholesky(S)
+    except np.linalg.LinAlgError:
+        return np.inf
+    white = np.linalg.solve(root, X[:, :, None])
+    size = np.log(np.diagonal(root, axis1=1, axis2=2).real)
+    return float(2.0 * np.sum(size) + np.sum(np.abs(white) ** 2))

@@ -1,0 +1,159 @@
+"""The spectrum of whitened innovations: of a record, and what a plant makes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+
+from ..lti.frequency import frequency_response
+from ..lti.statespace import StateSpace
+from ..plant import StandardPlant
+from ..values import ComplexArray, FloatArray
+from .estimator import KalmanEstimator
+from .whiteness import PooledSpectrum
+
+#: lines of a spectrum that are computed at once
+_LINES = 4000
+
+
+class Lines(NamedTuple):
+    """Fourier transform X (m, p) of whitened innovations at lines [cycles per sample]."""
+
+    freq: FloatArray
+    X: ComplexArray
+    samples: int
+
+    @property
+    def pooled(self) -> PooledSpectrum:
+        """The periodogram, mean over the channels."""
+        return PooledSpectrum(self.freq, np.mean(np.abs(self.X) ** 2, axis=1), self.X.shape[1])
+
+    def beside(self, S: ComplexArray) -> PooledSpectrum:
+        """Return ``X* S^-1 X / p``: 1 in the mean where the innovations have the density S."""
+        solved = np.linalg.solve(S, self.X[:, :, None])[:, :, 0]
+        density = np.sum(self.X.conj() * solved, axis=1).real / self.X.shape[1]
+        return PooledSpectrum(self.freq, density, self.X.shape[1])
+
+
+class Parts(NamedTuple):
+    """Density (m, p, p) of whitened innovations: by disturbances, and by the sensors' noise."""
+
+    process: ComplexArray
+    sensors: ComplexArray
+
+    @property
+    def both(self) -> ComplexArray:
+        """Their sum."""
+        return self.process + self.sensors
+
+    @property
+    def pooled(self) -> FloatArray:
+        """Mean over the channels, (2, m)."""
+        means = [np.mean(np.diagonal(part, axis1=1, axis2=2).real, axis=1) for part in self]
+        return np.asarray(np.stack(means))
+
+
+def lines_of(white: FloatArray) -> Lines:
+    """Return the lines of vectors (N, p) without 0 and the Nyquist frequency; missing are zero."""
+    there = np.all(np.isfinite(white), axis=1)
+    x = np.where(there[:, None], white, 0.0)
+    at = slice(1, (len(x) - 1) // 2 + 1)
+    X = np.fft.rfft(x, axis=0)[at] / np.sqrt(max(int(there.sum()), 1))
+    return Lines(np.fft.rfftfreq(len(x))[at].astype(np.float64), X, len(x))
+
+
+def seen_from_states(A: FloatArray, C: FloatArray, freq: FloatArray) -> ComplexArray:
+    """Return ``C (z I - A)^-1`` (m, p, n) at frequencies [cycles per sample].
+
+    Of the transposed system, which has the fewer inputs.
+    """
+    n, p = C.shape[1], C.shape[0]
+    turned = StateSpace(A.T, C.T, np.eye(n), np.zeros((n, p)), 1.0)
+    return np.asarray(frequency_response(turned, freq).data.transpose(2, 1, 0))
+
+
+def whitening(observer: KalmanEstimator, freq: FloatArray) -> ComplexArray:
+    """Return ``W (I - C (z I - A + K C)^-1 K)`` (m, p, p): from y to the whitened innovations."""
+    m, K = observer.model, observer.predictor_gain
+    back = np.eye(K.shape[1]) - seen_from_states(m.A - K @ m.C2, m.C2, freq) @ K
+    return np.asarray(np.linalg.solve(_unit(observer), back))
+
+
+def steady_gain(observer: KalmanEstimator) -> FloatArray:
+    """Return the whitened innovations (p, p) that constant offsets of the sensors make."""
+    m, K = observer.model, observer.predictor_gain
+    moved = np.linalg.solve(np.eye(len(m.A)) - m.A + K @ m.C2, K)
+    return np.asarray(np.linalg.solve(_unit(observer), np.eye(K.shape[1]) - m.C2 @ moved))
+
+
+def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
+    """Return the whitened innovations (count, p, p) after one sample of each sensor is 1 off."""
+    m, K = observer.model, observer.predictor_gain
+    closed, x = m.A - K @ m.C2, K
+    found = np.empty((count, K.shape[1], K.shape[1]))
+    found[0] = np.eye(K.shape[1])
+    for k in range(1, count):
+        found[k], x = -m.C2 @ x, closed @ x
+    return np.asarray(np.linalg.solve(_unit(observer), found))
+
+
+def parts_of(observer: KalmanEstimator, plant: StandardPlant | None, freq: FloatArray) -> Parts:
+    """Return the density of the whitened innovations of a filter that runs on a plant.
+
+    ``V (Y Y* + R) V*`` with V that of `whitening`, ``Y = C (z I - A)^-1 G + H`` from the noises of
+    the plant to its sensors and R the sensors' own. None: on the filter's own model, where modes
+    left out are white noise of the sensors and the sum of both parts is I.
+    """
+    p = len(observer.sensors)
+    process = np.empty((freq.size, p, p), dtype=np.complex128)
+    sensors = np.empty_like(process)
+    for at in _pieces(freq.size):
+        V = whitening(observer, freq[at])
+        if plant is None:
+            sensors[at] = _squared(V @ np.linalg.cholesky(observer.model.R))
+            process[at] = np.eye(p) - sensors[at]
+            continue
+        rows = [plant.y.index(name) for name in observer.sensors]
+        g = plant.system
+        C = g.C[g.output_index(observer.sensors)]
+        Y = seen_from_states(g.A, C, freq[at]) @ plant.noise_factor + plant.noise_direct[rows]
+        process[at] = _squared(V @ Y)
+        own = plant.sensor_noise_factor[rows]
+        sensors[at] = _squared(V @ own)
+    return Parts(process, sensors)
+
+
+def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> Parts:
+    """Return the mean of the periodogram of so many samples, at the lines of `lines_of`.
+
+    The density seen through the record's length (Fejer's kernel): its covariance c_l counts
+    ``1 - |l| / N``. A line narrower than 1 / N leaks into its neighbours in just this way.
+    """
+    freq = np.arange(1, samples + 1) / (2.0 * samples)
+    lag = np.minimum(np.arange(2 * samples), 2 * samples - np.arange(2 * samples))
+    weight = (1.0 - lag / samples)[:, None, None]
+    at = slice(2, 2 * ((samples - 1) // 2) + 1, 2)
+
+    def seen(density: ComplexArray) -> ComplexArray:
+        whole = np.concatenate([density[:1].real, density])
+        covariance = np.fft.irfft(whole, 2 * samples, axis=0)
+        return np.asarray(np.fft.rfft(covariance * weight, axis=0)[at])
+
+    found = parts_of(observer, plant, freq)
+    return Parts(seen(found.process), seen(found.sensors))
+
+
+def _unit(observer: KalmanEstimator) -> FloatArray:
+    S = observer.model.innovation(observer.predicted_covariance)
+    return np.asarray(np.linalg.cholesky(0.5 * (S + S.T)))
+
+
+def _squared(part: ComplexArray) -> ComplexArray:
+    return np.asarray(part @ np.conj(np.swapaxes(part, 1, 2)))
+
+
+def _pieces(count: int) -> Iterator[slice]:
+    for start in range(0, count, _LINES):
+        yield slice(start, start + _LINES)
