@@ -11,14 +11,15 @@ from ..plant import StandardPlant
 from ..plant.uncertainty.uncertain_plant import Delta, with_changes
 from ..values import ComplexArray, FloatArray, IntArray, with_unit
 from .estimator import KalmanEstimator
-from .innovation_spectrum import Lines, Parts, impulse, parts_of, steady_gain
+from .innovation_spectrum import InnovationLines, InnovationParts, impulse, parts_of, steady_gain
 from .whiteness import ExcessPeak
 
 Cause = Literal[
     "none", "noise level", "noise ratio", "frequency", "truncation", "folding", "offset", "outliers"
 ]
-#: a peak this close to a mode, relative, may belong to it
-_NEAR = 0.06
+#: a peak this close to a mode, relative, may belong to it: that of the innovations lies beyond the
+#: machine's mode, seen from the model's
+_NEAR = 0.12
 #: largest part of the samples that are outliers, and how many a short record may have
 _RARE, _FEW = 0.01, 20
 #: samples of one burst of motion that follow each other, and part of all that makes them one
@@ -28,10 +29,10 @@ _FOLLOWED = 2000
 #: lines next to 0 that an offset is compared with
 _LOWEST = 8
 #: lines of a band at most, evaluations of the search for a mode's change, and widths of a new mode
-_BAND, _SEARCH, _WIDTHS = 600, 60, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
+_BAND, _SEARCH, _WIDTHS = 400, 40, (3e-4, 1e-3, 3e-3, 1e-2, 3e-2, 1e-1)
 
 
-class Verdict(NamedTuple):
+class LikelyCause(NamedTuple):
     """A likely cause, and in words."""
 
     cause: Cause
@@ -161,7 +162,7 @@ def settling(observer: KalmanEstimator) -> int:
     return int(np.ceil(np.log(1e-3) / np.log(radius))) if 0 < radius < 1 else 1
 
 
-class Modes(NamedTuple):
+class SampledModes(NamedTuple):
     """Elastic modes of a plant: their numbers, from 1, and frequencies [Hz]."""
 
     numbers: IntArray
@@ -172,15 +173,15 @@ class Modes(NamedTuple):
         return f"mode {self.numbers[i]} ({self.freq[i]:.4g} Hz"
 
 
-def modes_of(plant: StandardPlant) -> Modes:
+def modes_of(plant: StandardPlant) -> SampledModes:
     """Return the elastic modes of a plant."""
     if plant.is_assembled:
         omega = np.sqrt(np.abs(np.linalg.det(plant.modal_blocks)))[plant.n_rigid :]
-        return Modes(plant.n_rigid + 1 + np.arange(omega.size), omega / (2 * np.pi))
+        return SampledModes(plant.n_rigid + 1 + np.arange(omega.size), omega / (2 * np.pi))
     poles = np.linalg.eigvals(plant.system.A)
     swinging = poles[(poles.imag > 0) & (np.abs(poles) > 0.1)]
     freq = np.sort(np.angle(swinging)) / (2 * np.pi * plant.dt)
-    return Modes(1 + np.arange(freq.size), freq)
+    return SampledModes(1 + np.arange(freq.size), freq)
 
 
 def folded(freq: FloatArray, rate: float) -> FloatArray:
@@ -190,11 +191,11 @@ def folded(freq: FloatArray, rate: float) -> FloatArray:
 
 def peak_verdict(
     observer: KalmanEstimator,
-    lines: Lines,
+    lines: InnovationLines,
     level: FloatArray,
     peaks: list[ExcessPeak],
     whole: tuple[StandardPlant, IntArray] | None,
-) -> Verdict:
+) -> LikelyCause:
     """Return the verdict of peaks beyond the pooled `level` (m,).
 
     `whole` is the larger plant with the numbers of the modes left out, where it is known.
@@ -206,17 +207,17 @@ def peak_verdict(
     highest = max(peaks, key=lambda one: one.height)
     at = highest.freq * rate
     near = np.flatnonzero(np.abs(seen - at) <= _NEAR * np.maximum(seen, 1e-300))
-    changed = [int(i) for i in near if _changed(observer, lines, level, at, kept, int(i))]
-    if changed:
-        i = min(changed, key=lambda j: float(abs(seen[j] - at)))
-        return Verdict(
+    near = near[np.argsort(np.abs(seen[near] - at))]
+    i = next((int(j) for j in near if _changed(observer, lines, level, at, kept, int(j))), None)
+    if i is not None:
+        return LikelyCause(
             "frequency",
             f"{_said(highest, rate)}, near {kept.named(i)} in the plant): its frequency or damping "
             "is not the machine's. Update the model.",
         )
     found = None if whole is None else _named(observer, left_modes(*whole), at)
     if found is not None:
-        return Verdict(found.cause, f"{_said(highest, rate)}: {found.text}")
+        return LikelyCause(found.cause, f"{_said(highest, rate)}: {found.text}")
     # modes left out above those of the plant make peaks among these too: their compliance lacks
     above = [one for one in peaks if one.freq * rate > top]
     shown = max(above, key=lambda one: one.height, default=highest)
@@ -227,8 +228,8 @@ def peak_verdict(
     lacks = "or a disturbance that the plant lacks. Keep more modes, or add the disturbance."
     if above:
         out = f"a mode left out (above {nyquist} it appears folded)"
-        return Verdict("truncation", f"{_said(shown, rate)}, {where}: {out}, {lacks}")
-    return Verdict(
+        return LikelyCause("truncation", f"{_said(shown, rate)}, {where}: {out}, {lacks}")
+    return LikelyCause(
         "folding",
         f"{_said(shown, rate)}, {where}; it has modes up to {top:.4g} Hz: one left out that lies "
         f"above {nyquist} and appears folded (from {rate - at:.5g} or {rate + at:.5g} Hz, say), "
@@ -243,14 +244,14 @@ def _said(peak: ExcessPeak, rate: float) -> str:
     )
 
 
-def left_modes(whole: StandardPlant, numbers: IntArray) -> Modes:
+def left_modes(whole: StandardPlant, numbers: IntArray) -> SampledModes:
     """Return the modes left out of a larger plant."""
     every = modes_of(whole)
     at = np.flatnonzero(np.isin(every.numbers, numbers))
-    return Modes(every.numbers[at], every.freq[at])
+    return SampledModes(every.numbers[at], every.freq[at])
 
 
-def _named(observer: KalmanEstimator, left: Modes, at: float) -> Verdict | None:
+def _named(observer: KalmanEstimator, left: SampledModes, at: float) -> LikelyCause | None:
     """Return which mode left out appears at a frequency [Hz], or None."""
     rate = 1.0 / observer.plant.dt
     seen = folded(left.freq, rate)
@@ -265,13 +266,13 @@ def _named(observer: KalmanEstimator, left: Modes, at: float) -> Verdict | None:
     )
     if left.freq[i] > 0.5 * rate:
         text = f"{name}, appears folded at {seen[i]:.4g} Hz. Keep it, filter before sampling, or"
-        return Verdict("folding", f"{text} {cure}.")
-    return Verdict("truncation", f"{name}. Keep it, or {cure}.")
+        return LikelyCause("folding", f"{text} {cure}.")
+    return LikelyCause("truncation", f"{name}. Keep it, or {cure}.")
 
 
 def known_verdict(
-    observer: KalmanEstimator, left: Modes, parts: Parts, freq: FloatArray
-) -> Verdict:
+    observer: KalmanEstimator, left: SampledModes, parts: InnovationParts, freq: FloatArray
+) -> LikelyCause:
     """Return the verdict of innovations that are those of the larger plant, as they should be."""
     rate = 1.0 / observer.plant.dt
     at = float(freq[np.argmax(parts.pooled.sum(axis=0))]) * rate
@@ -281,7 +282,7 @@ def known_verdict(
         if observer.left_out is None
         else "These count as white noise in this filter: its predicted errors hold."
     )
-    return Verdict(
+    return LikelyCause(
         "folding" if left.freq[i] > 0.5 * rate else "truncation",
         "the innovations are those of the larger model: the plant is right, they are coloured by "
         f"the {counted(left.freq.size, 'mode')} left out (most at {at:.4g} Hz, next to "
@@ -290,7 +291,12 @@ def known_verdict(
 
 
 def _changed(
-    observer: KalmanEstimator, lines: Lines, level: FloatArray, at: float, kept: Modes, i: int
+    observer: KalmanEstimator,
+    lines: InnovationLines,
+    level: FloatArray,
+    at: float,
+    kept: SampledModes,
+    i: int,
 ) -> bool:
     """Return whether another frequency or damping of a mode explains a peak better than a new mode.
 
@@ -310,7 +316,7 @@ def _changed(
     reach = 3.0 * abs(at - seen) + 0.02 * at
     freq = lines.freq * rate
     band = np.flatnonzero(np.abs(freq - 0.5 * (at + seen)) <= reach)
-    band = band[:: max(1, band.size // _BAND)]
+    band = band[:: -(-band.size // _BAND)]
     X, base, p = lines.X[band], level[band], lines.X.shape[1]
     number = int(kept.numbers[i])
     own = np.eye(p)[None]
@@ -326,12 +332,20 @@ def _changed(
         S = parts_of(observer, machine, lines.freq[band]).both - usual + own
         return _whittle(S * base[:, None, None], X)
 
-    first = np.array([[1.0, 0.0], [0.8, 0.3], [1.2, -0.3]])
+    starts = [np.array([share, factor]) for share in (0.0, 0.5, 1.0) for factor in (-1.4, 0.0, 1.4)]
     with np.errstate(all="ignore"):
+        first = min(starts, key=cost)
         best = minimize(
-            cost, first[0], method="Nelder-Mead",
-            options={"maxfev": _SEARCH, "initial_simplex": first, "xatol": 1e-2, "fatol": 0.5},
-        ).fun  # fmt: skip
+            cost,
+            first,
+            method="Nelder-Mead",
+            options={
+                "maxfev": _SEARCH,
+                "initial_simplex": first + np.array([[0.0, 0.0], [0.2, 0.2], [0.2, -0.3]]),
+                "xatol": 1e-2,
+                "fatol": 0.5,
+            },
+        ).fun
     new = min(_new_mode(X, base, freq[band], at, width * at) for width in _WIDTHS)
     price = 0.5 * np.log(band.size)
     return bool(best + 2 * price <= new + (2 * p + 1) * price)

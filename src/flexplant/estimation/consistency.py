@@ -9,13 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arguments import between
-from ..errors import ModelError, ShapeError
+from ..errors import ModelError, ShapeError, counted
 from ..plant import StandardPlant, larger_plant
 from ..plant.realisation import Structure
 from ..values import FloatArray, Value, instance, real_array, short
 from .causes import (
     Cause,
-    Verdict,
+    LikelyCause,
     known_verdict,
     left_modes,
     offset,
@@ -27,7 +27,7 @@ from .causes import (
 from .estimate import Estimate
 from .estimator import KalmanEstimator
 from .estimator_channels import poi_channels, read_alike, row_of
-from .innovation_spectrum import Lines, Parts, expected, lines_of, parts_of
+from .innovation_spectrum import InnovationLines, InnovationParts, expected, lines_of, parts_of
 from .left_out import left_out
 from .whiteness import ExcessPeak, Statistic, cumulative_periodogram, level_test, ljung_box, peaks
 
@@ -35,6 +35,8 @@ from .whiteness import ExcessPeak, Statistic, cumulative_periodogram, level_test
 _FEWEST = 200
 #: tests that share the level
 _TESTS = 5
+#: samples that are compared with a larger plant: its response is computed at each of their lines
+_COMPARED = 32768
 #: the innovations are those of the larger plant unless it is this unlikely: they fail as those of
 #: the plant already, so that a failure by chance would name a cause that is none
 _AGREES = 1e-4
@@ -205,13 +207,13 @@ def consistency(
     said, rest = [], raw
     single = outliers(observer, white, normal, alpha)
     if single is not None:
-        said.append(Verdict("outliers", outlier_text(single, observer, estimate.time)))
+        said.append(LikelyCause("outliers", outlier_text(single, observer, estimate.time)))
         white = single.white
     settled = white.copy()
     settled[: min(settling(observer), len(white) // 4)] = np.nan
     constant = offset(observer, settled, alpha)
     if constant is not None:
-        said.append(Verdict("offset", constant.text))
+        said.append(LikelyCause("offset", constant.text))
         white = settled - constant.mean  # what an offset does at first is no constant
     whole = _whole(observer, larger)
     if said or whole is not None:
@@ -219,6 +221,8 @@ def consistency(
     verdict = _verdict(observer, rest, whole, estimate.sensors)
     if not said or verdict.cause != "none":
         said.append(verdict)
+    gated = int(estimate.gated.sum())
+    left = f" {counted(gated, 'sample')} beyond the gate left out." if gated else ""
     rate = 1.0 / observer.plant.dt
     return Consistency(
         raw.nis.statistic,
@@ -229,7 +233,7 @@ def consistency(
         _nees(observer, estimate, truth, share),
         tuple((one.freq * rate, one.height) for one in rest.peaks[:6]),
         tuple(one.cause for one in said),
-        " ".join(one.text for one in said),
+        " ".join(one.text for one in said) + left,
         share,
     )
 
@@ -241,8 +245,8 @@ class _Facts(NamedTuple):
     box: Statistic
     bartlett: Statistic
     peaks: list[ExcessPeak]
-    lines: Lines
-    parts: Parts
+    lines: InnovationLines
+    parts: InnovationParts
     levels: FloatArray
     ratios: FloatArray
     samples: int
@@ -279,7 +283,7 @@ def _tested(
     count = int(there.sum())
     nis = level_test(float(np.sum(white[there] ** 2)), count * white.shape[1])
     box = ljung_box(white, min(100, count // 20))
-    lines = lines_of(white)
+    lines = lines_of(white if whole is None else white[-_COMPARED:])
     pooled = lines.pooled
     parts = (
         parts_of(observer, None, lines.freq)
@@ -306,10 +310,10 @@ def _whole(observer: KalmanEstimator, larger: Any) -> StandardPlant | None:
 
 def _verdict(
     observer: KalmanEstimator, facts: _Facts, whole: StandardPlant | None, names: Any
-) -> Verdict:
+) -> LikelyCause:
     """Return the likely cause and the verdict in words."""
     if facts.white and facts.nis.p_value >= facts.alpha:
-        return Verdict("none", "the innovations are white and of the predicted size.")
+        return LikelyCause("none", "the innovations are white and of the predicted size.")
     numbers = None
     if whole is not None and whole.is_assembled:
         missed = observer.left_out if observer.left_out is not None else left_out(
@@ -320,12 +324,12 @@ def _verdict(
         left = left_modes(whole, numbers)
         return known_verdict(observer, left, facts.parts, facts.lines.freq)
     if facts.white:
-        return Verdict("noise level", _level_text(facts, names))
+        return LikelyCause("noise level", _level_text(facts, names))
     if facts.peaks:
         known = None if whole is None or numbers is None else (whole, numbers)
         return peak_verdict(observer, facts.lines, facts.expected, facts.peaks, known)
     process, sensor = np.sqrt(facts.levels)
-    return Verdict(
+    return LikelyCause(
         "noise ratio",
         "the innovations are coloured as with other noises: the process noise is about "
         f"{process:.3g} times and that of the sensors {sensor:.3g} times the stated one. Estimate "

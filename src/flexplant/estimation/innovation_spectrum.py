@@ -18,7 +18,7 @@ from .whiteness import PooledSpectrum
 _LINES = 4000
 
 
-class Lines(NamedTuple):
+class InnovationLines(NamedTuple):
     """Fourier transform X (m, p) of whitened innovations at lines [cycles per sample]."""
 
     freq: FloatArray
@@ -37,7 +37,7 @@ class Lines(NamedTuple):
         return PooledSpectrum(self.freq, density, self.X.shape[1])
 
 
-class Parts(NamedTuple):
+class InnovationParts(NamedTuple):
     """Density (m, p, p) of whitened innovations: by disturbances, and by the sensors' noise."""
 
     process: ComplexArray
@@ -55,13 +55,13 @@ class Parts(NamedTuple):
         return np.asarray(np.stack(means))
 
 
-def lines_of(white: FloatArray) -> Lines:
+def lines_of(white: FloatArray) -> InnovationLines:
     """Return the lines of vectors (N, p) without 0 and the Nyquist frequency; missing are zero."""
     there = np.all(np.isfinite(white), axis=1)
     x = np.where(there[:, None], white, 0.0)
     at = slice(1, (len(x) - 1) // 2 + 1)
     X = np.fft.rfft(x, axis=0)[at] / np.sqrt(max(int(there.sum()), 1))
-    return Lines(np.fft.rfftfreq(len(x))[at].astype(np.float64), X, len(x))
+    return InnovationLines(np.fft.rfftfreq(len(x))[at].astype(np.float64), X, len(x))
 
 
 def seen_from_states(A: FloatArray, C: FloatArray, freq: FloatArray) -> ComplexArray:
@@ -99,7 +99,9 @@ def impulse(observer: KalmanEstimator, count: int) -> FloatArray:
     return np.asarray(np.linalg.solve(_unit(observer), found))
 
 
-def parts_of(observer: KalmanEstimator, plant: StandardPlant | None, freq: FloatArray) -> Parts:
+def parts_of(
+    observer: KalmanEstimator, plant: StandardPlant | None, freq: FloatArray
+) -> InnovationParts:
     """Return the density of the whitened innovations of a filter that runs on a plant.
 
     ``V (Y Y* + R) V*`` with V that of `whitening`, ``Y = C (z I - A)^-1 G + H`` from the noises of
@@ -122,10 +124,10 @@ def parts_of(observer: KalmanEstimator, plant: StandardPlant | None, freq: Float
         process[at] = _squared(V @ Y)
         own = plant.sensor_noise_factor[rows]
         sensors[at] = _squared(V @ own)
-    return Parts(process, sensors)
+    return InnovationParts(process, sensors)
 
 
-def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> Parts:
+def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> InnovationParts:
     """Return the mean of the periodogram of so many samples, at the lines of `lines_of`.
 
     The density seen through the record's length (Fejer's kernel): its covariance c_l counts
@@ -142,7 +144,7 @@ def expected(observer: KalmanEstimator, plant: StandardPlant, samples: int) -> P
         return np.asarray(np.fft.rfft(covariance * weight, axis=0)[at])
 
     found = parts_of(observer, plant, freq)
-    return Parts(seen(found.process), seen(found.sensors))
+    return InnovationParts(seen(found.process), seen(found.sensors))
 
 
 def _unit(observer: KalmanEstimator) -> FloatArray:

@@ -93,7 +93,7 @@ def estimate_noise(
     ModelError
         When fewer than 1000 samples are left without gaps and start-up.
     SolverError
-        When the search does not settle; the message says what the record tells of the plant.
+        When the search does not settle; the message says what the record shows of the plant.
 
     Warns
     -----
