@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ..errors import ModelError, ShapeError, counted
-from ..lti.between_lines import between_lines
+from ..lti.between_lines import followed
 from ..lti.frequency import Frf
 from ..lti.statespace import StateSpace, System, as_statespace
 from ..values import ComplexArray, FloatArray, flag, instance, positive
@@ -172,18 +172,10 @@ def _sampled(
         at = np.abs(moved)
         known = (at >= lines[0]) & (at <= lines[-1])
         G = np.zeros(total.shape, dtype=complex)
-        G[..., known] = _between(lines, data, at[known])
+        G[..., known] = followed(lines, data, at[known])
         hold = np.sinc(moved / rate) * np.exp(-2j * np.pi * moved * (0.5 + late) / rate)
         total += np.where(moved < 0.0, G.conj(), G) * hold
     return total
-
-
-def _between(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> ComplexArray:
-    """Return the response at frequencies within the lines."""
-    if lines.size < 4:
-        each = [[np.interp(freq, lines, one) for one in row] for row in data]
-        return np.asarray(each, dtype=np.complex128)
-    return between_lines(lines, data, freq)[0]
 
 
 def _images(lines: FloatArray, freq: FloatArray, rate: float) -> list[FloatArray]:

@@ -15,6 +15,7 @@ from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, short
+from .hidden_modes import FEWEST, HiddenModes, hidden_modes
 
 Side = Literal["u", "y"]
 #: loop gain below which |S| is at most 1 / (1 - 0.5), which is seldom the largest
@@ -85,6 +86,19 @@ class BrokenLoop:
             return self.measured
         return resonance_grid(self.poles(), self.dt)
 
+    @cached_property
+    def hidden(self) -> HiddenModes:
+        """What lies between the lines of a measured plant."""
+        lines = self.grid
+        return hidden_modes(lines, self.plant(lines), self.controller(lines))
+
+    @cached_property
+    def followed(self) -> FloatArray:
+        """The grid, and frequencies through the modes between the lines of a measured plant."""
+        if self.measured is None or self.measured.size < FEWEST:
+            return self.grid
+        return np.union1d(self.grid, self.hidden.found)
+
     @property
     def is_unstable(self) -> bool:
         """Whether a pole is not strictly inside the stability region; a measured plant has none."""
@@ -104,7 +118,7 @@ class BrokenLoop:
 
     def _worst(self, at: Side) -> tuple[float, float]:
         if self.measured is not None:
-            return highest(lambda freq: self.size(freq, at), self.measured, 0)
+            return highest(lambda freq: self.size(freq, at), self.followed, 0)
         grid = resonance_grid(self.poles(), self.dt, points=_POINTS, around=SOUGHT)
         return highest(lambda freq: self.size(freq, at), grid, 6)
 

@@ -8,10 +8,10 @@ import numpy as np
 
 from ..lti.responses import Responder
 from ..values import ComplexArray, FloatArray
+from .hidden_modes import HiddenModes
 
-#: phase step of det(I - L) between two lines above which its path is not known, and how far its
-#: ends may be from where they have to end
-_STEP, _END = 0.6 * np.pi, 0.25 * np.pi
+#: how far the phase of det(I - L) may be from where its ends have to be
+_END = 0.25 * np.pi
 #: what the slope of |det(I - L)| at the lowest lines may differ from the number of integrators
 _SLOPE = 0.75
 #: how far, beside the lowest line, a measured plant is continued to lower frequencies
@@ -27,42 +27,67 @@ class NyquistCount(NamedTuple):
         Poles of the closed loop outside the stability region.
     reason : str
         Why they could not be counted.
+    narrowest, near : float [Hz]
+        The count holds if the plant has no mode of a half-power width below it that the lines do
+        not show, and where that would be; 0 when they show all.
     """
 
     unstable: int | None
     reason: str = ""
+    narrowest: float = 0.0
+    near: float = 0.0
 
 
 def nyquist_count(
-    freq: FloatArray, L: ComplexArray, *, at_zero: int, unstable: int
+    lines: FloatArray,
+    plant: ComplexArray,
+    controller: Responder,
+    hidden: HiddenModes,
+    *,
+    slope: int,
+    at_zero: int,
+    unstable: int,
 ) -> NyquistCount:
-    """Return the unstable poles of ``u = L u``, counted on the lines that are known.
+    """Return the unstable poles of ``u = K P u``, counted on the lines and what lies between them.
 
-    From 0+ to the highest frequency the argument of ``F = det(I - L)`` changes by
-    ``pi (P + n0 / 2 - Z)``: P unstable and n0 integrating poles of L, Z unstable ones of the loop.
-    Below the lines F continues as ``c / (i w)^n0``, c real; above them it ends positive.
+    From 0+ to the highest frequency the argument of ``F = det(I - K P)`` changes by
+    ``pi (p + n0 / 2 - z)``: p unstable and n0 integrating poles of K P, z unstable ones of the
+    loop. Below the lines F continues as ``c / (i w)^n0``, c real; above them it ends positive.
 
     Parameters
     ----------
-    freq : (n_freq,) array [Hz]
+    lines : (n,) array [Hz]
         Increasing, positive.
-    L : (n_freq, m, m) complex array
-        The loop gain; the critical point is +1.
+    plant : (ny, nu, n) complex array
+        P there; the critical point of K P is +1.
+    controller : function of frequency
+        K (nu, ny, n_freq).
+    hidden : HiddenModes
+        What lies between the lines.
+    slope : int
+        2 for a free rigid body, 0 for a held structure.
     at_zero, unstable : int
-        n0 and P: poles of plant and controller at zero frequency, and outside the stability region.
+        n0 and p: poles of plant and controller at zero frequency, and outside the stability region.
     """
+    freq, L = _continued(lines, plant, controller, slope)
     F = np.linalg.det(np.eye(L.shape[-1]) - L)
-    if freq.size < 3 or not np.all(np.abs(F) > 0.0):
-        return NyquistCount(None, "fewer than 3 lines, or one on the critical point")
-    steps = np.angle(F[1:] / F[:-1])
-    worst = int(np.argmax(np.abs(steps)))
-    if abs(steps[worst]) > _STEP:
-        return NyquistCount(
-            None,
-            f"the phase turns by {np.degrees(abs(steps[worst])):.0f} deg between the lines at "
-            f"{freq[worst]:.4g} and {freq[worst + 1]:.4g} Hz: measure with a finer resolution "
-            "there, or give the loop less gain at that resonance",
-        )
+    if not np.all(np.abs(F) > 0.0):
+        return NyquistCount(None, "a line lies on the critical point")
+    first = freq.size - lines.size
+    below = np.angle(F[1 : first + 1] / F[:first])
+    steps = np.concatenate([below, hidden.step])
+    for open_, what in (
+        (hidden.unknown, "the phase turns too far for its path to be known"),
+        (hidden.undecided, "lies a mode that is unstable in the loop if it is a little narrower"),
+    ):
+        if open_.any():
+            worst = int(np.argmax(open_))
+            return NyquistCount(
+                None,
+                f"between the lines at {lines[worst]:.4g} and {lines[worst + 1]:.4g} Hz {what}: "
+                "measure with a finer resolution there, or give the loop less gain at that "
+                "resonance",
+            )
     slope = -float(np.polyfit(np.log(freq[:3]), np.log(np.abs(F[:3])), 1)[0])
     if abs(slope - at_zero) > _SLOPE:
         return NyquistCount(
@@ -71,8 +96,8 @@ def nyquist_count(
             f"controller were stated to integrate {at_zero} times: state the rigid-body modes that "
             "these channels show",
         )
-    first, last = float(np.angle(F[0])), float(np.angle(F[-1]))
-    start = first + 0.5 * np.pi * at_zero  # the argument of c: a multiple of pi
+    last = float(np.angle(F[-1]))
+    start = float(np.angle(F[0])) + 0.5 * np.pi * at_zero  # the argument of c: a multiple of pi
     low = start - np.pi * np.round(start / np.pi)
     for miss, place, where in ((low, freq[0], "lower"), (last, freq[-1], "higher")):
         if abs(miss) > _END:
@@ -89,27 +114,19 @@ def nyquist_count(
             f"the phase turns so that {count:.3g} poles would be unstable: state the rigid-body "
             "and the unstable poles that the plant has",
         )
-    return NyquistCount(round(count))
+    widest = int(np.argmax(hidden.width))
+    return NyquistCount(
+        round(count), "", float(hidden.width[widest]), float(0.5 * np.sum(lines[widest : widest + 2]))
+    )
 
 
-def continued(
+def _continued(
     freq: FloatArray, plant: ComplexArray, controller: Responder, slope: int
 ) -> tuple[FloatArray, ComplexArray]:
     """Return frequencies and K P (n_freq, nu, nu) of a measured plant, also below its lines.
 
     There the controller is known, and the plant is that of the lowest line: its real part over
     ``f^slope``, its imaginary part (delay) less by a factor of frequency.
-
-    Parameters
-    ----------
-    freq : (n_freq,) array [Hz]
-        The lines.
-    plant : (ny, nu, n_freq) complex array
-        P there.
-    controller : function of frequency
-        K (nu, ny, n_freq).
-    slope : int
-        2 for a free rigid body, 0 for a held structure.
     """
     low = np.geomspace(_BELOW, 1.0, 150)[:-1]
     first = plant[:, :, :1]

@@ -11,7 +11,8 @@ import numpy as np
 from ..errors import counted, unknown_label
 from ..values import ComplexArray, FloatArray, Value, whole
 from .broken import BrokenLoop, inverted
-from .nyquist import NyquistCount, continued, nyquist_count
+from .hidden_modes import FEWEST, low_slope
+from .nyquist import NyquistCount, nyquist_count
 from .sensitivity import Loop, taken_apart
 
 #: a pole of the controller this near to zero frequency integrates
@@ -92,6 +93,9 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         Poles of the closed loop outside the stability region; None where that is not known.
     reason : str
         Why it is not known.
+    narrowest, near : float [Hz]
+        Of a measured plant: it is stable if it has no mode of a half-power width below it that its
+        lines do not show, and where that mode would be. 0 where the lines show all, and of a model.
 
     Examples
     --------
@@ -108,10 +112,15 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     modulus_margin: float
     unstable: int | None
     reason: str = ""
+    narrowest: float = 0.0
+    near: float = 0.0
 
     @property
     def is_stable(self) -> bool | None:
-        """Whether the closed loop is stable; None where it cannot be judged."""
+        """Whether the closed loop is stable; None where it cannot be judged.
+
+        Of a measured plant, if it has no hidden mode narrower than `narrowest`.
+        """
         return None if self.unstable is None else self.unstable == 0
 
     @property
@@ -133,9 +142,14 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
 
     def __repr__(self) -> str:
         state = {True: "stable", False: f"unstable, {self.poles}", None: "stability not judged"}
+        limit = (
+            f" if no mode is narrower than {self.narrowest:.2g} Hz (near {self.near:.4g} Hz)"
+            if self.narrowest and self.is_stable
+            else ""
+        )
         together = f" of {len(self)} loops together" if len(self) > 1 else ""
         margin = f"modulus margin {self.modulus_margin:.3f}{together}"
-        lines = [f"<LoopReport: {state[self.is_stable]}, {margin}>"]
+        lines = [f"<LoopReport: {state[self.is_stable]}{limit}, {margin}>"]
         lines += [f"  {loop!r}" for loop in self.loops[:4]]
         lines += [f"  and {len(self) - 4} more"] if len(self) > 4 else []
         lines += [f"  stability: {self.reason}"] if self.reason else []
@@ -150,7 +164,9 @@ def report_loops(
     Each loop is broken while the others stay closed: ``L_i = 1 - 1 / S_ii`` with
     ``S = (I - L)^-1``. Stability of a model follows from the poles; that of a measured plant from
     the Nyquist count, with the poles at zero and outside the stability region that are stated for
-    the plant and known of the controller.
+    the plant and known of the controller. Modes between the lines are followed as far as the lines
+    show them; what they do not show is said, "stable if no mode is narrower than 0.02 Hz", or
+    stability is not judged.
 
     Parameters
     ----------
@@ -187,9 +203,9 @@ def report_loops(
     """
     rigid, unstable = whole(rigid, "rigid", minimum=0), whole(unstable, "unstable", minimum=0)
     parts = taken_apart(loop)
-    grid = parts.grid
+    grid = parts.followed
     S = inverted(parts.gain(grid, at))
-    count = _count(parts, grid, rigid, unstable)
+    count = _count(parts, parts.grid, rigid, unstable)
     names = parts.u if at == "u" else parts.y
 
     def one(i: int) -> LoopMargins:
@@ -204,7 +220,7 @@ def report_loops(
 
     margin = 0.0 if count.unstable else 1.0 / parts.worst(at)[0]
     loops = tuple(one(i) for i in range(len(names)))
-    return LoopReport(loops, margin, count.unstable, count.reason)
+    return LoopReport(loops, margin, *count)
 
 
 def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> NyquistCount:
@@ -213,15 +229,15 @@ def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> Ny
     scale = 1.0 if parts.dt else np.max(np.abs(poles), initial=1e-300)
     if parts.measured is None:
         return NyquistCount(int(np.count_nonzero(distance.real >= 0.0)))
-    if grid.size < 3:
-        return NyquistCount(None, f"{grid.size} lines show no stability: measure more")
+    if grid.size < FEWEST:
+        return NyquistCount(
+            None, f"{grid.size} lines show no stability, {FEWEST} are the fewest: measure more"
+        )
     zero = np.abs(distance) <= _INTEGRATES * scale
     own = int(np.count_nonzero((distance.real > 0.0) & ~zero))
     at_zero = 2 * rigid + int(np.count_nonzero(zero))
     plant = parts.plant(grid)
-    low = grid <= max(1.5 * grid[0], grid[min(3, grid.size - 1)])
-    size = np.linalg.norm(plant[:, :, low], axis=(0, 1))
-    slope = -float(np.polyfit(np.log(grid[low]), np.log(np.maximum(size, 1e-300)), 1)[0])
+    slope = low_slope(grid, plant)
     if abs(slope - (2 if rigid else 0)) > 1.0:
         return NyquistCount(
             None,
@@ -229,8 +245,10 @@ def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> Ny
             f"but rigid={rigid} was stated: a free body falls with slope 2, a held one "
             "does not. State rigid=, or measure at lower frequencies",
         )
-    freq, L = continued(grid, plant, parts.controller, 2 if rigid else 0)
-    return nyquist_count(freq, L, at_zero=at_zero, unstable=unstable + own)
+    return nyquist_count(
+        grid, plant, parts.controller, parts.hidden,
+        slope=2 if rigid else 0, at_zero=at_zero, unstable=unstable + own,
+    )  # fmt: skip
 
 
 def loop_margins(

@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..errors import LabelError, ModelError, ShapeError, unknown_label
+from ..lti.between_lines import followed
 from ..lti.frequency import Frf, frequency_response, sampled_freq
 from ..lti.interconnection import loop_poles
 from ..lti.responses import remembered, responder
@@ -311,7 +312,7 @@ def _measured(plant: Frf, controller: StateSpace, quantities: dict[str, str]) ->
         tuple(driven),
         tuple(controller.inputs),
         lambda freq: frequency_response(controller, freq).data,
-        lambda freq: np.asarray(P[:, :, np.searchsorted(plant.freq, freq)], dtype=np.complex128),
+        lambda freq: followed(np.asarray(plant.freq), P, freq),
         controller.poles,
         controller.dt,
         np.array(plant.freq),

@@ -8,9 +8,11 @@ from ..values import ComplexArray, FloatArray, IntArray
 
 #: change of a response between two lines, beside its size, below which it is a straight line
 _STRAIGHT = 1e-9
+#: neighbouring lines through which a mode on a straight line is fitted
+LINES = 4
 #: where an interval is filled: by its length, and about a resonance by its half-width
 _SHARES = (0.25, 0.5, 0.75)
-_AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
+AROUND = np.array([-6.0, -3.0, -1.5, -0.8, -0.4, 0.0, 0.4, 0.8, 1.5, 3.0, 6.0])
 
 
 def between_lines(
@@ -43,6 +45,19 @@ def between_lines(
     return 0.5 * (below + above), np.asarray(np.abs(below - above))
 
 
+def followed(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> ComplexArray:
+    """Return responses (..., k) at frequencies within the lines: as given on them, else between."""
+    place = np.minimum(np.searchsorted(lines, freq), lines.size - 1)
+    found = np.asarray(data[..., place], dtype=np.complex128)
+    off = lines[place] != freq
+    if lines.size < LINES:
+        straight = [np.interp(freq[off], lines, one) for one in data.reshape(-1, lines.size)]
+        found[..., off] = np.reshape(straight, (*data.shape[:-1], -1))
+    elif off.any():
+        found[..., off] = between_lines(lines, data, freq[off])[0]
+    return found
+
+
 def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> FloatArray:
     """Return frequencies [Hz] in some intervals, dense where the circles through lines turn.
 
@@ -61,9 +76,40 @@ def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> Fl
         first = np.clip(first, 0, lines.size - 3)
         c = _circle(lines, data, first)[1]
         pole = lines[first] - 1.0 / np.where(c == 0.0, 1e-300, c)
-        near = pole.real + np.abs(pole.imag) * _AROUND[:, None]
+        near = pole.real + np.abs(pole.imag) * AROUND[:, None]
         found += list(np.clip(near, low + 0.01 * wide, low + 0.99 * wide))
     return np.unique(np.concatenate(found))
+
+
+def pole_between(
+    lines: FloatArray, data: ComplexArray
+) -> tuple[ComplexArray, ComplexArray, FloatArray]:
+    """Return p and rho of ``g = a + b f + rho / (f - p)``, through `LINES` lines each.
+
+    Third divided differences of g over the lines f_j, in which a + b f is nothing, are
+    ``[g] = -rho / prod(f_j - p)`` and ``[f g] = p [g]``.
+
+    Parameters
+    ----------
+    lines : (LINES, k) array [Hz]
+        Of k responses, from any origin.
+    data : (LINES, k) complex array
+        The responses there.
+
+    Returns
+    -------
+    pole, residue : (k,) complex array
+    tail : (k,) array
+        Size of the residue that a mode at the origin has, were [g] of it alone.
+    """
+    apart = lines[:, None] - lines[None]
+    apart[range(LINES), range(LINES)] = 1.0
+    weighed = data / apart.prod(axis=1)
+    third = weighed.sum(axis=0)
+    third = np.where(third == 0.0, 1e-300, third)
+    pole = (lines * weighed).sum(axis=0) / third
+    residue = -third * np.prod(lines - pole, axis=0)
+    return pole, residue, np.abs(third * np.prod(lines, axis=0))
 
 
 def _circle(

@@ -7,7 +7,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..loop.nyquist import continued, nyquist_count
+from ..loop.hidden_modes import FEWEST, hidden_modes
+from ..loop.nyquist import nyquist_count
 from ..lti.between_lines import between_lines, steps_between
 from ..values import ComplexArray, FloatArray
 from .law import Law
@@ -132,14 +133,19 @@ class MeasuredAxis:
         return self._peaks[self._peaks > self.suspension]
 
     def is_stable(self, law: Law) -> bool:
-        """Return whether the loop of a law is stable, by the Nyquist count on the lines."""
+        """Return whether the loop of a law is stable, by the Nyquist count."""
 
         def respond(freq: FloatArray) -> ComplexArray:
             return -law.response(freq)[None, None]
 
-        slope = 2 if self.free else 0
-        freq, L = continued(self.freq, self.G[None, None], respond, slope)
-        return nyquist_count(freq, L, at_zero=slope + 1, unstable=0).unstable == 0
+        if self.freq.size < FEWEST:
+            return False
+        plant, slope = self.G[None, None], 2 if self.free else 0
+        hidden = hidden_modes(self.freq, plant, respond(self.freq))
+        count = nyquist_count(
+            self.freq, plant, respond, hidden, slope=slope, at_zero=slope + 1, unstable=0
+        )
+        return count.unstable == 0
 
 
 def _scatter(freq: FloatArray, G: ComplexArray) -> FloatArray:
