@@ -2,11 +2,13 @@
 
 import numpy as np
 import pytest
+import scipy.linalg as la
 
 import flexplant as fx
 from flexplant.errors import ModelError
 from flexplant.loop import in_axes, report_loops
 from flexplant.lti import Frf, StateSpace, append, discretized, frequency_response
+from flexplant.lti.interconnection import loop_poles
 from flexplant.plant import assemble_plant, decouple
 from stages import RATE, ports, reduced
 
@@ -116,6 +118,55 @@ def test_the_count_is_that_of_the_characteristic_polynomial(springs):
         assert (report.modulus_margin == 0.0) == (wanted > 0)
         seen.add(wanted > 0)
     assert seen == {True, False}
+
+
+def body_with_modes(rng, axes):
+    """Free bodies and lightly damped modes of any sign on them, PID with roll-off; coarse lines."""
+    count, spacing = rng.integers(1, 4), rng.choice([0.1, 0.25, 0.5, 1.0, 2.0])
+    freq, zeta = rng.uniform(15.0, 300.0, count), 10.0 ** rng.uniform(-4.0, -1.5, count)
+    size = np.sqrt(10.0 ** rng.uniform(-2.0, 0.0, count))[:, None]
+    omega = 2 * np.pi * freq
+    pairs = [[[0, 1], [-(w**2), -2 * z * w]] for w, z in zip(omega, zeta, strict=True)]
+    A = la.block_diag(*[[[0, 1], [0, 0]]] * axes, *pairs)
+    B, C = np.zeros((len(A), axes)), np.zeros((axes, len(A)))
+    shapes = rng.standard_normal((2, count, axes)) * size
+    B[1::2] = np.vstack([np.eye(axes), shapes[0]])
+    C[:, ::2] = np.hstack([np.eye(axes), shapes[rng.integers(2)].T])
+    G = StateSpace(A, B, C, np.zeros((axes, axes)))
+    laws = []
+    for one in 10.0 ** rng.uniform(0.7, 1.7) * rng.uniform(0.7, 1.3, axes):
+        pid = fx.Pid.corners(
+            (2 * np.pi * one) ** 2 / 3, integrator=one / 10, zero=one / 3, pole=3 * one
+        )
+        laws.append((pid * fx.LowPass(10 * one)).system)
+    parts = [la.block_diag(*[getattr(law, name) for law in laws]) for name in "ABCD"]
+    K = StateSpace(parts[0], parts[1], -parts[2], -parts[3], inputs=G.outputs, outputs=G.inputs)
+    lines = np.arange(max(1.0, spacing), 420.0, spacing) + rng.uniform(0.0, spacing)
+    return G, K, lines, 2.0 * zeta * freq
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-3])
+@pytest.mark.parametrize("axes", [1, 2])
+def test_stable_on_coarse_lines_is_stable_or_says_of_which_modes_it_is_not(axes, noise):
+    """Of loops on lines that step over resonances: exact poles decide."""
+    rng, seen = np.random.default_rng(axes), {}
+    for _ in range(40):
+        G, K, lines, widths = body_with_modes(rng, axes)
+        frf = frequency_response(G, lines)
+        error = rng.standard_normal((2, *frf.data.shape))
+        frf = frf.replace(data=frf.data * (1.0 + noise * (error[0] + 1j * error[1])))
+        report = report_loops((frf, K), rigid=axes)
+        truly = bool(np.any(loop_poles(G, K).real > 0.0))
+        said = "open" if report.is_stable is None else "unstable"
+        if report.is_stable:
+            said = "if" if report.narrowest else "stable"
+            assert not truly or np.any(widths < report.narrowest)
+            assert ("if no mode is narrower than" in repr(report)) == (said == "if")
+        assert truly or said != "unstable"
+        seen[said] = seen.get(said, 0) + 1
+    assert seen["unstable"] > 6
+    assert seen["stable" if not noise else "if"] > 12
+    assert seen.get("open", 0) < 8
 
 
 def test_what_cannot_be_judged_says_why():

@@ -87,6 +87,20 @@ def test_nyquist_names_the_distance_from_minus_one():
         fx.plot.nyquist(L, channel=("x", "y"))
 
 
+def test_nyquist_of_a_measured_gain_follows_the_resonance_between_its_lines():
+    """Lines of 0.5 Hz over a mode of half-width 0.07 Hz: the circle, not the chord."""
+    body, mode = tf([1.0], [1.0, 0.0, 0.0]), tf([-1.5e-3], [1.0, 0.001 * 860.8, 860.8**2])
+    L = (2 * np.pi * 20.0) ** 2 * tf([0.02, 1.0], [1e-4, 1.0]) * (body + mode)
+    frf = fx.lti.frequency_response(L, np.arange(1.0, 400.0, 0.5) + 0.2)
+    labels = []
+    for one in (L, frf):
+        ax = fx.plot.nyquist({"L": one})
+        labels.append(float(ax.get_legend().get_texts()[0].get_text().split()[4]))
+    assert labels[1] == pytest.approx(labels[0], abs=0.3)
+    on_lines = -20 * np.log10(np.abs(1 + frf.data).min())
+    assert labels[0] > on_lines + 1.0
+
+
 def test_nyquist_of_a_closed_loop_is_broken_at_each_actuator():
     plant = fx.testbeds.three_masses()
     observer = fx.design_kalman(plant)

@@ -125,14 +125,20 @@ def _judged(
     safe = (critical <= least) | (width.min(axis=0) - error > critical)
     unstable = found & (width.max(axis=0) + error < needed.min(axis=0))
     undecided = found & ~safe & ~unstable & ((p + d).imag.min(axis=0) < 0.0)
-    narrow = np.maximum(np.where(safe | unstable, 0.0, critical), np.where(other > least, other, 0.0))
-    through = _through(p, wide, middle, found) + _through(p + d, wide, middle, found)
+    narrow = np.maximum(
+        np.where(safe | unstable, 0.0, critical), np.where(other > least, other, 0.0)
+    )
+    near = [middle + at.mean(axis=0) for at in (p, p + d)]
+    through = np.concatenate(
+        [at[found].real + np.abs(at[found].imag) * AROUND[:, None] for at in near]
+    )
+    through = through[(through > freq[0]) & (through < freq[-1])]
     return HiddenModes(
         step + 2.0 * np.pi * turns,
         unknown,
         undecided,
         np.minimum(2.0 * narrow, _SHOWN * wide),
-        np.unique(np.concatenate([np.zeros(0), *through])),
+        np.unique(through),
     )
 
 
@@ -144,12 +150,3 @@ def _spread(values: ComplexArray) -> FloatArray:
 def _turn(at: ComplexArray, wide: FloatArray) -> FloatArray:
     """Return the change of the argument of ``f - at`` over an interval."""
     return np.asarray(np.angle(0.5 * wide - at) - np.angle(-0.5 * wide - at))
-
-
-def _through(
-    at: ComplexArray, wide: FloatArray, middle: FloatArray, where: npt.NDArray[np.bool_]
-) -> list[FloatArray]:
-    """Return frequencies through poles, the mean of the fits, within their intervals."""
-    pole, wide = at.mean(axis=0)[where], wide[where]
-    near = pole.real + np.abs(pole.imag) * AROUND[:, None]
-    return list(middle[where] + np.clip(near, -0.49 * wide, 0.49 * wide))

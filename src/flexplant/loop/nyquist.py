@@ -116,7 +116,10 @@ def nyquist_count(
         )
     widest = int(np.argmax(hidden.width))
     return NyquistCount(
-        round(count), "", float(hidden.width[widest]), float(0.5 * np.sum(lines[widest : widest + 2]))
+        round(count),
+        "",
+        float(hidden.width[widest]),
+        float(0.5 * np.sum(lines[widest : widest + 2])),
     )
 
 

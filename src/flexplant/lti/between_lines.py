@@ -1,4 +1,4 @@
-"""A measured response between its lines, by the resonance that three lines make."""
+"""A measured response between its lines, by the resonance that neighbouring lines make."""
 
 from __future__ import annotations
 
@@ -8,6 +8,9 @@ from ..values import ComplexArray, FloatArray, IntArray
 
 #: change of a response between two lines, beside its size, below which it is a straight line
 _STRAIGHT = 1e-9
+#: third difference, beside the terms of its sum, that is rounding, and how far away the pole of
+#: such lines is put
+_ROUNDING, _FAR = 1e-14, 1e6
 #: neighbouring lines through which a mode on a straight line is fitted
 LINES = 4
 #: where an interval is filled: by its length, and about a resonance by its half-width
@@ -101,13 +104,16 @@ def pole_between(
     pole, residue : (k,) complex array
     tail : (k,) array
         Size of the residue that a mode at the origin has, were [g] of it alone.
+        A straight line has residue 0.
     """
     apart = lines[:, None] - lines[None]
     apart[range(LINES), range(LINES)] = 1.0
     weighed = data / apart.prod(axis=1)
     third = weighed.sum(axis=0)
-    third = np.where(third == 0.0, 1e-300, third)
-    pole = (lines * weighed).sum(axis=0) / third
+    bent = np.abs(third) > _ROUNDING * np.abs(weighed).sum(axis=0)
+    third = np.where(bent, third, 0.0)
+    pole = (lines * weighed).sum(axis=0) / np.where(bent, third, 1.0)
+    pole = np.where(bent, pole, _FAR * np.abs(lines).max(axis=0))
     residue = -third * np.prod(lines - pole, axis=0)
     return pole, residue, np.abs(third * np.prod(lines, axis=0))
 

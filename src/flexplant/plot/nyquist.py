@@ -10,11 +10,15 @@ from matplotlib.patches import Circle
 
 from ..errors import ModelError, unknown_label
 from ..loop import ClosedLoop, sensitivity
+from ..lti.between_lines import LINES, followed, steps_between
 from ..lti.frequency import Frf
-from ..values import FloatArray, positive
+from ..values import ComplexArray, FloatArray, positive
 from ._axes import axes, finish, legend
 from ._style import GREY, RED
 from .gains import curves, labelled
+
+#: step of L beside its distance from -1 that is filled in
+_STEEP = 0.15
 
 
 def nyquist(
@@ -29,7 +33,8 @@ def nyquist(
     """Draw loop gains L in the complex plane, with -1 and the circle in which ``|S| > modulus``.
 
     ``S = 1 / (1 + L)``: its size is the inverse of the distance from -1. Frequencies are positive;
-    the mirror image is not drawn.
+    the mirror image is not drawn. Where a measured gain steps over a resonance the curve follows
+    the circle through its neighbouring lines.
 
     Parameters
     ----------
@@ -66,6 +71,7 @@ def nyquist(
     'L: |S| up to 8.7 dB, at 0.8221 Hz'
     """
     given, ax = ax is not None, axes(ax, figsize=(9.0, 5.0))
+    measured = [name for name, one in labelled(loop_gains).items() if isinstance(one, Frf)]
     for curve in curves(_opened(loop_gains, freq), freq):
         known = list(curve.response)
         if channel is None and len(known) > 1:
@@ -76,10 +82,12 @@ def nyquist(
         chosen = known[0] if channel is None else channel
         if chosen not in known:
             raise unknown_label("channel", str(chosen), [str(one) for one in known])
-        values = curve.response[chosen]
+        lines, values = curve.response.freq, curve.response[chosen]
+        if curve.label in measured:
+            lines, values = _followed(lines, values)
         nearest = int(np.argmin(np.abs(1.0 + values)))
         size = -20.0 * np.log10(abs(1.0 + values[nearest]))
-        text = f"|S| up to {size:.1f} dB, at {curve.response.freq[nearest]:.4g} Hz"
+        text = f"|S| up to {size:.1f} dB, at {lines[nearest]:.4g} Hz"
         label = f"{curve.label}: {text}" if curve.label else text
         ax.plot(values.real, values.imag, label=label, **curve.line)
         near = values[nearest]
@@ -108,6 +116,18 @@ def nyquist(
     ax.set(xlim=(-limit, limit), ylim=(-limit, limit), aspect="equal")
     legend(ax, given=given)
     return finish(ax, x="real part of L", y="imaginary part of L")
+
+
+def _followed(freq: FloatArray, L: ComplexArray) -> tuple[FloatArray, ComplexArray]:
+    """Return a loop gain with points between lines where it moves much beside 1 + L."""
+    if freq.size < LINES:
+        return freq, L
+    away = np.abs(1.0 + L)
+    steep = np.flatnonzero(np.abs(np.diff(L)) > _STEEP * np.minimum(away[1:], away[:-1]))
+    if not steep.size:
+        return freq, L
+    every = np.union1d(freq, steps_between(freq, L, steep))
+    return every, followed(freq, L, every)
 
 
 def _opened(found: Any, freq: FloatArray | None) -> dict[str, Any]:

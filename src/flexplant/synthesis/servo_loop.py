@@ -74,7 +74,9 @@ class ServoLoop:
 
         Of an unstable loop too, so check that.
         """
-        return self.broken(axis).worst("u")
+        size = self.broken(axis).size(self.freq)
+        top = int(np.argmax(size))
+        return float(size[top]), float(self.freq[top])
 
     @cached_property
     def _near(self) -> FloatArray:
