@@ -1,10 +1,14 @@
 """The tuner beside brute force over the same laws, beyond resonances, on noise and coarse lines."""
 
+from functools import cache
+
 import numpy as np
 import pytest
 
+import flexplant as fx
 from flexplant import Frf
 from flexplant.synthesis import tune_loops
+from flexplant.synthesis.joint_plant import JointPlant
 from oracles_tuning import best_bandwidth
 
 RATE, MASS = 1e4, 2.0
@@ -104,3 +108,93 @@ def test_a_plant_that_moves_against_its_force_is_named():
     found = tune_loops(Frf(freq, -response(freq, {})[None, None]), rate=RATE, hold=False, notches=0)
     assert found.laws["y1"].gain < 0.0
     assert "moves against its force" in repr(found)
+
+
+@cache
+def block():
+    """24 kg of aluminium: six rigid-body axes, modes from 1189 Hz on."""
+    size = 0.42, 0.36, 0.059
+    body = fx.solid_block(
+        size=size, elements=(6, 5, 2), density=2700, youngs_modulus=70e9, poisson_ratio=0.33
+    )
+    X, Y, Z = size
+    corners = [(x, y, 0.0) for y in (0.06, Y - 0.06) for x in (0.06, X - 0.06)]
+    u = [(p, "z") for p in corners]
+    u += [((0.0, y, 0.03), "x") for y in (0.08, Y - 0.08)]
+    u += [((x, 0.0, 0.03), "y") for x in (0.08, X - 0.08)]
+    y = [((0.02, 0.02, Z), "z"), ((X - 0.02, 0.02, Z), "z"), ((X / 2, Y - 0.02, Z), "z")]
+    y += [((X, 0.05, 0.04), "x"), ((X, Y - 0.05, 0.04), "x"), ((X / 2 - 0.03, Y, 0.04), "y")]
+    y += [((X - 0.05, Y - 0.02, Z), "z"), ((0.05, Y, 0.04), "y")]
+    ports = fx.Ports(
+        u=[fx.Actuator(f"u{i}", at=p, direction=d) for i, (p, d) in enumerate(u)],
+        y=[fx.Sensor(f"y{i}", at=p, direction=d) for i, (p, d) in enumerate(y)],
+    )
+    modes = fx.solve_modes(body, count=40, damping=fx.ModalDamping(0.005))
+    small = modes.select(list(range(12)))
+    return fx.assemble_plant(small, ports).discretized(RATE, delay=1), modes
+
+
+def joint_peaks(plant, design):
+    """The largest singular values of S at u and at y, dense over the resonances."""
+    G = plant.system.select(plant.y, plant.u)
+    K = design.system.select(plant.u, plant.y)
+    own = [f * (1 + 1e-3 * np.sinh(np.linspace(-5, 5, 81))) for f in plant.model.freq[6:]]
+    freq = np.unique(np.concatenate([np.geomspace(1.0, 4990.0, 2000), *own]))
+    near = fx.frequency_response(G, freq[freq < 4990.0])
+    P = np.moveaxis(near.data, -1, 0)
+    C = np.moveaxis(fx.frequency_response(K, near.freq).data, -1, 0)
+    eye = np.eye(len(plant.u))
+    return [1 / np.linalg.svd(eye - L, compute_uv=False)[:, -1].min() for L in (C @ P, P @ C)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("known", [False, True])
+def test_six_axes_hold_the_peak_together(known):
+    """Each axis alone reaches 400 Hz and more, and the modes couple them: 40 dB at u together."""
+    plant, modes = block()
+    found = tune_loops(plant, peak=1.7, notches=1, larger=modes if known else None)
+    loop = fx.close_loop(plant, found, larger=modes)
+    assert loop.is_stable and loop.modulus_margin >= 1 / 1.7
+    assert min(one.modulus_margin for one in found.report.loops) >= 1 / 1.7
+    assert max(joint_peaks(plant, found)) < 1.7 * 1.001
+    assert min(one.crossovers[0] for one in found.report.loops) > 60.0
+    if known:
+        assert loop.left_out.modulus_margin >= 1 / 1.7
+        assert found.left_out.is_fine
+
+
+def coupled(share):
+    """Two masses, each an axis of its own, with one mode at 600 Hz that both move and see."""
+    freq = dense({600.0: 1.0})
+    s, w = 2j * np.pi * freq, 2 * np.pi * 600.0
+    late = np.exp(-1.5 * s / RATE) * np.sinc(freq / RATE)
+    mode = np.array([[0.1, share], [share, 0.1]])[:, :, None] / (s**2 + 2e-3 * w * s + w**2)
+    return Frf(freq, (np.eye(2)[:, :, None] / s**2 + mode) / MASS * late)
+
+
+@pytest.mark.slow
+def test_what_ended_the_search_is_said():
+    """Where no laws hold the peak together, the best come back with what stands in the way."""
+    found = tune_loops(coupled(0.05), rate=RATE, hold=False, notches=0)
+    assert 1 / found.report.modulus_margin <= 2.0
+    with pytest.warns(
+        fx.FlexplantWarning, match=r"below .* was not reached: \|S\| at [uy] is .* Hz"
+    ):
+        found = tune_loops(coupled(0.05), rate=RATE, hold=False, notches=0, peak=1.1)
+
+
+def test_slopes_of_the_joint_distances():
+    """By differences of the laws, at u, at y and in each axis, with more channels than axes."""
+    rng, n, k = np.random.default_rng(4), 5, 2
+    G = rng.standard_normal((3, 4, n)) + 1j * rng.standard_normal((3, 4, n))
+    before, after = rng.standard_normal((4, k)), rng.standard_normal((k, 3))
+    frf = Frf(np.arange(1.0, n + 1), G)
+    one = JointPlant(frf, before, after, ("a", "b"), 0).coupling(frf.freq)
+    C, D = (rng.standard_normal((n, k)) + 1j * rng.standard_normal((n, k)) for _ in range(2))
+    assert one.of.places == ("at u", "at y", "of a", "of b")
+    L = np.moveaxis(G, -1, 0) @ before @ (C[:, :, None] * after)
+    least = np.linalg.svd(np.eye(3) + L, compute_uv=False)[:, -1]
+    assert one.distances(C)[1] == pytest.approx(least)
+    change = (one.distances(C + 1e-6 * D) - one.distances(C - 1e-6 * D)) / 2e-6
+    for place, slope in enumerate(change):
+        assert np.sum(one.slopes(C, place) * D, axis=1).real == pytest.approx(slope, rel=1e-5)

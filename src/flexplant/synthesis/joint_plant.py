@@ -16,11 +16,11 @@ from ..lti.interconnection import loop_poles
 from ..lti.joining import stacked
 from ..lti.responses import responder
 from ..lti.statespace import StateSpace
-from ..values import ComplexArray, FloatArray
+from ..values import ComplexArray, FloatArray, IntArray
 from .law import Law
 
-#: logarithmic part of a grid through the resonances
-_POINTS = 250
+#: logarithmic part of a grid through the resonances, and times that it is refined
+_POINTS, _REFINEMENTS = 250, 6
 
 
 class Worst(NamedTuple):
@@ -69,9 +69,7 @@ class JointPlant:
         """The lines of an Frf, or frequencies through the resonances of a model."""
         if isinstance(self.plant, Frf):
             return self.plant.freq
-        dt = self.plant.dt
-        grid = resonance_grid(self.plant.poles(), dt, points=_POINTS, around=SOUGHT)
-        return grid[(grid > 0.0) & (grid < 0.4999 / dt)] if dt else grid[grid > 0.0]
+        return self._through(self.plant.poles())
 
     @cached_property
     def respond(self) -> Callable[[FloatArray], ComplexArray]:
@@ -109,17 +107,29 @@ class JointPlant:
         """Return the largest |S| of a stable loop, the grid refined at its peaks."""
 
         def sizes(freq: FloatArray) -> FloatArray:
-            C = np.stack([law.at(freq) for law in laws], axis=-1)
-            return 1.0 / self.coupling(freq).distances(C)
+            return 1.0 / self.coupling(freq).distances(_gains(laws, freq))
 
-        grid, rounds = self.grid, 0
-        if not isinstance(self.plant, Frf):
-            dt, rounds = self.plant.dt, 6
-            grid = resonance_grid(self._poles(laws), dt, points=_POINTS, around=SOUGHT)
-            grid = grid[(grid > 0.0) & (grid < 0.4999 / dt)] if dt else grid[grid > 0.0]
-        size, freq = highest(lambda f: sizes(f).max(axis=0), grid, rounds)
+        rounds = 0 if isinstance(self.plant, Frf) else _REFINEMENTS
+        size, freq = highest(lambda f: sizes(f).max(axis=0), self._closed_grid(laws), rounds)
         place = self.places[int(np.argmax(sizes(np.array([freq]))[:, 0]))]
         return Worst(size, freq, f"{place}{self.kind}")
+
+    def high(self, laws: Sequence[Law], size: float) -> FloatArray:
+        """Return frequencies through the resonances of the closed loop where |S| is above a size.
+
+        A mode is as narrow as its damping, and the loop moves it off the grid of the plant.
+        """
+        grid = self._closed_grid(laws)
+        least = self.coupling(grid).distances(_gains(laws, grid)).min(axis=0)
+        return np.asarray(grid[least * size < 1.0])
+
+    def _closed_grid(self, laws: Sequence[Law]) -> FloatArray:
+        return self.grid if isinstance(self.plant, Frf) else self._through(self._poles(laws))
+
+    def _through(self, poles: ComplexArray) -> FloatArray:
+        dt = float(self.plant.dt)  # type: ignore[union-attr]
+        grid = resonance_grid(poles, dt, points=_POINTS, around=SOUGHT)
+        return grid[(grid > 0.0) & (grid < 0.4999 / dt)] if dt else grid[grid > 0.0]
 
     def _poles(self, laws: Sequence[Law]) -> ComplexArray:
         assert isinstance(self.plant, StateSpace)  # noqa: S101 - an Frf has no poles
@@ -129,6 +139,10 @@ class JointPlant:
             A, -B @ self.after, self.before @ C, -self.before @ D @ self.after, self.plant.dt
         )
         return loop_poles(self.plant, K)
+
+
+def _gains(laws: Sequence[Law], freq: FloatArray) -> ComplexArray:
+    return np.stack([law.at(freq) for law in laws], axis=-1)
 
 
 class Coupling(NamedTuple):
@@ -175,6 +189,11 @@ class Coupling(NamedTuple):
         if of.places[place] == "at u":
             return np.asarray((v @ of.before) * np.einsum("fku,fu->fk", self.felt, w))
         return np.asarray(np.einsum("fy,fyk->fk", v, self.seen) * (w @ of.after.T))
+
+    def rows(self, rows: IntArray) -> Coupling:
+        """Return what couples the axes at some of the frequencies."""
+        parts = (self.seen[rows], self.felt[rows], self.inner[rows])
+        return Coupling(self.freq[rows], *parts, self.of)
 
     def _inverse(self, C: ComplexArray) -> ComplexArray:
         return np.asarray(np.linalg.inv(np.eye(C.shape[1]) + self.inner * C[:, None, :]))

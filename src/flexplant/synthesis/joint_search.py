@@ -18,9 +18,9 @@ from .law_search import lowest_of
 #: slower starts, as a factor, until the loops are stable with |S| below so much
 _SLOWER, _STARTS, _WILD = 0.8, 30, 10.0
 #: steps between two checks, and checks at which frequencies are added
-_STEPS, _ROUNDS = 30, 4
+_STEPS, _ROUNDS = 50, 6
 #: radii [e-folds], penalty on what is violated, step of differences
-_RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 1e-3, 20.0, 1e-6
+_RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 1e-3, 4.0, 1e-6
 #: points of one place that count in a step, at most and as far above the bound
 _POINTS, _REACH = 12, 0.3
 #: distance kept beyond what is needed, to end with no less
@@ -78,17 +78,19 @@ class JointSearch:
         found = self._start()
         if found is None:
             return None
-        known, added = found, np.empty(0)
+        known, added, spare = found, [np.empty(0) for _ in self.plants], _SPARE
         for _ in range(_ROUNDS):
-            again = self.checked(self._raised(found.numbers, added))
+            laws = [law.law(x) for law, x in zip(self.of, found.numbers, strict=True)]
+            high = [plant.high(laws, _NEAR * self.peak) for plant in self.plants]
+            added = [np.union1d(*both) for both in zip(added, high, strict=True)]
+            again = self.checked(self._raised(found.numbers, added, 1.0 / self.peak + spare))
             if again is None:
                 break
             found = again
             if found.worst.size <= self.peak:
                 return found
             known = min(known, found, key=lambda one: one.worst.size)
-            near = found.worst.freq * (1.0 + 1e-4 * np.arange(-3, 4))
-            added = np.union1d(added, near)
+            spare += 1.0 / self.peak - 1.0 / found.worst.size  # what lies between the points
         for step in range(1, _DOWN + 1):
             slower = self.checked(self._slowed(known.numbers, _LITTLE**step))
             if slower is not None and slower.worst.size <= self.peak:
@@ -113,33 +115,38 @@ class JointSearch:
             wild = wild or found
         return wild
 
-    def _raised(self, numbers: list[FloatArray], added: FloatArray) -> list[FloatArray]:
+    def _raised(
+        self, numbers: list[FloatArray], added: Sequence[FloatArray], least: float
+    ) -> list[FloatArray]:
         """Return what steps from stable laws lead to.
 
         Each step is the best of the linearised problem within a radius, with an exact penalty on
         what is violated ([Fletcher1987]_, chapter 14). ``det(I + P C)`` turns as often as before,
         so that the loop stays stable.
         """
-        couplings = []
-        for plant in self.plants:
-            model = hasattr(plant.plant, "poles")
-            inside = added[(added > plant.grid[0]) & (added < plant.grid[-1])]
-            grid = np.union1d(plant.grid, inside) if model else plant.grid
-            couplings.append(plant.coupling(grid))
+        grids = [np.union1d(one.grid, more) for one, more in zip(self.plants, added, strict=True)]
+        couplings = [one.coupling(grid) for one, grid in zip(self.plants, grids, strict=True)]
         x, radius = np.concatenate(numbers), _RADIUS
         gains = self._gains(x, couplings)
-        rooms = self._rooms(gains, couplings)
-        least = min(float(room.min()) for room in rooms)
+        rooms = self._rooms(gains, couplings, least)
+        lowest = min(float(room.min()) for room in rooms)
         for _ in range(_STEPS):
-            step, expected = self._step(x, gains, rooms, couplings, radius)
+            program = self._program(x, gains, rooms, couplings)
+            step, expected = program.step(program.room, radius)
             if radius < _SMALLEST or expected < _SMALLEST:
                 break
-            there = self._gains(x + step, couplings)
-            found = self._rooms(there, couplings)
-            low = min(float(room.min()) for room in found)
-            gained = self._mean(step) + _PENALTY * (min(low, 0.0) - min(least, 0.0))
+            for last in (False, True):
+                there = self._gains(x + step, couplings)
+                found = self._rooms(there, couplings, least)
+                low = min(float(room.min()) for room in found)
+                gained = program.mean(step) + _PENALTY * (min(low, 0.0) - min(lowest, 0.0))
+                if gained > 0.1 * expected or last:
+                    break
+                # second-order correction: the bounds are curved, and steps along them short
+                bent = program.at(found) - program.slopes @ step
+                step = program.step(bent, radius)[0]
             if gained > 0.1 * expected and all(map(_alike, couplings, gains, there)):
-                x, gains, rooms, least = x + step, there, found, low
+                x, gains, rooms, lowest = x + step, there, found, low
                 radius *= 2.0 if gained > 0.7 * expected and radius < _RADIUS else 1.0
             else:
                 radius *= 0.4
@@ -156,53 +163,35 @@ class JointSearch:
         return found
 
     def _rooms(
-        self, gains: Sequence[ComplexArray], couplings: Sequence[Coupling]
+        self, gains: Sequence[ComplexArray], couplings: Sequence[Coupling], least: float
     ) -> list[FloatArray]:
-        """Return what the distances to the critical point have to spare (places, n_freq)."""
-        least = 1.0 / self.peak + _SPARE
+        """Return what the distances have beyond the least allowed (places, n_freq)."""
         return [one.distances(C) - least for one, C in zip(couplings, gains, strict=True)]
 
-    def _step(
+    def _program(
         self,
         x: FloatArray,
         gains: Sequence[ComplexArray],
         rooms: Sequence[FloatArray],
         couplings: Sequence[Coupling],
-        radius: float,
-    ) -> tuple[FloatArray, float]:
-        """Return the step of the linear program, and the gain that it predicts."""
-        from scipy.optimize import linprog
-
-        slopes, spare = [], []
-        for one, C, room in zip(couplings, gains, rooms, strict=True):
+    ) -> _Program:
+        """Return the problem linearised at some numbers."""
+        slopes, places = [np.empty((0, x.size))], []
+        for number, (one, C, room) in enumerate(zip(couplings, gains, rooms, strict=True)):
             for place, own in enumerate(room):
                 rows = _critical(own)
                 if rows.size:
-                    some = Coupling(*(part[rows] for part in one[:4]), one.of)
+                    some = one.rows(rows)
                     slopes.append(self._by_numbers(x, some, some.slopes(C[rows], place)))
-                    spare.append(own[rows])
-        room = np.concatenate([*spare, [np.inf]])
+                    places.append((number, place, rows))
         limits = [law.limits(own) for law, own in zip(self.of, self._split(x), strict=True)]
-        low, high = (np.concatenate([one[i] for one in limits]) for i in (0, 1))
-        bound, most = la.block_diag(*(one[2] for one in limits)), [one[3] for one in limits]
-        slack = np.maximum(np.concatenate(most) - bound @ x, 0.0)
-        aim = np.zeros(x.size + 1)
-        aim[self._places], aim[-1] = -1.0 / len(self.of), _PENALTY
-        rows = np.vstack([*slopes, np.empty((0, x.size))])
-        answer = linprog(
-            aim,
-            A_ub=np.block([
-                [-rows, -np.ones((len(rows), 1))],
-                [bound, np.zeros((slack.size, 1))],
-            ]),
-            b_ub=np.concatenate([room[:-1], slack]),
-            bounds=np.vstack(
-                [np.clip([low - x, high - x], -radius, radius).T, [0.0, np.inf]]
-            ).tolist(),
-        )  # fmt: skip
-        if answer.x is None or answer.fun is None:
-            return np.zeros(x.size), 0.0
-        return answer.x[:-1], float(-answer.fun) - _PENALTY * min(float(room.min()), 0.0)
+        low, high = (np.concatenate([one[i] for one in limits]) - x for i in (0, 1))
+        bound = la.block_diag(*(one[2] for one in limits))
+        slack = np.maximum(np.concatenate([one[3] for one in limits]) - bound @ x, 0.0)
+        program = _Program(
+            np.vstack(slopes), places, np.empty(0), low, high, bound, slack, self._places
+        )
+        return program._replace(room=program.at(rooms))
 
     def _by_numbers(self, x: FloatArray, some: Coupling, slopes: ComplexArray) -> FloatArray:
         """Return the derivatives by the numbers from those by the laws, by differences."""
@@ -217,9 +206,6 @@ class JointSearch:
                 found.append((slopes[:, i] * change).real)
         return np.array(found).T
 
-    def _mean(self, step: FloatArray) -> float:
-        return float(np.mean(step[self._places]))
-
     @property
     def _places(self) -> IntArray:
         """Where the bandwidths are among the numbers of all axes."""
@@ -227,6 +213,49 @@ class JointSearch:
 
     def _split(self, x: FloatArray) -> list[FloatArray]:
         return np.split(x, self._places[1:])
+
+
+class _Program(NamedTuple):
+    """The linearised problem: ``room + slopes step >= 0`` at some points of some places."""
+
+    slopes: FloatArray
+    places: list[tuple[int, int, IntArray]]
+    room: FloatArray
+    low: FloatArray
+    high: FloatArray
+    bound: FloatArray
+    slack: FloatArray
+    bandwidths: IntArray
+
+    def at(self, rooms: Sequence[FloatArray]) -> FloatArray:
+        """Return the room at the points of the program."""
+        return np.concatenate([[], *(rooms[i][k, rows] for i, k, rows in self.places)])
+
+    def mean(self, step: FloatArray) -> float:
+        """Return the mean growth of the bandwidths."""
+        return float(np.mean(step[self.bandwidths]))
+
+    def step(self, room: FloatArray, radius: float) -> tuple[FloatArray, float]:
+        """Return the best step within a radius for some room, and the gain that it predicts."""
+        from scipy.optimize import linprog
+
+        aim = np.zeros(self.low.size + 1)
+        aim[self.bandwidths], aim[-1] = -1.0 / self.bandwidths.size, _PENALTY
+        answer = linprog(
+            aim,
+            A_ub=np.block([
+                [-self.slopes, -np.ones((room.size, 1))],
+                [self.bound, np.zeros((self.slack.size, 1))],
+            ]),
+            b_ub=np.concatenate([room, self.slack]),
+            bounds=np.vstack(
+                [np.clip([self.low, self.high], -radius, radius).T, [0.0, np.inf]]
+            ).tolist(),
+        )  # fmt: skip
+        if answer.x is None or answer.fun is None:
+            return np.zeros(self.low.size), 0.0
+        now = float(min(self.room.min(initial=np.inf), 0.0))
+        return answer.x[:-1], float(-answer.fun) - _PENALTY * now
 
 
 def _critical(room: FloatArray) -> IntArray:

@@ -1,4 +1,4 @@
-"""tune_loops: for each decoupled axis the law of highest bandwidth that keeps a modulus margin."""
+"""tune_loops: laws of decoupled axes, of the highest bandwidth that keeps a modulus margin."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def tune_loops(
     larger: Any = None,
     progress: bool | None = None,
 ) -> LoopDesign:
-    """Return the laws of highest bandwidth that keep |S| of each axis below a peak.
+    """Return the laws of highest bandwidth that keep |S| below a peak, all axes together.
 
     Each axis gets ``k (1 + w_i / s) (1 + a s / w_b) / (1 + s / (b w_b)) F(s)`` with a low-pass and
     notches in F. w_b, where the loop of the rigid body alone crosses 1, is made as large as
@@ -54,6 +54,12 @@ def tune_loops(
     frequency, depth and width of the notches are found on the way, from many starts: the best of
     them, without proof that no other law does better. w_i is w_b / 10, no zero lies below it, no
     corner above 0.45 of the rate or the last line.
+
+    Where the laws found for each axis alone do not hold the peak together, those of all axes are
+    changed together until they do, for the highest geometric mean of their bandwidths: |S| of each
+    axis with the others closed, and the largest singular value of S at u and of S at y, where the
+    channels of a side have one unit; with the modes left out too, where these are known. Laws that
+    come closest to the peak are returned with a warning that says what ended the search.
 
     No model is needed: the plant may be an Frf. A line is taken to lie anywhere within two standard
     deviations, by its variance, else its coherence (averages by `freedom`; unless given as if of
@@ -67,14 +73,15 @@ def tune_loops(
     plant, before, after, rate, delay, hold
         As for `design_loops`.
     peak : float
-        Bound on |S|; 2 is a modulus margin of 6 dB.
+        Bound on |S|, at u, at y and of each axis; 2 is a modulus margin of 6 dB.
     rigid : int, optional
         Rigid-body modes that the axes show; unless given as many as axes, of a model those that it
         has. 0 on springs whose modes lie within the lines.
     notches : int
         At most so many for each axis; one has to raise the bandwidth by 2 %.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
-        A model with the modes left out, for the check of a StandardPlant as for `larger_plant`.
+        A model with the modes left out, as for `larger_plant`, of a StandardPlant: the peak holds
+        there too. Unless given, with those that the plant's reduced model still has.
     progress : bool, optional
         A bar: None shows one on a terminal or in a notebook, for work of more than two seconds.
 
@@ -86,10 +93,16 @@ def tune_loops(
     Raises
     ------
     SolverError
-        When no bandwidth within the lines holds the peak, with the axis; or when the axes disturb
-        each other too much.
+        When no bandwidth within the lines holds the peak, with the axis; or when no laws that were
+        found are stable together.
     ModelError, ShapeError, LabelError, AssumptionError
         As for `design_loops`; ModelError when peak is not above 1.
+
+    Warns
+    -----
+    FlexplantWarning
+        When the peak was not reached: the largest |S|, where, and at which frequency. The note is
+        in `notes` too.
 
     Examples
     --------
