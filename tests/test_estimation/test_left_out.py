@@ -7,7 +7,6 @@ import pytest
 
 from flexplant.errors import (
     AssumptionError,
-    CertificateError,
     FlexplantWarning,
     LabelError,
     ModelError,
@@ -17,8 +16,8 @@ from flexplant.estimation.error import error_variances
 from flexplant.estimation.left_out import left_out
 from flexplant.lti import lowpass
 from flexplant.modes import solve_modes
-from flexplant.plant import GroundSpring, Sensor, assemble_plant, larger_plant, suspend
-from flexplant.reduction import DesiredDofs, ModalTruncation, reduce, select_dofs
+from flexplant.plant import Sensor, assemble_plant, larger_plant
+from flexplant.reduction import DesiredDofs, ModalTruncation, reduce
 from flexplant.structure import FEModel, ModalDamping, kirchhoff_plate
 from oracles_estimation import error_by_frequency, truncated_covariance
 from plates import make_plate
@@ -315,26 +314,3 @@ def test_predicted_within_five_percent_on_machines_of_another_mesh(kind, zeta):
         error = estimator.rms("die", on=truth)
         assert estimator.rms("die") == pytest.approx(error, rel=0.05, abs=0)
         assert error < 1.02 * design_kalman(estimator.plant).rms("die", on=truth)
-
-
-def suspended_plants(damping):
-    """Nine of 16 modes on four springs, with seven that are left out known; and all 16."""
-    modes = solve_modes(make_plate(), count=16, damping=ModalDamping(1e-4))
-    few = reduce(modes, DesiredDofs(select_dofs(modes.select(range(9)), 9)))
-    springs = [GroundSpring(at=p, stiffness=2000.0, damping=damping) for p in CORNERS]
-    models = [suspend(model, springs) for model in (few, modes)]
-    return [sampled(model, ports(asd=1e-3)) for model in models]
-
-
-def test_dampers_of_a_suspension_damp_the_modes_left_out_as_well():
-    plant, truth = suspended_plants(damping=10.0)
-    kalman = design_kalman(plant)
-    assert kalman.certificate.left_out == 7
-    for axis in AXES:
-        assert kalman.rms(axis) == pytest.approx(kalman.rms(axis, on=truth), rel=0.02, abs=0)
-
-
-def test_an_error_that_is_lost_in_rounding_names_the_modes_without_damping():
-    plant, truth = suspended_plants(damping=1e-7)
-    with pytest.raises(CertificateError, match=r"Modes at .* Hz have next to no damping"):
-        design_kalman(plant, larger=plant).rms("die:z", on=truth)
