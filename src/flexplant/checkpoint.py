@@ -2,22 +2,33 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
-import pickle
+import re
+import sys
+import zlib
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import IO, Any, Self
 
-from .errors import ModelError
+from .errors import FlexplantError, ModelError
+
+#: files that this process has locked: a lock of the system holds between processes only
+_locked: set[tuple[int, int]] = set()
+#: where a result begins, in a line that was cut or joined with the next
+_BEGIN = re.compile(r"\[\d+, ")
+#: the byte that Windows locks, far behind the end: locked bytes cannot be read there
+_FAR = 2**40
 
 
 class Checkpoint:
-    """A file of JSON lines: what the work is, then ``[number, result]`` of each item.
+    """A file of JSON lines: what the work is, then ``[number, result, sum]`` of each item.
 
-    Each line is written at once and reaches the disk before the next item is counted; a line
-    that was cut off is dropped and its item computed again.
+    Each line is written at once and reaches the disk before the next item is counted. Of a file
+    that was damaged all results are taken whose check sum is right; the rest is computed again.
+    As a context it closes the file, which one process at a time can write to.
 
     Parameters
     ----------
@@ -34,6 +45,8 @@ class Checkpoint:
     ------
     ModelError
         When the file is of other work, or no such file.
+    FlexplantError
+        When it cannot be written, or other work writes to it now.
     """
 
     def __init__(
@@ -46,8 +59,11 @@ class Checkpoint:
         if not isinstance(path, str | Path | None):
             raise ModelError(f"a checkpoint is a path, got {path!r:.80}. Pass 'search.jsonl', say.")
         self.path = None if path is None else Path(path)
-        self.header = {"kind": f"flexplant {kind}", **header}
+        version = sys.modules["flexplant"].__version__
+        self.header = {"kind": f"flexplant {kind}", "flexplant": version, **header}
         self.rows: dict[int, Any] = {}
+        self._file: IO[bytes] | None = None
+        self._key: tuple[int, int] | None = None
         if self.path is None:
             return
         if not self.path.parent.is_dir():
@@ -55,30 +71,61 @@ class Checkpoint:
                 f"the folder {self.path.parent} of the checkpoint does not exist, so that nothing "
                 "could be kept. Make it, or give another path."
             )
-        if self.path.exists() and self.path.stat().st_size:
-            self._resume(self.path, kind, set(free))
-        else:
-            _append(self.path, self.header)
+        try:
+            self._file = self.path.open("a+b")
+        except OSError as error:
+            raise self._failed("opened for writing", error) from error
+        try:
+            self._lock(self._file)
+            self._resume(self._file, kind, set(free))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the file, which ends its lock."""
+        if self._file is not None:
+            with suppress(OSError):  # each line was written and flushed by itself
+                self._file.close()
+        if self._key is not None:
+            _locked.discard(self._key)
+        self._file = self._key = None
 
     def add(self, number: int, result: Any) -> None:
         """Keep what came out for an item."""
         self.rows[number] = result
-        if self.path is not None:
-            _append(self.path, [number, result])
+        if self._file is not None:
+            text = _dumped([number, result])
+            self._append(self._file, f"{text[:-1]}, {_sum(text)}]\n".encode())
 
-    def _resume(self, path: Path, kind: str, free: set[str]) -> None:
-        content = path.read_bytes()
-        whole = content.rfind(b"\n") + 1
-        lines = content[:whole].splitlines()
+    def _resume(self, file: IO[bytes], kind: str, free: set[str]) -> None:
+        """Take what the file has; write the header where there is nothing."""
+        file.seek(0)
+        content = file.read()
+        first, *lines = content.split(b"\n")
+        start = _dumped(self.header).partition(",")[0].encode()
+        if not lines and (first[: len(start)] == start[: len(first)] or not first.strip(b"\0")):
+            file.truncate(0)  # empty, or its first line was cut
+            self._append(file, _dumped(self.header).encode() + b"\n")
+            return
         try:
-            found = json.loads(lines[0])
-            known = isinstance(found, dict) and found.get("kind") == self.header["kind"]
-            entries = [json.loads(line) for line in lines[1:]]
-        except (ValueError, IndexError):
-            known = False
-        if not known:
+            found = json.loads(first)
+        except ValueError:
+            found = None
+        if not isinstance(found, dict) or found.get("kind") != self.header["kind"]:
             raise ModelError(
-                f"{path} is not the checkpoint of a {kind}: nothing is written to it. Name a "
+                f"{self.path} is not the checkpoint of a {kind}: nothing is written to it. Name a "
                 f"file that does not exist, or one that a {kind} wrote."
             )
         other = [
@@ -89,30 +136,82 @@ class Checkpoint:
         ]
         if other:
             raise ModelError(
-                f"{path} is the checkpoint of another {kind}: what differs is "
-                f"{', '.join(other)}. Give another file, or delete this one."
+                f"{self.path} is the checkpoint of another {kind}: what differs is "
+                f"{', '.join(other)}. Values count by content, functions of your own modules by "
+                "code, as far as they are reached. Give another file, or delete this one."
             )
         self.header = found
-        self.rows = {int(number): row for number, row in entries}
-        if whole < len(content):  # a line that was cut off
-            with path.open("r+b") as file:
-                file.truncate(whole)
+        for line in lines:
+            self.rows.update(_entries(line.decode(errors="replace")))
+        if lines[-1]:  # cut off: what is appended has a line of its own
+            self._append(file, b"\n")
 
-
-def fingerprint(items: Iterable[Any]) -> str:
-    """Return a digest of what can be pickled, and of the names of what cannot."""
-    digest = hashlib.sha256()
-    for item in items:
+    def _append(self, file: IO[bytes], line: bytes) -> None:
         try:
-            content = pickle.dumps(item, protocol=5)
-        except (pickle.PicklingError, AttributeError, TypeError):  # a function made on the spot
-            content = str(getattr(item, "__qualname__", type(item).__qualname__)).encode()
-        digest.update(hashlib.sha256(content).digest())
-    return digest.hexdigest()
+            file.write(line)
+            file.flush()
+            os.fsync(file.fileno())
+        except OSError as error:
+            raise self._failed("written", error) from error
+
+    def _failed(self, done: str, error: OSError) -> FlexplantError:
+        return FlexplantError(
+            f"the checkpoint {self.path} cannot be {done} ({error.strerror or error}): results "
+            "would be lost. What it has is kept: make room or give the right to write, and "
+            "begin again with the same file."
+        )
+
+    def _lock(self, file: IO[bytes]) -> None:
+        """Lock the file for this process, until it is closed or the process ends."""
+        status = os.fstat(file.fileno())
+        key = status.st_dev, status.st_ino
+        if key in _locked or not _is_locked_now(file):
+            raise FlexplantError(
+                f"other work writes to the checkpoint {self.path} now: results of both would be "
+                "mixed. Wait until it ends, or give another file."
+            )
+        _locked.add(key)
+        self._key = key
 
 
-def _append(path: Path, entry: Any) -> None:
-    with path.open("ab") as file:
-        file.write(json.dumps(entry, default=lambda value: value.tolist()).encode() + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
+def _is_locked_now(file: IO[bytes]) -> bool:
+    """Lock a file and return True; False when another process has locked it."""
+    try:
+        if sys.platform == "win32":
+            import msvcrt
+
+            file.seek(_FAR)
+            msvcrt.locking(file.fileno(), msvcrt.LK_NBLCK, 1)
+        else:
+            import fcntl
+
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except (BlockingIOError, PermissionError):
+        return False
+    except OSError:  # a file system without locks
+        return True
+    return True
+
+
+def _entries(line: str) -> dict[int, Any]:
+    """Return the results of a line whose check sums are right, wherever they begin in it."""
+    found: dict[int, Any] = {}
+    at = 0
+    while (begin := _BEGIN.search(line, at)) is not None:
+        at = begin.start() + 1
+        try:
+            entry, end = json.JSONDecoder().raw_decode(line, begin.start())
+        except ValueError:
+            continue
+        if len(entry) == 3 and isinstance(entry[0], int) and entry[2] == _sum(_dumped(entry[:2])):
+            found[entry[0]] = entry[1]
+            at = end
+    return found
+
+
+def _dumped(entry: Any) -> str:
+    return json.dumps(entry, default=lambda value: value.tolist())
+
+
+def _sum(text: str) -> int:
+    return zlib.crc32(text.encode())

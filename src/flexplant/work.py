@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from concurrent.futures import Executor
 from pathlib import Path
-from typing import Any, TypeVar
+from types import TracebackType
+from typing import Any, Self, TypeVar
 
 import numpy as np
 
@@ -19,6 +20,8 @@ Result = TypeVar("Result")
 
 class Work:
     """Steps of long work: each is `mapped` on the executor, and what a file has is not repeated.
+
+    As a context it closes the file.
 
     The same steps come in the same order when the work is begun again, so that results are known
     by their number.
@@ -65,6 +68,17 @@ class Work:
         """Seeds of what is random."""
         entropy, key = self._log.header["rng"]
         return np.random.SeedSequence(entropy, spawn_key=tuple(key))
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._log.close()
 
     def mapped(
         self,

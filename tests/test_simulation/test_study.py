@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flexplant.errors import LabelError, ModelError
+from flexplant.errors import FlexplantError, LabelError, ModelError
 from flexplant.simulation import StudyTable, study
 from flexplant.store import load
 
@@ -141,6 +141,7 @@ def test_the_checkpoint_of_another_study_is_refused(tmp_path):
     for machines, pipeline, options in (
         (range(5), drawn, {"rng": 1}),
         ([0, 1, 2, 4], drawn, {"rng": 1}),
+        (range(4), lambda machine, rng: drawn(machine, rng), {"rng": 1}),
         (range(4), drawn, {"rng": 2}),
         (range(4), ends, {}),
     ):
@@ -152,6 +153,77 @@ def test_the_checkpoint_of_another_study_is_refused(tmp_path):
         study(range(4), drawn, rng=1, checkpoint=other)
     assert (path.read_bytes(), other.read_text()) == (before, "mine\n")
     assert json.loads(before.splitlines()[0])["machines"] == 4
+
+
+def damaged(lines):
+    """Yield a checkpoint of five lines as accidents leave it, and the rows that are lost."""
+    head, *rows = lines
+    yield [head, rows[0], b"\0" * 30 + b"\n", *rows[2:]], {1}  # a power cut
+    yield [head, b"\0" * 9 + rows[0], *rows[1:]], set()
+    yield [head, rows[0][:-1], *rows[1:]], set()  # two in a line
+    yield [head, rows[0], rows[1][:9], *rows[2:]], {1}  # cut, and the next in its line
+    yield [head, *rows[:3], rows[3][:-9]], {3}
+    yield [head, rows[0].replace(b"1", b"7", 1), *rows[1:]], {0}  # another value
+    yield [head, b"\xff\xfe[[{\n", *rows], set()
+    yield [head[:20]], {0, 1, 2, 3}
+    yield [], {0, 1, 2, 3}
+
+
+@pytest.mark.parametrize("case", range(9))
+def test_of_a_damaged_file_all_that_is_whole_is_taken(tmp_path, case):
+    path = tmp_path / "rows.jsonl"
+
+    def noted(machine):
+        (tmp_path / f"computed-{machine}").touch()
+        return {"value": machine + 0.1, "name": '[1, {"'}
+
+    def computed():
+        found = {int(file.name.partition("-")[2]) for file in tmp_path.glob("computed-*")}
+        for number in found:
+            (tmp_path / f"computed-{number}").unlink()
+        return found
+
+    table = study(range(1, 5), noted, checkpoint=path)
+    assert computed() == {1, 2, 3, 4}
+    lines, lost = list(damaged(path.read_bytes().splitlines(keepends=True)))[case]
+    path.write_bytes(b"".join(lines))
+    same(study(range(1, 5), noted, checkpoint=path), table)
+    assert computed() == {number + 1 for number in lost}
+    same(study(range(1, 5), noted, checkpoint=path), table)
+    assert computed() == set()
+
+
+@pytest.mark.parametrize("process", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_two_studies_do_not_write_to_one_file(tmp_path, process):
+    path = tmp_path / "rows.jsonl"
+    code = SCRIPT.format(tests=str(Path(__file__).parent), folder=str(tmp_path), path=str(path))
+
+    def inner(machine):
+        if not process:
+            return study([1.0], drawn, checkpoint=path)
+        done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+        raise FlexplantError(done.stderr.splitlines()[-1])
+
+    failed = study([1.0], inner, checkpoint=path)["failed"][0]
+    assert f"other work writes to the checkpoint {path} now" in failed
+    assert study([1.0], inner, checkpoint=path)["failed"][0] == failed  # not locked any more
+
+
+def test_a_full_disk_and_what_cannot_be_written(tmp_path):
+    with pytest.raises(FlexplantError, match="cannot be opened for writing"):
+        study([1.0], drawn, checkpoint=tmp_path)
+    path = tmp_path / "rows.jsonl"
+    study([0, 1], drawn, rng=1, checkpoint=path)
+    path.write_bytes(b"".join(path.read_bytes().splitlines(keepends=True)[:2]))
+    resource = pytest.importorskip("resource")
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 9, limits[1]))
+    try:
+        with pytest.raises(FlexplantError, match=r"cannot be written \(File too large\)"):
+            study([0, 1], drawn, rng=1, checkpoint=path)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    same(study([0, 1], drawn, rng=1, checkpoint=path), study([0, 1], drawn, rng=1))
 
 
 @pytest.mark.parametrize(

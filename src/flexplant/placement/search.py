@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ..checkpoint import fingerprint
 from ..errors import InfeasibleError, ModelError
+from ..fingerprint import fingerprint
 from ..plant import StandardPlant
 from ..values import Rng, instance, short
 from ..work import Work
@@ -266,8 +266,8 @@ def _placed(
     if checkpoint is not None:
         parts = [plant, *ports, layouts.criterion, problem.count, problem.required, problem.rows]
         header = {"problem": fingerprint([*parts, method])}
-    work = Work(executor, progress, rng, checkpoint, "search", header)
-    found = method.search(problem, work)
+    with Work(executor, progress, rng, checkpoint, "search", header) as work:
+        found = method.search(problem, work)
     if not np.isfinite(found.value):
         raise InfeasibleError(
             f"no choice of {problem.count} of the {len(ports)} candidates has a finite score; the "

@@ -9,8 +9,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ..checkpoint import Checkpoint, fingerprint
+from ..checkpoint import Checkpoint
 from ..errors import ModelError
+from ..fingerprint import fingerprint
 from ..parallel import Progress, one_thread
 from ..surviving import DIED, Died, survived
 from ..values import seed_sequence, short
@@ -82,28 +83,28 @@ def study(
             "returns a mapping, or a MachinePipeline."
         )
     source = None if rng is None else seed_sequence(rng)
-    log = Checkpoint(
-        checkpoint,
-        "study",
-        {
-            "machines": len(items),
-            "fingerprint": fingerprint([pipeline, *items]),
-            "rng": None if source is None else [source.entropy, list(source.spawn_key)],
-        },
-        free=("rng",) if isinstance(rng, np.random.Generator) else (),
-    )
-    seeds: list[Any] = [None] * len(items)
-    if log.header["rng"] is not None:
-        entropy, key = log.header["rng"]
-        seeds = list(np.random.SeedSequence(entropy, spawn_key=tuple(key)).spawn(len(items)))
-    left = [i for i in range(len(items)) if i not in log.rows]
-    calls = {i: (pipeline, items[i], seeds[i]) for i in left}
-    with Progress(len(items), "machines", progress=progress) as bar:
+    header: dict[str, Any] = {
+        "machines": len(items),
+        "rng": None if source is None else [source.entropy, list(source.spawn_key)],
+    }
+    if checkpoint is not None:
+        header |= {"pipeline": fingerprint([pipeline]), "values of machines": fingerprint(items)}
+    free = ("rng",) if isinstance(rng, np.random.Generator) else ()
+    with (
+        Checkpoint(checkpoint, "study", header, free) as log,
+        Progress(len(items), "machines", progress=progress) as bar,
+    ):
+        seeds: list[Any] = [None] * len(items)
+        if log.header["rng"] is not None:
+            entropy, key = log.header["rng"]
+            seeds = list(np.random.SeedSequence(entropy, spawn_key=tuple(key)).spawn(len(items)))
+        left = [i for i in range(len(items)) if i not in log.rows]
+        calls = {i: (pipeline, items[i], seeds[i]) for i in left}
         bar.advance(len(log.rows))
         for number, outcome in _outcomes(calls, executor):
             log.add(number, _kept(outcome))
             bar.advance()
-    return tabled([log.rows[i] for i in range(len(items))])
+        return tabled([log.rows[i] for i in range(len(items))])
 
 
 def _outcomes(
