@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..loop.nyquist import continued, nyquist_count
+from ..loop.hidden_modes import hidden_modes
+from ..loop.nyquist import nyquist_count
 from ..lti.frequency import Frf
 from ..lti.grid import SOUGHT, highest, resonance_grid
 from ..lti.interconnection import loop_poles
@@ -98,10 +99,17 @@ class JointPlant:
             each = np.array([-law.response(freq) for law in laws])
             return np.asarray(np.eye(len(laws))[:, :, None] * each)
 
-        slope = 2 if self.rigid else 0
-        freq, L = continued(self.grid, P, respond, slope)
-        at_zero = 2 * self.rigid + len(laws)  # each law integrates once
-        return nyquist_count(freq, L, at_zero=at_zero, unstable=0).unstable == 0
+        lines = self.grid
+        count = nyquist_count(
+            lines,
+            P,
+            respond,
+            hidden_modes(lines, P, respond(lines)),
+            slope=2 if self.rigid else 0,
+            at_zero=2 * self.rigid + len(laws),  # each law integrates once
+            unstable=0,
+        )
+        return count.unstable == 0
 
     def worst(self, laws: Sequence[Law]) -> Worst:
         """Return the largest |S| of a stable loop, the grid refined at its peaks."""
