@@ -13,8 +13,11 @@ from flexplant.errors import LabelError, ModelError
 from flexplant.estimation import consistency, design_kalman
 from flexplant.estimation.innovation_spectrum import parts_of
 from flexplant.estimation.whiteness import cumulative_periodogram, ljung_box, spectrum_of
-from flexplant.plant import assemble_plant
+from flexplant.modes import solve_modes
+from flexplant.plant import Sensor, assemble_plant
 from flexplant.plant.uncertainty.uncertain_plant import Delta, with_changes
+from flexplant.structure import ModalDamping, chain
+from flexplant.testbeds import three_masses
 from oracles_estimation import records_of
 
 RATE = 4e3
@@ -31,10 +34,10 @@ def machine():
     return plant(count=9)
 
 
-def recorded(truth, steps=20000, seed=1):
+def recorded(truth, steps=20000, seed=1, axes=("die:z", "die:rx", "die:ry")):
     g = truth.system
     y = [name for name in truth.y if name not in truth.w]
-    z = ["die:z", "die:rx", "die:ry"]
+    z = list(axes)
     rows = [truth.y.index(name) for name in y]
     records = records_of(
         g.A, g.C[g.output_index(y)], g.C[g.output_index(z)], truth.noise_factor,
@@ -157,6 +160,33 @@ def test_a_changed_mode_is_no_other_mode(mode, kind, amount):
     found = judged(plant(count=12), moved)
     assert found.causes == ("frequency",)
     assert f"near mode {mode} " in found.text
+
+
+def one_sensor(count):
+    """Modes of a chain of five masses pushed at one end and seen at the other."""
+    every = solve_modes(
+        chain(masses=[1.0] * 5, stiffnesses=[4e5] * 4), count=5, damping=ModalDamping(0.01)
+    )
+    own = three_masses().assembled.ports.replace(y=[Sensor("y1", at="5:x", asd=1e-11)])
+    return assemble_plant(every.select(range(count)), own).discretized(2e3, delay=1)
+
+
+@pytest.mark.parametrize(
+    ("kept", "mode", "kind", "amount", "cause"),
+    [
+        (5, 2, "freq", 0.05, "frequency"),
+        (5, 3, "damping", -0.8, "frequency"),
+        (4, 2, "freq", 0.0, "truncation"),
+        (3, 2, "freq", 0.0, "truncation"),
+    ],
+)
+def test_one_sensor_shows_whether_a_mode_has_moved_or_is_left_out(kept, mode, kind, amount, cause):
+    truth = with_changes(one_sensor(5), [(Delta("change", mode, kind, 1.0), amount)])
+    observer = design_kalman(one_sensor(kept), larger=one_sensor(kept))
+    records, _ = recorded(truth, axes=("die:x",))
+    found = consistency(observer, observer.estimate(records))
+    assert found.causes == (cause,)
+    assert cause == "truncation" or f"near mode {mode} " in found.text
 
 
 @pytest.mark.parametrize(("sensor", "size"), [("y1", 20e-9), ("y3", -5e-9), ("y2", 1e-6)])
