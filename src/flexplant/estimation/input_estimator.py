@@ -28,7 +28,7 @@ class InputCertificate(Certificate):
         ``M F - I`` and of ``(G - L F)`` beside G; 0 when inputs are assumed to be random walks.
     difference : float
         Largest relative difference between the variances with the P that the gains were computed
-        from and those with the P of the gains' own Stein equation, at most 1 %.
+        from and those with the P of the gains' own Stein equation, at most 1e-6.
 
     Examples
     --------

@@ -14,9 +14,8 @@ from ..values import FloatArray, real_array
 from .estimator_channels import sensors
 from .filter_model import FilterModel, filter_model
 
-#: two ways to a variance agree to this, half a per cent of an rms: what is in doubt below it is
-#: stated, and no machine is known so well
-AGREEMENT = 1e-2
+#: the covariance of the Riccati equation and that of the gain's own Stein equation agree to this
+AGREEMENT = 1e-6
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -30,9 +29,10 @@ class KalmanCertificate(Certificate):
     residual : float
         Of the Riccati equation, relative, in states of unit variance.
     difference : float
-        Largest relative difference between two ways to the POI variances, at most 1 %: on the
-        filter's own model the Riccati equation and a Stein equation of the gain; on the plant with
-        the modes left out the joint Stein equation and its dual.
+        Largest relative difference between two ways to the POI variances: on the filter's own
+        model the Riccati equation and a Stein equation of the gain, at most 1e-6; on the plant with
+        the modes left out the joint Stein equation and its dual, at most 1 %, with what rounding of
+        hardly damped poles may change.
     left_out : int, optional
         How many modes left out are in the predicted error; None: none are known, truncation is not
         in the number.
@@ -80,7 +80,7 @@ def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -
     ShapeError
         When sizes do not match.
     CertificateError
-        When the error is not stable or the difference exceeds 1 %.
+        When the error is not stable or the difference exceeds 1e-6.
 
     Examples
     --------
