@@ -8,8 +8,8 @@ import pytest
 import scipy.signal
 
 import oracles_synthesis as oracle
-from flexplant.errors import AssumptionError, InfeasibleError, SolverError
-from flexplant.lti import StateSpace
+from flexplant.errors import AssumptionError, FlexplantWarning, InfeasibleError, SolverError
+from flexplant.lti import StateSpace, hinf_norm
 from flexplant.synthesis import Riccati, StructuredLmi, attempts, design_hinf
 
 
@@ -127,7 +127,7 @@ def test_a_method_that_fails_leaves_the_problem_to_the_next(monkeypatch):
     plant = structure(5, w=2)
     best = solved(*plant)
 
-    def failing(self, problem):
+    def failing(self, *problem):
         raise SolverError("these equations were not solved.")
 
     monkeypatch.setattr(Riccati, "_regular", failing)
@@ -167,19 +167,24 @@ def test_a_norm_that_rounding_raises_is_the_one_that_counts(monkeypatch):
 
 
 def test_where_all_fail_each_says_why(monkeypatch):
-    plant = structure(5, w=2)
+    """A stable plant is left without feedback, and its norm is verified."""
+    A, B, C, D = plant = structure(5, w=2)
 
-    def failing(self, problem):
+    def failing(self, *problem):
         raise SolverError("these equations were not solved.")
 
     monkeypatch.setattr(Riccati, "_regular", failing)
     monkeypatch.setattr(attempts, "_LONG", 1e-3)
     message = (
-        r"^these equations were not solved\. \(Tried besides: StructuredLmi\(\): the time limit "
+        r"these equations were not solved\. \(Tried besides: StructuredLmi\(\): the time limit "
         r"of 0\.001 s was reached after 1 step, .* Riccati\(regularised=True\): the same\)$"
     )
-    with pytest.raises(SolverError, match=message):
-        solved(*plant)
+    with pytest.raises(SolverError, match=f"^{message}"):
+        solved(A + 5.0 * np.eye(len(A)), B, C, D)
+    with pytest.warns(FlexplantWarning, match=rf"^no feedback \(K = 0\), .*: {message}"):
+        found = solved(*plant)
+    norm = hinf_norm(StateSpace(A, B[:, :2], C[:1], D[:1, :2]))
+    assert found.lower <= found.gamma == pytest.approx(norm, rel=1e-6, abs=0)
 
 
 def test_nothing_is_added_where_it_must_not_be():
@@ -193,7 +198,7 @@ def test_nothing_is_added_where_it_must_not_be():
     ):
         solved(*structure(5, effort=1e-2), method=Riccati(regularised=False))
     plant = structure(5, w=2, noise=1e-2, effort=1e-2)
-    plain, added = solved(*plant), solved(*plant, method=Riccati(regularised=True))
+    plain, added = solved(*plant), solved(*plant, method=Riccati(0.01, regularised=True))
     assert not plain.notes
     assert added.certificate["added noise"] <= 1e-3
     assert added.gamma == pytest.approx(plain.gamma, rel=1e-2, abs=0)

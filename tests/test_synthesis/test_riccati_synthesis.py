@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from flexplant.errors import (
     AssumptionError,
     CertificateError,
+    FlexplantWarning,
     InfeasibleError,
     ModelError,
     SolverError,
@@ -96,7 +97,7 @@ def test_the_scalar_optimum_lies_between_lower_and_gamma(a, dt):
     best = scalar_optimum(a)
     found = checked(*scalar(a, dt))
     assert best * (1 - 2e-3) <= found.lower <= best * (1 + 1e-6)
-    assert best * (1 - 1e-6) <= found.gamma <= 1.055 * best
+    assert best * (1 - 1e-6) <= found.gamma <= 1.012 * best
 
 
 def test_without_back_off_the_optimum_is_met_within_the_tolerance():
@@ -219,7 +220,7 @@ def test_lower_stays_where_nothing_was_refuted(monkeypatch):
 
     monkeypatch.setattr(hinf_riccati, "_attempt", fragile)
     found = Riccati().solve(prepared(*scalar(1.0)))
-    assert found.gamma <= 1.055 * scalar_optimum(1.0)
+    assert found.gamma <= 1.012 * scalar_optimum(1.0)
     assert found.lower == 0.0
 
 
@@ -245,7 +246,7 @@ def test_compleib_with_full_rank(name):
     P, u, y = compleib(name)
     best = problems()[name]
     found = checked(P, u, y)
-    assert best * (1 - 1e-3) <= found.gamma <= 1.05 * best
+    assert best * (1 - 1e-3) <= found.gamma <= 1.012 * best
     assert 0.999 * best <= found.lower <= best * (1 + 1e-3)
     for i in range(len(u)):
         flipped = found.system.C.copy()
@@ -317,8 +318,11 @@ def test_a_gamma_that_hangs_on_the_last_digits_of_the_plant_is_refused():
     best = design_hinf(P, u=u, y=y).gamma
     found = design_hinf(turned(P, 1e4), u=u, y=y)
     assert found.gamma == pytest.approx(best, rel=1e-3, abs=0)
+    hidden = turned(P, 1e5)
     with pytest.raises(SolverError, match=r"badly conditioned: A is .*(one rounding|hang on)"):
-        design_hinf(turned(P, 1e5), u=u, y=y)
+        design_hinf(hidden, Riccati(), u=u, y=y)
+    with pytest.warns(FlexplantWarning, match=r"^no feedback .*badly conditioned: A is "):
+        assert not design_hinf(hidden, u=u, y=y).system.n_states
 
 
 def test_a_gamma_that_falls_with_the_added_noise_has_the_infimum_zero():

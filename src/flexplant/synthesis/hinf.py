@@ -7,7 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import AssumptionError, CertificateError, FlexplantError, ModelError, SolverError
+from ..errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantError,
+    ModelError,
+    SolverError,
+    warn,
+)
 from ..lti.interconnection import lft
 from ..lti.norms import hinf_norm
 from ..lti.preparation import Prepared, departure_from_normal, prepared
@@ -15,7 +22,7 @@ from ..lti.statespace import StateSpace, System
 from ..parallel import one_thread
 from ..plant import StandardPlant
 from ..values import short
-from .attempts import Answer, answered, best_answer
+from .attempts import Answer, answered, best_answer, idle_answer
 from .central import require_shown
 from .certificate import reached_norms
 from .controller import Controller
@@ -57,7 +64,8 @@ def design_hinf(
         Unless given they are tried in turn until one is verified close to its lower bound, else
         the best one is taken: `Riccati()`, which adds a little noise and effort where D12 or D21
         is singular; `Riccati(regularised=True)`, which adds them anyway; `StructuredLmi()`, which
-        needs none, up to 40 states. `Lmi()` is its readable form for less than 30.
+        needs none, up to 40 states. `Lmi()` is its readable form for less than 30. Where all fail,
+        a stable plant is left without feedback, K = 0, and the notes say why.
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
@@ -81,7 +89,8 @@ def design_hinf(
     AssumptionError
         When an assumption of the method fails; the message says which, in physical words.
     InfeasibleError, SolverError
-        When no stabilising controller was found.
+        When no stabilising controller was found; never, but where gamma has the infimum zero, for a
+        stable plant when no method is given.
     CertificateError
         When the closed loop misses the norm that was claimed.
     ModelError
@@ -92,6 +101,7 @@ def design_hinf(
     -----
     FlexplantWarning
         When the modes left out make the loop unstable, or bring |S| at u above 8 dB; it names them.
+        When a stable plant is left without feedback.
 
     References
     ----------
@@ -127,11 +137,19 @@ def design_hinf(
             answer = answered(plant, problem, method)
         _require_known(plant, problem, answer)
     except (AssumptionError, SolverError, CertificateError) as error:
-        raise _blamed(problem, error) from error
+        blamed = _blamed(problem, error)
+        named = isinstance(error, AssumptionError)  # what physically lacks is not for a note
+        if named or method is not None or not plant.system.is_stable:
+            raise blamed from error
+        try:
+            answer = idle_answer(plant, problem, blamed)
+        except FlexplantError:
+            raise blamed from error
+        warn(answer.found.notes[0])
     found = answer.found
     one = Controller(
         answer.controller,
-        f"H-infinity by {type(answer.method).__name__}",
+        f"H-infinity by {type(answer.method).__name__}" if answer.method else "no feedback",
         gamma=answer.gamma,
         lower=answer.lower,
         certificate=answer.certificate | dict(found.certificate),

@@ -22,6 +22,9 @@ from .method import SolvedController
 from .reach import beyond_rounding
 from .singular import made_regular, missing_ranks, require_ranks
 
+#: distances from the smallest gamma: 5 % of it cost 3 to 5 % of rms and 0.02 of margin; near it
+#: gains stay finite where D12 and D21 have full rank, and grow without bound where they have not
+_REGULAR, _SINGULAR = 0.01, 0.05
 #: steps of the bisection, and of going up from its result
 _BISECTION, _GROWTH = 60, 12
 #: a norm beside that of the least quadratic cost at which nothing is left to gain
@@ -50,8 +53,9 @@ class Riccati(Value):
 
     Parameters
     ----------
-    back_off : float
-        Relative distance from the smallest gamma found.
+    back_off : float, optional
+        Relative distance from the smallest gamma found. Unless given 1 % where D12 and D21 have
+        full rank, and 5 % where noise and effort are added.
     tolerance : float
         Relative width at which the bisection stops.
     regularised : bool, optional
@@ -77,14 +81,16 @@ class Riccati(Value):
     True
     """
 
-    back_off: float = 0.05
+    back_off: float | None = None
     tolerance: float = 1e-3
     regularised: bool | None = None
     progress: bool | None = None
 
     def __post_init__(self) -> None:
         self._set(
-            back_off=positive(self.back_off, "back_off", zero=True),
+            back_off=None
+            if self.back_off is None
+            else positive(self.back_off, "back_off", zero=True),
             tolerance=positive(self.tolerance, "tolerance"),
         )
 
@@ -104,15 +110,15 @@ class Riccati(Value):
         lacking = missing_ranks(problem)
         if self.regularised is False:
             require_ranks(lacking)
-            return self._regular(problem)
+            return self._regular(problem, _REGULAR)
         if not lacking and self.regularised is None:
             try:
-                return self._regular(problem)
+                return self._regular(problem, _REGULAR)
             except (AssumptionError, SolverError) as error:
                 lacking = (str(error).rstrip("."),)
-        return made_regular(problem, self._regular, lacking)
+        return made_regular(problem, lambda regular: self._regular(regular, _SINGULAR), lacking)
 
-    def _regular(self, problem: Prepared) -> SolvedController:
+    def _regular(self, problem: Prepared, back_off: float) -> SolvedController:
         # the least quadratic cost stabilises: its norm is where the search for less begins
         try:
             least = quadratic(problem)
@@ -129,7 +135,7 @@ class Riccati(Value):
         scaled = problem.measured_in(unit)
         with Progress(_BISECTION, "steps of the bisection", progress=self.progress) as bar:
             high, low = self._searched(scaled, bar)
-        controller, norm = self._accepted(scaled, high)
+        controller, norm = self._accepted(scaled, high, back_off)
         if controller is None:  # nothing below it holds
             controller = least.replace(C=least.C / unit)
             norm = _norm(scaled, controller)
@@ -162,9 +168,11 @@ class Riccati(Value):
                 low = middle
         return high, low
 
-    def _accepted(self, problem: Prepared, high: float) -> tuple[StateSpace | None, float]:
+    def _accepted(
+        self, problem: Prepared, high: float, back_off: float
+    ) -> tuple[StateSpace | None, float]:
         """Return the backed-off controller with the norm of its loop, going up until it holds."""
-        step = self.back_off
+        step = back_off if self.back_off is None else self.back_off
         for _ in range(_GROWTH):
             gamma = high * (1.0 + step)
             controller = _attempt(problem, gamma).controller

@@ -16,7 +16,7 @@ from .structured_lmi import StructuredLmi
 
 #: points of the sweep, and times that it is refined
 _POINTS, _REFINEMENTS = 200, 2
-#: a gap between gamma and the bound that is left as it is: methods stay 5 % away
+#: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
 _CLOSE = 0.0525
 #: up to so many states, and for so long [s], the LMIs are solved for a bound
 _STATES, _SECONDS = 24, 5.0
