@@ -7,7 +7,14 @@ import control
 import numpy as np
 import pytest
 
-from flexplant.errors import AssumptionError, CertificateError, LabelError, ModelError, SolverError
+from flexplant.errors import (
+    AssumptionError,
+    CertificateError,
+    FlexplantWarning,
+    LabelError,
+    ModelError,
+    SolverError,
+)
 from flexplant.loop import close_loop
 from flexplant.lti import StateSpace, hinf_norm, lft
 from flexplant.plant import (
@@ -261,8 +268,8 @@ def test_a_plant_beyond_rounding_is_told_so():
     B, C = np.eye(n)[:, [0, -1]] @ np.ones((2, 2)), np.ones((2, n))
     P = StateSpace(A, B, C, [[0.0, 1], [1, 0]], inputs=["w", "u"], outputs=["z", "y"])
     with pytest.raises((SolverError, AssumptionError), match="weight"):
-        design_hinf(P, fx.Riccati(), u="u", y="y")
-    with pytest.warns(fx.FlexplantWarning, match=r"^no feedback .* weight"):  # it is stable
+        design_hinf(P, Riccati(), u="u", y="y")
+    with pytest.warns(FlexplantWarning, match=r"^no feedback .* weight"):  # it is stable
         assert design_hinf(P, u="u", y="y").gamma > 1e40
 
 
