@@ -111,7 +111,8 @@ class Ports(Value):
             self._set(**{side: ports})
         check_names([port.name for port in self.forces], "inputs w and u")
         # a channel that w and y share is a reference
-        check_names([port.name for port in (*self.w, *self.y)], "ports w and y")
+        names = [*(port.name for port in self.w), *(port.name for port in self.y)]
+        check_names(names, "ports w and y")
         check_names([poi.name for poi in self.z], "POIs")
         check_names([reference.poi for reference in self.references], "references")
         for reference in self.references:
