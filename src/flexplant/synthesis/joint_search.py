@@ -25,8 +25,9 @@ _RADIUS, _SMALLEST, _PENALTY, _DIFFERENCE = 0.25, 1e-3, 4.0, 1e-6
 _POINTS, _REACH = 12, 0.3
 #: distance kept beyond what is needed, to end with no less
 _SPARE = 2e-3
-#: steps down, and their factor, where the grid missed the very top of a peak
-_DOWN, _LITTLE = 5, 0.99
+#: steps down, and their factor, where the grid missed the very top of a peak; |S| beside the bound
+#: from which on that is no cure
+_DOWN, _LITTLE, _FAR = 5, 0.99, 1.05
 #: part of the bound on |S| from which on a frequency of the closed loop is added
 _NEAR = 0.9
 
@@ -75,6 +76,9 @@ class JointSearch:
 
         They hold the peak, or come as close to it as any that were found.
         """
+        held = self._held(self.given)
+        if held is not None:
+            return held
         found = self._start()
         if found is None:
             return None
@@ -91,11 +95,17 @@ class JointSearch:
                 return found
             known = min(known, found, key=lambda one: one.worst.size)
             spare += 1.0 / self.peak - 1.0 / found.worst.size  # what lies between the points
-        for step in range(1, _DOWN + 1):
-            slower = self.checked(self._slowed(known.numbers, _LITTLE**step))
-            if slower is not None and slower.worst.size <= self.peak:
-                return slower
-        return known
+        return self._held(known.numbers) or known
+
+    def _held(self, numbers: Sequence[FloatArray]) -> JointLaws | None:
+        """Return the laws, or ones a little slower, that hold the peak; None where it is far."""
+        for step in range(_DOWN):
+            found = self.checked(self._slowed(numbers, _LITTLE**step))
+            if found is None or found.worst.size > _FAR * self.peak:
+                return None
+            if found.worst.size <= self.peak:
+                return found
+        return None
 
     def _slowed(self, numbers: Sequence[FloatArray], factor: float) -> list[FloatArray]:
         """Return the numbers with bandwidths times a factor, none below the lowest."""
