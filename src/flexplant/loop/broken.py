@@ -15,6 +15,7 @@ from ..lti.responses import Responder, responder
 from ..lti.statespace import StateSpace
 from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, short
+from .axis_scaling import scaled_size
 from .hidden_modes import FEWEST, HiddenModes, hidden_modes
 
 Side = Literal["u", "y"]
@@ -108,27 +109,47 @@ class BrokenLoop:
         edge = np.abs(poles) - 1.0 if self.dt else poles.real
         return bool(np.max(edge, initial=-1.0) >= 0)
 
-    @cached_property
-    def worst(self) -> Callable[[Side], tuple[float, float]]:
-        """The function of a side that gives the largest sigma_max(S) there, its frequency [Hz].
+    def mixed(self, at: Side = "u") -> tuple[str, ...]:
+        """Return the units of the channels where it is broken if they have several, else none.
 
-        Over a grid refined at the peaks.
+        A largest singular value then adds what cannot be added: an axis in other units has another.
+        """
+        names = self.u if at == "u" else self.y
+        known = tuple(dict.fromkeys(self.units.get(name, "unknown") for name in names))
+        return known if len(known) > 1 else ()
+
+    @cached_property
+    def worst(self) -> Callable[[Side, bool], tuple[float, float]]:
+        """The function of a side that gives the largest S there and its frequency [Hz].
+
+        Its size is that with scaled axes where it is required (True), else sigma_max; over a grid
+        refined at the peaks.
         """
         return cache(self._worst)
 
-    def _worst(self, at: Side) -> tuple[float, float]:
+    def _worst(self, at: Side, scaled: bool) -> tuple[float, float]:
+        def find(freq: FloatArray) -> FloatArray:
+            return self.size(freq, at, scaled)
+
         if self.measured is not None:
-            return highest(lambda freq: self.size(freq, at), self.followed, 0)
+            return highest(find, self.followed, 0)
         grid = resonance_grid(self.poles(), self.dt, points=_POINTS, around=SOUGHT)
-        return highest(lambda freq: self.size(freq, at), grid, 6)
+        return highest(find, grid, 6)
 
-    def size(self, freq: FloatArray, at: Side = "u") -> FloatArray:
-        """Return sigma_max(S) at frequencies [Hz], a lower bound where it is not high."""
-        return sensitivity_size(self.gain(freq, at))
+    def size(self, freq: FloatArray, at: Side, scaled: bool) -> FloatArray:
+        """Return the size of S at frequencies [Hz], a bound of it where it is not high."""
+        gain = self.gain(freq, at)
+        return scaled_size(inverted(gain)) if scaled else sensitivity_size(gain)
 
-    def margin(self, at: Side = "u") -> float:
-        """Return ``1 / max_f sigma_max(S)``; 0 when unstable."""
-        return 0.0 if self.is_unstable else 1.0 / self.worst(at)[0]
+    def margin(self, at: Side = "u", scaled: bool | None = None) -> float:
+        """Return ``1 / max_f |S|``; 0 when unstable.
+
+        |S| is the largest singular value; with scaled axes where channels have several units,
+        unless it is chosen.
+        """
+        if self.is_unstable:
+            return 0.0
+        return 1.0 / self.worst(at, bool(self.mixed(at)) if scaled is None else scaled)[0]
 
 
 def inverted(L: ComplexArray) -> ComplexArray:

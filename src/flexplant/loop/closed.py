@@ -278,7 +278,7 @@ class ClosedLoop(Value):
         if not whole.is_stable:
             found = growing_modes(whole.monitored, states)
         else:
-            peak = whole.broken.worst("u")[1]
+            peak = whole.broken.worst("u", bool(whole.broken.mixed("u")))[1]
             if high(margin, without):
                 found = growing_modes(whole.monitored, states, near=peak)
         sampled = bool(self.plant.dt)
@@ -289,7 +289,8 @@ class ClosedLoop(Value):
         """Smallest distance of the loop gain to the critical point, broken at u.
 
         ``1 / max_f sigma_max(S_u)`` with ``S_u = (I - K P)^-1``, over a grid refined at the closed
-        loop's resonances. An unstable loop has none: 0.
+        loop's resonances; with scaled axes where actuators have several units, as
+        `LoopReport.scaled_margin`. An unstable loop has none: 0.
         """
         return self.broken.margin()
 

@@ -18,7 +18,8 @@ def modulus_margin(loop: Loop) -> float:
     loop : ClosedLoop, or (plant, controller)
         As for `loop_gain`. An unstable loop has no margin: 0. For a measured plant the peak is
         that over its lines and through the modes that these show between them; its stability, and
-        what the lines leave open, is found by `report_loops`.
+        what the lines leave open, is found by `report_loops`. Where the actuators have several
+        units (N and N m) it is the margin with scaled axes, `LoopReport.scaled_margin`.
 
     Returns
     -------

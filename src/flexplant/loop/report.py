@@ -89,6 +89,8 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
         Of each channel where the loops are broken.
     modulus_margin : float
         Of all together, ``1 / max sigma_max(S)`` with S where they are broken; 0 when unstable.
+        Where the channels have several `units` a singular value mixes them, and it is the scaled
+        margin.
     unstable : int, optional
         Poles of the closed loop outside the stability region; None where that is not known.
     reason : str
@@ -96,6 +98,12 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     narrowest, near : float [Hz]
         Of a measured plant: it is stable if it has no mode of a half-power width below it that its
         lines do not show, and where that mode would be. 0 where the lines show all, and of a model.
+    scaled_margin : float
+        Of all together, ``1 / max min_D sigma_max(D S D^-1)``: each frequency with its axes scaled
+        for the least size (the upper bound of mu, an uncertainty for each axis), to 2 %. No unit
+        changes it.
+    units : tuple of str
+        Of the channels, where they have several.
 
     Examples
     --------
@@ -114,6 +122,8 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
     reason: str = ""
     narrowest: float = 0.0
     near: float = 0.0
+    scaled_margin: float = 0.0
+    units: tuple[str, ...] = ()
 
     @property
     def is_stable(self) -> bool | None:
@@ -147,8 +157,13 @@ class LoopReport(Value, Mapping[str, LoopMargins]):
             if self.narrowest and self.is_stable
             else ""
         )
-        together = f" of {len(self)} loops together" if len(self) > 1 else ""
-        margin = f"modulus margin {self.modulus_margin:.3f}{together}"
+        margin = f"modulus margin {self.modulus_margin:.3f}"
+        if self.units:
+            margin += (
+                f" of {len(self)} loops together, axes scaled (units: {', '.join(self.units)})"
+            )
+        elif len(self) > 1:
+            margin += f" of {len(self)} loops together, {self.scaled_margin:.3f} with scaled axes"
         lines = [f"<LoopReport: {state[self.is_stable]}{limit}, {margin}>"]
         lines += [f"  {loop!r}" for loop in self.loops[:4]]
         lines += [f"  and {len(self) - 4} more"] if len(self) > 4 else []
@@ -218,9 +233,11 @@ def report_loops(
 
         return loop_margins(names[i], grid, 1.0 - 1.0 / S[:, i, i], exact, sampled=bool(parts.dt))
 
-    margin = 0.0 if count.unstable else 1.0 / parts.worst(at)[0]
+    scaled = 0.0 if count.unstable else 1.0 / parts.worst(at, len(names) > 1)[0]
+    units = parts.mixed(at)
+    margin = scaled if units or count.unstable else 1.0 / parts.worst(at, False)[0]
     loops = tuple(one(i) for i in range(len(names)))
-    return LoopReport(loops, margin, *count)
+    return LoopReport(loops, margin, *count, scaled_margin=scaled, units=units)
 
 
 def _count(parts: BrokenLoop, grid: FloatArray, rigid: int, unstable: int) -> NyquistCount:

@@ -74,7 +74,8 @@ class ServoLoop:
 
         Of an unstable loop too, so check that.
         """
-        size = self.broken(axis).size(self.freq)
+        loop = self.broken(axis)
+        size = loop.size(self.freq, "u", bool(loop.mixed("u")))
         top = int(np.argmax(size))
         return float(size[top]), float(self.freq[top])
 
