@@ -104,7 +104,7 @@ class LoopComparison(Value):
             shown = "".join(f"{c:>{w}s}" for c, w in zip(cell, wide, strict=True))
             lines.append(f"{name:{width}s}{shown}")
         if self.channel:
-            lines.append(f"S is {self.channel}; at u it is the largest singular value.")
+            lines.append(f"S is {self.channel}; at u it is 1 / modulus margin.")
         return "\n".join(lines)
 
 

@@ -73,8 +73,8 @@ def nyquist_count(
     F = np.linalg.det(np.eye(L.shape[-1]) - L)
     if not np.all(np.abs(F) > 0.0):
         return NyquistCount(None, "a line lies on the critical point")
-    first = freq.size - lines.size
-    below = np.angle(F[1 : first + 1] / F[:first])
+    below_lines = freq.size - lines.size
+    below = np.angle(F[1 : below_lines + 1] / F[:below_lines])
     steps = np.concatenate([below, hidden.step])
     for open_, what in (
         (hidden.unknown, "the phase turns too far for its path to be known"),
@@ -88,11 +88,11 @@ def nyquist_count(
                 "measure with a finer resolution there, or give the loop less gain at that "
                 "resonance",
             )
-    slope = -float(np.polyfit(np.log(freq[:3]), np.log(np.abs(F[:3])), 1)[0])
-    if abs(slope - at_zero) > _SLOPE:
+    grows = -float(np.polyfit(np.log(freq[:3]), np.log(np.abs(F[:3])), 1)[0])
+    if abs(grows - at_zero) > _SLOPE:
         return NyquistCount(
             None,
-            f"towards zero frequency det(I - L) grows with slope {slope:.2g}, where plant and "
+            f"towards zero frequency det(I - L) grows with slope {grows:.2g}, where plant and "
             f"controller were stated to integrate {at_zero} times: state the rigid-body modes that "
             "these channels show",
         )
