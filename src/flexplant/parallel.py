@@ -18,7 +18,7 @@ import numpy as np
 
 from .errors import ModelError, SolverError
 from .progress import Progress as Progress
-from .surviving import DIED, Died, survived
+from .surviving import Lost, survived
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")
@@ -114,8 +114,9 @@ def mapped(
     executor : concurrent.futures.Executor, optional
         Threads, processes, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; only
         `submit` is used. The first items are computed here to learn how long one takes, the rest
-        goes out in chunks of about half a second. When a process of a pool dies, its chunks are
-        done once more, each in a process of its own. None: a plain loop.
+        goes out in chunks of about half a second. When a process of a pool dies, what was out is
+        done once more, and the rest goes on in processes started like those of the pool. None: a
+        plain loop.
     progress : bool, optional
         A bar: None shows one on a terminal for work of more than two seconds.
     rng : int, SeedSequence or Generator, optional
@@ -188,10 +189,10 @@ def _send(
     chunks = [calls[i : i + size] for i in range(0, len(calls), size)]
     out = {i: (function, [call for _, call in chunk]) for i, chunk in enumerate(chunks)}
     for i, found in survived(_chunk, out, executor):
-        if isinstance(found, Died):
+        if isinstance(found, Lost):
             raise SolverError(
-                f"items from number {chunks[i][0][0]}: {DIED}. Give the workers more memory, or "
-                "compute without an executor."
+                f"items from number {chunks[i][0][0]}: {found.reason}. Give the workers "
+                "more memory, or compute without an executor."
             )
         for (number, _), result in zip(chunks[i], found, strict=True):
             keep(number, result)

@@ -6,13 +6,20 @@ import signal
 import subprocess
 import sys
 import time
-from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from multiprocessing import current_process, get_context
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from flexplant.errors import FlexplantError, LabelError, ModelError
+from flexplant.errors import (
+    FlexplantError,
+    FlexplantWarning,
+    LabelError,
+    ModelError,
+    SolverError,
+)
 from flexplant.simulation import StudyTable, study
 from flexplant.store import load
 
@@ -23,12 +30,6 @@ def drawn(machine, generator):
         raise ValueError("no pole\nwas found")
     M = generator.normal(size=(60, 60))
     return {"largest": np.linalg.norm(M @ M, 2), "stable": machine % 2 == 0, "name": f"m{machine}"}
-
-
-def ends(machine):
-    if machine == 2:
-        os._exit(1)
-    return {"value": 2.0 * machine}
 
 
 def counted(machine):
@@ -84,12 +85,61 @@ def test_a_machine_that_fails_is_a_row_with_its_reason():
     assert "3 of 4" in shown
 
 
-def test_a_process_that_dies_takes_only_its_machine_with_it():
-    with ProcessPoolExecutor(2) as pool:
-        table = study(range(6), ends, executor=pool)
-    np.testing.assert_array_equal(table["value"], [0.0, 2.0, np.nan, 6.0, 8.0, 10.0])
-    assert "worker died, twice" in table["failed"][2]
-    assert (table["failed"] != "").sum() == 1
+CONTEXTS = ["fork", pytest.param("spawn", marks=pytest.mark.slow)]
+
+
+def begun(mark):
+    """Initialise a process of a pool."""
+    os.environ["STUDY_MARK"] = mark
+
+
+def marked(machine):
+    if machine == 2:
+        os._exit(1)
+    if machine == 4:
+        time.sleep(600)
+    method = type(current_process()).__name__
+    return {"pid": os.getpid(), "mark": os.environ.get("STUDY_MARK", ""), "method": method}
+
+
+@pytest.mark.parametrize("context", CONTEXTS)
+@pytest.mark.parametrize("limit", [False, True])
+def test_a_process_that_dies_or_hangs_takes_only_its_machine_with_it(context, limit):
+    """The rest goes on in processes like those of the pool, no more of them at a time."""
+    machines = [m for m in range(20) if limit or m != 4]
+    where = get_context(context)
+    with ProcessPoolExecutor(2, mp_context=where, initializer=begun, initargs=("set",)) as pool:
+        table = study(machines, marked, executor=pool, timeout=2.0 if limit else None)
+    failed = {m: reason for m, reason in zip(machines, table["failed"], strict=True) if reason}
+    assert list(failed) == ([2, 4] if limit else [2])
+    assert "worker died, twice" in failed[2]
+    assert not limit or failed[4] == "took longer than 2 s, and was ended"
+    ok = table["failed"] == ""
+    assert set(table["mark"][ok]) == {"set"}
+    assert set(table["method"][ok]) == {f"{context.title()}Process"}
+    assert len(set(table["pid"][ok])) <= 2 + 2 + 2 + limit  # of the pool, like it, in their place
+
+
+def test_a_pool_that_cannot_start_and_a_limit_without_processes():
+    failing = ProcessPoolExecutor(1, initializer=os._exit, initargs=(1,))
+    with failing as pool, pytest.raises(SolverError, match="Check the executor's initializer"):
+        study([1.0], drawn, executor=pool)
+    for executor in (None, Executor()):
+        with pytest.raises(ModelError, match=r"timeout .*ProcessPoolExecutor.*leave timeout= out"):
+            study([1.0], drawn, executor=executor, timeout=1.0)
+
+
+def leaves(machine):
+    if machine == 1:
+        sys.exit("no licence")
+    return {"value": 1.0}
+
+
+def test_a_pipeline_that_exits_is_a_machine_that_fails():
+    expected = ["", "SystemExit: no licence", ""]
+    assert study(range(3), leaves)["failed"].tolist() == expected
+    with ProcessPoolExecutor(1) as pool:
+        assert study(range(3), leaves, executor=pool)["failed"].tolist() == expected
 
 
 SCRIPT = """
@@ -143,7 +193,7 @@ def test_the_checkpoint_of_another_study_is_refused(tmp_path):
         ([0, 1, 2, 4], drawn, {"rng": 1}),
         (range(4), lambda machine, rng: drawn(machine, rng), {"rng": 1}),
         (range(4), drawn, {"rng": 2}),
-        (range(4), ends, {}),
+        (range(4), leaves, {}),
     ):
         with pytest.raises(ModelError, match="of another study"):
             study(machines, pipeline, checkpoint=path, **options)
@@ -239,11 +289,33 @@ def test_what_is_no_row_is_refused(result, message):
         study([1], lambda machine: result)
 
 
-def test_rows_have_the_same_columns_and_kinds():
-    with pytest.raises(ModelError, match=r"columns \['b'\] for one machine and \['a'\]"):
-        study([0, 1], lambda machine: {"ab"[machine]: 1.0})
-    with pytest.raises(ModelError, match="values of different kinds"):
-        study([0, 1], lambda machine: {"a": [1.0, "x"][machine]})
+def test_what_is_no_row_of_another_machine_than_the_first_fails():
+    table = study(range(3), lambda machine: [{"a": 1.0}, {"a": [1, 2]}, 3.0][machine])
+    assert table["failed"][0] == ""
+    assert table["failed"][1].startswith("ModelError: column 'a' holds [1, 2]")
+    assert table["failed"][2].startswith("ModelError: what the pipeline returns must be")
+
+
+def test_columns_that_differ_are_missing_where_they_are_not(tmp_path):
+    rows = [{"a": 1.0, "b": True}, {"a": 2, "c": "x"}, {"c": "y", "a": 3.0, "b": True}]
+    lines = []
+    for _ in range(2):  # computed, then from the file
+        with pytest.warns(FlexplantWarning, match=r"2 machines of 3 \(number 0 first\).*'c', 'b'"):
+            lines.append(study(range(3), lambda m: rows[m], checkpoint=tmp_path / "rows.jsonl"))
+    same(*lines)
+    assert list(lines[0]) == ["a", "b", "c", "failed"]
+    assert lines[0]["a"].tolist() == [1.0, 2.0, 3.0]
+    assert lines[0]["b"].tolist() == [True, False, True]
+    assert lines[0]["c"].tolist() == ["", "x", "y"]
+    assert lines[0]["failed"].tolist() == ["", "", ""]
+
+
+@pytest.mark.parametrize("odd", range(3))
+def test_a_value_of_another_kind_than_most_fails_its_machine(odd):
+    table = study(range(3), lambda machine: {"a": "?" if machine == odd else 1.0 * machine})
+    assert np.isnan(table["a"]).tolist() == [machine == odd for machine in range(3)]
+    said = "column 'a' holds '?', a text: most machines have a number there"
+    assert table["failed"].tolist() == [said if machine == odd else "" for machine in range(3)]
 
 
 def test_wrong_calls():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,19 +10,22 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import ModelError, counted, require_known
+from ..errors import ModelError, counted, require_known, warn
 from ..values import Value, instance, short
 
 #: reasons that the repr lists
 _SHOWN = 3
+#: what stands for a missing number, truth or text, and what each is called
+_MISSING: dict[type, Any] = {float: np.nan, bool: False, str: ""}
+_CALLED = {float: "number", bool: "truth", str: "text"}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
     """Results by column, ``table["MA"]`` of shape (n_machines,); ``pandas.DataFrame(dict(table))``.
 
-    Where a machine failed, numbers are NaN, texts empty and truths False; the column "failed"
-    holds the reason, empty otherwise.
+    Where a machine failed or lacks a column, numbers are NaN, texts empty and truths False; the
+    column "failed" holds the reason, empty otherwise.
 
     Parameters
     ----------
@@ -82,22 +86,42 @@ class StudyTable(Value, Mapping[str, npt.NDArray[Any]]):
 def tabled(rows: Sequence[Mapping[str, Any] | str]) -> StudyTable:
     """Return the table of rows; a text in place of a row is the reason why there is none.
 
-    Raises
-    ------
-    ModelError
-        When the rows have different columns or a column has values of different kinds.
+    A row whose value is of another kind than most in its column counts as failed.
     """
-    failed = tuple(row if isinstance(row, str) else "" for row in rows)
     found = [row for row in rows if not isinstance(row, str)]
-    names = list(found[0]) if found else []
-    for row in found:
-        if set(row) != set(names):
-            raise ModelError(
-                f"the pipeline returned the columns {sorted(row)} for one machine and "
-                f"{sorted(names)} for another. Return the same names for all of them."
+    kinds: dict[str, type] = {}
+    for name in dict.fromkeys(name for row in found for name in row):
+        counts = Counter(type(row[name]) for row in found if name in row)
+        kinds[name] = counts.most_common(1)[0][0]
+    judged = [row if isinstance(row, str) else _misfit(row, kinds) or row for row in rows]
+    lacking = {
+        i: [name for name in kinds if name not in row]
+        for i, row in enumerate(judged)
+        if not isinstance(row, str) and len(row) < len(kinds)
+    }
+    if lacking:
+        names = ", ".join(map(repr, dict.fromkeys(n for few in lacking.values() for n in few)))
+        warn(
+            f"{counted(len(lacking), 'machine')} of {len(rows)} (number {min(lacking)} first) lack "
+            f"columns that others have: {names}. There the table has NaN, False or ''. Return the "
+            "same names for all of them."
+        )
+    columns = {
+        name: np.array([none if isinstance(row, str) else row.get(name, none) for row in judged])
+        for name, none in ((name, _MISSING[kind]) for name, kind in kinds.items())
+    }
+    return StudyTable(columns, tuple(row if isinstance(row, str) else "" for row in judged))
+
+
+def _misfit(row: Mapping[str, Any], kinds: Mapping[str, type]) -> str:
+    """Return why a row does not fit into a table; "" when it does."""
+    for name, value in row.items():
+        if type(value) is not kinds[name]:
+            return (
+                f"column {name!r} holds {short(value)}, a {_CALLED[type(value)]}: most machines "
+                f"have a {_CALLED[kinds[name]]} there"
             )
-    columns = {name: _column(name, rows, found[0][name]) for name in names}
-    return StudyTable(columns, failed)
+    return ""
 
 
 def checked_row(row: Any) -> dict[str, Any]:
@@ -125,13 +149,3 @@ def checked_row(row: Any) -> dict[str, Any]:
                 "each machine. Return several columns, or save arrays to files of your own."
             )
     return plain
-
-
-def _column(name: str, rows: Sequence[Mapping[str, Any] | str], first: Any) -> npt.NDArray[Any]:
-    missing: Any = "" if isinstance(first, str) else False if isinstance(first, bool) else np.nan
-    values = [missing if isinstance(row, str) else row[name] for row in rows]
-    if any(type(value) is not type(missing) for value in values):
-        raise ModelError(
-            f"column {name!r} has values of different kinds. Return numbers, truths or texts only."
-        )
-    return np.array(values)
