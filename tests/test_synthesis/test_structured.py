@@ -23,7 +23,7 @@ from flexplant.synthesis import (
     design_loops,
     design_structured,
 )
-from flexplant.synthesis.nonsmooth import bfgs, sampled_minimum, smallest_combination
+from flexplant.synthesis.nonsmooth import bfgs
 from flexplant.synthesis.structured_loop import ScaledLoop
 from stages import ports, sampled
 

@@ -38,6 +38,8 @@ class Controller(Value):
         What the certificate does not cover, and what else is worth knowing.
     structure : FixedOrder, TunedLaws or ObserverGains, optional
         Of `design_structured`: what it was given, with the numbers that it found.
+    tried : mapping {str: float}
+        What was tried, in turn, and the gamma that each reached; infinite where it failed.
 
     Examples
     --------
@@ -56,12 +58,14 @@ class Controller(Value):
     left_out: SpillOver | None = None
     notes: tuple[str, ...] = ()
     structure: Value | None = None
+    tried: Mapping[str, float] | None = None
 
     def __post_init__(self) -> None:
         self._set(
             certificate=dict(self.certificate or {}),
             reached=dict(self.reached or {}),
             notes=tuple(self.notes),
+            tried=dict(self.tried or {}),
         )
 
     def to_control(self) -> Any:

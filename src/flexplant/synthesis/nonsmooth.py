@@ -1,12 +1,13 @@
-"""Minimising functions that are not smooth where it matters: BFGS, then gradient sampling."""
+"""Minimising the largest of many smooth functions: models of all that are near it, at once."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, Protocol, TypeAlias
 
 import numpy as np
+import scipy.linalg as la
 
 from ..values import FloatArray
 
@@ -15,13 +16,52 @@ Function: TypeAlias = Callable[[FloatArray], tuple[float, FloatArray]]
 
 #: weak Wolfe conditions, and steps of their bisection
 _ARMIJO, _WOLFE, _BISECTIONS = 1e-4, 0.9, 30
-#: so many steps that gain less than this part together end BFGS (parameters that run to infinity
+#: so many steps that gain less than this together end a search (parameters that run to infinity
 #: gain little for ever)
-_PATIENCE, _GAIN = 5, 1e-5
-#: radii of the gradient sampling, beside the size of the parameters; samples per parameter
-_RADII, _SAMPLES = (1e-2, 1e-3, 1e-4, 1e-5), 2.0
-#: most samples, most steps at one radius, and what one has to gain
-_MOST, _STEPS, _STEP_GAIN = 60, 12, 1e-6
+_PATIENCE, _GAIN = 8, 1e-4
+#: the first step, beside the size of the parameters
+_FIRST = 0.3
+#: part of the decrease of the model that a step has to reach; below and above which the model
+#: is trusted less and more
+_ENOUGH, _POOR, _GOOD = 0.05, 0.3, 0.7
+#: factors of the damping after a step that is good, poor, refused with a new peak, and without
+_LESS, _MORE, _ANEW, _AGAIN = 0.2, 3.0, 2.0, 5.0
+#: refused steps after each other that end a search, and a decrease that is none
+_REFUSED, _SETTLED = 20, 1e-6
+#: shares below this are rounding
+_SHARE = 1e-9
+#: small beside the rest of the quadratic program, large beside the rounding of its squares
+_LIFT = 1e-3
+
+
+class Pieces(NamedTuple):
+    """Smooth functions of x near the largest: values (k,), gradients (k, n), Hessian of one."""
+
+    value: FloatArray
+    gradient: FloatArray
+    hessian: Callable[[int], FloatArray]
+
+    def and_those(self, other: Pieces) -> Pieces:
+        """Return these pieces and others."""
+        count = self.value.size
+        return Pieces(
+            np.concatenate([self.value, other.value]),
+            np.concatenate([self.gradient, other.gradient]),
+            lambda i: self.hessian(i) if i < count else other.hessian(i - count),
+        )
+
+
+class Maximum(Protocol):
+    """The largest of many smooth functions of x, told apart by where they are taken (a place)."""
+
+    def value(self, x: FloatArray) -> tuple[float, object]:
+        """Return the largest value, infinite where it is not defined, and its place."""
+
+    def pieces(self, x: FloatArray) -> Pieces:
+        """Return all functions near the largest at x, itself among them."""
+
+    def piece(self, x: FloatArray, place: object) -> Pieces:
+        """Return at x the functions of one place."""
 
 
 @dataclass(frozen=True)
@@ -33,60 +73,40 @@ class Minimum:
     x : (n,) array
         The parameters.
     value : float
-        The function there.
-    slope : float
-        Norm of the smallest convex combination of the gradients sampled around x.
-    radius : float
-        Within this distance; infinite when nothing was sampled.
-    evaluations : int
-        Calls of the function.
+        The largest function there.
+    settled : bool
+        Whether the search ended by itself.
     """
 
     x: FloatArray
     value: float
-    slope: float
-    radius: float
-    evaluations: int
-
-    @property
-    def decrease(self) -> float:
-        """What a step within the radius would lower the value by to first order, relative to it."""
-        return float(self.slope * self.radius / abs(self.value)) if self.value else 0.0
+    settled: bool
 
 
 def bfgs(
-    function: Function, x: FloatArray, *, enough: float, steps: int, out_of_time: Callable[[], bool]
+    function: Function,
+    x: FloatArray,
+    *,
+    enough: float,
+    steps: int,
+    spent: Callable[[], bool] = lambda: False,
 ) -> tuple[FloatArray, float]:
     """Return where BFGS with a weak Wolfe line search ends, and the value there.
 
-    Parameters
-    ----------
-    function : function
-        Value and gradient.
-    x : (n,) array
-        The start, with a finite value.
-    enough : float
-        It stops below this value.
-    steps : int
-        At most.
-    out_of_time : function
-        It stops when this is true.
-
-    References
-    ----------
+    It stops below the value `enough`, after so many steps, and when `spent` is true
     [LewisOverton2013]_.
     """
     value, gradient = function(x)
     H, values = np.eye(x.size), [value]
     for _ in range(steps):
-        if value < enough or out_of_time() or not np.any(gradient):
+        if value < enough or spent() or not np.any(gradient):
             break
         direction = -H @ gradient
         slope = float(gradient @ direction)
         if not slope < 0.0:
             H, direction = np.eye(x.size), -gradient
             slope = -float(gradient @ gradient)
-        found = _line_search(function, x, value, direction, slope, out_of_time)
+        found = _line_search(function, x, value, direction, slope)
         if found is None:
             break
         step, new, at = found
@@ -100,18 +120,13 @@ def bfgs(
             left = np.eye(x.size) - rho * np.outer(s, change)
             H = left @ H @ left.T + rho * np.outer(s, s)
         values.append(value)
-        if len(values) > _PATIENCE and values[-_PATIENCE - 1] - value <= _GAIN * abs(value):
+        if len(values) > _PATIENCE and values[-_PATIENCE - 1] - value <= 0.1 * _GAIN * abs(value):
             break
     return x, value
 
 
 def _line_search(
-    function: Function,
-    x: FloatArray,
-    value: float,
-    direction: FloatArray,
-    slope: float,
-    out_of_time: Callable[[], bool],
+    function: Function, x: FloatArray, value: float, direction: FloatArray, slope: float
 ) -> tuple[float, float, FloatArray] | None:
     """Return a step of the weak Wolfe conditions, or the best that decreases; None without."""
     low, high, step = 0.0, np.inf, 1.0
@@ -123,82 +138,145 @@ def _line_search(
         else:
             if best is None or new < best[1]:
                 best = step, new, gradient
-            if float(gradient @ direction) >= _WOLFE * slope or out_of_time():
+            if float(gradient @ direction) >= _WOLFE * slope:
                 return step, new, gradient
             low = step
         step = 0.5 * (low + high) if np.isfinite(high) else 2.0 * low
     return best
 
 
-def sampled_minimum(
-    function: Function,
-    x: FloatArray,
-    value: float,
-    *,
-    rng: np.random.Generator,
-    out_of_time: Callable[[], bool],
+def minimax(
+    function: Maximum, x: FloatArray, *, steps: int, spent: Callable[[], bool] = lambda: False
 ) -> Minimum:
-    """Return the minimum near x by gradient sampling, with the report on its optimality.
+    """Return a local minimum of the largest function near x.
 
-    At a kink no gradient is small; the smallest convex combination of gradients around it is.
+    Each step minimises ``max_i (f_i + g_i' d) + d' (|H| + mu I) d / 2``, H the Hessian of the
+    functions weighted as the step weights their gradients, |H| with its negative eigenvalues
+    turned round. A step that another peak refuses is tried again with the model of that peak, at
+    x, and a larger mu. After so many steps, or when `spent` is true, it stops.
 
     Parameters
     ----------
-    function : function
-        Value and gradient.
-    x, value : (n,) array, float
-        Where BFGS ended.
-    rng : Generator
-        Draws the samples.
-    out_of_time : function
-        It stops when this is true.
+    function : Maximum
+        With a finite value at x; of size 1, such as the logarithm of a gain.
+    x : (n,) array
+        The start.
+    steps : int
+        At most.
+    spent : callable
+        True when no more evaluations are to be made.
 
     References
     ----------
-    [Burke2005]_.
+    [ApkarianNoll2006]_.
     """
-    count = int(min(_MOST, _SAMPLES * x.size + 1))
-    evaluations, slope, reached = 0, np.inf, np.inf
-    for part in _RADII:
-        radius = part * max(1.0, float(np.linalg.norm(x)))
-        for _ in range(_STEPS):
-            if out_of_time():
-                return Minimum(x, value, slope, reached, evaluations)
-            steps = rng.standard_normal((count, x.size))
-            steps *= (rng.random(count) ** (1.0 / x.size) / np.linalg.norm(steps, axis=1))[:, None]
-            steps[0] = 0.0
-            near = [function(x + radius * one) for one in steps]
-            evaluations += count
-            gradients = np.array([g for v, g in near if np.isfinite(v)])
-            downhill = smallest_combination(gradients)
-            slope, reached = float(np.linalg.norm(downhill)), radius
-            if slope * radius <= _STEP_GAIN * abs(value):
+    value, _ = function.value(x)
+    pieces, weights, mu = function.pieces(x), None, None
+    values, refused = [value], 0
+    while len(values) <= steps and refused <= _REFUSED and not spent():
+        if mu is None:
+            slope = float(np.linalg.norm(pieces.gradient[np.argmax(pieces.value)]))
+            mu = slope / (_FIRST * max(1.0, float(np.linalg.norm(x))))
+        model = _Model(pieces, value, weights)
+        step, weights, decrease = model.step(mu)
+        if decrease <= _SETTLED:
+            if refused or mu <= 1e-3 * model.size:
                 break
-            step, found = radius, False
-            for _ in range(_BISECTIONS // 2):
-                new, _ = function(x - step * downhill / slope)
-                evaluations += 1
-                if new < value - 1e-6 * step * slope:
-                    x, value, found = x - step * downhill / slope, new, True
-                    break
-                step *= 0.5
-            if not found:
+            mu *= 1e-2
+            continue
+        new, place = function.value(x + step)
+        part = (value - new) / decrease
+        if part >= _ENOUGH:
+            x, value, refused, weights = x + step, new, 0, None
+            pieces = function.pieces(x)
+            values.append(value)
+            mu *= _LESS if part > _GOOD else _MORE if part < _POOR else 1.0
+            if len(values) > _PATIENCE and values[-_PATIENCE - 1] - value <= _GAIN:
                 break
-    return Minimum(x, value, slope, reached, evaluations)
+        else:
+            refused += 1
+            if np.isfinite(new):
+                pieces = pieces.and_those(function.piece(x, place))
+                weights = np.append(weights, np.zeros(pieces.value.size - weights.size))
+            mu *= _ANEW if np.isfinite(new) else _AGAIN
+    return Minimum(x, value, len(values) <= steps and not spent())
 
 
-def smallest_combination(gradients: FloatArray) -> FloatArray:
-    """Return the convex combination of gradients (rows) that has the smallest norm.
+class _Model:
+    """Gradients of pieces in the directions of |H|, H of the weights that the step finds."""
 
-    With weights t mu, sum(mu) = 1, the least of ``|G' t mu|^2 + (t - 1)^2`` grows with ``|G' mu|``:
-    a problem of least squares with non-negative unknowns.
+    def __init__(self, pieces: Pieces, value: float, weights: FloatArray | None) -> None:
+        self.pieces, self.beside = pieces, pieces.value - value
+        self._known: dict[int, FloatArray] = {}
+        if weights is None:  # of the largest alone
+            weights = (np.arange(self.beside.size) == np.argmax(self.beside)).astype(float)
+        self.weights = weights
+
+    def step(self, mu: float) -> tuple[FloatArray, FloatArray, float]:
+        """Return the step, the weights of the pieces, and by how much the largest decreases."""
+        weights = self.weights
+        for _ in range(2):  # the weights of the first give the Hessian of the second
+            values, vectors = la.eigh(self._hessian(weights))
+            self.size = float(np.abs(values).max())
+            root = np.sqrt(np.abs(values) + mu)
+            weights, y = downhill(self.pieces.gradient @ vectors / root, self.beside)
+            step = vectors @ (y / root)
+        return step, weights, -float(np.max(self.beside + self.pieces.gradient @ step))
+
+    def _hessian(self, weights: FloatArray) -> FloatArray:
+        active = np.flatnonzero(weights > _SHARE)
+        for i in active:
+            if int(i) not in self._known:
+                self._known[int(i)] = self.pieces.hessian(int(i))
+        return np.asarray(sum(weights[i] * self._known[int(i)] for i in active))
+
+
+def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the weights and the minimum y of ``max_i (c_i + g_i' y) + |y|^2 / 2``.
+
+    ``y = -G' w`` with weights w >= 0, sum(w) = 1. With t for the maximum this is the point of a
+    polyhedron next to the origin, but for a small share of t^2, which non-negative least squares
+    finds [LawsonHanson1995]_.
     """
     from scipy.optimize import nnls
 
-    size = float(np.linalg.norm(gradients, axis=1).max())
-    if not size:
-        return np.zeros(gradients.shape[1])
-    count = gradients.shape[0]
-    left = np.vstack([gradients.T / size, np.ones((1, count))])
-    weights, _ = nnls(left, np.append(np.zeros(gradients.shape[1]), 1.0))
-    return np.asarray(gradients.T @ (weights / weights.sum()))
+    size = max(float(np.linalg.norm(gradients, axis=1).max()), np.finfo(float).tiny)
+    G, c = gradients / size, np.maximum(beside / size**2, -1.0 / _LIFT)
+    lifted = np.vstack([-_LIFT * G.T, np.ones((1, c.size)), _LIFT * c[None] + 1.0 / _LIFT])
+    right = np.zeros(lifted.shape[0])
+    right[-1] = 1.0
+    weights, _ = nnls(lifted, right, maxiter=100 * c.size)
+    weights = weights / weights.sum()
+    return weights, -size * (G.T @ weights)
+
+
+def decrease_left(pieces: Pieces, radius: float) -> tuple[float, float]:
+    """Return the least slope of convex combinations of the gradients, and the decrease left.
+
+    ``-min_(|d| <= r) max_i (c_i + g_i' d)``, c_i below the largest: what a step of the radius
+    would still gain, to first order; found by bisection over the weight of |d|^2.
+    """
+    beside = pieces.value - pieces.value.max()
+    top = pieces.gradient[np.argmax(beside)]
+    low, high = 0.0, np.log(1e3 * (1.0 + float(np.linalg.norm(top)) / radius))
+    low, slope, gained = -high, 0.0, 0.0
+    for _ in range(_BISECTIONS):
+        middle = 0.5 * (low + high)
+        root = np.exp(0.5 * middle)
+        weights, y = downhill(pieces.gradient / root, beside)
+        step = y / root
+        if float(np.linalg.norm(step)) > radius:
+            low = middle
+        else:
+            high = middle
+            slope = float(np.linalg.norm(weights @ pieces.gradient))
+            gained = max(gained, -float(np.max(beside + pieces.gradient @ step)))
+    return slope, gained
+
+
+def joined(parts: Sequence[Pieces]) -> Pieces:
+    """Return the pieces of several functions, such as the gains of several plants."""
+    every = parts[0]
+    for one in parts[1:]:
+        every = every.and_those(one)
+    return every

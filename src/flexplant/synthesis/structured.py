@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -15,29 +14,39 @@ from ..lti.responses import responder
 from ..lti.statespace import System
 from ..parallel import Progress, one_thread
 from ..plant import StandardPlant, standard_plant
-from ..values import FloatArray, Rng, generator, positive, short, whole
+from ..values import FloatArray, Rng, generator, short, whole
 from .certificate import certified_norm, reached_norms
 from .controller import Controller
-from .nonsmooth import Minimum, bfgs, sampled_minimum
+from .nonsmooth import Pieces, bfgs, decrease_left, joined, minimax
 from .reach import require_stabilisable
 from .spill_over_check import with_left_out
-from .structured_loop import DECAY, Matrices, ScaledLoop
+from .structured_loop import DECAY, ScaledLoop
 from .structures import ControllerFamily, ControllerStructure, as_system
 
-#: steps of BFGS for stability and for the norm
-_STEPS = 300
-#: what the search adds to the norm, relative to it, for parameters of size 1
+#: steps for stability, from each start towards the least norm, and on from the best of them
+_STABLE, _FEW, _MANY = 300, 40, 300
+#: how many starts are continued
+_CONTINUED = 4
+#: what the search adds to the logarithm of the norm for parameters of size 1
 _SMALL = 1e-6
-#: rounds of gradient sampling and BFGS, and what one has to gain for another
-_ROUNDS, _ROUND_GAIN = 10, 1e-4
-#: of the time, what is for BFGS; the rest is for gradient sampling
+#: of the evaluations, what is for the starts; the rest is for continuing the best of them
 _SHARE = 0.7
-#: of the time that is left, what each smaller structure takes at most
+#: of the evaluations that are left, what each smaller structure takes at most
 _QUARTER = 0.25
+#: spread of starts around the best end, beside that around the structure's own start
+_NARROWER = 0.5
+#: radius around the end, relative, within which the report looks for a decrease
+_RADIUS = 1e-3
 #: the norm that the search claims and the one verified on the plant as given agree to this
 _AGREEMENT = 1e-3
 #: relative decrease that is left above which the end is said to be no local minimum
 _SHORT = 1e-2
+#: logarithms of norms that count as the same
+_SAME = 0.01
+#: part of the largest norm from which on another plant's counts
+_PART = 0.5
+#: a norm that has a logarithm
+_NOTHING = np.finfo(float).tiny
 
 
 @one_thread()
@@ -47,19 +56,19 @@ def design_structured(
     *,
     u: Sequence[str] | None = None,
     y: Sequence[str] | None = None,
-    starts: int = 4,
+    starts: int = 8,
     rng: Rng = 0,
-    time_limit: float = 60.0,
+    evaluations: int = 10_000,
     larger: Any = None,
     progress: bool | None = None,
 ) -> Controller:
     """Return the controller of a structure with the least H-infinity norm found from w to z.
 
     From several starts the spectral abscissa of the closed loop is lowered until it is stable, then
-    the norm, the largest over all plants, by BFGS with its gradient at the peak frequency
-    (``d|T| = Re u* dT v``, u and v the singular vectors there). The best is finished by gradient
-    sampling, which goes on at kinks, where several peaks are equally high, and reports how far from
-    a local minimum it ends. The problem is not convex: another start may do better.
+    the norm, the largest over all plants. At the minimum several peaks are equally high: each step
+    takes the gains at all high frequencies together, with their gradients
+    (``d|T| = Re u* dT v``, u and v the singular vectors there) and second derivatives. The best
+    ends are continued. The problem is not convex: another start may do better.
 
     Parameters
     ----------
@@ -71,11 +80,11 @@ def design_structured(
     u, y : sequences of str, optional
         Channels of the controller, for a StateSpace.
     starts : int
-        The first is the structure's own, the others are drawn around it.
+        The first is the structure's own, the others are drawn around it and around the best end.
     rng : int, SeedSequence or Generator
-        Draws starts and samples.
-    time_limit : float [s]
-        The search ends then with the best that it has.
+        Draws starts.
+    evaluations : int
+        After so many closed loops of each plant the search ends with the best that it has.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the (first) plant left out, as for `larger_plant`.
     progress : bool, optional
@@ -85,10 +94,11 @@ def design_structured(
     -------
     Controller
         `structure` is the one given with the numbers found, of `TunedLaws` the laws; a further
-        design can begin there. `gamma` is the largest verified norm. The certificate holds the norm
-        of each plant, and of the local minimum `slope`, the norm of the smallest convex combination
-        of gradients within `radius` of the parameters, and `decrease left`, what a step of that
-        radius would still lower gamma by to first order, relative to it.
+        design can begin there. `gamma` is the largest verified norm, `tried` holds what each
+        start reached. The certificate holds the norm of each plant, and of the local minimum
+        `slope`, the norm of the smallest convex combination of the gradients (of log gamma, by the
+        parameters), and `decrease left`, what a step of the length `radius` would still lower gamma
+        by to first order, relative to it.
 
     Raises
     ------
@@ -108,7 +118,7 @@ def design_structured(
 
     References
     ----------
-    [ApkarianNoll2006]_; [Burke2006]_.
+    [ApkarianNoll2006]_; [LewisOverton2013]_.
 
     Examples
     --------
@@ -125,24 +135,19 @@ def design_structured(
             f"{short(structure)}. Pass one of them, such as TunedLaws(law) or FixedOrder(2)."
         )
     starts, random = whole(starts, "starts"), generator(rng)
-    limit, begun = positive(time_limit, "time_limit"), time.perf_counter()
+    evaluations = whole(evaluations, "evaluations")
     problems = [prepared(one.system, one.u, one.y) for one in plants]
     for one, problem in zip(plants, problems, strict=True):
         require_stabilisable(one, problem, "structured synthesis")
     family = structure.family(plants[0], problems[0])
-    search = _StructureSearch(
-        family, [ScaledLoop(p, family.order) for p in problems], problems, begun + _SHARE * limit
-    )
-    with Progress(starts + 1, "starts of the search", progress=progress) as bar:
-        x, value = search.best(starts, random, bar)
-        search.end = begun + limit
-        found = search.finished(x, value, random)
-        bar.advance()
+    search = _StructureSearch(family, problems, evaluations)
+    with Progress(starts + _CONTINUED, "starts of the search", progress=progress) as bar:
+        found = search.best(starts, random, bar)
     final = family.structure(found.x)
     K = as_system(family.matrices(found.x), (plants[0].y, plants[0].u), plants[0].dt)
     K = K.replace(name="structured", units=plants[0].units)
     closed = [lft(one.system, K) for one in plants]
-    claim = found.value / (1.0 + _SMALL * float(np.sqrt(1.0 + found.x @ found.x)))
+    claim = float(np.exp(found.value - _SMALL * _size(found.x)))
     each = [certified_norm(loop, claim) for loop in closed]
     worst = int(np.argmax([one["norm"] for one in each]))
     if not abs(each[worst]["norm"] - claim) <= _AGREEMENT * claim:
@@ -151,16 +156,18 @@ def design_structured(
             f"{claim:.6g} in the scaled problem: it is too badly conditioned to trust. Bring "
             "the weights closer together."
         )
+    radius = _RADIUS * max(1.0, float(np.linalg.norm(found.x)))
+    slope, decrease = decrease_left(search.pieces(found.x), radius)
     certificate = dict(each[worst]) | {
-        "slope": found.slope,
-        "radius": found.radius,
-        "decrease left": found.decrease,
+        "slope": slope,
+        "radius": radius,
+        "decrease left": decrease,
     }
     if len(plants) > 1:
         certificate |= {f"norm of plant {i}": one["norm"] for i, one in enumerate(each, 1)}
     notes = search.notes
-    if found.decrease > _SHORT:
-        notes += ("not yet a local minimum (decrease left): more starts, time or another order",)
+    if decrease > _SHORT:
+        notes += ("not yet a local minimum (decrease left): more starts, evaluations or another order",)
     answer = Controller(
         K,
         f"H-infinity of structure {(structure if final is None else final)!r}",
@@ -169,6 +176,7 @@ def design_structured(
         reached=reached_norms(plants[worst], closed[worst], responder(closed[worst])),
         notes=notes,
         structure=final,
+        tried=search.tried,
     )
     return with_left_out(answer, plants[0], larger)
 
@@ -206,122 +214,154 @@ def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> lis
     return plants
 
 
+class _End(NamedTuple):
+    """Where a start ended: log of the norm (infinite when not stabilised), and the abscissa."""
+
+    value: float
+    x: FloatArray
+    decay: float
+    name: str
+    settled: bool = False
+
+
 class _StructureSearch:
-    """The functions of the parameters, and the search through starts."""
+    """The functions of the parameters, how often they were computed, and the search from starts."""
 
-    def __init__(
-        self,
-        family: ControllerFamily,
-        loops: list[ScaledLoop],
-        problems: list[Prepared],
-        end: float,
-    ) -> None:
-        self.family, self.loops, self.problems, self.end = family, loops, problems, end
+    def __init__(self, family: ControllerFamily, problems: list[Prepared], limit: float) -> None:
+        self.family, self.problems, self.limit = family, problems, limit
+        self.loops = [ScaledLoop(p, family.order) for p in problems]
+        self.evaluations = 0
         self.notes: tuple[str, ...] = ()
+        #: the norm that each start reached
+        self.tried: dict[str, float] = {}
 
-    def out_of_time(self) -> bool:
-        """Whether the time limit has passed."""
-        return time.perf_counter() > self.end
+    def _spent(self, share: float = 1.0) -> Callable[[], bool]:
+        return lambda: self.evaluations >= share * self.limit
 
     def stability(self, theta: FloatArray) -> tuple[float, FloatArray]:
         """Return the largest spectral abscissa of the loops and its gradient."""
+        self.evaluations += 1
         K = self.family.matrices(theta)
-        if not all(np.all(np.isfinite(part)) for part in K):
+        if not np.all(np.isfinite(K.joined)):
             return np.inf, np.zeros(theta.size)
         value, by, _ = max((loop.stability(K) for loop in self.loops), key=lambda one: one[0])
-        return value, self.family.slope(theta, by)
+        return value, np.tensordot(self.family.jacobian(theta), by, axes=2)
 
-    def norm(self, theta: FloatArray) -> tuple[float, FloatArray]:
-        """Return the largest norm of the loops, a little more for large parameters; its gradient.
+    def value(self, theta: FloatArray) -> tuple[float, tuple[int, float]]:
+        """Return the logarithm of the largest norm of the loops, and which and where it is.
 
-        Some infima are only neared as gains grow without bound: this ends them at finite ones.
+        A little more for large parameters: some infima are only neared as gains grow without
+        bound, this ends them at finite ones.
         """
+        self.evaluations += 1
         K = self.family.matrices(theta)
-        if not all(np.all(np.isfinite(part)) for part in K):
-            return np.inf, np.zeros(theta.size)
-        best: tuple[float, Matrices | None] = (-1.0, None)
-        for loop in self.loops:
-            value, by, _ = loop.norm(K)
-            if by is None:
-                return np.inf, np.zeros(theta.size)
-            best = max(best, (value, by), key=lambda one: one[0])
-        assert best[1] is not None  # noqa: S101 - there is at least one loop, and none was unstable
-        size = float(np.sqrt(1.0 + theta @ theta))
-        slope = (1.0 + _SMALL * size) * self.family.slope(theta, best[1])
-        return (1.0 + _SMALL * size) * best[0], slope + _SMALL * best[0] / size * theta
+        if not np.all(np.isfinite(K.joined)):
+            return np.inf, (0, 0.0)
+        gains = [loop.gain(K) for loop in self.loops]
+        worst = int(np.argmax([gain for gain, _ in gains]))
+        gain, freq = gains[worst]
+        return float(np.log(max(gain, _NOTHING))) + _SMALL * _size(theta), (worst, freq)
 
-    def best(
-        self, starts: int, rng: np.random.Generator, bar: Progress
-    ) -> tuple[FloatArray, float]:
-        """Return the best parameters from all starts and the norm there.
+    def pieces(self, theta: FloatArray) -> Pieces:
+        """Return the gains that are near the largest, as `value` counts them."""
+        K = self.family.matrices(theta)
+        self.evaluations += 1
+        each = [loop.gain(K) for loop in self.loops]
+        most = max(gain for gain, _ in each)
+        return joined(
+            [
+                self._of_loop(theta, i, freq, sweep=True)
+                for i, (gain, freq) in enumerate(each)
+                if gain >= _PART * most
+            ]
+        )
+
+    def piece(self, theta: FloatArray, place: tuple[int, float]) -> Pieces:
+        """Return the gains at the place of a peak elsewhere."""
+        return self._of_loop(theta, *place, sweep=False)
+
+    def _of_loop(self, theta: FloatArray, number: int, freq: float, *, sweep: bool) -> Pieces:
+        K, by = self.family.matrices(theta), self.family.jacobian(theta)
+        found, size = self.loops[number].pieces(K, by, freq, sweep=sweep), _size(theta)
+        return found._replace(
+            value=found.value + _SMALL * size, gradient=found.gradient + _SMALL / size * theta
+        )
+
+    def best(self, starts: int, rng: np.random.Generator, bar: Progress) -> _End:
+        """Return the best end of all starts.
 
         Raises
         ------
         InfeasibleError
             When none is stabilised.
         """
-        ends: list[tuple[float, FloatArray]] = []
-        lowest, closest = np.inf, self.family.first
-        done = 0
+        ends: list[_End] = []
         nested = self.family.nested(self._minimised)
-        for i in range(-1 if nested is not None else 0, starts):
-            if done and self.out_of_time():
+        if nested is not None:
+            ends.append(self._descended("lower orders", nested))
+        for i in range(starts):
+            if ends and self._spent(_SHARE)():
                 break
-            done += 1
-            theta = self.family.first if nested is None or i >= 0 else nested
-            if i >= 0:
-                bar.advance()
-            if i > 0:
-                theta = theta + self.family.spread * rng.standard_normal(theta.size)
-            value, x, decay = self._descended(theta)
-            if decay < lowest:
-                lowest, closest = decay, x
-            if np.isfinite(value):
-                ends.append((value, x))
-        if not ends:
-            raise self._infeasible(closest, done)
-        value, x = min(ends, key=lambda one: one[0])
-        same = sum(other <= value * 1.01 for other, _ in ends)
-        self.notes = (f"{same} of {done} starts end within 1 % of the best",)
-        if self.out_of_time():
-            self.notes += ("the time limit ended the search: a later one may find less",)
-        return x, value
+            ends.append(self._descended(f"start {i + 1}", self._drawn(i, ends, rng)))
+            bar.advance()
+        stable = [end for end in ends if np.isfinite(end.value)]
+        if not stable:
+            raise self._infeasible(min(ends, key=lambda end: end.decay).x, len(ends))
+        stable.sort(key=lambda end: (end.settled, end.value))  # a settled one gains little
+        for i in range(min(_CONTINUED, len(stable))):
+            stable[i] = self._continued(stable[i])
+            bar.advance()
+        best = min(range(len(stable)), key=lambda i: stable[i].value)
+        stable[best] = self._continued(stable[best])
+        self.tried = {end.name: float(np.exp(end.value)) for end in (*ends, *stable)}
+        best = min(stable, key=lambda end: end.value)
+        same = sum(end.value <= best.value + _SAME for end in stable)
+        self.notes = (f"{same} of {len(ends)} starts end within 1 % of the best",)
+        if self._spent()():
+            self.notes += (f"{self.limit} evaluations ended the search: more may find less",)
+        return best
 
-    def _descended(self, theta: FloatArray) -> tuple[float, FloatArray, float]:
-        """Return norm (infinite when not stabilised), parameters and abscissa from one start."""
+    def _continued(self, end: _End) -> _End:
+        """Return where an end goes with many steps more."""
+        found = minimax(self, end.x, steps=_MANY, spent=self._spent())
+        return end._replace(x=found.x, value=found.value, settled=found.settled)
+
+    def _drawn(self, i: int, ends: list[_End], rng: np.random.Generator) -> FloatArray:
+        """Return a start: the structure's own, one around it, or one around the best end."""
+        first = self.family.first
+        draw = rng.standard_normal(first.size)
+        best = min(ends, key=lambda end: end.value, default=None)
+        if i == 0:
+            return first
+        if i % 2 or best is None or not np.isfinite(best.value):
+            return np.asarray(first + self.family.spread * draw)
+        size = max(1.0, float(np.sqrt(np.mean(best.x**2))))
+        return np.asarray(best.x + _NARROWER * self.family.spread * size * draw)
+
+    def _descended(self, name: str, theta: FloatArray, steps: int = _FEW) -> _End:
+        """Return where a start ends after a few steps."""
+        spent = self._spent(_SHARE)
         theta, decay = bfgs(
-            self.stability, theta, enough=-DECAY * 10, steps=_STEPS, out_of_time=self.out_of_time
+            self.stability, theta, enough=-DECAY * 10, steps=_STABLE, spent=spent
         )
-        if not (decay < -DECAY and np.isfinite(self.norm(theta)[0])):
-            return np.inf, theta, decay
-        x, value = bfgs(self.norm, theta, enough=0.0, steps=_STEPS, out_of_time=self.out_of_time)
-        return value, x, decay
+        if not (decay < -DECAY and np.isfinite(self.value(theta)[0])):
+            return _End(np.inf, theta, decay, name)
+        found = minimax(self, theta, steps=steps, spent=spent)
+        return _End(found.value, found.x, decay, name, found.settled)
 
     def _minimised(self, family: ControllerFamily) -> FloatArray | None:
         """Return the best parameters of another structure, from its first start and one beside it.
 
-        In a quarter of the time that is left; None when it is not stabilised.
+        With a quarter of the evaluations that are left; None when it is not stabilised.
         """
-        now = time.perf_counter()
-        loops = [ScaledLoop(p, family.order) for p in self.problems]
-        other = _StructureSearch(family, loops, self.problems, now + _QUARTER * (self.end - now))
+        left = self.limit - self.evaluations
+        other = _StructureSearch(family, self.problems, _QUARTER * left)
         # a plant without a controller may be stationary: a free mass is
         draw = np.random.default_rng(family.order).standard_normal(family.first.size)
         starts = (family.first, family.first + family.spread * draw)
-        ends = [other._descended(start) for start in starts]
-        value, x, _ = min(ends, key=lambda end: end[0])
-        return x if np.isfinite(value) else None
-
-    def finished(self, x: FloatArray, value: float, rng: np.random.Generator) -> Minimum:
-        """Return the minimum near x: gradient sampling, and BFGS again while that gains."""
-        for _ in range(_ROUNDS):
-            found = sampled_minimum(self.norm, x, value, rng=rng, out_of_time=self.out_of_time)
-            x, value = bfgs(
-                self.norm, found.x, enough=0.0, steps=_STEPS, out_of_time=self.out_of_time
-            )
-            if self.out_of_time() or not value < found.value * (1.0 - _ROUND_GAIN):
-                break
-        return found
+        end = min((other._descended("", one, _MANY) for one in starts), key=lambda end: end.value)
+        self.evaluations += other.evaluations
+        return end.x if np.isfinite(end.value) else None
 
     def _infeasible(self, theta: FloatArray, starts: int) -> InfeasibleError:
         K = self.family.matrices(theta)
@@ -334,5 +374,9 @@ class _StructureSearch:
             f"{starts} starts the best leaves a pole at {freq:.4g} Hz (size {size:.4g} Hz, real "
             f"part {value:.3g} of the plant's speed). Give the structure more freedom (a higher "
             "order, a lead), the gain of a law the other sign, a start that stabilises, or more "
-            "starts and time."
+            "starts and evaluations."
         )
+
+
+def _size(theta: FloatArray) -> float:
+    return float(np.sqrt(1.0 + theta @ theta))

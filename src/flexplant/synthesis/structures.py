@@ -23,7 +23,7 @@ from .structured_loop import Matrices
 
 #: step of a derivative by differences, and the steps and weights of fourth order
 _STEP = 1e-3
-DIFFERENCES = tuple(
+_DIFFERENCES = tuple(
     (k * _STEP, w / (12.0 * _STEP)) for k, w in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0))
 )
 
@@ -54,8 +54,8 @@ class ControllerFamily(Protocol):
     def matrices(self, theta: FloatArray) -> Matrices:
         """Return the controller y -> u; of a sampled plant in the s of Tustin's rule."""
 
-    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
-        """Return the gradient by the parameters from that by the matrices."""
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
 
     def structure(self, theta: FloatArray) -> Value | None:
         """Return the structure with these parameters as its own, where it is a value."""
@@ -168,6 +168,8 @@ class _Entries(ControllerFamily):
         rest = np.zeros(free.shape)
         rest[range(order), range(order)] = -1.0
         self.first: FloatArray = rest[free]
+        self._jacobian = np.zeros((self.first.size, *free.shape))
+        self._jacobian[(range(self.first.size), *np.nonzero(free))] = self.scale[free]
 
     def nested(self, minimise: Minimise) -> FloatArray | None:
         """Return the best controller of each order in turn, with one state more that acts little.
@@ -197,16 +199,17 @@ class _Entries(ControllerFamily):
 
     def starting(self, K: Matrices) -> _Entries:
         """Return itself with the parameters of a controller as its first ones."""
-        self.first = (_joined(K) / self.scale)[self.free]
+        self.first = (K.joined / self.scale)[self.free]
         return self
 
     def matrices(self, theta: FloatArray) -> Matrices:
         entries = np.zeros(self.scale.shape)
         entries[self.free] = theta
-        return _cut(entries * self.scale, self.order)
+        entries, k = entries * self.scale, self.order
+        return Matrices(entries[:k, :k], entries[:k, k:], entries[k:, :k], entries[k:, k:])
 
-    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
-        return np.asarray((_joined(by) * self.scale)[self.free])
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        return self._jacobian
 
     def structure(self, theta: FloatArray) -> FixedOrder:
         return FixedOrder(
@@ -214,14 +217,6 @@ class _Entries(ControllerFamily):
             None if self.order else self.pattern,
             as_system(self.matrices(theta), self.names, self.dt),
         )
-
-
-def _joined(K: Matrices) -> FloatArray:
-    return np.asarray(np.block([[K.A, K.B], [K.C, K.D]]))
-
-
-def _cut(all_: FloatArray, k: int) -> Matrices:
-    return Matrices(all_[:k, :k], all_[:k, k:], all_[k:, :k], all_[k:, k:])
 
 
 def as_system(K: Matrices, names: tuple[Sequence[str], Sequence[str]], dt: float) -> StateSpace:
@@ -283,13 +278,21 @@ class _Gains(ControllerFamily):
             np.zeros((F.shape[0], L.shape[1])),
         )
 
-    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
-        p, root = self.p, np.sqrt(self.p.speed)
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        p, root, n = self.p, np.sqrt(self.p.speed), self.order
         F, L = self._parts(theta)
-        A = p.speed * by.A
-        on_F = p.B2.T @ A + p.D22.T @ L.T @ A + root * p.u_scale.T @ by.C
-        on_L = A @ (p.C2 + p.D22 @ F).T - root * by.B @ p.y_scale.T
-        return np.concatenate([on_F.ravel(), on_L.ravel()])
+        by = np.zeros((theta.size, n + F.shape[0], n + L.shape[1]))
+        split, onto = F.size, p.B2 + L @ p.D22
+        # an entry of F at (i, j): column j of A by column i of B2 + L D22; of L: a row of A
+        on_F, on_L = by[:split].reshape(*F.shape, *by.shape[1:]), by[split:]
+        for j in range(n):
+            on_F[:, j, :n, j] = p.speed * onto.T
+            on_F[:, j, n:, j] = root * p.u_scale.T
+        rows = on_L.reshape(*L.shape, *by.shape[1:])
+        for i in range(n):
+            rows[i, :, i, :n] = p.speed * (p.C2 + p.D22 @ F)
+            rows[i, :, i, n:] = -root * p.y_scale
+        return by
 
     def structure(self, theta: FloatArray) -> ObserverGains:
         return self._structure
@@ -357,6 +360,16 @@ class Parametrised:
         return Differenced(matrices, self.start / unit, self.spread)
 
 
+def differenced(
+    matrices: Callable[[FloatArray], Matrices], theta: FloatArray, number: int
+) -> FloatArray:
+    """Return the derivative of [A, B; C, D] by one parameter."""
+    along = np.eye(theta.size)[number]
+    return np.asarray(
+        sum(weight * matrices(theta + step * along).joined for step, weight in _DIFFERENCES)
+    )
+
+
 class Differenced:
     """A family whose matrices are differentiated by differences, exact for polynomials up to 4."""
 
@@ -373,17 +386,9 @@ class Differenced:
         """Return None: there are no smaller structures."""
         return None
 
-    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
-        """Return the gradient by the parameters from that by the matrices."""
-
-        def along(i: int, step: float) -> float:
-            moved = theta.copy()
-            moved[i] += step
-            return float(sum(np.sum(g * m) for g, m in zip(by, self.matrices(moved), strict=True)))
-
-        return np.array(
-            [sum(w * along(i, step) for step, w in DIFFERENCES) for i in range(theta.size)]
-        )
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
+        return np.array([differenced(self.matrices, theta, i) for i in range(theta.size)])
 
     def structure(self, theta: FloatArray) -> None:
         """Return None: a function is no value that could be kept in a file."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -14,10 +15,10 @@ from ..lti.preparation import Prepared
 from ..lti.statespace import System
 from ..plant import StandardPlant
 from ..values import FloatArray, Value, name_list, rebuild
-from .law import Element, Law, Section, SingleElement, chained
+from .law import Element, Law, SingleElement, chained
 from .loop_design import axes_of, checked_laws
 from .structured_loop import Matrices
-from .structures import DIFFERENCES, ControllerFamily
+from .structures import ControllerFamily, differenced
 
 #: what an element may have free; the depth of a notch is not, unless it is named
 _NUMBERS = ("p", "i", "d", "pole", "freq", "ratio", "width", "damping", "depth")
@@ -125,37 +126,38 @@ class _Laws(ControllerFamily):
         if not self.numbers:
             raise ModelError(f"no number of the laws is free: name some of {_NUMBERS} in free=.")
         self.first = np.zeros(len(self.numbers))
-        self._orders = [self._matrices(i, self.first)[0].shape[0] for i in range(len(self._each))]
-        self._ends = np.cumsum(self._orders)
-        self.order = int(self._ends[-1])
+        self.order = sum(
+            self._matrices(i, self.first)[0].shape[0] for i in range(len(self._each))
+        )
 
     def matrices(self, theta: FloatArray) -> Matrices:
-        """Return the controller y -> u."""
-        parts = [self._matrices(i, theta) for i in range(len(self._each))]
+        """Return the controller y -> u; NaN for corners too high."""
+        corners = [
+            corner
+            for i, law in enumerate(self._each)
+            for j in range(len(law.factors))
+            for corner in _corners(self._element(i, j, theta))
+        ]
+        K = self._joined([self._matrices(i, theta) for i in range(len(self._each))])
+        return K if max(corners, default=0.0) <= self._highest else K._replace(D=np.nan * K.D)
+
+    def _joined(self, parts: Sequence[tuple[FloatArray, ...]]) -> Matrices:
         A, B, C, D = (la.block_diag(*(part[j] for part in parts)) for j in range(4))
         return Matrices(A, -B @ self.after, self.before @ C, -self.before @ D @ self.after)
 
-    def slope(self, theta: FloatArray, by: Matrices) -> FloatArray:
-        """Return the gradient by the parameters from that by the matrices."""
-        found = np.zeros(theta.size)
-        known = [self._sections(i, theta) for i in range(len(self._each))]
-        for k, (i, factor, name) in enumerate(self.numbers):
-            own = slice(self._ends[i] - self._orders[i], self._ends[i])
-            left, right = self.before[:, i : i + 1].T, -self.after[i : i + 1].T
-            mine = (by.A[own, own], by.B[own] @ right, left @ by.C[:, own], left @ by.D @ right)
-            gain, sections = known[i]
-            for step, weight in DIFFERENCES:
-                size, moved = float(np.exp(step)), list(sections)
-                if factor >= 0:
-                    element = self._element(i, factor, theta)
-                    scaled = {name: size * getattr(element, name)}
-                    moved[factor] = _with(element, scaled).section.at(self._rate(i))
-                    size = 1.0
-                parts = chained(size * gain, [one.matrices for one in moved])
-                found[k] += weight * sum(
-                    float(np.sum(g * m)) for g, m in zip(mine, parts, strict=True)
-                )
-        return found
+    def jacobian(self, theta: FloatArray) -> FloatArray:
+        """Return the derivatives (n, rows, columns) of [A, B; C, D] by the parameters."""
+        parts = [self._matrices(i, theta) for i in range(len(self._each))]
+
+        def moved(axis: int, to: FloatArray) -> Matrices:
+            return self._joined([*parts[:axis], self._matrices(axis, to), *parts[axis + 1 :]])
+
+        return np.array(
+            [
+                differenced(partial(moved, number.axis), theta, i)
+                for i, number in enumerate(self.numbers)
+            ]
+        )
 
     def structure(self, theta: FloatArray) -> TunedLaws:
         """Return the structure with its laws at these parameters, continuous."""
@@ -183,18 +185,13 @@ class _Laws(ControllerFamily):
     def _rate(self, axis: int) -> float:
         return self.rate if self._each[axis].prewarped else 0.0
 
-    def _sections(self, axis: int, theta: FloatArray) -> tuple[float, list[Section]]:
-        count = len(self._each[axis].factors)
-        sections = [self._element(axis, i, theta).section for i in range(count)]
-        return self._gain(axis, theta), [one.at(self._rate(axis)) for one in sections]
-
     def _matrices(self, axis: int, theta: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the matrices of a law in the s of Tustin's rule; NaN for corners too high."""
-        gain, sections = self._sections(axis, theta)
-        count = len(self._each[axis].factors)
-        corners = [f for i in range(count) for f in _corners(self._element(axis, i, theta))]
-        far = any(corner > self._highest for corner in corners)
-        return chained(np.nan if far else gain, [one.matrices for one in sections])
+        """Return the matrices of a law in the s of Tustin's rule."""
+        sections = [
+            self._element(axis, i, theta).section.at(self._rate(axis)).matrices
+            for i in range(len(self._each[axis].factors))
+        ]
+        return chained(self._gain(axis, theta), sections)
 
 
 def _factor(theta: float) -> float:
