@@ -41,10 +41,6 @@
    transfer function matrix, Syst. Control Lett. 14, 1990.
 .. [BrysonFrazier1963] Bryson, Frazier, Smoothing for linear and nonlinear dynamic systems, Optimum
    System Synthesis Conference, 1963.
-.. [Burke2005] Burke, Lewis, Overton, A robust gradient sampling algorithm for nonsmooth, nonconvex
-   optimization, SIAM J. Optim. 15, 2005.
-.. [Burke2006] Burke, Henrion, Lewis, Overton, HIFOO: a Matlab package for fixed-order controller
-   design and H-infinity optimization, IFAC Symposium on Robust Control Design, 2006.
 .. [Cauberghe2004] Cauberghe, Applied frequency-domain system identification in the field of
    experimental and operational modal analysis, PhD thesis, Vrije Universiteit Brussel, 2004.
 .. [ChenChen2008] Chen, Chen, Extended Bayesian information criteria for model selection with large
@@ -154,6 +150,7 @@
    on the mu-norm, Automatica 36, 2000.
 .. [LevineAthans1970] Levine, Athans, On the determination of the optimal constant output feedback
    gains for linear multivariable systems, IEEE Trans. Autom. Control 15, 1970.
+.. [LawsonHanson1995] Lawson, Hanson, Solving Least Squares Problems, SIAM, 1995.
 .. [LewisOverton2013] Lewis, Overton, Nonsmooth optimization via quasi-Newton methods, Math.
    Program. 141, 2013.
 .. [Limebeer1993] Limebeer, Kasenally, Perkins, On the design of robust two degree of freedom

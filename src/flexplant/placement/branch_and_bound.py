@@ -5,7 +5,6 @@ from __future__ import annotations
 import heapq
 from dataclasses import dataclass
 from functools import partial
-from time import monotonic
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,16 +37,16 @@ class BranchAndBound(Search):
     gap : float
         It ends when no choice can be better by more than this part of the value (a variance: of
         its root about half as much); 0 for the optimum.
-    time_limit : float [s]
-        It ends after this time, with the gap that was reached and a warning. The exchanges at the
-        start are not cut short.
+    branches : int
+        It ends after opening so many, with the gap that was reached and a warning; 0 leaves the
+        exchanges at the start and the bound of the relaxation.
     starts : int
         Starts of the exchanges, as in `Exchange`.
 
     Raises
     ------
     ModelError
-        When the gap is not in [0, 1), the time limit not positive or starts not at least 1.
+        When the gap is not in [0, 1), branches are negative or starts not at least 1.
 
     Notes
     -----
@@ -65,13 +64,13 @@ class BranchAndBound(Search):
     """
 
     gap: float = 0.0
-    time_limit: float = 60.0
+    branches: int = 20_000
     starts: int = 4
 
     def __post_init__(self) -> None:
         self._set(
             gap=positive(self.gap, "gap", zero=True),
-            time_limit=positive(self.time_limit, "time_limit"),
+            branches=whole(self.branches, "branches", minimum=0),
             starts=whole(self.starts, "starts"),
         )
         if self.gap >= 1:
@@ -92,28 +91,30 @@ class BranchAndBound(Search):
                 "bounded: it takes PoiVariance(own_modes=True), PoiLqr or ClosedLoopH2, "
                 "of ports without a filter or delay of their own. Use Exhaustive() or Exchange()."
             )
-        end = monotonic() + self.time_limit
+        opened = 0
         chosen, history, evaluations = best_start(problem, self.starts, problem.relaxed(), work)
         value = min(steps[-1] for steps in history)
         tree = _Tree(problem, scorer, self.gap, chosen, value)
         with Progress(problem.root.size, "choices settled", progress=work.progress) as bar:
-            while (batch := tree.next_batch()) and monotonic() < end:
+            while (batch := tree.next_batch()) and opened < self.branches:
+                batch = batch[: self.branches - opened]
+                opened += len(batch)
                 tree.pop(len(batch))
-                opened = work.mapped(
+                found = work.mapped(
                     partial(_open, problem, scorer, tree.cutoff),
                     batch,
                     progress=False,
                     restored=_restored,
                 )
-                bar.advance(sum(map(tree.take, opened)))
+                bar.advance(sum(map(tree.take, found)))
         bound = tree.bound
         stopped = ""
         if batch:
-            stopped = f"the time limit of {self.time_limit:.3g} s was reached"
+            stopped = f"the limit of {self.branches} branches was reached"
             warn(
                 f"{stopped}: no choice is more than {100 * (1 - bound / tree.value):.2g} % better "
                 f"in value than the one found, but {100 * self.gap:.2g} % was wanted. Raise "
-                "time_limit, or accept a larger gap."
+                "branches, or accept a larger gap."
             )
         return Found(
             tree.chosen,

@@ -25,10 +25,9 @@ from .structured_lmi import SmallestGamma, StructuredLmi
 _CLOSE = 1.06
 #: and one so close to the best, found earlier, is preferred to it
 _SAME = 1.02
-#: problems of at most so many states go to the LMIs where no answer is close
-_SMALL = 40
-#: and have so long [s] where there is an answer already, and where there is none
-_SECONDS, _LONG = 5.0, 60.0
+#: problems of at most so many states go to the LMIs where no answer is close: where there is one
+#: already, and where there is none (their work grows with its sixth power)
+_SMALL, _LARGER = 30, 40
 
 
 class Answer(NamedTuple):
@@ -78,9 +77,9 @@ def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) 
     search = _Search(plant, problem)
     riccati = Riccati(progress=progress)
     search.attempt("Riccati()", riccati, riccati.solve)
-    small = 0 < problem.A.shape[0] <= _SMALL
+    small = 0 < problem.A.shape[0] <= (_SMALL if search.answers else _LARGER)
     if not search.is_close and small:
-        lmi = StructuredLmi(time_limit=_SECONDS if search.answers else _LONG, progress=progress)
+        lmi = StructuredLmi(progress=progress)
         bound = search.bounded(lmi)
     if not search.is_close and not search.has_added:
         added = Riccati(regularised=True, progress=progress)

@@ -7,7 +7,6 @@ corrector, from a start that need not be feasible [Helmberg1996]_.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Protocol
 
@@ -110,10 +109,9 @@ def smallest(
     y: FloatArray,
     size: float,
     tolerance: float,
-    seconds: Callable[[], float],
     count: Callable[[], None] = lambda: None,
-) -> tuple[list[Iterate], bool]:
-    """Return the points up to a relative gap of tolerance, and whether time ran out.
+) -> list[Iterate]:
+    """Return the points up to a relative gap of tolerance.
 
     Parameters
     ----------
@@ -123,8 +121,6 @@ def smallest(
         Where it starts, as for `iterates`.
     tolerance : float
         Relative gap, and residuals beside the size of the constants.
-    seconds : callable
-        Returns the time that is left [s].
     count : callable
         Called after each step.
     """
@@ -136,15 +132,7 @@ def smallest(
         residual = max(one.primal_residual, one.dual_residual)
         if one.gap <= tolerance * value and residual <= 0.1 * tolerance:
             break
-        if seconds() <= 0.0:
-            return found, True
-    return found, False
-
-
-def clock(limit: float) -> Callable[[], float]:
-    """Return a function that returns how much of limit [s] is left."""
-    end = time.monotonic() + limit
-    return lambda: end - time.monotonic()
+    return found
 
 
 class _Direction(NamedTuple):

@@ -42,8 +42,6 @@ class Lmi(Value):
         Of the solver: gap and residuals, relative.
     max_states : int
         Larger problems are refused.
-    time_limit : float [s]
-        For each of the few semidefinite programs.
     progress : bool, optional
         True shows a bar of these programs at once, False never; None after two seconds on a
         terminal.
@@ -69,7 +67,6 @@ class Lmi(Value):
     back_off: float = 0.05
     tolerance: float = 1e-9
     max_states: int = 30
-    time_limit: float = 60.0
     progress: bool | None = None
 
     def __post_init__(self) -> None:
@@ -109,7 +106,6 @@ class Lmi(Value):
             "tol_gap_abs": tolerance,
             "tol_gap_rel": tolerance,
             "tol_feas": tolerance,
-            "time_limit": self.time_limit,
         }
 
     def _smallest(self, plant: Plant, count: Callable[[], None]) -> Optimum:

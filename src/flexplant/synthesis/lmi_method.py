@@ -36,7 +36,6 @@ def checked_settings(method: Any) -> dict[str, Any]:
         "back_off": positive(method.back_off, "back_off"),
         "tolerance": positive(method.tolerance, "tolerance"),
         "max_states": whole(method.max_states, "max_states"),
-        "time_limit": positive(method.time_limit, "time_limit"),
     }
 
 
@@ -67,7 +66,6 @@ def first_verified(
     gamma: float,
     lower: float,
     candidates: Iterable[Candidate],
-    notes: tuple[str, ...] = (),
 ) -> SolvedController:
     """Return the first candidate whose closed loop keeps its target.
 
@@ -84,7 +82,7 @@ def first_verified(
         except (FlexplantError, la.LinAlgError) as error:
             failures.append(f"{name}: {error}")
             continue
-        return SolvedController(*K, norm, min(lower, norm), {}, notes)
+        return SolvedController(*K, norm, min(lower, norm), {})
     raise SolverError(
         f"the LMIs give gamma = {gamma:.6g} as smallest, but no controller. "
         + " ".join(failures[-_LISTED:])

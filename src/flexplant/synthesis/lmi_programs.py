@@ -159,14 +159,6 @@ def solve_program(
             status == "InsufficientProgress" or (failed and violation > VIOLATION)
         ):
             reached = raw
-        if "MaxTime" in status:
-            break
-    if reached is None and "MaxTime" in status:
-        raise SolverError(
-            f"the time limit of {settings['time_limit']:.3g} s was reached ({how}, "
-            f"{counted(_order(problem), 'state')}). Raise time_limit, reduce the order of the "
-            "plant, or use StructuredLmi(), which takes a tenth of the time."
-        )
     if reached is None:
         raise SolverError(
             f"the LMIs were not solved ({how}, residuals {raw.r_prim:.1e} and {raw.r_dual:.1e}, "

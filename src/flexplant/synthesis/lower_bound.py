@@ -18,8 +18,8 @@ from .structured_lmi import StructuredLmi
 _POINTS, _REFINEMENTS = 200, 2
 #: a gap between gamma and the bound that is left as it is: methods stay up to 5 % away
 _CLOSE = 0.0525
-#: up to so many states, and for so long [s], the LMIs are solved for a bound
-_STATES, _SECONDS = 24, 5.0
+#: up to so many states the LMIs, whose work grows with its sixth power, are solved for a bound
+_STATES = 24
 #: relative: a pole so close to the axis is taken for undamped, no point lies so close to it
 _UNDAMPED = 1e-6
 
@@ -42,7 +42,7 @@ def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
     found = raised_bound(problem, gamma, max(known, pointwise_bound(problem)))
     if found * (1.0 + _CLOSE) < gamma and problem.A.shape[0] <= _STATES:
         with suppress(FlexplantError):  # what is known stays
-            found = max(found, StructuredLmi(time_limit=_SECONDS).smallest(problem).lower)
+            found = max(found, StructuredLmi().smallest(problem).lower)
     return min(found, gamma)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple, Protocol, TypeAlias
 
 import numpy as np
 import scipy.linalg as la
@@ -54,14 +54,14 @@ class Pieces(NamedTuple):
 class Maximum(Protocol):
     """The largest of many smooth functions of x, told apart by where they are taken (a place)."""
 
-    def value(self, x: FloatArray) -> tuple[float, object]:
+    def value(self, theta: FloatArray, /) -> tuple[float, Any]:
         """Return the largest value, infinite where it is not defined, and its place."""
 
-    def pieces(self, x: FloatArray) -> Pieces:
-        """Return all functions near the largest at x, itself among them."""
+    def pieces(self, theta: FloatArray, /) -> Pieces:
+        """Return all functions near the largest, itself among them."""
 
-    def piece(self, x: FloatArray, place: object) -> Pieces:
-        """Return at x the functions of one place."""
+    def piece(self, theta: FloatArray, place: Any, /) -> Pieces:
+        """Return the functions of one place."""
 
 
 @dataclass(frozen=True)
@@ -207,7 +207,6 @@ class _Model:
 
     def __init__(self, pieces: Pieces, value: float, weights: FloatArray | None) -> None:
         self.pieces, self.beside = pieces, pieces.value - value
-        self._known: dict[int, FloatArray] = {}
         if weights is None:  # of the largest alone
             weights = (np.arange(self.beside.size) == np.argmax(self.beside)).astype(float)
         self.weights = weights
@@ -224,11 +223,8 @@ class _Model:
         return step, weights, -float(np.max(self.beside + self.pieces.gradient @ step))
 
     def _hessian(self, weights: FloatArray) -> FloatArray:
-        active = np.flatnonzero(weights > _SHARE)
-        for i in active:
-            if int(i) not in self._known:
-                self._known[int(i)] = self.pieces.hessian(int(i))
-        return np.asarray(sum(weights[i] * self._known[int(i)] for i in active))
+        active = np.flatnonzero(weights > _SHARE).tolist()
+        return np.asarray(sum(weights[i] * self.pieces.hessian(i) for i in active))
 
 
 def downhill(gradients: FloatArray, beside: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -33,8 +33,13 @@ _SMALL = 1e-6
 _SHARE = 0.7
 #: of the evaluations that are left, what each smaller structure takes at most
 _QUARTER = 0.25
-#: spread of starts around the best end, beside that around the structure's own start
-_NARROWER = 0.5
+#: spreads of starts around the structure's own, in turn, and around the best end
+_SPREADS, _NARROWER = (0.0, 1.0, 0.3, 3.0), 0.5
+#: draws of a start until one is stabilised
+_DRAWS = 4
+#: steps that lower the spectral abscissa further before the norm is looked at, for drawn starts:
+#: just stable, a loop has peaks that hide the others
+_DEEPER = 50
 #: radius around the end, relative, within which the report looks for a decrease
 _RADIUS = 1e-3
 #: the norm that the search claims and the one verified on the plant as given agree to this
@@ -167,7 +172,7 @@ def design_structured(
         certificate |= {f"norm of plant {i}": one["norm"] for i, one in enumerate(each, 1)}
     notes = search.notes
     if decrease > _SHORT:
-        notes += ("not yet a local minimum (decrease left): more starts, evaluations or another order",)
+        notes += ("not yet a local minimum (decrease left): more evaluations or another order",)
     answer = Controller(
         K,
         f"H-infinity of structure {(structure if final is None else final)!r}",
@@ -232,6 +237,8 @@ class _StructureSearch:
         self.loops = [ScaledLoop(p, family.order) for p in problems]
         self.evaluations = 0
         self.notes: tuple[str, ...] = ()
+        #: the parameters of the last value, and the gain and frequency of each loop there
+        self._latest: tuple[FloatArray, list[tuple[float, float]]] = np.zeros(0), []
         #: the norm that each start reached
         self.tried: dict[str, float] = {}
 
@@ -257,16 +264,16 @@ class _StructureSearch:
         K = self.family.matrices(theta)
         if not np.all(np.isfinite(K.joined)):
             return np.inf, (0, 0.0)
-        gains = [loop.gain(K) for loop in self.loops]
-        worst = int(np.argmax([gain for gain, _ in gains]))
-        gain, freq = gains[worst]
+        self._latest = theta, [loop.gain(K) for loop in self.loops]
+        worst = int(np.argmax([gain for gain, _ in self._latest[1]]))
+        gain, freq = self._latest[1][worst]
         return float(np.log(max(gain, _NOTHING))) + _SMALL * _size(theta), (worst, freq)
 
     def pieces(self, theta: FloatArray) -> Pieces:
         """Return the gains that are near the largest, as `value` counts them."""
-        K = self.family.matrices(theta)
-        self.evaluations += 1
-        each = [loop.gain(K) for loop in self.loops]
+        if not np.array_equal(theta, self._latest[0]):
+            self.value(theta)
+        _, each = self._latest
         most = max(gain for gain, _ in each)
         return joined(
             [
@@ -302,7 +309,7 @@ class _StructureSearch:
         for i in range(starts):
             if ends and self._spent(_SHARE)():
                 break
-            ends.append(self._descended(f"start {i + 1}", self._drawn(i, ends, rng)))
+            ends.append(self._started(i, ends, rng))
             bar.advance()
         stable = [end for end in ends if np.isfinite(end.value)]
         if not stable:
@@ -326,24 +333,31 @@ class _StructureSearch:
         found = minimax(self, end.x, steps=_MANY, spent=self._spent())
         return end._replace(x=found.x, value=found.value, settled=found.settled)
 
-    def _drawn(self, i: int, ends: list[_End], rng: np.random.Generator) -> FloatArray:
-        """Return a start: the structure's own, one around it, or one around the best end."""
-        first = self.family.first
-        draw = rng.standard_normal(first.size)
-        best = min(ends, key=lambda end: end.value, default=None)
+    def _started(self, i: int, ends: list[_End], rng: np.random.Generator) -> _End:
+        """Return the end of the structure's own start, of one around it or around the best end."""
+        name, first, width = f"start {i + 1}", self.family.first, self.family.spread
         if i == 0:
-            return first
-        if i % 2 or best is None or not np.isfinite(best.value):
-            return np.asarray(first + self.family.spread * draw)
-        size = max(1.0, float(np.sqrt(np.mean(best.x**2))))
-        return np.asarray(best.x + _NARROWER * self.family.spread * size * draw)
+            return self._descended(name, first)
+        best = min(ends, key=lambda end: end.value)
+        for again in range(_DRAWS):
+            draw = width * rng.standard_normal(first.size)
+            if i % 2 or not np.isfinite(best.value):
+                spread = _SPREADS[(i // 2 + again) % len(_SPREADS)]
+                end = self._descended(name, first + spread * draw, deeper=_DEEPER)
+            else:
+                size = max(1.0, float(np.sqrt(np.mean(best.x**2))))
+                end = self._descended(name, best.x + _NARROWER * size * draw)
+            if np.isfinite(end.value) or self._spent(_SHARE)():
+                break
+        return end
 
-    def _descended(self, name: str, theta: FloatArray, steps: int = _FEW) -> _End:
+    def _descended(self, name: str, theta: FloatArray, steps: int = _FEW, deeper: int = 0) -> _End:
         """Return where a start ends after a few steps."""
         spent = self._spent(_SHARE)
-        theta, decay = bfgs(
-            self.stability, theta, enough=-DECAY * 10, steps=_STABLE, spent=spent
-        )
+        for enough, most in ((-10 * DECAY, _STABLE), (-np.inf, deeper)):
+            theta, decay = bfgs(self.stability, theta, enough=enough, steps=most, spent=spent)
+            if decay > enough:
+                break
         if not (decay < -DECAY and np.isfinite(self.value(theta)[0])):
             return _End(np.inf, theta, decay, name)
         found = minimax(self, theta, steps=steps, spent=spent)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -14,7 +14,7 @@ from ..errors import FlexplantError, SolverError, counted
 from ..lti.preparation import Prepared
 from ..parallel import Progress
 from ..values import FloatArray, Value
-from .interior_point import STEPS, Iterate, clock, smallest
+from .interior_point import STEPS, Iterate, smallest
 from .lmi_method import (
     LOOSER,
     NOTHING,
@@ -65,8 +65,6 @@ class StructuredLmi(Value):
         Relative gap between gamma and its lower bound at which the search stops.
     max_states : int
         Larger problems are refused.
-    time_limit : float [s]
-        For the whole search.
     progress : bool, optional
         True shows a bar of the steps at once, False never; None after two seconds on a terminal.
 
@@ -90,7 +88,6 @@ class StructuredLmi(Value):
     back_off: float = 0.05
     tolerance: float = 1e-6
     max_states: int = 80
-    time_limit: float = 120.0
     progress: bool | None = None
 
     def __post_init__(self) -> None:
@@ -140,7 +137,7 @@ class StructuredLmi(Value):
             for point in found.points_below(1.0 + part)[:_POINTS]
             for target in [found.scale * float(point.y[-1])]
         ]
-        return first_verified(problem, found.value, found.lower, candidates, found.notes)
+        return first_verified(problem, found.value, found.lower, candidates)
 
     def smallest(self, problem: Prepared) -> SmallestGamma:
         """Return the smallest gamma of the LMIs with its lower bound, without a controller.
@@ -151,7 +148,6 @@ class StructuredLmi(Value):
             As for `solve`.
         """
         check_size(self, problem)
-        left = clock(self.time_limit)
         plant = Plant.of(problem)
         guess = scale = plant.size()
         failures: list[FlexplantError] = []
@@ -159,7 +155,7 @@ class StructuredLmi(Value):
             try:
                 start = states(plant.scaled(guess).with_unit_channels())  # whatever the unit of z
                 for _ in range(3):
-                    found = self._solved(start.scaled(scale / guess), scale, left)
+                    found = self._solved(start.scaled(scale / guess), scale)
                     low, high = _ROUGH
                     settled = found.value - found.lower <= _SETTLED * found.value
                     if settled or low < found.value / scale < high:
@@ -175,20 +171,11 @@ class StructuredLmi(Value):
         check_cost(found.value, guess)
         return found
 
-    def _solved(self, plant: Plant, scale: float, left: Callable[[], float]) -> SmallestGamma:
+    def _solved(self, plant: Plant, scale: float) -> SmallestGamma:
         program = ProjectedLmis(plant)
         with Progress(STEPS, "steps of the LMIs", progress=self.progress) as bar:
-            points, late = smallest(
-                program, program.start(_START), _START, self.tolerance, left, bar.advance
-            )
+            points = smallest(program, program.start(_START), _START, self.tolerance, bar.advance)
         feasible = [one for one in points if _holds(program, one.y)]
-        if not feasible and late:
-            raise SolverError(
-                f"the time limit of {self.time_limit:.3g} s was reached after "
-                f"{counted(len(points), 'step')}, before any gamma was found "
-                f"({counted(program.n, 'state')}). Raise time_limit or reduce the order of the "
-                "plant."
-            )
         if not feasible:
             raise SolverError(
                 "the LMIs were not solved: no point satisfies them after "
@@ -199,11 +186,6 @@ class StructuredLmi(Value):
         best = min(feasible, key=lambda one: float(one.y[-1]))
         R, S, value = program.matrices(best.y)
         lower = max(_bound(program, plant, one.X, R, S) for one in points)
-        gap = 100.0 * (value / max(lower, 1e-300) - 1.0)
-        late_note = (
-            f"the time limit of {self.time_limit:.3g} s was reached: gamma is within {gap:.2g} % "
-            "of the smallest."
-        )
         return SmallestGamma(
             scale * value,
             scale * min(lower, value),
@@ -211,7 +193,6 @@ class StructuredLmi(Value):
             plant,
             program,
             feasible,
-            (late_note,) if late else (),
         )
 
 
@@ -224,7 +205,6 @@ class SmallestGamma(NamedTuple):
     plant: Plant
     program: ProjectedLmis
     points: Sequence[Iterate]
-    notes: tuple[str, ...]
 
     def points_below(self, factor: float) -> list[Iterate]:
         """Return the points with gamma at most factor times the smallest, the first one first."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from functools import partial
+from functools import cache, partial
 from typing import NamedTuple
 
 import numpy as np
@@ -139,7 +139,7 @@ class ScaledLoop:
         return Pieces(
             np.log(value),
             np.tensordot(slope, by, axes=([1, 2], [1, 2])),
-            lambda j: loop.hessian(float(places[at[j]]), int(which[j]), by),
+            cache(lambda j: loop.hessian(float(places[at[j]]), int(which[j]), by)),
         )
 
 

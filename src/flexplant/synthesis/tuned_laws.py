@@ -126,9 +126,7 @@ class _Laws(ControllerFamily):
         if not self.numbers:
             raise ModelError(f"no number of the laws is free: name some of {_NUMBERS} in free=.")
         self.first = np.zeros(len(self.numbers))
-        self.order = sum(
-            self._matrices(i, self.first)[0].shape[0] for i in range(len(self._each))
-        )
+        self.order = sum(self._matrices(i, self.first)[0].shape[0] for i in range(len(self._each)))
 
     def matrices(self, theta: FloatArray) -> Matrices:
         """Return the controller y -> u; NaN for corners too high."""

@@ -41,7 +41,6 @@ def design_lmi(
     subject_to: Sequence[H2 | Hinf | PeakGain | PoleRegion] = (),
     back_off: float = 0.03,
     max_states: int = 20,
-    time_limit: float = 60.0,
     larger: Any = None,
 ) -> Controller:
     """Return a controller that keeps several norms below bounds and makes one of them small.
@@ -65,8 +64,6 @@ def design_lmi(
         more where no controller keeps the bounds there: the certificate says how much.
     max_states : int
         Larger problems are refused: the time grows with the sixth power.
-    time_limit : float [s]
-        For each semidefinite program.
     larger : Modes, FEModel, ReducedModel or StandardPlant, optional
         A model with the modes that the plant left out, as for `larger_plant`.
 
@@ -113,9 +110,7 @@ def design_lmi(
     require_stabilisable(given, prepared(given.system, given.u, given.y), "synthesis by LMIs")
     require_reachable(given, subject_to)
     scaled = _prepared(given)
-    problem = ObjectivePrograms(
-        given, scaled, minimize, tuple(subject_to), positive(time_limit, "time_limit")
-    )
+    problem = ObjectivePrograms(given, scaled, minimize, tuple(subject_to))
     rates = _rates(problem)
     failures: list[Exception] = []
     best: tuple[float, float] | None = None
