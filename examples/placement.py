@@ -79,9 +79,7 @@ def sensors(plant: fx.StandardPlant, machines: list[fx.StandardPlant]) -> dict[s
     )
     return {
         "the die's error": best(goal),
-        "variance within 12 %, proven": best(
-            goal, method=BranchAndBound(gap=0.12, time_limit=10.0, starts=1)
-        ),
+        "variance within 12 %, proven": best(goal, method=BranchAndBound(gap=0.12, starts=1)),
         "0.25 m apart": best(goal, constraints=[MinimumDistance(0.25)]),
         "none at the cable": best(goal, constraints=[Excluded(CABLE)]),
         "worst machine of three": best(OverMachines(goal, machines)),

@@ -160,19 +160,22 @@ def test_branches_find_what_every_subset_shows(make, monkeypatch, side):
     assert rough.gap <= 0.2
 
 
-def test_a_time_limit_says_that_it_was_hit(make):
+def test_a_limit_of_branches_says_that_it_was_hit(make):
     plant, sensors, _ = make(14, count=12)
     best = place_sensors(plant, sensors, 4)
-    method = BranchAndBound(time_limit=1e-6, starts=1)
-    with pytest.warns(FlexplantWarning, match=r"time limit of 1e-06 s was reached: no choice is"):
+    method = BranchAndBound(branches=0, starts=1)
+    with pytest.warns(FlexplantWarning, match=r"limit of 0 branches was reached: no choice is"):
         found = place_sensors(plant, sensors, 4, method=method)
-    assert "time limit" in found.stopped and "time limit" in repr(found)
+    assert "0 branches" in found.stopped and "0 branches" in repr(found)
     assert not found.proven
     assert 0.5 * best.value < found.bound < best.value <= found.value
     assert found.gap == pytest.approx(1 - found.bound / found.value, rel=1e-12, abs=0.0)
     # the relaxation is that of Exchange
     bound = place_sensors(plant, sensors, 4, method=Exchange(starts=1)).bound
     assert found.bound == pytest.approx(bound, rel=1e-9, abs=0.0)
+    with pytest.warns(FlexplantWarning, match="limit of 3 branches was reached"):
+        more = place_sensors(plant, sensors, 4, method=BranchAndBound(branches=3, starts=1))
+    assert found.bound <= more.bound < best.value
 
 
 def test_what_has_no_relaxation_is_refused(make):
@@ -182,7 +185,7 @@ def test_what_has_no_relaxation_is_refused(make):
     for bad, said in (
         ({"gap": 1.0}, "below 1"),
         ({"gap": -0.1}, "gap"),
-        ({"time_limit": 0}, "time"),
+        ({"branches": -1}, "branches"),
     ):
         with pytest.raises(ModelError, match=said):
             BranchAndBound(**bad)

@@ -180,7 +180,8 @@ def minimax(
         model = _Model(pieces, value, weights)
         step, weights, decrease = model.step(mu)
         if decrease <= _SETTLED:
-            if refused or mu <= 1e-3 * model.size:
+            far = float(np.linalg.norm(step)) >= max(1.0, float(np.linalg.norm(x)))
+            if refused or far or mu <= 1e-3 * model.size:
                 break
             mu *= 1e-2
             continue

@@ -37,9 +37,9 @@ _QUARTER = 0.25
 _SPREADS, _NARROWER = (0.0, 1.0, 0.3, 3.0), 0.5
 #: draws of a start until one is stabilised
 _DRAWS = 4
-#: steps that lower the spectral abscissa further before the norm is looked at, for drawn starts:
-#: just stable, a loop has peaks that hide the others
-_DEEPER = 50
+#: decay [1] of drawn starts before the norm is looked at, in so many steps more: just stable, a
+#: loop has peaks that hide the others
+_DECAYING, _DEEPER = 1e-2, 50
 #: radius around the end, relative, within which the report looks for a decrease
 _RADIUS = 1e-3
 #: the norm that the search claims and the one verified on the plant as given agree to this
@@ -152,7 +152,7 @@ def design_structured(
     K = as_system(family.matrices(found.x), (plants[0].y, plants[0].u), plants[0].dt)
     K = K.replace(name="structured", units=plants[0].units)
     closed = [lft(one.system, K) for one in plants]
-    claim = float(np.exp(found.value - _SMALL * _size(found.x)))
+    claim = _norm(found)
     each = [certified_norm(loop, claim) for loop in closed]
     worst = int(np.argmax([one["norm"] for one in each]))
     if not abs(each[worst]["norm"] - claim) <= _AGREEMENT * claim:
@@ -318,9 +318,9 @@ class _StructureSearch:
         for i in range(min(_CONTINUED, len(stable))):
             stable[i] = self._continued(stable[i])
             bar.advance()
-        best = min(range(len(stable)), key=lambda i: stable[i].value)
-        stable[best] = self._continued(stable[best])
-        self.tried = {end.name: float(np.exp(end.value)) for end in (*ends, *stable)}
+        lowest = min(range(len(stable)), key=lambda i: stable[i].value)
+        stable[lowest] = self._continued(stable[lowest])
+        self.tried = {end.name: _norm(end) for end in (*ends, *stable)}
         best = min(stable, key=lambda end: end.value)
         same = sum(end.value <= best.value + _SAME for end in stable)
         self.notes = (f"{same} of {len(ends)} starts end within 1 % of the best",)
@@ -354,7 +354,7 @@ class _StructureSearch:
     def _descended(self, name: str, theta: FloatArray, steps: int = _FEW, deeper: int = 0) -> _End:
         """Return where a start ends after a few steps."""
         spent = self._spent(_SHARE)
-        for enough, most in ((-10 * DECAY, _STABLE), (-np.inf, deeper)):
+        for enough, most in ((-10 * DECAY, _STABLE), (-_DECAYING, deeper)):
             theta, decay = bfgs(self.stability, theta, enough=enough, steps=most, spent=spent)
             if decay > enough:
                 break
@@ -394,3 +394,7 @@ class _StructureSearch:
 
 def _size(theta: FloatArray) -> float:
     return float(np.sqrt(1.0 + theta @ theta))
+
+
+def _norm(end: _End) -> float:
+    return float(np.exp(end.value - _SMALL * _size(end.x)))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg as la
@@ -71,8 +71,8 @@ class ScaledLoop:
     def closed(self, K: Matrices) -> _Closed | None:
         """Return the loop with a controller in the user's units; None when it is not finite."""
         scaled = self._out @ K.joined @ self._in
-        left = np.linalg.inv(np.eye(scaled.shape[0]) - scaled @ self.D22)
-        right = np.linalg.inv(np.eye(scaled.shape[1]) - self.D22 @ scaled)
+        left = np.asarray(np.linalg.inv(np.eye(scaled.shape[0]) - scaled @ self.D22))
+        right = np.asarray(np.linalg.inv(np.eye(scaled.shape[1]) - self.D22 @ scaled))
         Q = left @ scaled
         if not np.all(np.isfinite(Q)):
             return None
@@ -84,7 +84,7 @@ class ScaledLoop:
             self.B @ left,
             right @ self.C,
             self.D12 @ left,
-            right @ self.D21,
+            np.asarray(right @ self.D21),
             self.D22 @ left,
         )
 
@@ -92,8 +92,10 @@ class ScaledLoop:
         """Return the spectral abscissa [1], its gradient by [A, B; C, D], and the pole."""
         loop = self.closed(K)
         if loop is None:
-            return np.inf, np.zeros(self._out.shape[:1] + self._in.shape[:1]), complex(np.inf)
-        values, lefts, rights = la.eig(loop.A, left=True)
+            rows, columns = self._out.shape[0], self._in.shape[0]
+            return np.inf, np.zeros((rows, columns)), complex(np.inf)
+        found: Any = la.eig(loop.A, left=True, right=True)
+        values, lefts, rights = found
         worst = int(np.argmax(values.real))
         y, x = lefts[:, worst], rights[:, worst]
         overlap = np.vdot(y, x)
@@ -167,7 +169,8 @@ class _Closed(NamedTuple):
         first = np.append(0.0, resonance_grid(system.poles(), 0.0, points=_POINTS, around=(0.0,)))
 
         def gains(freq: FloatArray) -> FloatArray:
-            return np.linalg.norm(np.moveaxis(responses(system, freq), 2, 0), 2, axis=(1, 2))
+            all_ = np.moveaxis(responses(system, freq), 2, 0)
+            return np.asarray(np.linalg.norm(all_, 2, axis=(1, 2)))
 
         freq, gain = climbed(gains, first, _REFINEMENTS)
         beside = np.concatenate([[-np.inf], gain, [-np.inf]])

@@ -169,7 +169,8 @@ class _Entries(ControllerFamily):
         rest[range(order), range(order)] = -1.0
         self.first: FloatArray = rest[free]
         self._jacobian = np.zeros((self.first.size, *free.shape))
-        self._jacobian[(range(self.first.size), *np.nonzero(free))] = self.scale[free]
+        at, to = np.nonzero(free)
+        self._jacobian[np.arange(self.first.size), at, to] = self.scale[free]
 
     def nested(self, minimise: Minimise) -> FloatArray | None:
         """Return the best controller of each order in turn, with one state more that acts little.
