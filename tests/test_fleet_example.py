@@ -121,8 +121,8 @@ def test_a_virtual_machine_is_measured_with_the_options_given(fleet, monkeypatch
 def test_the_chain_refuses_what_it_cannot_use(fleet):
     chain = fleet.pipeline()
     assert repr(chain) == "<MachinePipeline: 5 parameters updated, H-infinity, 80, 60, 40 Hz>"
-    with pytest.raises(ModelError, match="full must be of type FEModel"):
-        chain.replace(full=chain.model)
+    with pytest.raises(ModelError, match="full must be of type FEModel or Modes or ReducedModel"):
+        chain.replace(full=chain.ports)
     with pytest.raises(ModelError, match="the ports need a reference"):
         chain.replace(ports=chain.ports.replace(references=()))
     with pytest.raises(ModelError, match="measurement"):

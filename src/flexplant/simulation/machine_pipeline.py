@@ -25,8 +25,8 @@ from ..plant import (
     reference_errors,
     stage_weights,
 )
-from ..reduction import ReducedModel
-from ..structure import FEModel
+from ..reduction import ModalTruncation, ReducedModel, reduce
+from ..structure import Damping, FEModel
 from ..synthesis import design_hinf
 from ..updating import Eigenvalues, Localisation, UpdateResult, localise, update
 from ..values import Value, generator, instance, positive, short, whole
@@ -58,8 +58,11 @@ class MachinePipeline(Value):
     ----------
     model : ReducedModel
         Of the drawing.
-    full : FEModel
+    full : FEModel, Modes or ReducedModel
         The drawing itself, whose further modes count in the observer and in the check of the loop.
+        An FEModel is updated and solved again; Modes, say of a model of more DOFs than damping
+        fits in a matrix for, are updated in their own coordinates, and so is a reduced model with
+        the modes that it left out.
     parameters : sequence
         What is updated on each machine.
     ports : Ports
@@ -67,8 +70,8 @@ class MachinePipeline(Value):
         of these, or DOFs of the model.
     rate : float [Hz]
         Of the controller.
-    delay : int [samples]
-        From measurement to actuation.
+    delay : float [samples]
+        From measurement to actuation, any fraction.
     modes : sequence of int, optional
         Numbers of the modes whose poles are used; all that were identified when not given.
     measurement : mapping, optional
@@ -98,9 +101,12 @@ class MachinePipeline(Value):
         Of that run.
     larger : int
         Modes of the updated full structure that are known, those of the reduced model included; at
-        most all.
+        most all. Of Modes and of a reduced model all count.
     folder : path, optional
         Where the report of each machine is written, a text file; the table names it.
+    damping : Damping, optional
+        Of an FEModel in place of its D, for models of any size: a `ModalDamping`, say. Parameters
+        of damping are not in it; give Modes to have them.
 
     Raises
     ------
@@ -119,11 +125,11 @@ class MachinePipeline(Value):
     """
 
     model: ReducedModel
-    full: FEModel
+    full: FEModel | Modes | ReducedModel
     parameters: Sequence[Any]
     ports: Ports
     rate: float
-    delay: int
+    delay: float
     modes: Sequence[int] | None = None
     measurement: Mapping[str, Any] | None = None
     band: tuple[float, float] | None = None
@@ -138,10 +144,16 @@ class MachinePipeline(Value):
     duration: float = 1.0
     larger: int = 80
     folder: str | None = None
+    damping: Damping | None = None
 
     def __post_init__(self) -> None:
-        for name, kind in (("model", ReducedModel), ("full", FEModel), ("ports", Ports)):
+        drawings = FEModel | Modes | ReducedModel
+        for name, kind in (("model", ReducedModel), ("full", drawings), ("ports", Ports)):
             instance(getattr(self, name), kind, name, "Give one of that type.")
+        if self.damping is not None:
+            instance(self.damping, Damping, "damping", "Pass ModalDamping(0.01) for 1 %.")
+            hint = "Leave damping= out: modes and reduced models have theirs."
+            instance(self.full, FEModel, "with damping=, full", hint)
         if self.measurement is not None:
             instance(self.measurement, Mapping, "measurement", "Give {'period': 0.5}, say, or {}.")
         if not self.ports.references:
@@ -149,7 +161,7 @@ class MachinePipeline(Value):
         self._set(
             parameters=tuple(self.parameters),
             rate=positive(self.rate, "rate"),
-            delay=whole(self.delay, "delay", minimum=0),
+            delay=positive(self.delay, "delay", zero=True),
             modes=None
             if self.modes is None
             else tuple(whole(n, "mode") for n in np.ravel(self.modes)),
@@ -206,8 +218,7 @@ class MachinePipeline(Value):
         with warnings.catch_warnings(record=True) as said:
             warnings.simplefilter("always")
             measured, places, fit = self._fitted(self._measured(machine, of_measurement))
-            updated = fit.applied_to(self.full)
-            many = solve_modes(updated, count=min(self.larger, updated.n_dof))
+            many = self._larger(fit)
             plant = assemble_plant(fit.model, self.ports).discretized(self.rate, delay=self.delay)
             observer = design_kalman(plant, larger=many)
             if self.blocks is None:
@@ -285,6 +296,17 @@ class MachinePipeline(Value):
             unknowns = [*unknowns, *chosen]
         return places, update(self.model, unknowns, residuals, starts=self.starts)
 
+    def _larger(self, fit: UpdateResult) -> Modes:
+        """Return the modes of the updated full structure."""
+        if isinstance(self.full, FEModel):
+            count = min(self.larger, self.full.n_dof)
+            return solve_modes(fit.applied_to(self.full), count=count, damping=self.damping)
+        known = self.full
+        if isinstance(known, Modes):  # their attachment vectors count among the modes left out
+            known = reduce(known, ModalTruncation(known.n_modes))
+        found: Modes = fit.applied_to(known.completed()).modes()
+        return found
+
     def _designed(
         self, plant: StandardPlant, many: Modes
     ) -> tuple[tuple[Any, ...], SpillOver | None]:
@@ -314,7 +336,8 @@ class MachinePipeline(Value):
         row |= {one.name: float(p) for one, p in zip(fit.unknowns, fit.values, strict=True)}
         row["modes measured"] = len(found.measured)
         row["p value"] = fit.p_value if fit.p_value is not None else float("nan")
-        row["estimate rms"] = found.observer.rms(self.error.replace(":error", ":z"))
+        poi = next(one for one in self.ports.z if f"{one.name}:error" == self.error)
+        row["estimate rms"] = found.observer.rms(f"{poi.name}:{poi.axes[0]}")
         row["margin expected"] = (
             float("nan") if found.left_out is None else found.left_out.modulus_margin
         )
