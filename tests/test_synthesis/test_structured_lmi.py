@@ -179,3 +179,12 @@ def test_bad_options(options):
 def test_too_many_states():
     with pytest.raises(ModelError, match="of 1 to 3 states, got 4"):
         StructuredLmi(max_states=3).solve(prepared(*flexible(2)))
+
+
+def test_what_was_tried_is_in_the_answer():
+    P, u, y = flexible(2)
+    named = design_hinf(P, StructuredLmi(), u=u, y=y)
+    assert named.tried == {"StructuredLmi()": named.gamma}
+    found = design_hinf(P, u=u, y=y)
+    assert next(iter(found.tried)) == "Riccati()"
+    assert found.gamma in found.tried.values()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import NamedTuple
 
@@ -40,6 +40,8 @@ class Answer(NamedTuple):
     respond: Responder
     certificate: dict[str, float]
     lower: float
+    #: what was tried, and the gamma that each reached
+    tried: Mapping[str, float]
 
     @property
     def gamma(self) -> float:
@@ -116,6 +118,7 @@ class _Search:
         #: answers whose loop may be stable with a larger norm than the method claims
         self.broken: list[tuple[SynthesisMethod, SolvedController]] = []
         self.lower = pointwise_bound(problem)
+        self.tried: dict[str, float] = {}
 
     @property
     def is_close(self) -> bool:
@@ -139,6 +142,7 @@ class _Search:
         InfeasibleError
             When there is none: no other method finds what does not exist.
         """
+        self.tried[name] = np.inf
         try:
             found = solve(self.problem)
         except InfeasibleError:
@@ -155,6 +159,7 @@ class _Search:
             self.broken.append((method, found))
         else:
             self.answers.append(one)
+            self.tried[name] = one.gamma
             known = max(self.lower, one.lower)
             self.lower = raised_bound(self.problem, one.gamma, known)
 
@@ -182,7 +187,7 @@ class _Search:
         if self.answers:
             least = min(one.gamma for one in self.answers)
             one = next(one for one in self.answers if one.gamma <= _SAME * least)
-            return one._replace(lower=min(self.lower, one.gamma))
+            return one._replace(lower=min(self.lower, one.gamma), tried=self.tried)
         (_, first), *others = self.failures
         said = [f"{name}: {'the same' if str(e) == str(first) else e}" for name, e in others]
         raise type(first)(str(first) + (f" (Tried besides: {' '.join(said)})" if said else ""))
@@ -217,4 +222,5 @@ def _of_loop(
     loop = lft(plant.system, controller)
     respond = remembered(responder(loop))  # swept twice over the same frequencies
     certificate = certified_norm(loop, found.gamma, respond)
-    return Answer(method, found, controller, loop, respond, certificate, found.lower)
+    tried = {f"{type(method).__name__}()": certificate["norm"]}
+    return Answer(method, found, controller, loop, respond, certificate, found.lower, tried)

@@ -155,6 +155,7 @@ def design_hinf(
         certificate=answer.certificate | dict(found.certificate),
         reached=reached_norms(plant, answer.loop, answer.respond),
         notes=found.notes,
+        tried=answer.tried,
     )
     return with_left_out(one, plant, larger)
 

@@ -52,7 +52,7 @@ class Pieces(NamedTuple):
 
 
 class Maximum(Protocol):
-    """The largest of many smooth functions of x, told apart by where they are taken (a place)."""
+    """The largest of many smooth functions of x, each of a place, such as a frequency."""
 
     def value(self, theta: FloatArray, /) -> tuple[float, Any]:
         """Return the largest value, infinite where it is not defined, and its place."""

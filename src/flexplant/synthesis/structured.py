@@ -37,7 +37,7 @@ _QUARTER = 0.25
 _SPREADS, _NARROWER = (0.0, 1.0, 0.3, 3.0), 0.5
 #: draws of a start until one is stabilised
 _DRAWS = 4
-#: decay [1] of drawn starts before the norm is looked at, in so many steps more: just stable, a
+#: decay [1] of drawn starts before the norm is lowered, in so many steps more: just stable, a
 #: loop has peaks that hide the others
 _DECAYING, _DEEPER = 1e-2, 50
 #: radius around the end, relative, within which the report looks for a decrease
