@@ -27,7 +27,11 @@ from oracles_synthesis import chain as oracle_chain
 
 DATA = Path(__file__).parents[3] / "shared" / "data" / "compleib-open.npz"
 #: static output feedback: Apkarian, Noll, Nonsmooth H-infinity synthesis, 2006; HIFOO, 2006
-PUBLISHED = {"HE1": 0.1538, "AC8": 2.005, "REA2": 1.149, "AC4": 0.9355, "CM1": 0.8165}
+PUBLISHED = {
+    "HE1": 0.1538, "AC8": 2.005, "REA2": 1.149, "AC4": 0.9355, "CM1": 0.8165, "AC2": 0.1115,
+    "AC15": 15.2074, "DIS1": 4.1716, "DIS2": 1.0548, "HE2": 4.2492, "HE5": 8.8952, "NN2": 2.2216,
+    "NN4": 1.3627, "NN8": 2.8871, "TG1": 12.8462, "AGS": 8.1732, "BDT1": 0.2664, "CSE1": 0.0201,
+}  # fmt: skip
 
 
 def compleib(name):
