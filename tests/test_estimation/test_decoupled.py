@@ -9,6 +9,9 @@ from flexplant.errors import ModelError
 from flexplant.plant import decouple, reference_errors
 from stages import CORNERS, L, ports, reduced, sampled, some_modes
 
+#: meshes are small here: what they do not resolve is the subject of test_mesh
+pytestmark = pytest.mark.filterwarnings("ignore:.*finer mesh as larger=")
+
 LARGER = some_modes(count=40, attached=False)
 
 

@@ -10,7 +10,15 @@ from flexplant.estimation import design_kalman
 from flexplant.estimation.mesh import nodes_per_wavelength
 from flexplant.modes import solve_modes
 from flexplant.plant import Actuator, Disturbance, Poi, Ports, Sensor, assemble_plant
-from flexplant.structure import FEModel, ModalDamping, beam, kirchhoff_plate
+from flexplant.reduction import ModalTruncation, reduce
+from flexplant.structure import (
+    FEModel,
+    ModalDamping,
+    Rectangle,
+    beam,
+    kirchhoff_plate,
+    solid_block,
+)
 
 WIDE, DEEP = 0.5, 0.3
 CORNERS = [(x, y, 0.0) for y in (0.0, DEEP) for x in (0.0, WIDE)]
@@ -43,8 +51,45 @@ def test_nodes_per_wavelength_of_a_beam():
     found = nodes_per_wavelength(model, modes.phi[:, :, None])
     number = np.arange(18, 42)
     assert found[number] == pytest.approx(80 * 2 / (number + 1 - 1.5), rel=0.05)
+    # nodes side by side, where no matrix couples them
     lumped = FEModel(np.diag(model.M.diagonal()), model.K, dofs=model.dofs)
-    assert nodes_per_wavelength(lumped, modes.phi[:, :, None]) is None
+    for other in (lumped, modes):
+        same = nodes_per_wavelength(other, modes.phi[:, :, None])
+        np.testing.assert_allclose(same, found, rtol=1e-12)
+
+
+MESHES = {
+    "plate": lambda: plate(8),
+    "block": lambda: solid_block(
+        size=(0.3, 0.2, 0.05), elements=(6, 4, 2), density=2700, youngs_modulus=70e9,
+        poisson_ratio=0.33,
+    ),
+    "hole": lambda: kirchhoff_plate(
+        size=(WIDE, DEEP), thickness=0.02, elements=(10, 8), density=2702, youngs_modulus=70e9,
+        poisson_ratio=0.35, holes=[Rectangle((0.15, 0.05), (0.4, 0.2))],
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", MESHES)
+def test_modes_have_the_mesh_of_their_model(kind):
+    model = MESHES[kind]()
+    modes = solve_modes(model, count=60)
+    shapes = modes.phi[:, 6:, None]
+    found = nodes_per_wavelength(modes, shapes) / nodes_per_wavelength(model, shapes)
+    assert found.min() > 0.85 and found.max() < 1.2
+    assert np.median(found) == pytest.approx(1.05, abs=0.06)
+
+
+def test_a_coarse_mesh_is_warned_of_in_every_form_of_the_larger_model():
+    coarse = plate(8)
+    modes = solve_modes(coarse, count=100)
+    small, plant = sampled(reduce(modes, ModalTruncation(24))), sampled(modes.select(range(24)))
+    shares = []
+    for given, larger in ((plant, coarse), (plant, modes), (small, None)):
+        with pytest.warns(FlexplantWarning, match="finer mesh as larger="):
+            shares.append(design_kalman(given, larger=larger).certificate.unresolved)
+    assert shares == pytest.approx([shares[0]] * 3, abs=0.1)
 
 
 @pytest.mark.slow
@@ -60,6 +105,3 @@ def test_a_mesh_that_is_too_coarse_is_warned_of_and_one_that_is_fine_is_not():
         right = design_kalman(sampled(solve_modes(fine, count=24)), larger=fine)
     assert right.rms("die") == pytest.approx(right.rms("die", on=truth), rel=0.05, abs=0)
     assert right.certificate.unresolved < 0.15 and "nodes" not in repr(right)
-    # modes without their matrices do not tell their mesh
-    some = design_kalman(sampled(solve_modes(fine, count=24)), larger=solve_modes(fine, count=60))
-    assert some.certificate.unresolved is None

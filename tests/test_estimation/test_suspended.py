@@ -29,6 +29,9 @@ from stages import CORNERS
 from stages import ports as square_ports
 from stages import sampled as square_sampled
 
+#: meshes are small here: what they do not resolve is the subject of test_mesh
+pytestmark = pytest.mark.filterwarnings("ignore:.*finer mesh as larger=")
+
 WIDE, DEEP, THICK = 0.4, 0.3, 0.02
 EDGES = [(x, y, 0.0) for x in (0.0, WIDE) for y in (0.0, DEEP)]
 QUARTERS = [(x, y, 0.0) for x in (WIDE / 4, 3 * WIDE / 4) for y in (DEEP / 4, 3 * DEEP / 4)]

@@ -14,8 +14,8 @@ from ..plant import StandardPlant
 from ..values import ComplexArray, FloatArray, IntArray
 from .estimator_channels import poi_channels
 
-#: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well, and
-#: what is in doubt below it is stated
+#: two ways to a variance agree to this, half a per cent of an rms: no machine is known so well;
+#: what may be off below it is stated
 _AGREEMENT = 1e-2
 #: a rigid-body motion may enter the error by this part of the motion itself
 _SEEN = 1e-7

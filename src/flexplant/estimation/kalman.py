@@ -45,9 +45,9 @@ def design_kalman(
     of those modes included: on a plate of 0.6 m x 0.6 m 8 x 8 elements predict the error
     of z on finer ones within 6 %, that of rotations within 23 %; on one of 0.5 m x 0.3 m it
     predicts z 65 % too large, since other shapes mix in modes of almost one frequency above
-    10 kHz. 12 x 12 elements are within 5 % for z there, beside 24 x 24. Where `larger` is an
-    FEModel the certificate states which share of a variance is from modes with fewer than 4 nodes
-    per wavelength (`unresolved`); more than half warns. Without any delay of u the static
+    10 kHz. 12 x 12 elements are within 5 % for z there, beside 24 x 24. The certificate states
+    which share of a variance is from modes left out with fewer than 4 nodes of their mesh per
+    wavelength (`unresolved`); more than half warns. Without any delay of u the static
     compliance is left out: it would close an algebraic loop from y to u to y.
 
     Parameters
