@@ -128,7 +128,7 @@ def design_kalman(
     certificate = design.certificate.replace(
         difference=max(design.certificate.difference, honest.difference),
         left_out=int(found.modes.size),
-        unresolved=unresolved_share(whole, found.modes, system, honest.values),
+        unresolved=unresolved_share(plant, whole, found.modes, system, honest.values),
     )
     return KalmanEstimator(
         system, plant, design.gain, design.covariance, certificate, honest.values, found

@@ -14,7 +14,7 @@ from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import FloatArray, IntArray
 from .error import error_variances
-from .estimator_channels import poi_channels
+from .estimator_channels import poi_channels, read_alike
 
 #: nodes per wavelength below which a mode is badly resolved: frequencies are off by some 5 %
 NODES = 4.0
@@ -111,7 +111,11 @@ def _triangulated(xyz: FloatArray) -> IntArray:
 
 
 def unresolved_share(
-    plant: StandardPlant, modes: IntArray, observer: StateSpace, variances: FloatArray
+    plant: StandardPlant,
+    larger: StandardPlant,
+    modes: IntArray,
+    observer: StateSpace,
+    variances: FloatArray,
 ) -> float | None:
     """Return the largest share of POI variances from modes left out that the mesh resolves badly.
 
@@ -120,6 +124,8 @@ def unresolved_share(
     Parameters
     ----------
     plant : StandardPlant
+        Of the filter: what reads its sensors reads the larger one's.
+    larger : StandardPlant
         With the modes left out; None is returned where it has no mesh.
     modes : array of int
         Numbers of the modes left out, from 1.
@@ -133,9 +139,9 @@ def unresolved_share(
     FlexplantWarning
         When it is more than half.
     """
-    if not plant.is_assembled:
+    if not larger.is_assembled:
         return None
-    model, outputs = plant.model, plant.assembled.realisation.outputs
+    model, outputs = larger.model, larger.assembled.realisation.outputs
     if not isinstance(model, FEModel | Modes | ReducedModel):
         return None
     if isinstance(model, ReducedModel):
@@ -146,10 +152,10 @@ def unresolved_share(
     coarse = modes[nodes[modes - 1] < NODES] - 1
     if not coarse.size:
         return 0.0
-    factor = np.array(plant.noise_factor)
-    factor[plant.modal_states.reshape(-1, 2)[coarse].reshape(-1)] = 0.0
-    still = plant.replace(origin=plant.assembled.replace(noise_factor=factor))
-    rest = error_variances(still, observer).values
+    factor = np.array(larger.noise_factor)
+    factor[larger.modal_states.reshape(-1, 2)[coarse].reshape(-1)] = 0.0
+    still = larger.replace(origin=larger.assembled.replace(noise_factor=factor))
+    rest = error_variances(read_alike(plant, still), observer).values
     shares = 1.0 - rest / np.where(variances > 0, variances, 1.0)
     share = float(np.max(shares))
     if share > WARNED:
