@@ -270,9 +270,9 @@ def test_a_damper_to_ground_on_a_free_plate_is_refused(plate):
 
 def test_mechanisms_are_refused():
     # a hinge in the middle: two bars, three motions without energy, two of them rigid-body ones
-    dofs = DofSet([1, 2, 3, 4], ["z"] * 4, [[x, 0, 0] for x in range(4)])
-    bend = np.array([[1.0, -2, 1, 0]])
-    model = FEModel(np.eye(4), 1e6 * bend.T @ bend, dofs=dofs)
+    dofs = DofSet([1, 2, 3, 4, 5], ["z"] * 5, [[x, 0, 0] for x in range(5)])
+    bend = np.array([[1.0, -2, 1, 0, 0], [0, 0, 1, -2, 1]])
+    model = FEModel(np.eye(5), 1e6 * bend.T @ bend, dofs=dofs)
     assert model.rigid_body.shape[1] == 2
     with pytest.raises(ModelError, match="no stiffness"):
         solve_modes(model)

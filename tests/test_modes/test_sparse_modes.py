@@ -6,6 +6,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 import meshes
+from flexplant import DofSet
 from flexplant.errors import ModelError
 from flexplant.modes import shifted
 from flexplant.modes import sparse_modes as counted
@@ -69,7 +70,7 @@ def test_one_starting_vector_is_enough(structure, monkeypatch):
     """In exact arithmetic it sees one member of each pair: rounding or the count brings others."""
     model, expected = structure
     lanczos = counted.BlockLanczos
-    monkeypatch.setattr(counted, "BlockLanczos", lambda *a, **k: lanczos(*a, **k, block=1))
+    monkeypatch.setattr(counted, "BlockLanczos", lambda *a, **k: lanczos(*a, **(k | {"block": 1})))
     squares, phi, _ = counted_modes(model, 12)
     assert_modes_of(model, squares, phi, expected)
 
@@ -181,3 +182,44 @@ def test_a_search_in_single_precision(structure, monkeypatch, soft):
     assert_modes_of(model, squares, phi, expected)
     assert certificate["counted"] == certificate["found"]
     assert used == ([True] if r == 6 else [True, False])
+
+
+def copies_of(mesh, copies, apart=2.0):
+    """Equal structures beside each other, which nothing joins."""
+    one = meshes.dofs_of(mesh)
+    M, K = (sp.block_diag([part] * copies, format="csc") for part in mesh[:2])
+    nodes = np.concatenate([one.nodes + 10**6 * i for i in range(copies)])
+    xyz = np.vstack([one.xyz + [apart * i, 0, 0] for i in range(copies)])
+    return FEModel(M, K, dofs=DofSet(nodes, one.directions * copies, xyz))
+
+
+@pytest.mark.parametrize("copies, count", [(13, 30), (40, 4), (40, 30), (25, 61)])
+def test_any_multiplicity_is_found(copies, count):
+    """More copies of a mode than a block has vectors, or than are wanted."""
+    mesh = meshes.solid(2, 2, 2)
+    grounded = (mesh[0], sp.csc_array(mesh[1] + 1e9 * mesh[0]), *mesh[2:])
+    one = la.eigh(grounded[1].toarray(), grounded[0].toarray(), eigvals_only=True)
+    model = copies_of(grounded, copies)
+    squares, phi, certificate = counted_modes(model, count)
+    assert squares.size == count
+    assert_modes_of(model, squares, phi, np.repeat(one, copies))
+    assert certificate["counted"] == certificate["found"]
+
+
+def test_bodies_that_nothing_joins_keep_their_motions():
+    """Free solids, more than fifty, and free masses: each has its own rigid-body motions."""
+    mesh = meshes.solid(1, 1, 1)
+    many = copies_of(mesh, 60)
+    M, K = (sp.block_diag([A, extra], format="csc") for A, extra in (
+        (many.M, sp.eye_array(4)), (many.K, sp.diags_array([0.0, 0.0, 0.0, 1e9]))
+    ))  # fmt: skip
+    dofs = DofSet(
+        [*many.dofs.nodes, -1, -1, -1, -2],
+        [*many.dofs.directions, "x", "y", "z", "x"],
+        np.vstack([many.dofs.xyz, [[3.0, 4.0, 5.0]] * 4]),
+    )
+    model = FEModel(M, K, dofs=dofs)
+    assert model.rigid_body.shape[1] == 6 * 60 + 3
+    elastic = la.eigh(mesh[1].toarray(), mesh[0].toarray(), eigvals_only=True)[6]
+    squares, _, _ = counted_modes(model, 2)
+    np.testing.assert_allclose(squares, [1e9, elastic], rtol=1e-8)

@@ -21,8 +21,8 @@ FOUND = 1e-8
 VALUE = 1e-6
 #: what a bar calls the blocks that extend the basis
 STEPS = "modes, steps of Lanczos"
-#: steps between two restarts
-_STEPS = 12
+#: steps between two restarts, with a large block
+_STEPS, _FEW_STEPS = 12, 6
 _RESTARTS = 60
 #: a block with directions this much shorter than others is orthonormalised again
 _LOST = 1e-3
@@ -36,6 +36,8 @@ _SURE = 1e-12
 _ROUNDING = 1e-14
 #: residuals of this part of the largest value are rounding: no step reduces them
 REACHED = 1e-15
+#: values this close (relative) are of one repeated mode
+SAME = 1e-8
 #: entries of a vector worked on at a time
 _PIECE = 8192
 
@@ -92,8 +94,11 @@ class BlockLanczos:
         self._over = np.zeros((self._next.shape[1], 0))
 
     def _reserve(self, want: int) -> None:
-        # after a restart want + block vectors are kept; more than as many or _STEPS blocks follow
-        room = 2 * self._block + max(_STEPS * self._block, 5 * want // 4 + self._block)
+        # after a restart want + block vectors are kept; more than as many or _STEPS blocks follow,
+        # of a large block fewer
+        room = 2 * self._block + max(
+            _STEPS * BLOCK, _FEW_STEPS * self._block, 5 * want // 4 + self._block
+        )
         self._capacity = self._r + want + self._block + room
 
     def lowest(
@@ -109,7 +114,9 @@ class BlockLanczos:
         The last `extra` of them need not be shapes yet, only values. Of shapes (n, m) that are
         found to `tolerance` but no further, `needed` says which tolerance (m,) each must reach.
         Fewer than `count` are returned where the others are so much smaller than the largest that
-        its rounding hides them: with those returned locked, another search finds the rest.
+        its rounding hides them, or where a value has as many copies as the block has vectors, which
+        see no more of them: with those returned locked, another search, of a larger block, finds
+        the rest.
 
         Raises
         ------
@@ -118,8 +125,6 @@ class BlockLanczos:
         """
         n = self._V.shape[1]
         count = min(count, n - self._r)
-        required = np.full(count, tolerance)
-        required[count - extra :] = max(tolerance, VALUE)
         check_at = self.steps
         for _ in range(_RESTARTS * _STEPS):
             if self._m + self._r >= n or not self._next.shape[1]:
@@ -133,13 +138,22 @@ class BlockLanczos:
             sure = int(np.count_nonzero(theta * FOUND >= _ROUNDING * theta[0]))
             limited = sure < min(count, theta.size)
             wanted = sure if limited else count
+            # a shape is as good as those of the same value: they may be mixed
+            last = theta[min(count, theta.size) - extra - 1] if theta.size > extra else 0.0
+            shapes = int(np.count_nonzero(theta[:count] >= (1 - SAME) * last))
+            required = np.full(count, tolerance)
+            required[shapes:] = max(tolerance, VALUE)
             strict = np.minimum(required, tolerance) if limited else required
             left = _unfinished(theta[:wanted], error, strict)
             if theta.size >= wanted and not left and needed is not None:
-                shapes = wanted if limited else wanted - extra
+                shapes = wanted if limited else shapes
                 close = np.flatnonzero(error[:shapes] > _SURE * theta[:shapes])
                 strict[close] = np.minimum(tolerance, needed(self._shapes(mix[:, close])))
                 left, needed = _unfinished(theta[:wanted], error, strict), None
+            if left:
+                held = _converged(theta[:wanted], error, np.full(wanted, _SURE))
+                if _most_copies(theta[:held]) >= self._block:
+                    wanted, left = held, 0
             done = theta.size >= wanted and not left
             if done or full:
                 keep = min(count + self._block, theta.size)
@@ -263,8 +277,24 @@ class BlockLanczos:
 
 def _unfinished(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
     """Return how many Ritz pairs have not reached their tolerance."""
+    return int(np.count_nonzero(_late(theta, error, required)))
+
+
+def _converged(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
+    """Return how many Ritz pairs precede the first that has not reached its tolerance."""
+    late = _late(theta, error, required)
+    return int(np.argmax(late)) if np.any(late) else theta.size
+
+
+def _late(theta: FloatArray, error: FloatArray, required: FloatArray) -> np.ndarray:
     limit = np.maximum(required[: theta.size] * theta, REACHED * theta[0])
-    return int(np.count_nonzero(error[: theta.size] > limit))
+    return np.asarray(error[: theta.size] > limit)
+
+
+def _most_copies(theta: FloatArray) -> int:
+    """Return how many descending values the largest group of equal ones has."""
+    ends = np.flatnonzero(theta[:-1] - theta[1:] > SAME * theta[:-1])
+    return int(np.diff(np.concatenate([[-1], ends, [theta.size - 1]])).max(initial=0))
 
 
 def along_basis(basis: FloatArray, loaded: FloatArray) -> FloatArray:

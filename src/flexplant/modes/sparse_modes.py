@@ -17,7 +17,7 @@ from ..structure.model import FEModel
 from ..structure.negative_stiffness import are_rigid
 from ..values import FloatArray, Rng
 from .davidson import BlockDavidson
-from .lanczos import REACHED, BlockLanczos
+from .lanczos import BLOCK, REACHED, SAME, BlockLanczos
 from .shifted import (
     CountingFactor,
     StiffnessFactor,
@@ -30,7 +30,7 @@ from .shifted import (
 #: modes beyond the last wanted one among which a gap is searched
 _EXTRA = 4
 #: omega^2 closer than this (relative), or than so many of their roundings, belong together
-_GAP, _GAP_ROUNDINGS = 1e-8, 4.0
+_GAP, _GAP_ROUNDINGS = SAME, 4.0
 #: more modes than this are not looked for: their shapes and the basis fill the memory
 _MOST = 2000
 #: searches with what is found locked, before giving up
@@ -110,6 +110,7 @@ def _counted(
                 "frequency, or for the lowest ones with count=."
             )
     squares, phi = np.zeros(0), np.zeros((n, 0))
+    counted, sure, shift = 0, 0, 0.0
     missing = min(count + _EXTRA, n - r)
     for search in range(_SEARCHES):
         factor = factor or new(model, method)
@@ -135,11 +136,14 @@ def _counted(
             counted, sure, shift = count, count, top
         else:
             sure, shift = _gap(squares, count, rounding)
-            if not sure and squares.size < n - r:
-                missing = min(2 * _EXTRA, n - r - squares.size)
-                continue
-            if not sure:
+            if not sure and squares.size == n - r:
                 sure, shift = squares.size, 2 * float(squares[-1])
+            if not sure:
+                # more copies of one mode than were found: none of another may be below them
+                sure, shift = _gap_below(squares, count, rounding)
+                if not shift:
+                    missing = min(squares.size, n - r - squares.size)
+                    continue
             counted = modes_below(model, shift) - r
         if counted == sure:
             return squares[:count], phi[:, :count], _certificate(shift, counted + r, sure + r)
@@ -147,8 +151,13 @@ def _counted(
             break
         missing = min(counted - sure + _EXTRA, n - r - squares.size)
     raise SolverError(
-        f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count finds {counted + r} modes, "
-        f"{sure + r} were found: closely repeated frequencies. Request some more or fewer modes."
+        (
+            f"below {np.sqrt(shift) / (2 * np.pi):.6g} Hz a Sturm count finds {counted + r} modes, "
+            f"{sure + r} were found"
+            if shift
+            else f"above mode {count + r} no gap is found to count modes in"
+        )
+        + ": closely repeated frequencies. Request some more or fewer modes."
     )
 
 
@@ -180,12 +189,14 @@ def _search(
 
     Soft modes first: they are locked, and a new search finds those that their rounding hides.
     """
-    held = model.body_motions
+    held, block = model.body_motions, BLOCK
     start = None if locked.shape[1] >= held.shape[1] else held
     squares, found = _searched(model, factor, locked, want, rng, start)
     while 0 < found.shape[1] < want:
-        beside = np.hstack([locked, found])
-        more = _searched(model, factor, beside, want - found.shape[1], rng, None)
+        beside, missing = np.hstack([locked, found]), want - found.shape[1]
+        # of a repeated mode, a block sees no more copies than it has vectors
+        block = min(2 * block, max(block, missing))
+        more = _searched(model, factor, beside, missing, rng, None, block)
         if not more[0].size:
             break
         squares, found = _beside(model, found, *more)
@@ -199,6 +210,7 @@ def _searched(
     want: int,
     rng: Rng,
     start: FloatArray | None,
+    block: int = BLOCK,
 ) -> tuple[FloatArray, FloatArray]:
     """Return omega^2 and shapes, up to `want`, of one search."""
     extra = min(_EXTRA, want - 1)
@@ -212,7 +224,9 @@ def _searched(
         if _excess(stiffness, mass, squares[: want - extra], phi, 0.0) > 1:
             raise SolverError("modes found with a factor in single precision are not accurate.")
         return squares, phi
-    lanczos = BlockLanczos(factor.solve, model.M, locked, want=want, rng=rng, start=start)
+    lanczos = BlockLanczos(
+        factor.solve, model.M, locked, want=want, rng=rng, block=block, start=start
+    )
     deflated = np.asarray(mass @ locked)
     best, squares, found = np.inf, np.zeros(0), np.zeros((locked.shape[0], 0))
     for part in _PARTS:
@@ -287,3 +301,16 @@ def _gap(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, fl
         return 0, 0.0
     i = int(np.argmax(np.where(real, wide / above[1:], 0.0)))
     return count + i, 0.5 * float(above[i] + above[i + 1])
+
+
+def _gap_below(squares: FloatArray, count: int, rounding: FloatArray) -> tuple[int, float]:
+    """Return how many modes lie below all copies of the last wanted one, and the middle of the gap.
+
+    Copies are equal to 1e-8 or to some roundings, the first and the last too. A shift of 0: they
+    are no copies.
+    """
+    closest = np.maximum(_GAP * squares[-1], _GAP_ROUNDINGS * float(rounding[-1]))
+    first = int(np.searchsorted(squares, squares[-1] - closest))
+    before = max(float(squares[first - 1]), 0.0) if first else 0.0
+    apart = squares[first] - before > closest and first < count
+    return first, 0.5 * (before + float(squares[first])) if apart else 0.0

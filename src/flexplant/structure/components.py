@@ -12,8 +12,8 @@ from ..labels import DofSet
 from ..sparse.factor import by_rows, diagonal
 from ..values import IntArray
 
-#: more pieces than this are no structure of several bodies
-_MOST_BODIES = 50
+#: more motions of all bodies together than this are not listed: full columns would fill the memory
+_MOST_MOTIONS = 2000
 
 
 def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
@@ -39,15 +39,25 @@ def pieces(K: Any, M: Any, dofs: DofSet | None) -> IntArray:
 def bodies(K: Any, M: Any, dofs: DofSet) -> list[IntArray]:
     """Return the DOFs of each body: of the pieces that nothing joins, the largest first.
 
-    Loose DOFs without stiffness are no body of their own, they go with the first. More than 50
-    pieces are no structure of several bodies: all DOFs are then taken together.
+    A mass that no stiffness joins to anything is a body, a single DOF that only ground holds is
+    none. DOFs with neither mass nor stiffness go with the first. Where the bodies may have more
+    than 2000 motions, all DOFs are taken together.
     """
     piece = pieces(K, M, dofs)
-    stiff = np.unique(piece[np.abs(diagonal(K)) > 0])
-    if not 1 < stiff.size <= _MOST_BODIES:
+    stiffness = diagonal(K)
+    there = np.abs(stiffness) > 0
+    if M is not None:
+        there = there | (diagonal(M) > 0)
+    sizes = np.bincount(piece)
+    held = (sizes[piece] == 1) & (stiffness > 0)
+    own = np.bincount(piece, weights=there & ~held) > 0
+    if np.count_nonzero(own) < 1 or np.minimum(sizes[own], 6).sum() > _MOST_MOTIONS:
         return [np.arange(piece.size)]
-    loose = ~np.isin(piece, stiff)
-    return [np.flatnonzero((piece == number) | (loose & (number == stiff[0]))) for number in stiff]
+    kept = np.flatnonzero(~held)
+    owner = np.where(own[piece[kept]], piece[kept], np.argmax(own))
+    order = np.argsort(owner, kind="stable")
+    ends = np.cumsum(np.bincount(owner)[own[: int(owner.max()) + 1]])
+    return np.split(kept[order], ends[:-1])
 
 
 def _joined(label: IntArray, one: Any, other: Any) -> IntArray:

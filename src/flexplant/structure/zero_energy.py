@@ -125,7 +125,7 @@ def _of_bodies(
     almost: list[FloatArray] = []
     free: list[FloatArray] = []
     for rows in several:
-        whole = len(several) == 1
+        whole = rows.size == motions.shape[0]
         stiffness, mass = (A if whole or A is None else A[rows][:, rows] for A in (K, M))
         own = own_motions(mass, motions[rows])
         found = _free_motions(stiffness, abs(stiffness), own, _MARGIN * rounding)
