@@ -189,7 +189,7 @@ def copies_of(mesh, copies, apart=2.0):
     one = meshes.dofs_of(mesh)
     M, K = (sp.block_diag([part] * copies, format="csc") for part in mesh[:2])
     nodes = np.concatenate([one.nodes + 10**6 * i for i in range(copies)])
-    xyz = np.vstack([one.xyz + [apart * i, 0, 0] for i in range(copies)])
+    xyz = np.vstack([one.xyz + np.array([apart * i, 0, 0]) for i in range(copies)])
     return FEModel(M, K, dofs=DofSet(nodes, one.directions * copies, xyz))
 
 
