@@ -10,9 +10,9 @@ import scipy.linalg as la
 from ..errors import SolverError, counted
 from ..progress import tick
 from ..sparse.factor import by_rows
+from ..sparse.lanczos import STEPS, BlockLanczos, along_basis
 from ..sparse.rayleigh_ritz import SPREAD
 from ..values import FloatArray, IntArray, Matrix, Rng
-from .lanczos import STEPS, BlockLanczos, along_basis
 
 #: steps with M times the last block in place of residuals
 _FIRST = 10

@@ -13,6 +13,7 @@ from ..errors import ModelError, warn
 from ..labels import Place
 from ..progress import Progress
 from ..sparse.factor import DENSE_LIMIT, dense, diagonal
+from ..sparse.lanczos import STEPS
 from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import column_groups, rounding_of
 from ..structure import Damping, FEModel, Hysteretic, ModalDamping
@@ -22,7 +23,6 @@ from ..values import FloatArray, instance, positive, short
 from .attachment_vectors import attachment_vectors, labels_of, places, projected_zeta
 from .damped_modes import damped_modes, leaving_overdamped, wider
 from .damper_forces import is_rayleigh
-from .lanczos import STEPS
 from .mode_errors import checked, rigid_residual
 from .modes import Modes
 from .normal_form import PROPORTIONAL, check_drag, normal_form

@@ -10,6 +10,7 @@ import numpy as np
 from ..errors import ModelError, SolverError
 from ..parallel import one_thread
 from ..sparse.factor import by_rows
+from ..sparse.lanczos import BLOCK, REACHED, SAME, BlockLanczos, iterated
 from ..sparse.pardiso import Pardiso
 from ..sparse.rayleigh_ritz import Absolute, column_groups, rayleigh_ritz, rounding_of
 from ..structure.eigen import check_stiffness
@@ -17,7 +18,6 @@ from ..structure.model import FEModel
 from ..structure.negative_stiffness import are_rigid
 from ..values import FloatArray, Rng
 from .davidson import BlockDavidson
-from .lanczos import BLOCK, REACHED, SAME, BlockLanczos
 from .shifted import (
     CountingFactor,
     StiffnessFactor,
@@ -43,8 +43,6 @@ _ROUNDINGS = 10.0
 _PARTS = (1.0, 0.03)
 #: shapes that are judged at a time, while the memory is at its peak
 _JUDGED = 8
-#: shapes that are solved for at a time: each time, the whole factor is read
-_SOLVED = 32
 
 
 def counted_modes(
@@ -227,7 +225,6 @@ def _searched(
     lanczos = BlockLanczos(
         factor.solve, model.M, locked, want=want, rng=rng, block=block, start=start
     )
-    deflated = np.asarray(mass @ locked)
     best, squares, found = np.inf, np.zeros(0), np.zeros((locked.shape[0], 0))
     for part in _PARTS:
         steps = lanczos.steps
@@ -235,13 +232,7 @@ def _searched(
         _, phi = lanczos.lowest(want, extra=extra, needed=needed)
         if steps == lanczos.steps:
             break
-        # one inverse iteration: what is left in phi of high modes, most of its residual, is gone
-        for at in column_groups(phi.shape[1], _SOLVED):
-            force = mass @ phi[:, at]
-            force -= deflated @ (locked.T @ force)
-            moved = factor.solve(force)
-            moved -= locked @ (deflated.T @ moved)
-            phi[:, at] = moved
+        iterated(factor.solve, mass, locked, phi)
         values, phi = rayleigh_ritz(stiffness, mass, phi)
         kept = values[: values.size - extra] if values.size == want else values
         # what the rounding of the largest 1 / (omega^2 - sigma) lets be reached

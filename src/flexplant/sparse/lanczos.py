@@ -9,9 +9,9 @@ import scipy.linalg as la
 
 from ..errors import SolverError, counted
 from ..progress import tick
-from ..sparse.factor import by_rows, without_zeros
-from ..sparse.rayleigh_ritz import mixed
 from ..values import FloatArray, Matrix, Rng
+from .factor import by_rows, without_zeros
+from .rayleigh_ritz import column_groups, mixed
 
 #: vectors that are solved for at a time
 BLOCK = 12
@@ -38,6 +38,8 @@ _ROUNDING = 1e-14
 REACHED = 1e-15
 #: values this close (relative) are of one repeated mode
 SAME = 1e-8
+#: shapes that are solved for at a time: each time, the whole factor is read
+_SOLVED = 32
 #: entries of a vector worked on at a time
 _PIECE = 8192
 
@@ -273,6 +275,22 @@ class BlockLanczos:
                 break
             loaded = self._M @ W
         return W, loaded, (along, over)
+
+
+def iterated(
+    solve: Callable[[FloatArray], FloatArray], M: Matrix, locked: FloatArray, phi: FloatArray
+) -> None:
+    """Move shapes on by one inverse iteration beside the locked ones, in place.
+
+    What is left in them of high modes, most of their residual, is gone then.
+    """
+    deflated = np.asarray(M @ locked)
+    for at in column_groups(phi.shape[1], _SOLVED):
+        force = np.asarray(M @ phi[:, at])
+        force -= deflated @ (locked.T @ force)
+        moved = solve(force)
+        moved -= locked @ (deflated.T @ moved)
+        phi[:, at] = moved
 
 
 def _unfinished(theta: FloatArray, error: FloatArray, required: FloatArray) -> int:
