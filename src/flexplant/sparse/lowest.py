@@ -15,8 +15,11 @@ from ..errors import SolverError
 from ..values import FloatArray, IntArray
 from .factor import DENSE_LIMIT, dense, diagonal, negative_pivots, symmetric_lu
 from .inertia import multifrontal_inertia
+from .lanczos import VALUE, BlockLanczos, iterated
 from .multifrontal import MultifrontalCholesky
 from .ordering import Dissection, dissect
+from .orthonormal import beyond
+from .rayleigh_ritz import rayleigh_ritz
 
 #: up to this many DOFs dense LAPACK finds every eigenvalue
 _DENSE = 300
@@ -24,6 +27,8 @@ _DENSE = 300
 _FIRST_SHIFT = 1e-8
 #: eigenvalues that rounding of this many units in the last place could make are zero
 ROUNDING = 30 * 2.0**-52
+#: relative error of an entry in double precision
+PRECISION = float(np.finfo(np.float64).eps)
 #: more zero eigenvalues than this are not listed one by one
 _MOST = 64
 
@@ -35,7 +40,7 @@ class Lowest:
     Attributes
     ----------
     values : (k,) array [1/s^2]
-        Ascending in size, the zero ones first.
+        Ascending in size, the zero ones first, those of the known motions before all.
     shapes : (n, k) array
         M-orthonormal.
     spread : (k,) array [1/s^2]
@@ -45,8 +50,8 @@ class Lowest:
     below : int or None
         Eigenvalues below the first that is not zero, counted by a factorisation (Sylvester); None
         when it was not possible. Less `n_zero` it is the number of negative ones, or missed ones.
-    worst : (float, (n,) array) or None
-        The lowest eigenvalue and its shape, where there are negative ones.
+    negative : ((q,), (n, q) arrays) or None
+        The negative eigenvalues and their shapes, where they were found.
     """
 
     values: FloatArray
@@ -54,7 +59,7 @@ class Lowest:
     spread: FloatArray
     n_zero: int
     below: int | None
-    worst: tuple[float, FloatArray] | None = None
+    negative: tuple[FloatArray, FloatArray] | None = None
 
 
 def lowest_modes(
@@ -62,6 +67,7 @@ def lowest_modes(
     M: Any,
     count: int,
     *,
+    known: FloatArray | None = None,
     rounding: float = 0.0,
     nodes: IntArray | None = None,
     xyz: FloatArray | None = None,
@@ -77,6 +83,9 @@ def lowest_modes(
         Symmetric; M positive semi-definite and nonzero.
     count : int
         How many at least.
+    known : (n, r) array, optional
+        M-orthonormal motions without energy. What is softest beside them is judged by the rounding
+        of its own energy, as the modes of a structure are; without them, by that of their sum too.
     rounding : float
         Relative error of the entries of K: of a text file, say.
     nodes, xyz : (n,), (n, 3) arrays, optional
@@ -88,21 +97,23 @@ def lowest_modes(
         When no shift makes K + s M regular, or the iteration does not converge.
     """
     K, M = sp.csc_array(K), sp.csc_array(M)
+    first = np.zeros((K.shape[0], 0)) if known is None else known
     stiff, heavy = np.abs(diagonal(K)), diagonal(M)
     ratios = stiff[heavy > 0] / heavy[heavy > 0]
     typical = float(np.median(ratios[ratios > 0])) if np.any(ratios > 0) else 1.0
     shift, number, size = _FIRST_SHIFT * typical, count, cast(Any, abs(K))
     floor = max(rounding, ROUNDING)
-    limit = min(int(np.count_nonzero(heavy > 0)), _MOST)
+    of_known = np.einsum("ij,ij->j", np.abs(first), np.asarray(size @ np.abs(first)))
     # one elimination order serves all shifts
     large = K.shape[0] > DENSE_LIMIT
     order = dissect(sp.csc_array(K + shift * M), nodes, xyz) if large else None
+    limit = min(int(np.count_nonzero(heavy > 0)) - first.shape[1], _MOST)
     for _ in range(6):
         number = min(number, limit)
-        shapes = _inverse_iteration(K, M, shift, number, order)
-        values = np.einsum("ij,ij->j", shapes, np.asarray(K @ shapes))
+        values, shapes = _inverse_iteration(K, M, shift, number, order, first)
         spread = np.einsum("ij,ij->j", np.abs(shapes), np.asarray(size @ np.abs(shapes)))
-        zero = np.abs(values) <= floor * spread
+        alone = floor if known is None else max(rounding, PRECISION)
+        zero = np.abs(values) <= alone * spread
         rank = np.lexsort((np.abs(values), ~zero))
         values, shapes, spread = values[rank], shapes[:, rank], spread[rank]
         n_zero = int(np.count_nonzero(zero))
@@ -112,20 +123,24 @@ def lowest_modes(
         elastic = np.abs(values[n_zero:])
         # close to the elastic modes, these separate well; as near to zero as rounding allows
         if elastic.size and shift > 1e3 * elastic[0]:
-            shift = max(float(elastic[0]), 10 * floor * float(spread[:n_zero].max(initial=0.0)))
+            most = float(np.concatenate([spread[:n_zero], of_known]).max(initial=0.0))
+            shift = max(float(elastic[0]), 10 * floor * most)
             continue
         break
+    values = np.concatenate([np.zeros(of_known.size), values])
+    shapes, spread = np.hstack([first, shapes]), np.concatenate([of_known, spread])
+    n_zero += of_known.size
     below = _count_below(K, M, values, n_zero, order)
-    worst = None
+    negative = None
     if below is not None and below > n_zero:
-        worst = _most_negative(K, M, shift, order)
-    return Lowest(values, shapes, spread, n_zero, below, worst)
+        negative = _most_negative(K, M, shift, below - n_zero, order)
+    return Lowest(values, shapes, spread, n_zero, below, negative)
 
 
 def _most_negative(
-    K: Any, M: Any, shift: float, order: Dissection | None
-) -> tuple[float, FloatArray] | None:
-    """Return the lowest eigenvalue and its shape: by a shift at which K + s M is definite."""
+    K: Any, M: Any, shift: float, count: int, order: Dissection | None
+) -> tuple[FloatArray, FloatArray] | None:
+    """Return the lowest eigenvalues and shapes: by a shift at which K + s M is definite."""
     for _ in range(30):
         try:
             if order is not None:
@@ -135,16 +150,18 @@ def _most_negative(
         except (SolverError, la.LinAlgError):
             shift *= 10.0
             continue
-        shape = _inverse_iteration(K, M, shift, 1, order)[:, 0]
-        return float(shape @ (K @ shape)), shape
+        none = np.zeros((K.shape[0], 0))
+        return _inverse_iteration(K, M, shift, min(count, _MOST), order, none)
     return None
 
 
 def _inverse_iteration(
-    K: Any, M: Any, shift: float, count: int, order: Dissection | None
-) -> FloatArray:
-    """Return the shapes (n, count) with the largest 1 / |lambda + shift|, M-orthonormal."""
-    n = K.shape[0]
+    K: Any, M: Any, shift: float, count: int, order: Dissection | None, known: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Return `count` eigenvalues of smallest lambda + shift, M-orthonormal shapes, beside known."""
+    n, r = known.shape
+    if count <= 0:
+        return np.zeros(0), np.zeros((n, 0))
     if n <= _DENSE or count > n // 3:
         stiff, heavy = dense(K + shift * M), dense(M)
         try:
@@ -159,23 +176,38 @@ def _inverse_iteration(
                     "Look at the DOFs without mass or stiffness first."
                 ) from error
             mu = 1 / np.where(found == 0, np.finfo(float).tiny, found)
-        best = np.argsort(-np.abs(mu))[:count]
-        shapes = shapes[:, best]
-    else:
-        lu = _factor(K + shift * M, order)
-        inverse: Any = spla.LinearOperator((n, n), matvec=lu.solve, dtype=np.float64)
-        # the same start every time: the same answer every time
-        start = lu.solve(M @ np.random.default_rng(0).standard_normal(n))
-        basis = min(n, 2 * count + 20)
-        try:
-            _, shapes = spla.eigsh(K, count, M, -shift, v0=start, ncv=basis, OPinv=inverse)
-        except (spla.ArpackError, spla.ArpackNoConvergence) as error:
-            raise SolverError(
-                f"the lowest eigenvalues of K and M did not converge ({error}). Look at the scales "
-                "of K and M: penalties and wrong units spread them."
-            ) from error
-    length = np.sqrt(np.abs(np.einsum("ij,ij->j", shapes, np.asarray(M @ shapes))))
-    return np.asarray(shapes / np.where(length > 0, length, 1.0), dtype=np.float64)
+        best = np.argsort(-np.abs(mu))[: count + r]
+        return rayleigh_ritz(K, M, beyond(M, known, shapes[:, best]))
+    factor = _factor(K + shift * M, order)
+    if not isinstance(factor, MultifrontalCholesky):
+        return rayleigh_ritz(K, M, beyond(M, known, _both_ways(K, M, shift, count + r, factor)))
+    values, shapes = np.zeros(0), np.zeros((n, 0))
+    while shapes.shape[1] < count:
+        # what rounding of the largest hides is found beside it
+        locked, want = np.hstack([known, shapes]), count - shapes.shape[1]
+        more = BlockLanczos(factor.solve, M, locked, want=want).lowest(want, VALUE)[1]
+        if not more.shape[1]:
+            break
+        iterated(factor.solve, M, locked, more)
+        values, shapes = rayleigh_ritz(K, M, np.hstack([shapes, more]))
+    return values, shapes
+
+
+def _both_ways(K: Any, M: Any, shift: float, count: int, factor: Any) -> FloatArray:
+    """Return shapes (n, count) with the largest |1 / (lambda + shift)|, K + shift M indefinite."""
+    n = K.shape[0]
+    inverse: Any = spla.LinearOperator((n, n), matvec=factor.solve, dtype=np.float64)
+    # the same start every time: the same answer every time
+    start = factor.solve(M @ np.random.default_rng(0).standard_normal(n))
+    basis = min(n, 2 * count + 20)
+    try:
+        found = spla.eigsh(K, count, M, -shift, v0=start, ncv=basis, OPinv=inverse)
+    except (spla.ArpackError, spla.ArpackNoConvergence) as error:
+        raise SolverError(
+            f"the lowest eigenvalues of K and M did not converge ({error}). Look at the scales "
+            "of K and M: penalties and wrong units spread them."
+        ) from error
+    return np.asarray(found[1], dtype=np.float64)
 
 
 def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], FloatArray]:

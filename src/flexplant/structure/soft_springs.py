@@ -7,11 +7,10 @@ from typing import Any
 import numpy as np
 import scipy.linalg as la
 
+from ..sparse.lowest import PRECISION
 from ..sparse.rayleigh_ritz import Absolute
 from ..values import FloatArray, Matrix
 
-#: relative error of an entry in double precision
-PRECISION = float(np.finfo(np.float64).eps)
 #: times the usual rounding of a row: a force larger than this is of a spring
 _OUTLIER = 30.0
 #: part of all DOFs: forces at fewer are of springs, not of rounding

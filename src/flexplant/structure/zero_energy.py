@@ -11,16 +11,14 @@ import scipy.linalg as la
 from ..errors import ModelError
 from ..labels import DIRECTIONS, DofSet
 from ..sparse.factor import by_rows, dense
-from ..sparse.lowest import ROUNDING
+from ..sparse.lowest import PRECISION, ROUNDING
 from ..values import FloatArray, IntArray
 from .components import bodies
 from .rigid import orthonormalised, rigid_motions
-from .soft_springs import PRECISION, unheld
+from .soft_springs import unheld
 
 #: times the energy that rounding of the entries allows: free
 _MARGIN = 3.0
-#: a zero-energy motion within this cosine of the rigid-body motions is one of them
-_RIGID = 0.99
 #: a motion is in the space of others when less than this part of it is left over
 _LEFT = 1e-6
 #: a singular value below this part of the largest is none
@@ -50,11 +48,8 @@ class ZeroEnergy:
         Pieces that nothing joins, each with motions of its own.
     rigid : (n, n_rigid) array
         A basis of them.
-    n_suspended : int
-        Motions given as of zero energy that soft springs hold: the rounding of K exceeds their
-        energy, but not the forces of the springs.
-    mechanisms : (n, m) array
-        Zero-energy motions beyond all these.
+    every : (n, m) array
+        Orthonormal motions of all bodies, free or held.
     length_factor : float or None
         By which the coordinates would have to be multiplied to fit K, when another unit explains
         why rotations cost energy.
@@ -66,22 +61,20 @@ class ZeroEnergy:
     n_rigid: int
     n_bodies: int
     rigid: FloatArray
-    n_suspended: int
-    mechanisms: FloatArray
+    every: FloatArray
     length_factor: float | None
 
 
 def zero_energy(
     K: Any,
     dofs: DofSet,
-    zero_modes: FloatArray,
     *,
     located: bool,
     rounding: float,
     M: Any = None,
     joint_motions: FloatArray | None = None,
 ) -> ZeroEnergy:
-    """Return the rigid-body motions of the geometry and the mechanisms among `zero_modes` (n, q).
+    """Return the rigid-body motions that the geometry allows, and which of them cost no energy.
 
     Free are those whose energy is below three times the relative `rounding` of the entries of K,
     unless soft springs hold them: judged by `unheld`, as the rigid-body motions of a model are.
@@ -95,12 +88,10 @@ def zero_energy(
     names = DIRECTIONS[: motions.shape[1]]
     present = np.any(motions != 0, axis=0)
     several = bodies(K, M, dofs)
-    every = motions if joint_motions is None else np.hstack([motions, joint_motions])
-    almost, basis = _of_bodies(K, M, every, several, rounding)
+    possible = motions if joint_motions is None else np.hstack([motions, joint_motions])
+    every, basis = _of_bodies(K, M, possible, several, rounding)
     left = motions - basis @ (basis.T @ motions)
     free = present & (np.linalg.norm(left, axis=0) < _RANK * np.linalg.norm(motions, axis=0))
-    suspended = _shared(zero_modes, almost) - _shared(zero_modes, basis)
-    extra = zero_modes.shape[1] - basis.shape[1] - suspended
     return ZeroEnergy(
         free=tuple(name for name, is_free in zip(names, free, strict=True) if is_free),
         grounded=tuple(
@@ -112,8 +103,7 @@ def zero_energy(
         n_rigid=basis.shape[1],
         n_bodies=len(several),
         rigid=basis,
-        n_suspended=suspended,
-        mechanisms=beyond(zero_modes, almost, extra),
+        every=every,
         length_factor=_length_factor(K, dofs, motions, free),
     )
 
@@ -121,8 +111,8 @@ def zero_energy(
 def _of_bodies(
     K: Any, M: Any, motions: FloatArray, several: list[IntArray], rounding: float
 ) -> tuple[FloatArray, FloatArray]:
-    """Return orthonormal motions of all bodies: without energy, and held by no spring either."""
-    almost: list[FloatArray] = []
+    """Return orthonormal motions of all bodies: all of them, and those that nothing holds."""
+    every: list[FloatArray] = []
     free: list[FloatArray] = []
     for rows in several:
         whole = rows.size == motions.shape[0]
@@ -130,10 +120,10 @@ def _of_bodies(
         own = own_motions(mass, motions[rows])
         found = _free_motions(stiffness, abs(stiffness), own, _MARGIN * rounding)
         mix = unheld(by_rows(stiffness), found, rounding * PRECISION / ROUNDING)
-        for part, kept in ((almost, _independent(found)), (free, _independent(found @ mix))):
+        for part, kept in ((every, _independent(own)), (free, _independent(found @ mix))):
             part.append(np.zeros((motions.shape[0], kept.shape[1])))
             part[-1][rows] = kept
-    return np.hstack(almost), np.hstack(free)
+    return np.hstack(every), np.hstack(free)
 
 
 def own_motions(M: Any, motions: FloatArray) -> FloatArray:
@@ -147,14 +137,6 @@ def own_motions(M: Any, motions: FloatArray) -> FloatArray:
         if found.shape == independent.shape:
             return found
     return independent
-
-
-def _shared(zero_modes: FloatArray, basis: FloatArray) -> int:
-    """Return how many directions of an orthonormal basis lie in the space of some modes."""
-    if not zero_modes.shape[1] or not basis.shape[1]:
-        return 0
-    space = la.qr(zero_modes, mode="economic")[0]
-    return int(np.count_nonzero(la.svdvals(space.T @ basis) > _RIGID))
 
 
 def _free_motions(K: Any, size: Any, motions: FloatArray, allowed: float) -> FloatArray:
@@ -191,8 +173,7 @@ def _independent(motions: FloatArray) -> FloatArray:
 def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
     """Return the rigid-body motions of the geometry that cost no more energy than rounding."""
     rounding = ROUNDING if digits is None else max(ROUNDING, 10.0**-digits)
-    none = np.zeros((len(dofs), 0))
-    return zero_energy(K, dofs, none, located=True, rounding=rounding, M=M).rigid
+    return zero_energy(K, dofs, located=True, rounding=rounding, M=M).rigid
 
 
 def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:

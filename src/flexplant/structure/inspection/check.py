@@ -144,7 +144,7 @@ def check(model: FEModel | FEMatrices) -> ModelCheck:
             "Pass FEMatrices(K, M, dofs=...), which takes matrices of any quality."
         )
     with Progress(0, "check"):
-        found = facts(matrices_, given.joint_motions if isinstance(model, FEModel) else None)
+        found = facts(matrices_, model if isinstance(model, FEModel) else None)
     parts = (matrices, zero_rows, rigid, _pieces, masses, scales, _digits)
     # of swapped matrices all else would be nonsense
     lines = [line for part in parts[: 1 if found.swapped else None] for line in part(found)]

@@ -15,14 +15,16 @@ from ...values import FloatArray, IntArray
 from ..components import pieces
 from ..condense import empty_rows
 from ..matrices import FEMatrices
+from ..model import FEModel
+from ..negative_stiffness import are_rigid, unstable_stiffness
 from ..precision import loss, shown_digits
-from ..rigid import RigidMass, rigid_mass, rigid_motions
+from ..rigid import RigidMass, orthonormalised, rigid_mass, rigid_motions
 from ..singular_mass import left_out, null_motions
 from ..soft_springs import PRECISION, unheld
-from ..zero_energy import ZeroEnergy, own_motions, zero_energy
+from ..zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
 
-#: requested from the solver: six rigid-body motions and some elastic modes
-_MODES = 10
+#: requested from the solver: six rigid-body motions and some elastic modes, a few beside more
+_MODES, _FEW = 10, 4
 #: DOFs without stiffness that are counted as motions without energy, at most
 _LOOSE = 64
 #: part of its largest possible energy that a rigid translation has at most in K, least in M
@@ -40,6 +42,7 @@ class Facts:
     massless: IntArray
     stiffless: IntArray
     empty: IntArray
+    n_unstable: int
     mass_definite: bool | None
     negative_mass: IntArray
     without_inertia: IntArray
@@ -84,52 +87,59 @@ class Facts:
         return float(np.sqrt(elastic[0]) / (2 * np.pi)) if elastic.size else float("nan")
 
 
-def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
+def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
     """Return the facts on some matrices, all that can be known of them.
 
     Parameters
     ----------
     given : FEMatrices
         The matrices.
-    joint_motions : (n, m) array, optional
-        Of a joined machine: what its joints allow.
+    model : FEModel, optional
+        Whose matrices they are: symmetric, and M and D definite.
     """
+    proven = model is not None
     skew = {
-        name: _skew(matrix)
+        name: (0.0, 0, 0) if proven else _skew(matrix)
         for name, matrix in (("K", given.K), ("M", given.M), ("D", given.D))
         if matrix is not None
     }
-    K, M, D = (_halved(matrix) for matrix in (given.K, given.M, given.D))
+    K, M, D = (
+        sp.csc_array(matrix) if proven and matrix is not None else _halved(matrix)
+        for matrix in (given.K, given.M, given.D)
+    )
     n = given.n_dof
     no_stiffness = empty_rows(K)
     no_mass = np.zeros(n, dtype=bool) if M is None else empty_rows(M)
     absent = no_stiffness & (no_mass if M is not None else True)
     there = np.flatnonzero(~absent)
-    mass_definite, negative, weak = _mass_state(given, M, no_mass)
+    none = np.zeros(0, dtype=np.int64)
+    mass_definite, negative, weak = (True, none, none) if proven else _mass_state(given, M, no_mass)
     digits = given.digits
     if digits is None and given.dofs is not None:
         digits = shown_digits(K, given.dofs)
     swapped = _are_swapped(given)
     loose = np.flatnonzero(no_stiffness & ~absent)
-    lowest, scaled, failure, rounding = None, False, "K and M are swapped", 0.0
+    lowest, scaled, failure = None, False, "K and M are swapped"
+    motions, mechanisms, unstable = None, np.zeros((n, 0)), 0
     if not swapped:
-        rounding = _rounding(K, M, given, digits)
-        lowest, scaled, failure = _lowest(given, K, M, there, loose, bool(mass_definite), rounding)
-    motions, mechanisms = None, np.zeros((n, 0))
-    if lowest is not None:
-        zero = lowest.shapes[:, : lowest.n_zero]
         if given.dofs is not None:
             motions = zero_energy(
                 K,
                 given.dofs,
-                zero,
                 located=given.located,
-                rounding=max(ROUNDING, rounding),
+                rounding=max(ROUNDING, _rounding(K, M, given, digits)),
                 M=M,
-                joint_motions=joint_motions,
+                joint_motions=None if model is None else model.joint_motions,
             )
-            mechanisms = motions.mechanisms
-            lowest = _held(lowest, motions.n_suspended)
+        written = 0.0 if digits is None else 10.0**-digits
+        lowest, scaled, failure = _lowest(
+            given, K, M, there, loose, bool(mass_definite), written, motions
+        )
+    if lowest is not None and motions is not None:
+        if scaled:
+            lowest, unstable = _of_springs(K, M, lowest, motions)
+        zero = lowest.shapes[:, : lowest.n_zero]
+        mechanisms = beyond(zero, motions.rigid)
     nothing = RigidMass(np.full(3, np.nan), np.full(3, np.nan), np.full((3, 3), np.nan))
     body = nothing if M is None or given.dofs is None else rigid_mass(M, given.dofs)
     if not given.located:
@@ -138,7 +148,8 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
         given=given,
         skew=skew,
         massless=np.flatnonzero(no_mass & ~absent),
-        stiffless=np.flatnonzero(no_stiffness & ~absent),
+        stiffless=loose,
+        n_unstable=unstable,
         empty=np.flatnonzero(absent),
         mass_definite=mass_definite,
         negative_mass=negative,
@@ -153,7 +164,7 @@ def facts(given: FEMatrices, joint_motions: FloatArray | None = None) -> Facts:
         loss=None if lowest is None or digits is None else loss(lowest, digits),
         digits=digits,
         swapped=swapped,
-        damping={} if D is None else _damping(D, motions),
+        damping={} if D is None else _damping(D, motions, proven),
     )
 
 
@@ -228,10 +239,31 @@ def _rounding(K: Any, M: Any, given: FEMatrices, digits: int | None) -> float:
     return max(written, 10 * float(np.max(work / most, initial=0.0)))
 
 
-def _held(lowest: Lowest, suspended: int) -> Lowest:
-    """Return the lowest modes, some of zero energy of which are held by soft springs."""
-    below = None if lowest.below is None else lowest.below - suspended
-    return replace(lowest, n_zero=lowest.n_zero - suspended, below=below)
+def _of_springs(K: Any, M: Any, lowest: Lowest, motions: ZeroEnergy) -> tuple[Lowest, int]:
+    """Return the lowest modes, those of springs not among the zero ones, and how many are unstable.
+
+    As the modes of a structure are judged: a rigid-body motion that is not free has springs, which
+    rounding does not hide; negative ones, of magnets, may only move the structure as a rigid body.
+    """
+    every = orthonormalised(M, motions.every, dependent="drop")
+    n_zero, values = lowest.n_zero, lowest.values
+    held = np.zeros(values.size, dtype=bool)
+    at = slice(motions.n_rigid, n_zero)
+    held[at] = are_rigid(M, every, lowest.shapes[:, at]) & (values[at] > 0)
+    order = np.argsort(np.where(np.arange(values.size) < n_zero, held, 1), kind="stable")
+    count = int(np.count_nonzero(held))
+    springs = replace(
+        lowest,
+        values=values[order],
+        shapes=lowest.shapes[:, order],
+        spread=lowest.spread[order],
+        n_zero=n_zero - count,
+        below=None if lowest.below is None else lowest.below - count,
+    )
+    if springs.negative is None:
+        return springs, 0
+    pulled = unstable_stiffness(K, every).size
+    return springs, pulled if np.all(are_rigid(M, every, springs.negative[1])) else 0
 
 
 def _lowest(
@@ -242,6 +274,7 @@ def _lowest(
     loose: IntArray,
     mass_definite: bool,
     rounding: float,
+    motions: ZeroEnergy | None,
 ) -> tuple[Lowest | None, bool, str]:
     """Return the lowest modes, whether M made them, and why there are none.
 
@@ -256,12 +289,19 @@ def _lowest(
     weight = sp.diags_array(np.where(stiff > 0, stiff, float(stiff.max()) or 1.0))
     scaled = M is not None and mass_definite
     inner: Any = M if scaled else weight
-    kept_K, kept_M = K[there][:, there], sp.csc_array(inner)[there][:, there]
+    whole = there.size == K.shape[0]
+    kept_K, kept_M = K, sp.csc_array(inner)
+    if not whole:
+        kept_K, kept_M = (A[there][:, there] for A in (kept_K, kept_M))
     try:
+        known = None
+        if motions is not None:
+            known = orthonormalised(kept_M, motions.rigid[there], dependent="drop")
         found = lowest_modes(
             kept_K,
             kept_M,
-            min(_MODES, there.size),
+            min(_MODES if known is None else max(_MODES - known.shape[1], _FEW), there.size),
+            known=known,
             rounding=rounding,
             nodes=None if given.dofs is None else given.dofs.nodes[there],
             xyz=given.dofs.xyz[there] if given.dofs is not None and given.located else None,
@@ -272,26 +312,26 @@ def _lowest(
     shapes = np.zeros((K.shape[0], few.size + found.shapes.shape[1]))
     shapes[few, np.arange(few.size)] = 1.0
     shapes[there, few.size :] = found.shapes
-    worst = None
-    if found.worst is not None:
-        shape = np.zeros(K.shape[0])
-        shape[there] = found.worst[1]
-        worst = found.worst[0], shape
+    negative = None
+    if found.negative is not None:
+        moved = np.zeros((K.shape[0], found.negative[0].size))
+        moved[there] = found.negative[1]
+        negative = found.negative[0], moved
     none = np.zeros(few.size)
-    whole = Lowest(
+    every = Lowest(
         np.concatenate([none, found.values]),
         shapes,
         np.concatenate([none, found.spread]),
         found.n_zero + few.size,
         None if found.below is None else found.below + few.size,
-        worst,
+        negative,
     )
-    return whole, scaled, ""
+    return every, scaled, ""
 
 
-def _damping(D: Any, motions: ZeroEnergy | None) -> dict[str, Any]:
+def _damping(D: Any, motions: ZeroEnergy | None, proven: bool) -> dict[str, Any]:
     kept = np.flatnonzero(~empty_rows(D))
-    definite = not kept.size or is_positive_definite(D[kept][:, kept], 1e-9)
+    definite = proven or not kept.size or is_positive_definite(D[kept][:, kept], 1e-9)
     drag = 0.0
     if motions is not None and motions.n_rigid and kept.size:
         size: Any = abs(D)

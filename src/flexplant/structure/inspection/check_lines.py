@@ -92,13 +92,20 @@ def _stiffness_line(found: Facts) -> Line:
             "mend what the other lines name first",
         )
     if found.n_negative:
-        worst = found.lowest.worst
+        negative = found.lowest.negative
         text = f"K has {counted(found.n_negative, 'negative eigenvalue')}"
-        if worst is not None:
-            lowest = f", the lowest {worst[0]:.3g} 1/s^2" if found.scaled_by_mass else ""
+        if negative is not None:
+            lowest = f", the lowest {negative[0][0]:.3g} 1/s^2" if found.scaled_by_mass else ""
             # displacements and rotations compare by the forces that they take
             size = np.sqrt(np.abs(diagonal(found.given.K)))
-            text += f"{lowest}, moving {listed(spread(found, size * worst[1]), most=3)}"
+            text += f"{lowest}, moving {listed(spread(found, size * negative[1][:, 0]), most=3)}"
+        if found.n_unstable == found.n_negative:
+            return (
+                "note",
+                "definiteness of K",
+                f"{text}: springs of negative stiffness, rigid-body motions are unstable",
+                "magnets? Else look for a sign; modes of negative frequency follow",
+            )
         return (
             "fail",
             "definiteness of K",
@@ -159,8 +166,10 @@ def zero_rows(found: Facts) -> Iterator[Line]:
             "offset masses without rotary inertia? FEMatrices.model(massless='condense')",
         )
     if found.stiffless.size:
+        # a mass by itself is a rigid body: only what is none fails
+        whole = found.motions is not None and not found.mechanisms.size
         yield (
-            "fail",
+            "note" if whole and not found.massless.size else "fail",
             "without stiffness",
             f"{listed(found.names(found.stiffless))}: free to drift away",
             "join them to the structure, or drop them",
@@ -184,7 +193,7 @@ def rigid(found: Facts) -> Iterator[Line]:
         return
     motions = found.motions
     text = _freedom(found, motions)
-    extra = motions.mechanisms.shape[1]
+    extra = found.mechanisms.shape[1]
     expected = f"{motions.n_rigid} by the geometry, {found.n_zero} found in K"
     odd = motions.length_factor
     if odd is not None:
@@ -214,7 +223,7 @@ def rigid(found: Facts) -> Iterator[Line]:
     if not extra:
         yield ("ok", "mechanisms", "none", "")
     elif odd is None:
-        moved = listed(spread(found, motions.mechanisms[:, 0]), most=4)
+        moved = listed(spread(found, found.mechanisms[:, 0]), most=4)
         yield (
             "fail",
             "mechanisms",
