@@ -261,3 +261,57 @@ def test_a_large_plate_takes_seconds():
     assert report.ok
     assert report.rigid == ("z", "rx", "ry")
     np.testing.assert_allclose(report.mass[2], 0.36 * 0.0272 * 2702, rtol=1e-12)
+
+
+def halves(soft, n=60):
+    """A free chain, in the middle of which one spring is softer."""
+    springs = np.full(n - 1, 1e9)
+    springs[n // 2] *= soft
+    return fx.chain(masses=np.ones(n), stiffnesses=springs)
+
+
+def magnets(n, pull, bends=False):
+    """A chain held at one end (not at all), with a spring of negative stiffness at the other."""
+    K = sp.lil_array(fx.chain(masses=np.ones(n), stiffnesses=np.full(n - 1, 1e9)).K)
+    K[n - 1, n - 1] -= pull
+    if bends:
+        K[0, 0] += 1e9
+    dofs = fx.DofSet(np.arange(1, n + 1), ["x"] * n, np.arange(3 * n).reshape(n, 3) * [1.0, 0, 0])
+    return fx.FEMatrices(sp.csc_array(K), sp.eye_array(n, format="csc"), dofs=dofs)
+
+
+def beside_a_mass(directions):
+    """A free truss, and a mass that nothing joins to it."""
+    one, m = truss(), len(directions)
+    K, M = (sp.block_diag([A, b * sp.eye_array(m)]) for A, b in ((one.K, 0.0), (one.M, 2.0)))
+    dofs = fx.DofSet(
+        [*one.dofs.nodes, *[99] * m], [*one.dofs.directions, *directions],
+        np.vstack([one.dofs.xyz, np.full((m, 3), 7.0)]),
+    )  # fmt: skip
+    return fx.FEMatrices(K, M, dofs=dofs)
+
+
+@pytest.mark.parametrize(
+    "given, taken",
+    [
+        (halves(1e-13), True),  # above one rounding of K, below thirty
+        (halves(0.0), True),  # two bodies
+        (magnets(40, 10.0), True),
+        (magnets(1600, 1.0), True),
+        (magnets(40, 1e11, bends=True), False),
+        (magnets(1600, 1e11, bends=True), False),
+        (beside_a_mass("xyz"), True),
+        (beside_a_mass(["rx"]), True),
+    ],
+)
+def test_check_and_solve_modes_judge_alike(given, taken):
+    report = fx.check(given)
+    assert report.ok == taken
+    if not taken:
+        with pytest.raises(ModelError, match="unstable|negative"):
+            fx.solve_modes(given.model(), count=8)
+        return
+    model = given if isinstance(given, fx.FEModel) else given.model()
+    modes = fx.solve_modes(model, count=min(12, model.n_dof))
+    assert report.n_zero == report.n_rigid == modes.n_rigid
+    assert (report.n_zero, fx.check(model).ok) == (modes.n_rigid, True)
