@@ -10,10 +10,10 @@ from flexplant import DofSet
 from flexplant.errors import ModelError
 from flexplant.modes import shifted
 from flexplant.modes import sparse_modes as counted
-from flexplant.sparse.lanczos import BlockLanczos
 from flexplant.modes.shifted import modes_below, stiffness_factor
 from flexplant.modes.sparse_modes import counted_modes
 from flexplant.sparse import ordering
+from flexplant.sparse.lanczos import BlockLanczos
 from flexplant.structure import FEModel
 
 

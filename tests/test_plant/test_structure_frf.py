@@ -7,7 +7,7 @@ import scipy.sparse as sp
 import flexplant as fx
 import oracles_reduction as oracle
 from flexplant.errors import FlexplantWarning, ModelError
-from flexplant.modes import dynamic_basis
+from flexplant.modes import direct_check, dynamic_basis
 from flexplant.modes import solve as solving
 from flexplant.plant import RigidForce
 from flexplant.sparse.factor import dynamic_lu
@@ -166,6 +166,41 @@ def test_modes_in_use_are_not_solved_again(plate, monkeypatch):
     monkeypatch.undo()
     del modes
     assert "30 modes" not in fx.frequency_response(model, PLAIN, FREQ).route
+
+
+@pytest.mark.parametrize(
+    "law",
+    [fx.ModalDamping(0.01), fx.Hysteretic(0.02), fx.Rayleigh(2.0, 1e-6), None],
+    ids=["modal", "hysteretic", "rayleigh", "dampers"],
+)
+@pytest.mark.parametrize("lost", [0, 2])
+def test_a_large_model_is_checked_without_another_factor(law, lost, monkeypatch):
+    """The error found is that of direct solutions, also where modes are missing in the band."""
+    model = make_plate(elements=(23, 23))
+    if law is None:
+        model = model.with_parts([fx.Damper("1:z", 30.0), fx.Damper("30:z", 5.0, to="9:z")])
+    modes = fx.solve_modes(model, below=2000.0, damping=fx.ModalDamping(0.0))
+    kept = np.delete(np.arange(modes.n_modes), [6, 8][:lost])
+    modes = modes.replace(
+        omega=modes.omega[kept], zeta=modes.zeta[kept], phi=modes.phi[:, kept],
+        residual=modes.residual[kept], rounding=modes.rounding[kept],
+    )  # fmt: skip
+    loads = np.array([model.row(at) for at in FORCED]).T
+    rows = np.array([model.row(at) for at in SEEN])
+    factor = direct_check.held_factor(model)
+    basis = dynamic_basis.DynamicBasis(model, modes, np.hstack([loads, rows.T]), law)
+    at, wanted = np.array([40.0, 320.0, 700.0, 1100.0]), []
+    made = dynamic_basis.ComplexSymmetricFactor
+    monkeypatch.setattr(dynamic_basis, "ComplexSymmetricFactor", lambda *a: wanted.append(made(*a)))
+    corrected = basis.corrected(at, loads, factor)
+    assert not wanted
+    monkeypatch.undo()
+    direct = np.array([rows @ basis.solved(f, loads) for f in at])
+    gap = np.abs(basis.response(at, rows, loads) - direct)
+    assert corrected is not None
+    left = np.abs(corrected.response(at, rows, loads) - direct)
+    assert left.max() < 0.1 * gap.max()
+    assert (gap.max() > 1e-3 * np.abs(direct).max()) == bool(lost)
 
 
 @pytest.mark.slow

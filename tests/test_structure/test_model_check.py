@@ -308,7 +308,7 @@ def test_check_and_solve_modes_judge_alike(given, taken):
     report = fx.check(given)
     assert report.ok == taken
     if not taken:
-        with pytest.raises(ModelError, match="unstable|negative"):
+        with pytest.raises(ModelError, match=r"unstable|negative"):
             fx.solve_modes(given.model(), count=8)
         return
     model = given if isinstance(given, fx.FEModel) else given.model()

@@ -19,7 +19,7 @@ from ..values import ComplexArray, FloatArray
 from .attachment_vectors import static_response
 from .damper_forces import damper_forces
 from .modes import Modes
-from .shifted import dissection_of, stiffness_factor
+from .shifted import StiffnessFactor, dissection_of, held_factor
 
 #: loads above which the second static response of each is left out
 _MANY = 30
@@ -31,6 +31,12 @@ _UNDAMPED = 1e-9
 _CHUNK, _ENTRIES = 256, 4_000_000
 #: relative change of a direct solution by its last refinement, wanted and at most
 _SETTLED, _UNSETTLED = 1e-9, 1e-6
+#: corrections of a basis before giving up: each leaves a seventh, or less, where all modes up to
+#: 1.5 times the frequency are in it
+_CORRECTIONS = 5
+#: part of what was left of the loads, as the root of energy, that is left then: what responses of
+#: a Galerkin basis are in error by is its square; or of the loads, where that is rounding
+_LEFT, _NOTHING = 0.2, 1e-9
 
 
 @dataclass(frozen=True)
@@ -129,7 +135,10 @@ class DynamicBasis:
         ModelError
             When a frequency is one of an undamped motion.
         """
-        left, right = rows @ self.V, self.V.T @ loads
+        return self._answered(freq, rows @ self.V, self.V.T @ loads)
+
+    def _answered(self, freq: FloatArray, left: FloatArray, right: FloatArray) -> ComplexArray:
+        """Return responses (n_freq, p, q), in coordinates: of rows (p, k) to forces (k, q)."""
         found = np.zeros((freq.size, left.shape[0], right.shape[1]), dtype=np.complex128)
         chunk = _CHUNK
         if self._coupled:
@@ -158,6 +167,52 @@ class DynamicBasis:
         """Return the static response (p, q), that of elastic motions; exact for the own loads."""
         elastic = self.V[:, self.n_rigid :]
         return np.asarray(((rows @ elastic) / self.squares[self.n_rigid :]) @ (elastic.T @ loads))
+
+    def corrected(
+        self, freq: FloatArray, loads: FloatArray, factor: StiffnessFactor
+    ) -> DynamicBasis | None:
+        """Return the basis with what all of the matrices add at some frequencies.
+
+        The motions that a factor of the stiffness finds for what the basis leaves of the loads join
+        it, until next to nothing of that is left in terms of energy; None where it does not settle,
+        since modes are missing or wrong: then only a direct solution says more.
+        """
+        n, count = self.n_modes, freq.size
+        inner, basis, first = self._inertia[:, :n], self, np.zeros(0)
+        forces = self.V[:, self.n_rigid :].T @ loads
+        energy = np.sum(forces**2 / np.abs(self.squares[self.n_rigid :, None]), axis=0)
+        for _ in range(_CORRECTIONS):
+            left = basis._left(freq, loads)
+            parts = np.hstack([left.real, left.imag])
+            moved = factor.solve(parts)
+            moved -= basis.V[:, :n] @ (inner.T @ moved)
+            stored = np.abs(np.sum(parts * moved, axis=0)).reshape(2, -1).sum(axis=0)
+            first = first if first.size else stored
+            if np.all(stored <= np.maximum(_LEFT**2 * first, _NOTHING**2 * np.tile(energy, count))):
+                return basis
+            basis = basis.enriched(moved)
+        return None
+
+    def _left(self, freq: FloatArray, loads: FloatArray) -> ComplexArray:
+        """Return what of the loads (n, f q) the motions of the basis do not take, by M, D and K."""
+        at = self._answered(freq, np.eye(self.V.shape[1]), self.V.T @ loads)
+        motion = self.V @ np.hstack(list(at))
+        omega = np.repeat(2 * np.pi * freq, loads.shape[1])
+        law = self.losses
+
+        def pushed(matrix: Any) -> ComplexArray:
+            return np.asarray(matrix @ motion.real + 1j * (matrix @ motion.imag))
+
+        force = pushed(self.model.K) * (1 + 1j * (law.eta + omega * law.b))
+        force -= pushed(self.model.M) * (omega**2 - 1j * omega * law.a)
+        if law.D is not None:
+            force += 1j * omega * pushed(law.D)
+        if law.H is not None:
+            force += 1j * pushed(law.H)
+        chosen = np.flatnonzero(law.own)
+        U = self._inertia[:, chosen]
+        force += 1j * omega * (U @ (law.own[chosen, None] * (U.T @ motion)))
+        return np.asarray(np.tile(loads, freq.size) - force)
 
     def solved(self, freq: float, loads: FloatArray) -> ComplexArray:
         """Return the motion (n, q) of all DOFs under loads, from the matrices alone.
@@ -258,8 +313,7 @@ def static_shapes(
     """
     if not loads.shape[1]:
         return loads
-    sparse = sp.issparse(model.K) and sp.issparse(model.M) and model.n_dof > DENSE_LIMIT
-    factor = stiffness_factor(model) if sparse else None
+    factor = held_factor(model)
 
     def static(forces: FloatArray) -> FloatArray:
         if model.n_unstable:

@@ -9,7 +9,7 @@ import numpy as np
 import scipy.sparse as sp
 
 from ..errors import ModelError, SolverError, counted
-from ..sparse.factor import same_pattern
+from ..sparse.factor import DENSE_LIMIT, same_pattern
 from ..sparse.inertia import SignedFactor, multifrontal_inertia, signed_factor
 from ..sparse.multifrontal import MultifrontalCholesky
 from ..sparse.ordering import Dissection, dissect
@@ -189,6 +189,12 @@ def stiffness_factor(model: FEModel, method: Pardiso | None = None) -> Stiffness
         factor = StiffnessFactor(model, method)
         _held[model] = weakref.ref(factor)
     return factor
+
+
+def held_factor(model: FEModel) -> StiffnessFactor | None:
+    """Return the factor of a large sparse model, in use as long as it is held; else None."""
+    large = model.n_dof > DENSE_LIMIT and sp.issparse(model.K) and sp.issparse(model.M)
+    return stiffness_factor(model) if large else None
 
 
 def search_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:

@@ -19,6 +19,7 @@ from ..lti.statespace import StateSpace, System
 from ..modes import Modes
 from ..modes.direct_check import checked_response
 from ..modes.dynamic_basis import DynamicBasis
+from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..progress import Progress
 from ..reduction import ReducedModel
@@ -204,10 +205,12 @@ def frequency_response(
     rows, loads = through.rows, through.loads
     with Progress(0, "frequency response"):
         modes = modes_reaching(model, float(grid.max(initial=0.0)))
+        factor = held_factor(model)  # one for the static shapes and the check
         basis = DynamicBasis(model, modes, np.hstack([loads, rows.T]), damping)
         basis, data, check = checked_response(
             basis, grid, rows, loads, checks=most, tolerance=limit, seen=through.seen
         )
+        del factor
     if check.freq.size and not check.holds(limit):
         warn(
             f"the responses of {model!r:.60} are not good to {limit:g}: {check}. Give more modes, "

@@ -11,6 +11,7 @@ from ..labels import Place
 from ..lti.grid import climbed
 from ..modes.attachment_vectors import labels_of, places
 from ..modes.modes import Modes
+from ..modes.shifted import held_factor
 from ..modes.solve import modes_reaching
 from ..structure import FEModel
 from ..values import ComplexArray, FloatArray, positive, real_array, whole
@@ -53,6 +54,8 @@ def quality_of(
     Br, Cr = reduced.T.T @ B, C @ reduced.T
     undamped = full.D is None if isinstance(full, FEModel) else not np.any(full.basis_zeta)
     factor = _loss(reduced, own, loss) if undamped else None
+    # one factor for the static shapes and the check, while it is held here
+    held = held_factor(full) if isinstance(full, FEModel) else None
     responses = FullResponses(full, modes, B, C, factor)
 
     def less(at: FloatArray) -> ComplexArray:
@@ -65,6 +68,7 @@ def quality_of(
     if not grid.size or grid[0] < 0:
         raise ModelError("freq needs at least one frequency [Hz], none below 0.")
     responses.checked(grid)
+    del held
     if freq is None and B.shape[1] and C.shape[0]:
         size = np.abs(responses.at(grid)).max(axis=0)
         size[size == 0] = 1.0
