@@ -9,8 +9,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import FlexplantWarning, LabelError, ModelError, ShapeError
-from flexplant.lti import StateSpace, frequency_response, tustin
-from flexplant.lti.discretisation import bilinear, discretized, pair_expm, pair_exponential
+from flexplant.lti import StateSpace, append, frequency_response, lowpass, series, tustin
+from flexplant.lti.discretisation import (
+    bilinear,
+    discretized,
+    held_exactly,
+    pair_expm,
+    pair_exponential,
+)
 from oracles_plant import delayed_run, hold
 
 RATE = 200.0
@@ -249,3 +255,38 @@ def test_the_bilinear_maps_do_not_depend_on_the_units_of_the_states():
         tustin(G.replace(A=np.array([[4000.0, 1e12], [0.0, -w[1]]])), 2000.0)
     with pytest.raises(ModelError, match="z = -1"):
         bilinear(sampled.replace(A=np.array([[-1.0, 1e12], [0.0, 0.5]])), 2000.0)
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.4, 1.0, 2.3])
+@pytest.mark.parametrize(("count", "push"), [(1, 1.0), (15, 1e-3), (15, 1e3), (15, 1e6), (45, 1.0)])
+def test_a_series_of_filters_and_modes_keeps_its_blocks(count, push, delay):
+    """Series either way, with frequencies far above the rate: expm rounds below the blocks."""
+    rng = np.random.default_rng(count + 1)
+    omega, zeta = 10.0 ** rng.uniform(0, 6, count), 10.0 ** rng.uniform(-3, -1, count)
+    A = np.zeros((2 * count, 2 * count))
+    for i, (w, z) in enumerate(zip(omega, zeta, strict=True)):
+        A[2 * i : 2 * i + 2, 2 * i : 2 * i + 2] = [[0, w], [-w, -2 * z * w]]
+    B, C = np.zeros((2 * count, 3)), np.zeros((3, 2 * count))
+    B[1::2], C[:, ::2] = push * rng.normal(size=(count, 3)), rng.normal(size=(3, count)) / omega
+    u, y = ["u1", "u2", "u3"], ["y1", "y2", "y3"]
+    modes = StateSpace(A, B, C, np.zeros((3, 3)), inputs=u, outputs=y, blocks=[2] * count)
+
+    def filters(inputs, outputs):
+        parts = []
+        for name, to, order in zip(inputs, outputs, (1, 2, 2), strict=True):
+            lag = lowpass(10.0 ** rng.uniform(0, 3.5), order=order)
+            parts.append(lag.renamed({lag.inputs[0]: name}, {lag.outputs[0]: to}))
+        return append(*parts)
+
+    before, after = filters(["c1", "c2", "c3"], u), filters(y, ["m1", "m2", "m3"])
+    for g in (series(before, modes), series(modes, after), series(series(before, modes), after)):
+        for rate in (3e2, 3e3, 3e4):
+            sampled = held_exactly(g, rate, delay=delay)
+            assert sampled.blocks[: len(g.blocks)] == g.blocks
+            # of a triangular matrix: those of the blocks, whatever stands above them
+            assert np.allclose(
+                np.sort(np.abs(sampled.poles()))[-g.n_states :],
+                np.sort(np.exp(g.poles().real / rate)),
+                rtol=1e-9,
+                atol=1e-9,
+            )

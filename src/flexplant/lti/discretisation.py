@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 import scipy.linalg as la
 
 from ..arguments import between
@@ -149,11 +150,22 @@ def propagated(g: StateSpace, h: float) -> Propagated:
     if pairs is None:
         augmented = np.zeros((n + g.B.shape[1],) * 2)
         augmented[:n, :n], augmented[:n, n:] = g.A * h, g.B * h
-        exponential = la.expm(augmented)
+        # rounding of expm would leave entries below the blocks of a series of systems
+        exponential = np.where(acting(augmented != 0), la.expm(augmented), 0.0)
         return Propagated(exponential[:n, :n], exponential[:n, n:])
     E, integral = pair_exponential(pairs, h)
     driven = np.einsum("bij,bjm->bim", integral, g.B.reshape(-1, 2, g.B.shape[1]))
     return Propagated(block_diagonal(E), driven.reshape(g.B.shape))
+
+
+def acting(direct: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    """Return which states (n, n) act on which in the end: where an exponential may be non-zero."""
+    reached = direct | np.eye(direct.shape[0], dtype=bool)
+    while True:
+        wider = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0
+        if np.array_equal(wider, reached):
+            return reached
+        reached = wider
 
 
 def diagonal_pairs(g: StateSpace) -> FloatArray | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import scipy.linalg as la
 
-from ..lti.discretisation import block_diagonal, pair_expm
+from ..lti.discretisation import acting, block_diagonal, pair_expm
 from ..lti.noise import accumulated_noise
 from ..values import FloatArray
 
@@ -64,7 +64,7 @@ class Flow:
         self.whole = size[:, None] * A / size
         self.rate = float(np.linalg.norm(self.whole, 1)) if n else 0.0
         if self.coupled:
-            self.reached = _closure(A != 0)
+            self.reached = acting(A != 0)
 
     def at(self, time: float) -> FloatArray:
         """Return ``e^(A time)`` (n, n)."""
@@ -90,16 +90,6 @@ class Flow:
     def noise(self, force: FloatArray, time: float) -> FloatArray:
         """Return G (n, r) with ``G G' = int_0^time e^(A s) force force' e^(A' s) ds``."""
         return accumulated_noise(self.at, force, time, self.rate)
-
-
-def _closure(direct: np.ndarray) -> np.ndarray:
-    """Return which states (n, n) act on which in the end: where an exponential may be non-zero."""
-    reached = direct | np.eye(direct.shape[0], dtype=bool)
-    while True:
-        wider = (reached.astype(np.float32) @ reached.astype(np.float32)) > 0
-        if np.array_equal(wider, reached):
-            return reached
-        reached = wider
 
 
 class HeldFlow:
