@@ -5,16 +5,42 @@ import signal
 import subprocess
 import sys
 import time
+from collections import Counter
 from concurrent.futures import ProcessPoolExecutor
+from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import flexplant.parallel
+from conftest import machine
 from flexplant.errors import ModelError, SolverError
+from flexplant.estimation import FixedLag
+from flexplant.lti import lowpass
+from flexplant.modes import Modes
 from flexplant.parallel import mapped
-from flexplant.placement import BranchAndBound, Exchange, Exhaustive, PoiVariance, place_sensors
+from flexplant.placement import (
+    BranchAndBound,
+    ClosedLoopH2,
+    Exchange,
+    Exhaustive,
+    PoiLqr,
+    PoiVariance,
+    pareto_curve,
+    place_actuators,
+    place_both,
+    place_sensors,
+    score_actuators,
+    score_sensors,
+    sensor_map,
+)
+from flexplant.placement.candidates import with_side
+from flexplant.placement.criterion import OnPlant
+from flexplant.placement.layouts import layouts_of
+from flexplant.plant import BaseAcceleration, building
+from placement_plate import plate_modes
 
 METHODS = (Exchange(starts=4), Exhaustive(), BranchAndBound(starts=2))
 
@@ -162,3 +188,86 @@ class Fragile:
             self.mark.touch()
             os._exit(1)
         return PoiVariance("die")(plant)
+
+
+def _shaken(count, shape=None, seed=12):
+    """Return a plant on a shaken floor, with candidates of both kinds."""
+    plant, sensors, actuators = machine(seed, count=count)
+    ports = plant.assembled.ports
+    floor = BaseAcceleration("floor", "z", asd=1e-4, shape=shape)
+    return plant.with_ports(ports.replace(w=[*ports.w, floor])), sensors, actuators
+
+
+def _spread(plant):
+    """A criterion of a user's own: it looks at the plant."""
+    return float(np.linalg.norm(plant.system.C @ plant.system.B))
+
+
+USES = {
+    "place_sensors": lambda p, y, u, how: place_sensors(p, y, 4, how("y"), method=Exchange(1)),
+    "place_actuators": lambda p, y, u, how: place_actuators(p, u, 3, how("u"), method=Exchange(1)),
+    "place_both": lambda p, y, u, how: place_both(p, y, u, (4, 3), how("yu"), method=Exchange(1)),
+    "score_sensors": lambda p, y, u, how: score_sensors(p, list(combinations(y, 4)), how("y")),
+    "score_actuators": lambda p, y, u, how: score_actuators(p, list(combinations(u, 3)), how("u")),
+    "sensor_map": lambda p, y, u, how: sensor_map(p, [s.at for s in y], how("y"), asd=1e-10),
+    "pareto_curve": lambda p, y, u, how: pareto_curve(p, y, [4, 5], how("y"), method=Exchange(1)),
+}
+WAYS = {
+    "usual": lambda side: None,
+    "own": lambda side: _spread,
+    "larger": lambda side: PoiVariance(larger=plate_modes(12)) if side == "y" else None,
+}
+
+
+@pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
+@pytest.mark.parametrize(
+    ("use", "way"),
+    [*((use, way) for use in USES for way in ("usual", "own")), ("sensor_map", "larger")],
+)
+def test_plants_are_assembled_once_not_per_choice(monkeypatch, use, way, shape):
+    """However many candidates there are, and what depends on the model alone is found once."""
+    calls = Counter()
+
+    def counted(owner, name):
+        plain = getattr(owner, name)
+
+        def wrapper(*given, **options):
+            calls[name] += 1
+            return plain(*given, **options)
+
+        monkeypatch.setattr(owner, name, wrapper)
+
+    seen = []
+    plants = [_shaken(count, shape) for count in (5, 7)]
+    counted(building, "continuous_plant")
+    counted(Modes, "inertia")
+    for plant, sensors, actuators in plants:
+        calls.clear()
+        USES[use](plant, sensors, actuators, WAYS[way])
+        seen.append(dict(calls))
+    assert seen[0] == seen[1]
+    each = 2 if use == "pareto_curve" else 1
+    # all candidates, the larger model and the confirmation of the answer by another route
+    assert seen[0].get("continuous_plant", 0) <= 4 * each
+    # of the floor, and of the rigid body: its mass about two points, its motions
+    assert seen[0].get("inertia", 0) <= 2 * 4 * each  # those of the larger model too
+
+
+@pytest.mark.parametrize("shape", [None, lowpass(60.0)], ids=["white", "shaped"])
+@pytest.mark.parametrize("delay", [1.0, 1.5])
+def test_on_a_shaken_floor_fast_scores_are_those_of_the_criteria(shape, delay):
+    plant, sensors, actuators = _shaken(6, shape)
+    plant = plant.continuous.discretized(4e3, delay=delay)
+    for side, criterion, ports, size in (
+        ("y", PoiVariance("die"), sensors, 4),
+        ("y", PoiVariance("die", lag=FixedLag(3)), sensors, 4),
+        ("u", PoiLqr("die", effort=1e-6), actuators, 3),
+        ("y", ClosedLoopH2("die", effort=1e-6), sensors, 4),
+        ("u", ClosedLoopH2("die", effort=1e-6), actuators, 3),
+    ):
+        layouts = layouts_of(plant, side, ports, criterion)
+        part = isinstance(criterion, ClosedLoopH2) and delay == 1.5
+        assert isinstance(layouts.scorer, OnPlant) == part
+        for chosen in ([0, 1, 2, 3][:size], [1, 3, 4, 5][:size]):
+            direct = criterion(with_side(plant, side, [ports[i] for i in chosen]))
+            assert layouts.score([chosen])[0] == pytest.approx(direct, rel=1e-7, abs=0)

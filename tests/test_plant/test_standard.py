@@ -6,8 +6,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from flexplant.errors import FlexplantError, LabelError, ModelError
-from flexplant.lti import StateSpace, frequency_response
-from flexplant.plant import Poi, Reference, Sensor, StandardPlant, assemble_plant
+from flexplant.lti import StateSpace, frequency_response, highpass, lowpass
+from flexplant.plant import (
+    Actuator,
+    BaseAcceleration,
+    Poi,
+    Reference,
+    Sensor,
+    StandardPlant,
+    assemble_plant,
+    building,
+)
 from flexplant.store import load
 from stages import OFF_NODE, RATE, Z8, L, ports, reduced, sampled, some_modes
 
@@ -324,3 +333,68 @@ class TestWhereItCameFrom:
         plant = assemble_plant(some_modes(), ports())
         assert plant.check() is plant.check()
         assert plant.check().assumptions is plant.check().assumptions
+
+
+DYNAMIC = lowpass(2e3, order=2)
+
+
+@pytest.mark.parametrize("delay", [None, 0.0, 1.0, 1.5])
+@pytest.mark.parametrize("late", [0.0, 130e-6])
+@pytest.mark.parametrize("part", [DYNAMIC, None], ids=["filters", "bare"])
+def test_some_of_a_plants_ports_are_rows_and_columns_of_it(monkeypatch, part, late, delay):
+    """What is left out takes its filters and delay lines along; nothing is assembled again."""
+    usual = ports()
+    floor = BaseAcceleration("floor", "z", asd=1e-5, shape=highpass(1.0, order=2))
+    y = [
+        Sensor("y1", at=Z8, asd=1e-11, dynamics=part, latency=late),
+        Sensor("y2", at=(0.1, 0.1, 0.0), asd=1e-11, absolute=True),
+        Sensor("y3", at=(0.2, 0.1, 0.0), asd=1e-11, dynamics=part),
+        Sensor("y4", at=(0.3, 0.2, 0.0), quantity="velocity", asd=1e-9, latency=late),
+    ]
+    u = [
+        Actuator("u1", at=Z8, dynamics=part),
+        Actuator("u2", at=(0.1, 0.3, 0.0), latency=late),
+        Actuator("u3", at=(0.3, 0.3, 0.0), dynamics=part, latency=late),
+    ]
+    every = usual.replace(w=[*usual.w, floor], y=y, u=u)
+
+    def made(own):
+        plain = assemble_plant(some_modes(), own)
+        return plain if delay is None else plain.discretized(RATE, delay=delay)
+
+    choices = [every.replace(y=a, u=b) for a, b in ((y[:1], u), (y[1:], u[1:]), (y[::2], u[:1]))]
+    fresh = [made(choice) for choice in choices]
+    whole = made(every)
+    monkeypatch.setattr(building, "continuous_plant", None)
+    for choice, expected in zip(choices, fresh, strict=True):
+        found = whole.with_ports(choice)
+        assert [getattr(found, s) for s in "wuzy"] == [getattr(expected, s) for s in "wuzy"]
+        assert found.system.states == expected.system.states
+        assert found.system.blocks == expected.system.blocks
+        assert found.asd == expected.asd
+        assert found.delay == expected.delay
+        for name in "ABCD":
+            one, other = getattr(found.system, name), getattr(expected.system, name)
+            assert np.allclose(one, other, rtol=1e-9, atol=1e-12 * np.abs(other).max())
+        if delay is not None:
+            noise, other = found.process_noise, expected.process_noise
+            size = np.sqrt(np.diagonal(other))
+            assert np.all(np.abs(noise - other) <= 1e-9 * np.outer(size, size))
+            assert found.continuous.system.states == expected.continuous.system.states
+
+
+def test_other_ports_are_assembled(plant):
+    """Another order, another place, or noise of an actuator that the states hold mixed."""
+    own = ports()
+    moved = [own.y[0].replace(at=(0.2, 0.2, 0.0)), *own.y[1:]]
+    noisy = [own.u[0].replace(asd=1e-3), *own.u[1:]]
+    whole = plant.with_ports(own.replace(u=noisy))
+    for one, other in (
+        (plant, own.replace(y=own.y[::-1])),
+        (plant, own.replace(y=moved)),
+        (whole, own.replace(u=own.u[1:])),
+    ):
+        found = one.discretized(RATE, delay=1).with_ports(other)
+        expected = assemble_plant(some_modes(), other).discretized(RATE, delay=1)
+        assert np.array_equal(found.system.C, expected.system.C)
+        assert np.allclose(found.process_noise, expected.process_noise, rtol=1e-9, atol=0)

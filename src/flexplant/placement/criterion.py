@@ -5,6 +5,7 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -72,7 +73,7 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class OnPlant(Scorer):
-    """The scores of a function from plant to float: for each choice the plant is made anew."""
+    """The scores of a function from plant to float: choices are rows and columns of one plant."""
 
     plant: StandardPlant
     side: Side
@@ -82,9 +83,41 @@ class OnPlant(Scorer):
     def __repr__(self) -> str:
         return repr(self.function)
 
+    @cached_property
+    def whole(self) -> StandardPlant:
+        """The plant with all candidates."""
+        return with_side(self.plant, self.side, self.candidates)
+
+    @property
+    def rows_only(self) -> bool:
+        """Whether no noise but their own reaches the sensors at once."""
+        quiet = [name for name in self.whole.w if not name.endswith(":noise")]
+        g = self.whole.system
+        return not np.any(g.D[np.ix_(g.output_index(self.whole.y), g.input_index(quiet))])
+
     def value(self, chosen: Sequence[int]) -> Any:
         """Return what the function gives on the plant with this choice."""
-        return self.function(with_side(self.plant, self.side, [self.candidates[i] for i in chosen]))
+        return self.function(with_side(self.whole, self.side, [self.candidates[i] for i in chosen]))
+
+
+@dataclass(frozen=True, eq=False)
+class OnBoth(Scorer):
+    """The scores of a function of a plant and a larger one of the same choice."""
+
+    chosen: OnPlant
+    larger: StandardPlant
+    function: Callable[[StandardPlant, StandardPlant], float]
+
+    def __repr__(self) -> str:
+        return repr(self.chosen)
+
+    def value(self, chosen: Sequence[int]) -> float:
+        """Return what the function gives on both plants with this choice."""
+        own = self.chosen
+        ports = [own.candidates[i] for i in chosen]
+        return self.function(
+            *(with_side(plant, own.side, ports) for plant in (own.whole, self.larger))
+        )
 
 
 class Criterion(Value):

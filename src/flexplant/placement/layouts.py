@@ -132,12 +132,12 @@ def layouts_of(
         criterion = {"y": PoiVariance(), "u": PoiLqr(), "yu": ClosedLoopH2()}[side]
     criterion = as_criterion(criterion, side)
     candidates = tuple(candidates)
-    with_side(plant, side, candidates)  # names and places, all at once
-    rigid = RigidPart.of(plant, side, candidates)
     plainly = OnPlant(plant, side, candidates, criterion)
+    _ = plainly.whole  # names and places, all at once
+    rigid = RigidPart.of(plant, side, candidates)
     layouts = Layouts(plant, side, candidates, criterion, rigid, plainly)
     criterion.check(plant, candidates)
     # without a single feasible choice there is nothing that choices could share
     if layouts.missing(range(len(candidates))):
         return layouts
-    return replace(layouts, scorer=criterion.scorer(plant, candidates))
+    return replace(layouts, scorer=criterion.scorer(plainly.whole, candidates))

@@ -11,9 +11,9 @@ from ..errors import LabelError, ModelError, counted, require_known
 from ..estimation.estimator_channels import sensors
 from ..lti.discretisation import held_exactly
 from ..lti.statespace import StateSpace
-from ..plant import Actuator, Disturbance, StandardPlant
+from ..plant import Actuator, StandardPlant
 from ..values import FloatArray, positive, short
-from .candidates import PlantChannel
+from .candidates import with_side
 
 #: POIs, or axes of a POI, that count, each once or by a factor
 Named: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
@@ -124,29 +124,22 @@ def poi_rows(plant: StandardPlant, factors: Mapping[str, float]) -> FloatArray:
 def structure_part(
     plant: StandardPlant, factors: Mapping[str, float]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return A, the noise factor and the rows of the POI on the structure's own states."""
+    """Return A, the noise factor and the rows of the POI on all states but delay lines of u."""
     n = _own_states(plant)
     return plant.system.A[:n, :n], plant.noise_factor[:n], poi_rows(plant, factors)[:, :n]
 
 
 def _own_states(plant: StandardPlant) -> int:
-    """Return how many states are those of the structure: all of a plant made elsewhere."""
-    if plant.is_assembled:
-        return int(plant.assembled.realisation.outputs.shape[1])
-    return plant.system.n_states
+    """Return how many states are no delay lines: all of a plant made elsewhere."""
+    return (plant.continuous if plant.is_assembled else plant).system.n_states
 
 
 def measured_rows(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
-    """Return what sensors see of the structure's states, over the deviation of one sample."""
-    rows = []
-    for port in candidates:
-        if isinstance(port, PlantChannel):
-            i = plant.y.index(port.name)
-            rows.append(plant.C2[i] / np.sqrt(plant.sensor_noise[i, i]))
-        else:
-            row = port.see(plant.assembled.realisation).row
-            rows.append(row / np.sqrt(0.5 * port.asd**2 / plant.dt))
-    return np.array(rows, dtype=np.float64).reshape(-1, _own_states(plant))
+    """Return what sensors see of these states, over the deviation of one sample."""
+    whole = with_side(plant, "y", candidates)
+    rows = [whole.y.index(port.name) for port in candidates]
+    size = np.sqrt(np.diagonal(whole.sensor_noise)[rows])
+    return np.asarray(whole.C2[rows, : _own_states(plant)] / size[:, None])
 
 
 def sensor_rows(plant: StandardPlant) -> list[int]:
@@ -155,7 +148,7 @@ def sensor_rows(plant: StandardPlant) -> list[int]:
 
 
 def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArray:
-    """Return what a unit of each actuator, held over one sample, does to the structure's states."""
+    """Return what a unit of each actuator, held over one sample, does to these states."""
     if not plant.is_assembled:
         return np.asarray(plant.B2[:, [plant.u.index(port.name) for port in candidates]])
     silent = np.zeros((0, _own_states(plant)))
@@ -163,14 +156,16 @@ def pushed_columns(plant: StandardPlant, candidates: Sequence[Any]) -> FloatArra
 
 
 def pushed(plant: StandardPlant, candidates: Sequence[Any], rows: FloatArray) -> StateSpace:
-    """Return the structure between forces of actuators and some rows of its states, continuous."""
-    real = plant.assembled.realisation
-    B = np.array([real.force(port.push(real)) for port in candidates]).T
-    return StateSpace(real.A, B, rows, np.zeros((len(rows), B.shape[1])), blocks=real.blocks)
+    """Return the system between actuators and some rows of its states, continuous."""
+    g = with_side(plant.continuous, "u", candidates).system
+    B = g.B[:, g.input_index([port.name for port in candidates])]
+    return StateSpace(g.A, B, rows, np.zeros((len(rows), B.shape[1])), blocks=g.blocks)
 
 
 def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
-    """Return whether candidates change rows of B or C only: no port has a filter or delay.
+    """Return whether candidates change rows of B or C only: they, y and u have no states.
+
+    Disturbances may have: a shape, the acceleration of the base.
 
     Parameters
     ----------
@@ -182,11 +177,11 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
     if not plant.is_assembled:
         return not np.any(plant.D22)
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
-    forces = all(isinstance(port, Disturbance) for port in ports.w)
+    # what is added to a sensor, and noise of an actuator, come and go with it
+    apart = all(port.added_to is None for port in ports.w)
+    apart = apart and not any(isinstance(c, Actuator) and c.asd > 0 for c in candidates)
     rigidly = not realisation.static_inputs.size
-    # noise of an actuator comes and goes with it
-    forces = forces and not any(isinstance(c, Actuator) and c.asd > 0 for c in candidates)
-    return forces and rigidly and all(map(bare, (*ports.w, *ports.u, *ports.y, *candidates)))
+    return apart and rigidly and all(map(bare, (*ports.u, *ports.y, *candidates)))
 
 
 def bare(port: Any) -> bool:

@@ -16,7 +16,7 @@ from ..plant.ground import followed
 from ..reduction import ReducedModel
 from ..structure import FEModel
 from ..values import FloatArray, flag, one_of, short
-from .criterion import Criterion, Scorer
+from .criterion import Criterion, OnBoth, OnPlant, Scorer
 from .poi_axes import (
     Named,
     bare,
@@ -126,7 +126,11 @@ class PoiVariance(Criterion):
         AssumptionError
             When no stationary filter exists: the message names what the sensors miss.
         """
-        estimator = design_kalman(plant, larger=plant if self._own else self.larger)
+        return self._value(plant, plant if self._own else self.larger)
+
+    def _value(self, plant: StandardPlant, larger: Any) -> float:
+        """Return the variance [m^2] on a plant with the modes left out given by another one."""
+        estimator = design_kalman(plant, larger=larger)
         factors = self._factors(plant)
         if self._lagging:
             terms = _lagged(estimator, poi_rows(plant, factors), self.lag)
@@ -161,13 +165,16 @@ class PoiVariance(Criterion):
 
         Delay lines of u are left out: their states are known exactly. Where ports have
         filters or delays every choice has states of its own, and with modes left out the noise of
-        its sensors is correlated: the plant is made anew. A prediction is
-        ``rows A X+ A' rows' + rows Q rows'``; for a lag the POI's motions some samples ago are
-        states as well.
+        its sensors is correlated: each is a filter of its own, on rows of the plants with all
+        candidates. A prediction is ``rows A X+ A' rows' + rows Q rows'``; for a lag the POI's
+        motions some samples ago are states as well.
         """
-        counted = not self._own and larger_plant(plant, self.larger) is not None
-        if counted or not plain(plant, candidates):
-            return super().scorer(plant, candidates)
+        chosen = OnPlant(plant, "y", tuple(candidates), self)
+        larger = None if self._own else larger_plant(chosen.whole, self.larger)
+        if larger is not None:
+            return OnBoth(chosen, larger, self._value)
+        if not plain(plant, candidates) or not chosen.rows_only:
+            return chosen
         A, noise, rows = structure_part(plant, self._factors(plant))
         items = measured_rows(plant, candidates)
         constants = np.zeros(len(rows))

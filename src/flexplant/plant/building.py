@@ -22,6 +22,7 @@ from .ports import Ports
 from .realisation import ModalRealisation
 from .residual_form import modes_of
 from .sampling import sampled_physical
+from .selection import selected
 
 P = TypeVar("P", bound=Partition)
 
@@ -164,6 +165,8 @@ def rebuilt(
 ) -> P:
     """Return a plant with other ports or of other modes, sampled like the old one.
 
+    Ports that are among its own are rows and columns of it.
+
     Raises
     ------
     ModelError
@@ -175,6 +178,12 @@ def rebuilt(
             "use plant.unweighted."
         )
     own = plant.assembled
+    if isinstance(ports, Ports) and realisation is None:
+        found = selected(own, ports)
+        if found is not None:
+            before = own.continuous
+            whole = None if before is None else rebuilt(before, ports=ports)
+            return wired(type(plant), found.replace(continuous=whole))
     fresh = continuous_plant(
         type(plant),
         own.realisation if realisation is None else realisation,

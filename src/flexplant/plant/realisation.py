@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy.linalg as la
@@ -18,6 +20,8 @@ from ..structure import FEModel
 from ..structure.negative_stiffness import signed_square
 from ..structure.placed import Structure as Structure
 from ..values import ComplexArray, FloatArray, Value
+
+T = TypeVar("T")
 
 #: a dense eigenproblem of more DOFs than this is refused: reduce first
 LARGEST_DENSE = 2500
@@ -85,6 +89,17 @@ class ModalRealisation(Value):
     def n_modes(self) -> int:
         """Number of modes, rigid-body ones included, residual vectors not."""
         return sum(name.startswith("mode") for name in self.names) // 2
+
+    def once(self, key: Hashable, found: Callable[[], T]) -> T:
+        """Return what is known of the structure by a key, found at the first call only.
+
+        Every plant with these modes shares it, whatever its ports.
+        """
+        known: dict[Hashable, Any] = self.__dict__.setdefault("_known", {})
+        if key not in known:
+            known[key] = found()
+        value: T = known[key]
+        return value
 
     @property
     def A(self) -> FloatArray:

@@ -53,6 +53,11 @@ def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArra
     ModelError
         When the model does not determine its inertia against this motion.
     """
+    key = ("inertia", direction, *np.asarray(about).tolist())
+    return realisation.once(key, lambda: _inertia_load(realisation, direction, about))
+
+
+def _inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:
     model, axis = realisation.model, DIRECTIONS.index(direction)
     motion = model.rigid_motions(about)[:, axis : axis + 1]
     if not np.any(motion):
@@ -82,7 +87,17 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
     ModelError
         When the structure cannot make any rigid-body motion.
     """
-    model = realisation.model
+    body, why = realisation.once("rigid body", lambda: _rigid_body(realisation.model))
+    if body is None:
+        raise ModelError(
+            f"this structure is held: it cannot move as a rigid body, {why}. Take the structure "
+            "without its supports."
+        )
+    return body
+
+
+def _rigid_body(model: Structure) -> tuple[RigidBody | None, str]:
+    """Return the rigid body; None and why, of a structure that is held."""
     everywhere, missed = model.rigid_motions(), model.missed_motions()
     moving = [
         i
@@ -97,14 +112,11 @@ def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
             if isinstance(model, FEModel)
             else f"its shapes miss {_listed(lost)} of these motions"
         )
-        raise ModelError(
-            f"this structure is held: it cannot move as a rigid body, {why}. Take the structure "
-            "without its supports."
-        )
+        return None, why
     axes = tuple(DIRECTIONS[i] for i in exists)
     centre = _centre(_mass(model, everywhere[:, exists]), axes)
     motions = model.rigid_motions(centre)[:, exists]
-    return RigidBody(axes, motions, _mass(model, motions), centre, lost)
+    return RigidBody(axes, motions, _mass(model, motions), centre, lost), ""
 
 
 def refuse_lost(

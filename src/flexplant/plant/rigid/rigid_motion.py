@@ -59,7 +59,7 @@ def rigid_modes(realisation: ModalRealisation, body: RigidBody | None) -> RigidM
         return free
     root = np.linalg.cholesky(body.mass)
     shapes = la.solve_triangular(root, body.motions.T, lower=True).T
-    load = realisation.model.inertia(shapes)
+    load = realisation.once("load of the rigid body", lambda: realisation.model.inertia(shapes))
     b = realisation.pairs.shape[0]
     see = (load.T @ realisation.outputs).reshape(-1, b, 2)
     push = (load.T @ realisation.inputs).reshape(-1, b, 2)
