@@ -6,7 +6,7 @@ import scipy.linalg as la
 import scipy.sparse as sp
 
 import flexplant as fx
-from flexplant.errors import SolverError
+from flexplant.errors import ModelError, SolverError
 from plates import make_plate
 
 MODELS = {
@@ -104,10 +104,19 @@ def test_consistent_units_and_supports(model):
 
 
 @pytest.mark.parametrize("model", [MODELS["plate"], MODELS["solid"]], ids=["plate", "solid"])
-def test_k_and_m_swapped(model):
-    report = fx.check(matrices(model, K=model.M, M=model.K))
+@pytest.mark.parametrize("held", [False, True])
+def test_k_and_m_swapped(model, held):
+    if held:
+        model = model.fixed(
+            [name for name in model.dofs.labels if model.dofs.location(name)[0] == 0]
+        )
+    given = fx.FEMatrices(model.M, model.K, dofs=model.dofs)
+    report = fx.check(given)
     assert [*report.of("fail"), *report.of("note")] == ["order of K and M"]  # nothing beside it
     assert "FEModel(M, K)" in line(report, "order of K and M")[3]
+    for massless in ("refuse", "condense"):
+        with pytest.raises(ModelError, match=r"swapped\? .* The order is FEMatrices\(K, M\)"):
+            given.model(massless=massless)
 
 
 @pytest.mark.parametrize("size", [1e-8, 1e-10])

@@ -10,8 +10,9 @@ import numpy.typing as npt
 import scipy.sparse as sp
 
 from ..errors import ModelError, ShapeError
+from ..labels import DofSet
 from ..sparse.factor import DENSE_LIMIT, dense, diagonal, is_positive_definite, unit_diagonal
-from ..values import Matrix, real_array
+from ..values import FloatArray, Matrix, real_array
 
 #: what becomes a matrix of a structure
 MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"
@@ -19,6 +20,8 @@ MatrixLike: TypeAlias = "npt.ArrayLike | sp.sparray | sp.spmatrix"
 _SYMMETRY_TOLERANCE = 1e-9
 #: relative to the diagonal: K and D may have eigenvalues this far below zero
 SEMIDEFINITE = 1e-9
+#: part of its largest possible energy that a rigid translation has at most in K, least in M
+_NONE, _SOME = 1e-6, 0.1
 #: a structure whose every DOF is slower than this [rad/s] is no machine
 _SLOW = 1e-2
 
@@ -109,7 +112,7 @@ def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
     ModelError
         When M, too, is a stiffness: DOFs that all move alike by it feel no force.
     """
-    fastest = float(np.sqrt(np.max(diagonal(K) / diagonal(M), initial=0.0)))
+    fastest = _fastest(M, K)
     if not 0.0 < fastest < _SLOW:
         return ""
     found = f"no sqrt(K_ii / M_ii) is above {fastest:.3g} rad/s, slower than any machine"
@@ -119,6 +122,36 @@ def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
             "structure moves as a whole, as a stiffness does. The order is FEModel(M, K, D)."
         )
     return f"{found}: are K and M swapped (the order is FEModel(M, K, D)), or in different units?"
+
+
+def are_swapped(K: Matrix, M: Matrix | None, dofs: DofSet | None) -> bool:
+    """Return whether M moves freely as a stiffness does, and K resists as a mass does.
+
+    By the energy of rigid translations; where supports hold the structure, by single DOFs, if no
+    motion is as fast as a structure's.
+    """
+    if dofs is None or M is None:
+        return False
+    moves = [(dofs.kinds == axis).astype(np.float64) for axis in range(3)]
+    moves = [motion for motion in moves if motion.any()]
+    energies = [(_energy(M, motion), _energy(K, motion)) for motion in moves]
+    if energies and all(of_M <= _NONE and of_K >= _SOME for of_M, of_K in energies):
+        return True
+    return bool(0.0 < _fastest(M, K) < _SLOW) and _unmoved(M, dofs.directions) > _unmoved(
+        K, dofs.directions
+    )
+
+
+def _energy(matrix: Any, motion: FloatArray) -> float:
+    """Return ``t^T A t``, of what it would be if nothing cancelled."""
+    size = float(motion @ (abs(matrix) @ motion))
+    return abs(float(motion @ (matrix @ motion))) / size if size else 0.0
+
+
+def _fastest(M: Matrix, K: Matrix) -> float:
+    """Return the largest sqrt(K_ii / M_ii) [rad/s] of a DOF with mass."""
+    heavy, stiff = diagonal(M), np.abs(diagonal(K))
+    return float(np.sqrt(np.max(stiff[heavy > 0] / heavy[heavy > 0], initial=0.0)))
 
 
 def _unmoved(matrix: Matrix, directions: Sequence[str]) -> int:

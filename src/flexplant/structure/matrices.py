@@ -18,7 +18,7 @@ from ..values import IntArray, Value, flag, instance, name_list, one_of, real_ar
 from .completion import completed as completed
 from .completion import square
 from .condense import empty_rows, held_rows
-from .definite import SEMIDEFINITE
+from .definite import SEMIDEFINITE, are_swapped
 from .local_axes import cosines
 from .model import FEModel
 from .precision import digits_of, endangered, held_by_rounding, shown_digits
@@ -339,6 +339,12 @@ class FEMatrices(Value):
                 f"it is not known what the {self.n_dof} rows stand for: nodes, directions, "
                 "coordinates. with_dofs(DofSet(nodes, directions, xyz)) gives it, or dofs= of "
                 "read_model."
+            )
+        if are_swapped(self.K, self.M, self.dofs):
+            raise ModelError(
+                "K and M are swapped? M gives rigid translations no inertia, as a stiffness gives "
+                "them no force, and K resists them as a mass does. The order is FEMatrices(K, M), "
+                "but FEModel(M, K)."
             )
         ready = self
         if flag(free, "free"):

@@ -14,6 +14,7 @@ from ...sparse.lowest import ROUNDING, Lowest, lowest_modes
 from ...values import FloatArray, IntArray
 from ..components import pieces
 from ..condense import empty_rows
+from ..definite import are_swapped
 from ..matrices import FEMatrices
 from ..model import FEModel
 from ..negative_stiffness import are_rigid, unstable_stiffness
@@ -27,8 +28,6 @@ from ..zero_energy import ZeroEnergy, beyond, own_motions, zero_energy
 _MODES, _FEW = 10, 4
 #: DOFs without stiffness that are counted as motions without energy, at most
 _LOOSE = 64
-#: part of its largest possible energy that a rigid translation has at most in K, least in M
-_NONE, _SOME = 1e-6, 0.1
 #: a rigid-body motion whose relative force is below this is free; its residual measures rounding
 _FREE = 1e-10
 
@@ -117,7 +116,7 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
     digits = given.digits
     if digits is None and given.dofs is not None:
         digits = shown_digits(K, given.dofs)
-    swapped = _are_swapped(given)
+    swapped = not proven and are_swapped(given.K, given.M, given.dofs)
     loose = np.flatnonzero(no_stiffness & ~absent)
     lowest, scaled, failure = None, False, "K and M are swapped"
     motions, mechanisms, unstable = None, np.zeros((n, 0)), 0
@@ -166,27 +165,6 @@ def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
         swapped=swapped,
         damping={} if D is None else _damping(D, motions, proven),
     )
-
-
-def _are_swapped(given: FEMatrices) -> bool:
-    """Return whether M moves freely as a stiffness does, and K resists as a mass does."""
-    dofs, M = given.dofs, given.M
-    if dofs is None or M is None:
-        return False
-    for direction in range(3):
-        motion = (dofs.kinds == direction).astype(np.float64)
-        if not motion.any():
-            continue
-        energy, most = (_energy(matrix, motion) for matrix in (M, given.K))
-        if energy > _NONE or most < _SOME:
-            return False
-    return bool(np.any(dofs.kinds < 3))
-
-
-def _energy(matrix: Any, motion: FloatArray) -> float:
-    """Return ``t^T A t``, of what it would be if nothing cancelled."""
-    size = float(motion @ (abs(matrix) @ motion))
-    return abs(float(motion @ (matrix @ motion))) / size if size else 0.0
 
 
 def _skew(matrix: Any) -> tuple[float, int, int]:
