@@ -49,7 +49,7 @@ def test_doctests_of_designs():
 #: public names without a doctest: what read_ansys reads cannot be written in a few lines, a Problem
 #: is what a search is given, a run of the others takes seconds
 WITHOUT = {"read_ansys", "Problem", "design_mu", "MachineReport"}
-PLOTS = {n: item for n, item in vars(plot).items() if inspect.isfunction(item)}
+PLOTS = {n: vars(plot)[n] for n in dir(plot) if inspect.isfunction(vars(plot)[n])}
 
 
 def test_every_public_name_has_a_doctest():

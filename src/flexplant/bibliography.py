@@ -148,9 +148,9 @@
    Autom. Control 32, 1987.
 .. [Lawrence2000] Lawrence, Tits, Van Dooren, A fast algorithm for the computation of an upper bound
    on the mu-norm, Automatica 36, 2000.
+.. [LawsonHanson1995] Lawson, Hanson, Solving Least Squares Problems, SIAM, 1995.
 .. [LevineAthans1970] Levine, Athans, On the determination of the optimal constant output feedback
    gains for linear multivariable systems, IEEE Trans. Autom. Control 15, 1970.
-.. [LawsonHanson1995] Lawson, Hanson, Solving Least Squares Problems, SIAM, 1995.
 .. [LewisOverton2013] Lewis, Overton, Nonsmooth optimization via quasi-Newton methods, Math.
    Program. 141, 2013.
 .. [Limebeer1993] Limebeer, Kasenally, Perkins, On the design of robust two degree of freedom
