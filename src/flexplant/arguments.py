@@ -13,31 +13,7 @@ from .values import FloatArray, positive, real_array, short
 
 
 def between(value: Any, name: str, low: float, high: float, hint: str, *, ends: str = "") -> float:
-    """Return `value` as a float between two bounds.
-
-    Parameters
-    ----------
-    value : float
-        What was given.
-    name : str
-        What the caller calls it.
-    low, high : float
-        The bounds; `low` is not negative, `high` may be infinite.
-    hint : str
-        What to do next, a sentence.
-    ends : str
-        Which bounds are allowed themselves: "[", "]" or "[]"; none unless given.
-
-    Raises
-    ------
-    ModelError
-        When it is out of bounds.
-
-    Examples
-    --------
-    >>> between(0.3, "share", 0.0, 1.0, "Choose 0.7, say.")
-    0.3
-    """
+    """Return `value` as a float between two bounds."""
     number = positive(value, name, zero=low == 0.0)
     above = number >= low if "[" in ends else number > low
     if not above or not (number <= high if "]" in ends else number < high):
@@ -54,15 +30,7 @@ def positive_array(
     hint: str = "Check its sign and its unit (SI).",
     zero: bool = False,
 ) -> FloatArray:
-    """Return `value` as a finite array of a shape whose entries are positive, or not negative.
-
-    Raises
-    ------
-    ShapeError
-        When the shape differs.
-    ModelError
-        When an entry is no number, not finite, negative, or zero where that is not allowed.
-    """
+    """Return `value` as a finite array of a shape whose entries are positive, or not negative."""
     array = real_array(value, name, shape)
     least = float(array.min(initial=np.inf))
     if least < 0.0 or (least == 0.0 and not zero):
@@ -72,26 +40,7 @@ def positive_array(
 
 
 def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> tuple[Any, ...]:
-    """Return several values as a tuple, all of a class.
-
-    Parameters
-    ----------
-    values : iterable
-        What was given.
-    kind : type or union of types
-        The class or classes of each.
-    name : str
-        What the caller calls them.
-    hint : str
-        How to make them, a sentence.
-    least : int
-        How many there must be at least.
-
-    Raises
-    ------
-    ModelError
-        When it is no list, one of them is of another class, or there are too few.
-    """
+    """Return several values as a tuple, all of a class."""
     several = isinstance(values, Iterable) and not isinstance(values, str)
     listed = tuple(values) if several else ()
     if not several or len(listed) < least or not all(isinstance(one, kind) for one in listed):
@@ -104,13 +53,7 @@ def members(values: Any, kind: Any, name: str, hint: str, *, least: int = 1) -> 
 def mapping(
     value: Any, name: str, hint: str, *, least: int = 0, error: type[FlexplantError] = ModelError
 ) -> dict[Any, Any]:
-    """Return a mapping of so many entries at least as a dict.
-
-    Raises
-    ------
-    FlexplantError
-        When it is none.
-    """
+    """Return a mapping of so many entries at least as a dict."""
     if not isinstance(value, Mapping) or len(value) < least:
         filled = f" with {least} or more entries" if least else ""
         raise error(f"{name} must be a mapping{filled}, got {short(value)}. {hint}")
@@ -118,13 +61,7 @@ def mapping(
 
 
 def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
-    """Return which elements of a mesh are chosen, some at least.
-
-    Raises
-    ------
-    ShapeError
-        When it is no array of True and False, or chooses none.
-    """
+    """Return which elements of a mesh are chosen, some at least."""
     mask = np.asarray(value)
     if mask.dtype != bool or not mask.any():
         raise ShapeError(
@@ -135,13 +72,7 @@ def element_mask(value: Any, name: str) -> npt.NDArray[np.bool_]:
 
 
 def function(value: Any, name: str, hint: str) -> Any:
-    """Return what can be called.
-
-    Raises
-    ------
-    ModelError
-        When it cannot.
-    """
+    """Return what can be called."""
     if not callable(value):
         raise ModelError(f"{name} must be a function, got {short(value)}. {hint}")
     return value

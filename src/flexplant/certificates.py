@@ -30,13 +30,7 @@ def stability(poles: ComplexArray, sampled: Any) -> float:
 
 
 def in_words(found: Mapping[str, Any]) -> str:
-    """Return the numbers of a certificate as one line; what is None is left out.
-
-    Examples
-    --------
-    >>> in_words({"norm": 1.31912, "spectral radius": 0.999983, "left_out": None})
-    'norm 1.319, spectral radius 0.999983'
-    """
+    """Return the numbers of a certificate as one line; what is None is left out."""
     return ", ".join(_worded(name, value) for name, value in found.items() if value is not None)
 
 

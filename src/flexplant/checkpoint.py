@@ -29,24 +29,6 @@ class Checkpoint:
     Each line is written at once and reaches the disk before the next item is counted. Of a file
     that was damaged all results are taken whose check sum is right; the rest is computed again.
     As a context it closes the file, which one process at a time can write to.
-
-    Parameters
-    ----------
-    path : Path or None
-        The file; None keeps nothing.
-    kind : str
-        What the work is called: "study", say.
-    header : mapping
-        What must be the same for the work to go on: a fingerprint, sizes, the entropy of seeds.
-    free : iterable of str
-        Entries of the header that are taken from the file instead.
-
-    Raises
-    ------
-    ModelError
-        When the file is of other work, or no such file.
-    FlexplantError
-        When it cannot be written, or other work writes to it now.
     """
 
     def __init__(

@@ -20,13 +20,7 @@ LARGEST_NODE = 2**53
 def columns_of(
     table: str | Path | Iterable[Mapping[str, Any]],
 ) -> tuple[IntArray, tuple[str, ...], FloatArray]:
-    """Return nodes (n,), directions and coordinates (n, 3) [m] of a table or a CSV file.
-
-    Raises
-    ------
-    LabelError
-        When a column is missing, or a cell is no number.
-    """
+    """Return nodes (n,), directions and coordinates (n, 3) [m] of a table or a CSV file."""
     if isinstance(table, str | Path):
         with open(table, newline="", encoding="utf-8") as file:
             rows: list[Mapping[str, Any]] = list(csv.DictReader(file))
@@ -104,13 +98,7 @@ def direction_names(directions: Any) -> tuple[str, ...]:
 def component_columns(
     names: Any, owners: Any, count: int
 ) -> tuple[tuple[str, ...], IntArray | None]:
-    """Return the names of components and which of them (count,) each DOF belongs to.
-
-    Raises
-    ------
-    LabelError
-        When a name cannot begin a label, or the DOFs and the names do not fit.
-    """
+    """Return the names of components and which of them (count,) each DOF belongs to."""
     listed_names = name_list(names, "components")
     if owners is None and not listed_names:
         return (), None
@@ -131,13 +119,7 @@ def component_columns(
 
 
 def at_nodes(wanted: IntArray, known: IntArray, xyz: FloatArray, source: str) -> FloatArray:
-    """Return the coordinates (n, 3) of some nodes out of a table of all.
-
-    Raises
-    ------
-    LabelError
-        When one is not there, or is there twice.
-    """
+    """Return the coordinates (n, 3) of some nodes out of a table of all."""
     numbers, count = np.unique(known, return_counts=True)
     if numbers.size < known.size:
         first, again = np.flatnonzero(known == numbers[np.argmax(count > 1)])[:2] + 1

@@ -19,17 +19,7 @@ _ROTATIONS = frozenset(DIRECTIONS[3:])
 
 
 class DofIndex:
-    """The rows of DOFs, given their node numbers (n,) and kinds (n,), 0 to 5 for x to rz.
-
-    Parameters
-    ----------
-    nodes, kinds : (n,) arrays of int
-        Node and direction of each DOF.
-    components : sequence of str
-        Names of components, which come before the node in a label.
-    component_of : (n,) array of int, optional
-        Which of them each DOF belongs to.
-    """
+    """The rows of DOFs, given their node numbers (n,) and kinds (n,), 0 to 5 for x to rz."""
 
     def __init__(
         self,

@@ -59,11 +59,6 @@ def fingerprint(items: Iterable[Any]) -> str:
 
     Code is the bytecode of functions, with their closures, defaults and the global values that
     they reach in modules of the user; functions and classes of installed packages count by name.
-
-    Raises
-    ------
-    ModelError
-        When something has no contents that can be compared, an open file say.
     """
     reader = _Contents()
     try:

@@ -17,21 +17,6 @@ def as_html(text: str) -> str:
     """Return the repr of a value as HTML: a heading, named entries as rows, the rest as it is.
 
     Lines that are aligned by spaces, tables among them, keep their alignment.
-
-    Parameters
-    ----------
-    text : str
-        What `repr` returns, of any number of lines.
-
-    Returns
-    -------
-    str
-        Well-formed, all names escaped, without scripts.
-
-    Examples
-    --------
-    >>> as_html("<Modes: 3 of 9 DOFs>")
-    '<div class="flexplant"><div><b>Modes</b>: 3 of 9 DOFs</div></div>'
     """
     first, *rest = text.split("\n")
     parts = []

@@ -102,49 +102,7 @@ def mapped(
     known: Mapping[int, Result] | None = None,
     each: Callable[[int, Result], None] | None = None,
 ) -> list[Result]:
-    """Return ``[function(item) for item in items]``, computed on an executor.
-
-    Parameters
-    ----------
-    function : callable
-        Of one item; of an item and its `numpy.random.Generator` when `rng` is given. For a
-        process pool it can be pickled: defined in a module, or a value of this package.
-    items : iterable
-        The items.
-    executor : concurrent.futures.Executor, optional
-        Threads, processes, `dask.distributed`'s `Client.get_executor()`, `mpi4py.futures`; only
-        `submit` is used. The first items are computed here to learn how long one takes, the rest
-        goes out in chunks of about half a second. When a process of a pool dies, what was out is
-        done once more, and the rest goes on in processes started like those of the pool. None: a
-        plain loop.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
-    rng : int, SeedSequence or Generator, optional
-        From it a seed is spawned for each item, whoever computes it.
-    description : str
-        Name of the bar.
-    known : mapping {int: result}, optional
-        Results of items, by their place, that are not computed again.
-    each : callable, optional
-        Called with the place of an item and its result as soon as it is here, in any order.
-
-    Returns
-    -------
-    list
-        In the order of the items; the same to the bit with and without an executor.
-
-    Raises
-    ------
-    ModelError
-        When the function cannot be called or the executor has no `submit`.
-    SolverError
-        When a worker died twice at the same items.
-
-    Examples
-    --------
-    >>> mapped(abs, [-1, 2, -3])
-    [1, 2, 3]
-    """
+    """Return ``[function(item) for item in items]``, computed on an executor."""
     if not callable(function):
         raise ModelError(f"function must be callable, got {type(function).__name__}.")
     if executor is not None and not callable(getattr(executor, "submit", None)):

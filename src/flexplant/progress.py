@@ -19,15 +19,6 @@ class Progress:
     """A bar for long work: after two seconds, on a terminal or in a notebook, unless forced.
 
     Work inside of other work shows none of its own, neither here nor in the process of a pool.
-
-    Parameters
-    ----------
-    total : int or None
-        Number of items; None where it is not known, 0 for work in one piece: the bar shows time.
-    description : str
-        What is done.
-    progress : bool, optional
-        True shows it at once and anywhere, False never; None decides.
     """
 
     def __init__(

@@ -103,15 +103,7 @@ def frozen(value: Any) -> Any:
 
 
 def save(value: Value, path: str | Path) -> None:
-    """Write `value` to `path` as .npz; a crash leaves the old file or none.
-
-    Parameters
-    ----------
-    value : Value
-        Any value of this package.
-    path : str or Path
-        The file to write, overwritten if present.
-    """
+    """Write `value` to `path` as .npz; a crash leaves the old file or none."""
     arrays: dict[str, Any] = {}
     header = json.dumps(_encode(value, arrays))
     arrays[_HEADER] = np.array(header)
@@ -121,13 +113,7 @@ def save(value: Value, path: str | Path) -> None:
 
 @contextmanager
 def written(path: str | Path) -> Iterator[IO[bytes]]:
-    """Open a new file that takes the place of `path` when all is written, not before.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file to write, overwritten if present.
-    """
+    """Open a new file that takes the place of `path` when all is written, not before."""
     target = Path(path)
     part = target.with_name(f"{target.name}.{uuid.uuid4().hex}.part")
     try:

@@ -42,13 +42,7 @@ _PREFIXED = re.compile(r"(m|g|s|N|rad|Hz|V|A|W|J|Pa|T)(?:\^(\d))?(?![A-Za-z])")
 
 
 def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
-    """Return the units of some channels; those of other names are left out.
-
-    Raises
-    ------
-    ModelError
-        When they are no mapping {channel: unit}.
-    """
+    """Return the units of some channels; those of other names are left out."""
     if not isinstance(units, Mapping) or not all(isinstance(u, str) for u in units.values()):
         raise ModelError(
             f"units must be a mapping {{channel: unit}}, got {short(units)}: {{'y1': 'm'}}."
@@ -57,15 +51,7 @@ def known_units(units: Any, names: Iterable[str]) -> dict[str, str]:
 
 
 def real_array(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -> FloatArray:
-    """Return `value` as a finite float64 array of the given shape (None: any length).
-
-    Raises
-    ------
-    ShapeError
-        When the shape differs.
-    ModelError
-        When entries are no numbers, complex, NaN, masked or infinite.
-    """
+    """Return `value` as a finite float64 array of the given shape (None: any length)."""
     array = np.array(floats(value, name, shape))
     if shape is not None and (
         array.ndim != len(shape)
@@ -94,11 +80,6 @@ def floats(value: Any, name: str, shape: tuple[int | None, ...] | None = None) -
     """Return real numbers as float64, of any shape, finite or not; masked entries are NaN.
 
     An array of float64 comes back itself, not a copy.
-
-    Raises
-    ------
-    ModelError
-        When entries are no numbers, or complex.
     """
     if type(value) is np.ndarray and value.dtype == np.float64:
         return value
@@ -159,13 +140,7 @@ def short(value: Any) -> str:
 
 
 def in_unit(size: float, unit: str | None) -> tuple[float, str]:
-    """Return the factor and the unit with its SI prefix that bring a size to 1 .. 1000.
-
-    Examples
-    --------
-    >>> in_unit(2e-9, "m"), in_unit(0.02, "kg"), in_unit(3e-18, "m^2"), in_unit(5.0, "%")
-    ((1e-09, 'nm'), (0.001, 'g'), (1e-18, 'nm^2'), (1.0, '%'))
-    """
+    """Return the factor and the unit with its SI prefix that bring a size to 1 .. 1000."""
     base, per = (unit[1:], 1e-3) if unit and unit.startswith("kg") else (unit or "", 1.0)
     head = _PREFIXED.match(base)
     if head is None or not size:
@@ -191,13 +166,7 @@ def sizes_of(sizes: Mapping[str, float], units: Mapping[str, str], most: int = 4
 
 
 def positive(value: Any, name: str, *, zero: bool = False) -> float:
-    """Return `value` as a positive (or, with `zero`, non-negative) float.
-
-    Raises
-    ------
-    ModelError
-        When it is not.
-    """
+    """Return `value` as a positive (or, with `zero`, non-negative) float."""
     if isinstance(value, bool | np.bool_):
         raise ModelError(f"{name} must be one number, got {value}. Pass the number that is meant.")
     number = (
@@ -212,27 +181,7 @@ def positive(value: Any, name: str, *, zero: bool = False) -> float:
 
 
 def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None) -> int:
-    """Return `value` as an int between bounds; 3.0 is none, nor is True.
-
-    Parameters
-    ----------
-    value : int or NumPy integer
-        What was given.
-    name : str
-        What the caller calls it.
-    minimum, maximum : int
-        Bounds, both allowed; no upper one when not given.
-
-    Raises
-    ------
-    ModelError
-        When it is no whole number, or out of bounds.
-
-    Examples
-    --------
-    >>> whole(np.int64(3), "count")
-    3
-    """
+    """Return `value` as an int between bounds; 3.0 is none, nor is True."""
     least = f"at least {minimum}" if maximum is None else f"from {minimum} to {maximum}"
     if isinstance(value, bool | np.bool_) or not isinstance(value, int | np.integer):
         raise ModelError(f"{name} must be a whole number {least}, got {short(value)}. Pass an int.")
@@ -243,13 +192,7 @@ def whole(value: Any, name: str, *, minimum: int = 1, maximum: int | None = None
 
 
 def flag(value: Any, name: str) -> bool:
-    """Return `value` as a bool: True or False, nothing that merely counts as one.
-
-    Raises
-    ------
-    ModelError
-        When it is another thing.
-    """
+    """Return `value` as a bool: True or False, nothing that merely counts as one."""
     if not isinstance(value, bool | np.bool_):
         raise ModelError(f"{name} must be True or False, got {short(value)}. Pass one of them.")
     return bool(value)
@@ -258,26 +201,7 @@ def flag(value: Any, name: str) -> bool:
 def instance(
     value: Any, kind: Any, name: str, hint: str, error: type[FlexplantError] = ModelError
 ) -> Any:
-    """Return `value`, which must be of a class, or of one of several.
-
-    Parameters
-    ----------
-    value : object
-        What was given.
-    kind : type or union of types
-        The class or classes.
-    name : str
-        What the caller calls it.
-    hint : str
-        How to make one, a sentence.
-    error : type of FlexplantError
-        What is raised.
-
-    Raises
-    ------
-    FlexplantError
-        When it is of another class.
-    """
+    """Return `value`, which must be of a class, or of one of several."""
     if not isinstance(value, kind):
         listed = [one.__name__ for one in getattr(kind, "__args__", (kind,))]
         kinds = " or ".join(name for name in listed if name != "NoneType")
@@ -286,13 +210,7 @@ def instance(
 
 
 def one_of(value: Any, name: str, choices: Iterable[str]) -> str:
-    """Return `value`, which must be one of some texts.
-
-    Raises
-    ------
-    ModelError
-        When it is none of them.
-    """
+    """Return `value`, which must be one of some texts."""
     listed = list(choices)
     if not isinstance(value, str) or value not in listed:
         raise ModelError(f"{name} must be one of {listed}, got {short(value)}. Pass one of them.")
@@ -303,11 +221,6 @@ def seed_sequence(rng: Any, name: str = "rng") -> np.random.SeedSequence:
     """Return the SeedSequence that a seed, SeedSequence, Generator or None stands for.
 
     A Generator is drawn from, so that two calls with the same one differ.
-
-    Raises
-    ------
-    ModelError
-        When `rng` is nothing that seeds.
     """
     if isinstance(rng, np.random.SeedSequence):
         return rng
@@ -331,11 +244,6 @@ def seed_of(sequence: np.random.SeedSequence) -> int | tuple[int, ...]:
     """Return the number, or numbers, that give the same draws as a SeedSequence when passed as rng.
 
     A spawned one mixes the key of its place in after four words of entropy, so that a list does.
-
-    Examples
-    --------
-    >>> seed_of(np.random.SeedSequence(7)), seed_of(np.random.SeedSequence(7, spawn_key=(2,)))
-    (7, (7, 0, 0, 0, 2))
     """
     entropy: Any = sequence.entropy
     given = entropy if isinstance(entropy, Sequence | np.ndarray) else (entropy,)
@@ -347,28 +255,14 @@ def seed_of(sequence: np.random.SeedSequence) -> int | tuple[int, ...]:
 
 
 def generator(rng: Any, name: str = "rng") -> np.random.Generator:
-    """Return the Generator that a seed, SeedSequence, Generator or None stands for.
-
-    Raises
-    ------
-    ModelError
-        When `rng` is nothing that seeds.
-    """
+    """Return the Generator that a seed, SeedSequence, Generator or None stands for."""
     if isinstance(rng, np.random.Generator):
         return rng
     return np.random.default_rng(seed_sequence(rng, name))
 
 
 def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tuple[str, ...]:
-    """Return `count` unique signal names, `prefix1`, `prefix2`, ... when none are given.
-
-    Raises
-    ------
-    LabelError
-        When names are doubled, empty, hold a '.' or begin with '-' (python-control refuses those).
-    ShapeError
-        When their number is not `count`.
-    """
+    """Return `count` unique signal names, `prefix1`, `prefix2`, ... when none are given."""
     listed = name_list(names, side) if names is not None else ()
     if not listed:
         return tuple(f"{prefix}{i}" for i in range(1, count + 1))
@@ -382,13 +276,7 @@ def signal_names(names: Iterable[str], count: int, prefix: str, side: str) -> tu
 
 
 def name_list(names: Any, what: str) -> tuple[str, ...]:
-    """Return names as a tuple of str; one str is one name.
-
-    Raises
-    ------
-    LabelError
-        When it is no sequence of names.
-    """
+    """Return names as a tuple of str; one str is one name."""
     if isinstance(names, str):
         return (names,)
     if not isinstance(names, Iterable) or isinstance(names, bytes):

@@ -18,13 +18,7 @@ _PACKAGES = (
 
 
 def versions() -> dict[str, str]:
-    """Return the versions of this package, Python, its libraries, BLAS, platform and threads.
-
-    Examples
-    --------
-    >>> list(versions())[:3]
-    ['flexplant', 'python', 'numpy']
-    """
+    """Return the versions of this package, Python, its libraries, BLAS, platform and threads."""
     from threadpoolctl import threadpool_info
 
     found = {"flexplant": sys.modules["flexplant"].__version__, "python": platform.python_version()}

@@ -25,26 +25,6 @@ class Work:
 
     The same steps come in the same order when the work is begun again, so that results are known
     by their number.
-
-    Parameters
-    ----------
-    executor : concurrent.futures.Executor, optional
-        As for `mapped`.
-    progress : bool, optional
-        A bar: None shows one on a terminal for work of more than two seconds.
-    rng : int, SeedSequence or Generator, optional
-        Seeds; when the file has those of an earlier beginning and none are given, these.
-    checkpoint : path, optional
-        The file; None keeps nothing.
-    kind : str
-        What the work is called.
-    header : mapping
-        What must be the same for the work to go on, as for `Checkpoint`.
-
-    Raises
-    ------
-    ModelError
-        When the file is of other work, or no such file.
     """
 
     def __init__(
@@ -90,22 +70,7 @@ class Work:
         progress: bool | None = None,
         restored: Callable[[Any], Result] | None = None,
     ) -> list[Result]:
-        """Return ``[function(item) for item in items]``, without those that the file has.
-
-        Parameters
-        ----------
-        function, items, rng, description
-            As for `flexplant.parallel.mapped`.
-        progress : bool, optional
-            Of this step alone; that of the work when not given.
-        restored : callable, optional
-            Result from its JSON form; None: the JSON form itself.
-
-        Raises
-        ------
-        ModelError
-            When the function cannot be called or the executor has no `submit`.
-        """
+        """Return ``[function(item) for item in items]``, without those that the file has."""
         listed = list(items)
         first, self._done = self._done, self._done + len(listed)
         rows, back = self._log.rows, restored or (lambda row: row)

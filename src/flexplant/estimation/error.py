@@ -50,35 +50,6 @@ def error_variances(
     Stein equation of its own. Damped modes that it follows are taken apart in the same way, such as
     those of a suspension. The elastic states are solved mode by mode, O(n^2) of them. The dual
     equation, from the output back to the noises, gives the same variances by another way.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        The machine: sampled, with `noise_factor`; it may have other modes than the observer's.
-    observer : StateSpace
-        From sensors of the plant (and u) to the estimates of its POIs, in their order.
-    suspension : array of int, optional
-        Modes of the plant, from 0, whose motion counts as that of a rigid body without error.
-
-    Returns
-    -------
-    Variances
-
-    Raises
-    ------
-    ModelError
-        When sampling times differ, or the noise of the plant is not known.
-    AssumptionError
-        When the error contains a rigid-body motion or an undamped mode of the plant.
-    CertificateError
-        When the dual equation gives variances that differ by more than 1 %.
-    SolverError
-        When the error is not stable.
-
-    Warns
-    -----
-    FlexplantWarning
-        When most of a variance is from modes with next to no damping.
     """
     if not np.isclose(plant.dt, observer.dt, rtol=1e-9, atol=0.0):
         raise ModelError(

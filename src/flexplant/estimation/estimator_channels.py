@@ -15,17 +15,7 @@ DERIVED = (":error", ":effort")
 
 
 def checked_plant(given: StandardPlant | System) -> StandardPlant:
-    """Return a StandardPlant that has something to estimate and to measure.
-
-    Raises
-    ------
-    ModelError
-        When it is no plant, weighted, or read through a block with dynamics or references.
-    LabelError
-        When it is a system whose channels do not name w, u, z and y.
-    AssumptionError
-        When it has no POI or no sensor.
-    """
+    """Return a StandardPlant that has something to estimate and to measure."""
     plant = standard_plant(given)
     if plant.origin.scaled:
         raise ModelError(
@@ -68,15 +58,7 @@ def poi_channels(plant: StandardPlant) -> tuple[str, ...]:
 
 
 def same_pois(plant: StandardPlant, on: StandardPlant | System) -> StandardPlant:
-    """Return another plant that has the sensors and POIs of the first.
-
-    Raises
-    ------
-    LabelError
-        When one is missing.
-    ModelError
-        When it is no plant, or has further POIs.
-    """
+    """Return another plant that has the sensors and POIs of the first."""
     other = read_alike(plant, standard_plant(on).unweighted)
     for side, names in (("z", poi_channels(plant)), ("y", sensors(plant))):
         for name in names:
@@ -96,13 +78,7 @@ def estimates(channels: Sequence[str]) -> tuple[str, ...]:
 
 
 def row_of(channels: Sequence[str], name: str) -> int:
-    """Return which POI channel a name means: `die`, `die:z`, `die:hat` and `die:error` are one.
-
-    Raises
-    ------
-    LabelError
-        When it means none.
-    """
+    """Return which POI channel a name means: `die`, `die:z`, `die:hat` and `die:error` are one."""
     known: dict[str, int] = {}
     for kind in ("hat", "error"):
         known |= {alias: i for i, alias in enumerate(_derived(channels, kind))}

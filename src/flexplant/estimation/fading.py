@@ -37,16 +37,6 @@ def excess(
     ``e = C F^k Y eta + white noise`` show eta by least squares: the partitioned filter. None where
     P_k is not above P, or has so much to show still that digits would be lost.
 
-    Parameters
-    ----------
-    steady : Steady
-        The stationary filter.
-    weight : (n, n) array
-        Of covariances, for what they add to all later estimates.
-    P, Z, found : arrays and KnownParameters
-        The covariance with the unknown parameters known, how these enter, and what is known of
-        them.
-
     References
     ----------
     [Lainiotis1975]_.

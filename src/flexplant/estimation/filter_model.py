@@ -114,13 +114,7 @@ def weighed(part: FloatArray, spread: FloatArray) -> FloatArray:
 
 
 def filter_model(plant: StandardPlant, found: LeftOut | None = None) -> FilterModel:
-    """Return the model of a sampled plant, with the modes left out as noise where known.
-
-    Raises
-    ------
-    ShapeError
-        When the process noise has another size than the states.
-    """
+    """Return the model of a sampled plant, with the modes left out as noise where known."""
     own = plant if found is None else found.plant
     g = own.system
     n = g.n_states

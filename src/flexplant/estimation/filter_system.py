@@ -55,13 +55,7 @@ def error_system(model: FilterModel, K: FloatArray, L_z: FloatArray) -> StateSpa
 
 
 def own_variances(model: FilterModel, K: FloatArray, L_z: FloatArray) -> FloatArray:
-    """Return the variances (nz,) of the error of a filter on its own model.
-
-    Raises
-    ------
-    SolverError
-        When the error is not stable.
-    """
+    """Return the variances (nz,) of the error of a filter on its own model."""
     m, left = model, model.C1 - L_z @ model.C2
     X = solve_stein(m.A - K @ m.C2, m.driven(K))
     return np.asarray(np.sum((left @ X) * left, axis=1) + np.sum((L_z @ m.R) * L_z, axis=1))

@@ -13,13 +13,7 @@ from .filter_model import FilterModel
 
 
 def twin(model: FilterModel, covariance: FloatArray) -> Any:
-    """Return filterpy's filter of a model; P is the covariance of x[k|k-1], x is at rest.
-
-    Raises
-    ------
-    ModelError
-        When u reaches y at once, or the noises of process and sensors are correlated.
-    """
+    """Return filterpy's filter of a model; P is the covariance of x[k|k-1], x is at rest."""
     if np.any(model.D2):
         raise ModelError(
             "filterpy's filter has no feedthrough from u to y, this plant has one. Sample it "

@@ -100,13 +100,7 @@ def check_gain(plant: StandardPlant, gain: FloatArray, covariance: FloatArray) -
 def error_of(
     model: FilterModel, gain: FloatArray, predictor: FloatArray, covariance: FloatArray
 ) -> tuple[float, float]:
-    """Return spectral radius and difference of a gain L and its predictor gain K, if both are good.
-
-    Raises
-    ------
-    CertificateError
-        As `check_gain`.
-    """
+    """Return spectral radius and difference of a gain L and its predictor gain K, if both hold."""
     closed = model.A - predictor @ model.C2
     radius = float(np.max(np.abs(np.linalg.eigvals(closed)), initial=0.0))
     if radius >= 1:

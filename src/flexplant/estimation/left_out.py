@@ -80,17 +80,6 @@ def left_out(plant: StandardPlant, larger: StandardPlant) -> LeftOut | None:
     with d = 2 zeta omega and ``W_ij = sum_w phi_iw phi_jw asd_w^2 / 2``. A sample has the same
     covariance. Disturbances with a shape drive a mode with their density at its frequency, and
     their slow part moves it statically; filters and delays of sensors act at its pole.
-
-    Parameters
-    ----------
-    plant, larger : StandardPlant
-        Sampled alike, with the same ports, both assembled from structures.
-
-    Raises
-    ------
-    ModelError
-        When one is not assembled from a structure, the larger one has fewer modes, or a mode left
-        out has no damping.
     """
     own, others_own = plant.assembled, larger.assembled
     small, big, ports = own.realisation, others_own.realisation, own.ports

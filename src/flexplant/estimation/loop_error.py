@@ -20,25 +20,6 @@ def loop_variances(plant: StandardPlant, estimator: StateSpace, loop: ClosedLoop
     What u does to a machine that is not the estimator's model enters the error, although the
     estimator reads u: the Stein equation of the whole loop, ``X = A X A' + G G'``, each noise
     twice (`loop.budget`).
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Of the estimator.
-    estimator : StateSpace
-        From sensors and u to the estimates of its POIs.
-    loop : ClosedLoop
-        Around any machine with these POIs and sensors. An estimator that is not in it runs beside
-        it.
-
-    Raises
-    ------
-    LabelError
-        When a sensor or POI is missing.
-    ModelError
-        When the estimates in the loop are those of another estimator, or noise is not known.
-    AssumptionError
-        When the loop is not stable.
     """
     same_pois(plant, loop.plant)
     channels = poi_channels(plant)

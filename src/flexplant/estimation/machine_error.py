@@ -28,19 +28,7 @@ class Gains(NamedTuple):
 
 
 class FilterPart(NamedTuple):
-    """What the errors on all machines share: the filter with some gains, states of unit size.
-
-    Parameters
-    ----------
-    K, L : arrays
-        Gains, K in scaled states and L_z in units of the value.
-    powers : list of (n, n) arrays
-        ``A_o^(2^k)`` of A_o = A0 - K C0, until it vanishes.
-    C0, E : arrays
-        Filter states to sensors, and to the error, less sign.
-    sight : (n, n) array
-        Y_oo of ``Y_oo = A_o' Y_oo A_o + E' E``.
-    """
+    """What the errors on all machines share: the filter with some gains, states of unit size."""
 
     K: FloatArray
     L: FloatArray
@@ -52,24 +40,7 @@ class FilterPart(NamedTuple):
 
 @np.errstate(over="ignore", invalid="ignore")
 def filter_part(m: FilterModel, gains: Gains, scale: FloatArray, unit: FloatArray) -> FilterPart:
-    """Return the part of the errors that does not depend on the machine.
-
-    Parameters
-    ----------
-    m : FilterModel
-        Its matrices.
-    gains : Gains
-        Of the filter.
-    scale : (n,) array
-        Of its states.
-    unit : (nz, 1) array
-        Of the POI motions.
-
-    Raises
-    ------
-    SolverError
-        When the filter is not stable.
-    """
+    """Return the part of the errors that does not depend on the machine."""
     K, L, C0 = gains.K / scale[:, None], gains.L_z / unit, m.C2 * scale
     power = m.A * scale / scale[:, None] - K @ C0
     powers, E = [power], m.C1 * scale / unit - L @ C0
@@ -87,19 +58,6 @@ class MachineError(NamedTuple):
     On a machine ``x+ = A x + G xi``, ``y = C x + v``, ``z = C1e x``, without the rigid-body motion
     x_r that both share: x and x_o are what is left beside V_e x_r and V_o x_r. All in states of
     unit size.
-
-    Parameters
-    ----------
-    powers : list of (n_e, n_e) arrays
-        ``A^(2^k)``, as many as were needed so far.
-    C, C1e, G : arrays
-        Of the machine's states that decay.
-    X : (n_e, n_e) array
-        Their covariance.
-    back, driven : arrays
-        ``V_o A_re`` and ``V_o G_r``: what moves the filter's part of the rigid-body motion.
-    root : (ny, s + r) array
-        Of the sensor noise: what the s sensors have alone, then what disturbances add at once.
     """
 
     powers: list[FloatArray]
@@ -172,26 +130,6 @@ def machine_error(
 
     Undamped motions x_r of the machine have no variance. A filter that holds them follows with
     V_o x_r whatever its gains are: ``A0 V_o = V_o A_rr``, ``C0 V_o = C_r``, ``C1 V_o = C1_r``.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Of the filter.
-    model : FilterModel
-        Its matrices.
-    machine : StandardPlant
-        Sampled alike.
-    start : Gains
-        A stable filter.
-    scale : (n,) array
-        Of the filter's states.
-    unit : (nz, 1) array
-        Of the POI motions.
-
-    Raises
-    ------
-    AssumptionError
-        When the filter does not hold a motion of the machine that does not decay.
     """
     m, own = model, filter_model(machine)
     G_all = machine.noise_factor

@@ -41,13 +41,6 @@ def nodes_per_wavelength(
     make a wavelength. Diagonals of elements count as neighbours, so that this is a mean over all
     directions. Both kinds of neighbours differ by 2 % to 7 % on plates and blocks. A full mass
     matrix has no mesh.
-
-    Parameters
-    ----------
-    model : FEModel, Modes or ReducedModel
-        The structure.
-    shapes : (n, m, c) array
-        Of m modes over all DOFs of the full structure; c parts each (real and imaginary).
     """
     dofs = model.full_dofs if isinstance(model, ReducedModel) else model.dofs
     count = np.count_nonzero(np.isin(dofs.directions, _MOVES))
@@ -120,24 +113,6 @@ def unresolved_share(
     """Return the largest share of POI variances from modes left out that the mesh resolves badly.
 
     Their disturbances are taken away, and the error is computed once more.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Of the filter: what reads its sensors reads the larger one's.
-    larger : StandardPlant
-        With the modes left out; None is returned where it has no mesh.
-    modes : array of int
-        Numbers of the modes left out, from 1.
-    observer : StateSpace
-        The filter.
-    variances : (nz,) array
-        Of its errors on the plant.
-
-    Warns
-    -----
-    FlexplantWarning
-        When it is more than half.
     """
     if not larger.is_assembled:
         return None

@@ -25,29 +25,6 @@ def moving_sight(
 
     Each distinct point is a POI of its own of the same plant: its rows of C and D are exact, and so
     are the covariances of the modes left out there.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Of the filter, assembled from a structure.
-    found : LeftOut, optional
-        What its left-out modes do.
-    model : FilterModel
-        Of both.
-    path : (count, 3) array [m] or mapping {name: (count, 3) array}
-        Where POIs are; a mapping when there are several.
-    count : int
-        Samples.
-
-    Raises
-    ------
-    LabelError
-        When a POI is unknown, or none is named where there are several, or a point is off the
-        structure.
-    ShapeError
-        When a path has another length than the record.
-    ModelError
-        When the plant was not assembled from a structure.
     """
     pois = {poi.name: poi for poi in plant.assembled.ports.z}
     if not isinstance(path, Mapping):

@@ -67,27 +67,7 @@ def passed(
     keep: bool = False,
     gate: float = np.inf,
 ) -> Passage:
-    """Return the filter's way through a record.
-
-    Parameters
-    ----------
-    steady : Steady
-        The stationary filter, in states and sensors of unit variance.
-    record : Recorded
-        In the units of the sensors.
-    s : (ny,) array
-        Units of the stationary filter's measurements.
-    sight : Sight
-        Of the POIs.
-    start : Start or (n,) array
-        Of a machine of unknown motion; or x[0|-1] of the stationary filter.
-    predict : bool
-        Whether the estimates are those before the measurement.
-    keep : bool
-        Whether a later pass needs the moments at which the gain was not stationary.
-    gate : float
-        Deviations beyond which an innovation makes its sample a missing one.
-    """
+    """Return the filter's way through a record."""
     return _Walk(steady, record, s, sight, predict=predict, keep=keep, gate=gate).done(start)
 
 

@@ -37,27 +37,7 @@ class Recorded(NamedTuple):
 
 
 def recorded(records: Any, model: FilterModel) -> Recorded:
-    """Return the sensors and commands of a model from what was recorded.
-
-    Parameters
-    ----------
-    records : Response, mapping {channel: (N,) array} or data frame
-        All sensors and commands by name; other channels are left aside. NaN and masked entries
-        are samples of a sensor that are missing. Times are its `time`, as an attribute or a
-        channel; without any the record starts at 0.
-    model : FilterModel
-        Whose channels are wanted.
-
-    Raises
-    ------
-    LabelError
-        When a channel is missing.
-    ShapeError
-        When channels are not of one length, or hold several runs.
-    ModelError
-        When it is no record, a channel is complex, a command is not finite or masked, or the times
-        are not the model's samples.
-    """
+    """Return the sensors and commands of a model from what was recorded."""
     if not hasattr(records, "keys") or not hasattr(records, "__getitem__"):
         raise ModelError(
             f"records must give channels by name, got {short(records)}. Pass a Response, a data "

@@ -24,17 +24,7 @@ class Statistic(NamedTuple):
 
 
 class PooledSpectrum(NamedTuple):
-    """Mean density of the channels over frequency, 1 for white noise of unit variance.
-
-    Parameters
-    ----------
-    freq : (m,) array [cycles per sample]
-        Lines, without 0 and the Nyquist frequency.
-    density : (m,) array
-        Mean over the channels.
-    channels : int
-        How many channels were averaged.
-    """
+    """Mean density of the channels over frequency, 1 for white noise of unit variance."""
 
     freq: FloatArray
     density: FloatArray
@@ -104,17 +94,7 @@ def cumulative_periodogram(found: PooledSpectrum) -> Statistic:
 
 
 class ExcessPeak(NamedTuple):
-    """Where a spectrum is above its mean.
-
-    Parameters
-    ----------
-    freq : float [cycles per sample]
-        Its frequency.
-    height : float
-        Beside the mean.
-    p_value : float
-        Probability of one as significant anywhere by chance.
-    """
+    """Where a spectrum is above its mean."""
 
     freq: float
     height: float

@@ -24,13 +24,6 @@ def hann_ratio(gap: ComplexArray, segment: float) -> tuple[ComplexArray, Complex
         + \frac{1}{2 \pi} \sin\frac{2 \pi \tau}{T}
 
     ([BendatPiersol2010]_, sections 11.5 and 11.6, for Hann windows); 1 far from the pole.
-
-    Parameters
-    ----------
-    gap : complex array [rad/s]
-        q, with a positive real part.
-    segment : float [s]
-        T.
     """
     T, turn = segment, 2j * np.pi
     x = gap * T

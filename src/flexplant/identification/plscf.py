@@ -39,17 +39,6 @@ class Moments:
     are nearly orthogonal: no other basis is needed for high orders, and coefficients are complex
     so that no order is spent on the conjugate poles outside the band. Every block of the
     normal equations is Toeplitz, and all orders share its moments.
-
-    Parameters
-    ----------
-    freq : (n_freq,) array [Hz]
-        The band.
-    data : (n_out, n_in, n_freq) complex array
-        The responses.
-    weight : (n_out, n_freq) array
-        w_o(f).
-    order : int
-        The highest.
     """
 
     def __init__(

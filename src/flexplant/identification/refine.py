@@ -95,7 +95,7 @@ def refined(
     fine: bool = False,
     below: float = np.inf,
 ) -> Fit:
-    r"""Return the weighted least-squares fit of
+    r"""Return the weighted least-squares fit of poles and residual terms.
 
     .. math:: H_{oi}(s) = \sum_k \frac{\psi_{ok} l_{ik}}{s - \lambda_k}
         + \frac{\bar\psi_{ok} \bar l_{ik}}{s - \bar\lambda_k} + \sum_p E_{oip} g_p(s),
@@ -106,12 +106,7 @@ def refined(
     column held at 1, are found by Levenberg-Marquardt: to a tenth of a standard deviation, or
     to 3e-3 of one where the fit is to be `fine`. A fit that will not come `below` a cost is given
     up: as soon as twenty times what a full step would gain is not enough.
-
-    Raises
-    ------
-    SolverError
-        When the fit does not settle and this is `strict`, or it is given up.
-    """  # noqa: D400 - the sentence is the equation
+    """
     pivots = np.argmax(np.abs(participation), axis=0)
     columns = np.arange(poles.size)
     participation = participation / participation[pivots, columns]

@@ -47,15 +47,6 @@ def peaks(lines: Lines, model: ComplexArray, used: float) -> list[Peak]:
     Over L lines of c channels the sum of :math:`2 |e|^2/\sigma^2` is chi-square with 2 c L degrees
     of freedom. Its middle and spread are also taken from all stretches (median, median absolute
     deviation): an estimated variance is off everywhere, a missed pole is off in one place.
-
-    Parameters
-    ----------
-    lines : Lines
-        What was fitted.
-    model : (n_out, n_in, n_freq) complex array
-        The fit.
-    used : float
-        Share of the data's freedom that the fit used up.
     """
     error = np.abs(lines.data - model) ** 2 * lines.weight**2
     channels = lines.data.shape[0] * lines.data.shape[1]

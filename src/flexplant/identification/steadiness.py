@@ -38,17 +38,6 @@ def inputs_checked(x: FloatArray, spectra: ComplexArray, samples: int, rate: flo
     .. math:: D(L) = \sum_t (x_{t+L} - x_t)^2 \Big/ \sum_t (x_{t+L}^2 + x_t^2),
 
     zero where the signals repeat after L samples and about one where they do not.
-
-    Parameters
-    ----------
-    x : (n_exp, n_in, n_time) array
-        Inputs or references.
-    spectra : (n_exp, n_in, n_offset, n_lines) complex array
-        Theirs, at excited lines and between.
-    samples : int
-        Of the stated period.
-    rate : float [Hz]
-        Stated.
     """
     n_time = x.shape[2]
     if n_time < 2 * samples:
@@ -111,17 +100,6 @@ def transient(
     At line k period p is ``S_k + tau_k z^p`` with ``z = exp(lambda T)``, the same for all lines,
     outputs and experiments that a mode reaches. Over a grid of z the energy that this explains
     of the periods' spread is compared with the rest by an F-test.
-
-    Parameters
-    ----------
-    freq : (n_lines,) array [Hz]
-        Of lines.
-    e : (n_exp, n_out, n_period, n_lines) complex array
-        ``Y - G U`` of every period, from the first of the record.
-    Y : the same shape
-        The outputs.
-    discard : int
-        Periods that were left out of the mean.
     """
     import scipy.ndimage as ndi  # both cost a tenth of a second that few need
     from scipy.stats import f as fisher

@@ -147,15 +147,7 @@ def structural_modes(
 def places_of(
     measured: Any, dofs: Any, over: Modes | None
 ) -> tuple[MeasuredPlaces, DofSet, IntArray]:
-    """Return the places of an identification's channels, the DOFs and their rows among these.
-
-    Raises
-    ------
-    ModelError
-        When the scale of the shapes is not known.
-    LabelError
-        When a channel is not one of `dofs`.
-    """
+    """Return the places of an identification's channels, the DOFs and their rows among these."""
     instance(measured, IdentifiedModes, "measured", "Pass the answer of identify_modes(frf).")
     instance(dofs, DofSet, "dofs", "Pass DofSet(nodes, directions, xyz), or model.dofs.")
     if over is not None:
@@ -316,13 +308,7 @@ def _expanded(over: Modes, rows: Any, columns: list[FloatArray]) -> tuple[list[F
 
 
 def expansion(over: Modes, rows: Any) -> FloatArray:
-    """Return ``Phi Phi_a^+`` (n, places) of a model's modes and the rows of measured places.
-
-    Raises
-    ------
-    ModelError
-        When there are more modes than places.
-    """
+    """Return ``Phi Phi_a^+`` (n, places) of a model's modes and the rows of measured places."""
     Phi = np.real(over.phi)
     seen = Phi[rows]
     count, places = over.n_modes, len(rows)

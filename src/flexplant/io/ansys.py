@@ -124,15 +124,7 @@ def cosines_of(angles: Any) -> FloatArray:
 
 
 def read_parsed(function: str, path: Path) -> dict[str, Any]:
-    """Return what a function of `foreign_parsers` finds in an ANSYS file.
-
-    Raises
-    ------
-    FlexplantError
-        When the package is missing, or the file cannot be read.
-    ModelError
-        When the package does not support what is in the file.
-    """
+    """Return what a function of `foreign_parsers` finds in an ANSYS file."""
     kind, found = in_child(function, path, keep="ansys")
     if kind in ("ImportError", "ModuleNotFoundError"):
         raise missing_extra("ansys-mapdl-reader", "ansys", f"reading {path.name!r}")
@@ -184,22 +176,7 @@ _MODAL = 2
 
 
 def read_rst_shapes(path: Path, nodes: Path | None) -> FileShapes:
-    """Return the mode shapes of an ANSYS result file, turned to global directions by its reader.
-
-    Parameters
-    ----------
-    path : Path
-        The .rst file of a modal analysis. Needs ansys-mapdl-reader.
-    nodes : Path, optional
-        Not needed: the file holds its nodes.
-
-    Raises
-    ------
-    FlexplantError
-        When the package is missing, or the file is damaged.
-    ModelError
-        When it is of another analysis or a cyclic sector, or DOFs are no displacements.
-    """
+    """Return the mode shapes of an ANSYS result file, turned to global directions by its reader."""
     found = read_parsed("ansys_modes", path)
     if found["analysis"] != _MODAL or found["cyclic"]:
         what = "a cyclic sector" if found["cyclic"] else "another analysis"

@@ -37,15 +37,7 @@ def assembled(
     located: bool = True,
     notes: Iterable[str] = (),
 ) -> FEMatrices:
-    """Return the FEMatrices of what a file holds under "K", "M", "D" (None: absent).
-
-    Raises
-    ------
-    ModelError
-        When there is no K, or entries are no finite real numbers.
-    ShapeError
-        When sizes differ.
-    """
+    """Return the FEMatrices of what a file holds under "K", "M", "D" (None: absent)."""
     if parts.get("K") is None:
         raise ModelError(f"{source!r} holds no stiffness matrix. Name the variable: stiffness=...")
     done: dict[str, Any] = {"M": None, "D": None}
@@ -75,17 +67,7 @@ def one_matrix_each(
     read: Callable[[Path], tuple[Any, int | None]],
     dofs: DofSet | str | Path | None,
 ) -> FEMatrices:
-    """Return the FEMatrices of files that hold one matrix each.
-
-    Parameters
-    ----------
-    paths : mapping {"K", "M", "D": path or None}
-        The files.
-    read : callable
-        Returns the matrix of a file, and the digits it was printed with.
-    dofs : DofSet, or path of a table for `read_dofs`, optional
-        What the rows stand for.
-    """
+    """Return the FEMatrices of files that hold one matrix each."""
     parts: dict[str, Any] = {}
     digits: int | None = None
     for name, path in paths.items():
@@ -98,13 +80,7 @@ def one_matrix_each(
 def from_triplets(
     values: FloatArray, i: IntArray, j: IntArray, n: int, path: object
 ) -> sp.csc_array:
-    """Return the full matrix (n, n) of listed entries, of one triangle or of both.
-
-    Raises
-    ------
-    FlexplantError
-        When an entry is listed twice.
-    """
+    """Return the full matrix (n, n) of listed entries, of one triangle or of both."""
     twice = np.count_nonzero(np.unique(i * n + j, return_counts=True)[1] > 1)
     if twice:
         raise damaged(path, f"entries stored twice: {twice} (several steps?)")
@@ -118,11 +94,6 @@ def chosen(
     """Return which of the names of a file are K, M and D; those named must be there.
 
     "usual" stands for one that has a usual name, as does None, but for D: None leaves it out.
-
-    Raises
-    ------
-    ModelError
-        When one that is named is missing, or no or several names look like K.
     """
     there = list(names)
     found: dict[str, str | None] = {}

@@ -23,21 +23,6 @@ def in_child(function: str, path: str | Path, *, keep: str = "") -> tuple[str, A
     A damaged file may make a parser crash, take all memory or never end: in a process of its own,
     with bounds, that is an error like any other. Where there is no Python to start (a frozen or
     embedded program), the function is run here.
-
-    Parameters
-    ----------
-    function : str
-        Its name.
-    path : str or Path
-        The file.
-    keep : str, optional
-        Package for whose next file the child waits. It starts in 0.4 s for SciPy, in 2 s for the
-        reader of ANSYS files, and then answers in milliseconds.
-
-    Raises
-    ------
-    FileNotFoundError
-        When there is no such file.
     """
     file = file_path(path)
     if not file.is_file():

@@ -107,13 +107,7 @@ def read_exodus_modes(
 def read_shapes(
     path: str | Path, times: str = "frequency", variables: Mapping[str, str] | None = None
 ) -> tuple[FloatArray, FloatArray, DofSet]:
-    """Return frequencies [rad/s], shapes and DOFs of a file; arguments as in `read_exodus_modes`.
-
-    Raises
-    ------
-    FlexplantError, LabelError, FileNotFoundError
-        As there.
-    """
+    """Return frequencies [rad/s], shapes and DOFs of a file, as `read_exodus_modes` does."""
     one_of(times, "times", ("frequency", "omega", "eigenvalue"))
     with opened(path) as file:
         xyz, ids = file.nodes()
@@ -162,20 +156,7 @@ def _chosen(names: list[str], given: Mapping[str, str] | None, path: str) -> dic
 
 @contextlib.contextmanager
 def opened(path: str | Path) -> Iterator[ExodusFile]:
-    """Return an Exodus file, netCDF-3 or netCDF-4, to be used in a `with` block.
-
-    Parameters
-    ----------
-    path : str or Path
-        The file.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no netCDF file, or h5py is needed and not installed.
-    FileNotFoundError
-        When there is no such file.
-    """
+    """Return an Exodus file, netCDF-3 or netCDF-4, to be used in a `with` block."""
     with file_path(path).open("rb") as raw:
         is_hdf = raw.read(8) == b"\x89HDF\r\n\x1a\n"
     h5py: Any = None
@@ -193,15 +174,7 @@ def opened(path: str | Path) -> Iterator[ExodusFile]:
 
 
 class ExodusFile:
-    """Arrays of an Exodus file by name.
-
-    Parameters
-    ----------
-    path : str
-        For messages.
-    file : netCDF or HDF5 file
-        Open.
-    """
+    """Arrays of an Exodus file by name."""
 
     def __init__(self, path: str, file: Any) -> None:
         self.path, self.file = path, file
@@ -213,13 +186,7 @@ class ExodusFile:
         return getattr(self.file, "variables", self.file)
 
     def array(self, name: str) -> Any:
-        """Return a variable as an array.
-
-        Raises
-        ------
-        FlexplantError
-            When there is none, or it cannot be read.
-        """
+        """Return a variable as an array."""
         if not self.holds(name):
             raise self._wrong(f"it has no {name!r}")
         array = np.array(self._names()[name][()] if self._hdf() else self._names()[name][:])
@@ -273,22 +240,7 @@ MESH = Elsewhere((".g",), "a mesh: give it to read_sierra(..., exodus=...)")
 
 
 def read_exodus_shapes(path: Path, nodes: Path | None) -> FileShapes:
-    """Return the mode shapes of an Exodus file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    nodes : Path, optional
-        Must not be given: the file holds its nodes.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no Exodus file, cut off, or without shapes.
-    ModelError
-        When `nodes` is given.
-    """
+    """Return the mode shapes of an Exodus file."""
     if nodes is not None:
         raise ModelError(f"{str(path)!r} holds its nodes: leave nodes= out.")
     omega, phi, dofs = read_shapes(path)

@@ -28,25 +28,7 @@ MISSING = (
 
 @dataclass(frozen=True)
 class FileShapes:
-    """Mode shapes as a file holds them, in its units.
-
-    Parameters
-    ----------
-    omega : (k,) array [rad/unit of time]
-        Frequencies, negative for negative eigenvalues.
-    phi : (n, k) array
-        FileShapes, in global directions.
-    dofs : DofSet
-        The rows.
-    masses : (k,) array, optional
-        Generalised masses of the shapes, where the file has them.
-    zeta : (k,) array, optional
-        Damping ratios, where the file has them.
-    notes : tuple of str
-        What was done in reading.
-    units : Units, optional
-        Of the numbers, where the file says so.
-    """
+    """Mode shapes as a file holds them, in its units."""
 
     omega: FloatArray
     phi: FloatArray
@@ -59,15 +41,7 @@ class FileShapes:
 
 @dataclass(frozen=True)
 class ModesFormat:
-    """Files that hold mode shapes, and their reader.
-
-    Parameters
-    ----------
-    suffixes : tuple of str
-        Endings of their names, in lower case.
-    read : callable
-        The file, and where its nodes are (a path or None), to FileShapes.
-    """
+    """Files that hold mode shapes, and their reader."""
 
     suffixes: tuple[str, ...]
     read: Callable[[Path, Path | None], FileShapes]
@@ -81,15 +55,7 @@ def modes_of(
     system: Units,
     path: str,
 ) -> Modes:
-    """Return the Modes of shapes, scaled to unit mass and SI.
-
-    Raises
-    ------
-    FlexplantError
-        When numbers are not finite.
-    ModelError
-        When damping is not known, masses are not positive, or modes are near zero.
-    """
+    """Return the Modes of shapes, scaled to unit mass and SI."""
     if not (np.all(np.isfinite(shapes.phi)) and np.all(np.isfinite(shapes.omega))):
         raise damaged(path, "NaN or infinite numbers in its modes")
     shapes = _unit_mass(shapes, path)
@@ -144,13 +110,7 @@ def _unit_mass(shapes: FileShapes, path: str) -> FileShapes:
 
 
 def frequencies(omega: FloatArray, rigid_below: float | None, path: str) -> Any:
-    """Return frequencies [rad/s] in order, how many are 0, and which mode each was.
-
-    Raises
-    ------
-    ModelError
-        When some are near zero and `rigid_below` does not say what they are.
-    """
+    """Return frequencies [rad/s] in order, how many are 0, and which mode each was."""
     limit = None if rigid_below is None else 2 * np.pi * positive(rigid_below, "rigid_below")
     rigid = np.abs(omega) < limit if limit is not None else omega == 0
     order = np.argsort(np.where(rigid, -np.inf, omega), kind="stable")
@@ -166,13 +126,7 @@ def frequencies(omega: FloatArray, rigid_below: float | None, path: str) -> Any:
 
 
 def check_mass(phi: FloatArray, M: Any, path: str) -> float:
-    """Return how far phi^T M phi is from the identity, which single precision may explain.
-
-    Raises
-    ------
-    ModelError
-        When it is farther.
-    """
+    """Return how far phi^T M phi is from the identity, which single precision may explain."""
     n = phi.shape[0]
     if M.shape != (n, n):
         raise ShapeError(

@@ -97,11 +97,6 @@ def sound(matrix: Any) -> Any:
     """Return a sparse matrix whose pointers and indices were checked, anything else as it is.
 
     Damaged ones make SciPy write outside of its arrays; its own check passes over empty matrices.
-
-    Raises
-    ------
-    ValueError
-        When they lead out of the matrix.
     """
     import numpy as np
 

@@ -17,22 +17,7 @@ HEAD = 20000
 
 @dataclass(frozen=True)
 class Format:
-    """Files that hold matrices, and their reader.
-
-    Parameters
-    ----------
-    suffixes : tuple of str
-        Endings of their names, in lower case.
-    read : callable
-        The reader: the file, then options by name, to FEMatrices.
-    begins : callable, optional
-        Decides from the first `HEAD` bytes, in lower case: what a file says of itself goes before
-        its name.
-    mesh : tuple of str
-        Endings of the files that hold the nodes of such matrices.
-    mesh_option : str
-        What the reader calls such a file.
-    """
+    """Files that hold matrices, and their reader."""
 
     suffixes: tuple[str, ...]
     read: Callable[..., FEMatrices]
@@ -55,17 +40,7 @@ class Format:
 
 @dataclass(frozen=True)
 class Elsewhere:
-    """Files without matrices, and what to do with them.
-
-    Parameters
-    ----------
-    suffixes : tuple of str
-        Endings of their names, in lower case.
-    reader : str
-        What they hold, and who reads them or what to write instead.
-    begins : callable, optional
-        Decides from the first `HEAD` bytes; any when not given.
-    """
+    """Files without matrices, and what to do with them."""
 
     suffixes: tuple[str, ...]
     reader: str

@@ -15,13 +15,7 @@ from ..reduction import ReducedModel
 
 
 def system_fields(system: Any) -> dict[str, Any]:
-    """Return the fields of a system or a standard plant.
-
-    Raises
-    ------
-    ModelError
-        When it is neither.
-    """
+    """Return the fields of a system or a standard plant."""
     plant = system if isinstance(system, StandardPlant) else None
     g = as_statespace(system.system if isinstance(system, StandardPlant) else system)
     content: dict[str, Any] = {"A": g.A, "B": g.B, "C": g.C, "D": g.D, "dt": g.dt}
@@ -36,13 +30,7 @@ def system_fields(system: Any) -> dict[str, Any]:
 
 
 def system_of(content: Mapping[str, Any]) -> StateSpace | StandardPlant:
-    """Return the system of some fields, a plant when they say which channels are w, u, z and y.
-
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        When what they hold is no system.
-    """
+    """Return the system of some fields, a plant when they say which channels are w, u, z and y."""
     blocks = content.get("blocks")
     g = StateSpace(
         content["A"],
@@ -101,13 +89,7 @@ def reduced_fields(model: ReducedModel) -> dict[str, Any]:
 
 
 def reduced_of(content: Mapping[str, Any]) -> ReducedModel:
-    """Return the reduced model of some fields.
-
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        When they do not belong together.
-    """
+    """Return the reduced model of some fields."""
     n = content["M"].shape[0]
     motions = content.get("joint_motions")
     return ReducedModel(
@@ -137,13 +119,7 @@ def frf_fields(frf: Frf) -> dict[str, Any]:
 
 
 def frf_of(content: Mapping[str, Any]) -> Frf:
-    """Return the frequency responses of some fields.
-
-    Raises
-    ------
-    ModelError, ShapeError, LabelError
-        When they do not belong together.
-    """
+    """Return the frequency responses of some fields."""
     freq = np.ravel(content["freq"])
     inputs, outputs = names_in(content.get("inputs")), names_in(content.get("outputs"))
     # MATLAB drops a last axis of one frequency

@@ -12,15 +12,7 @@ from .paths import file_path
 
 
 def mat_variables(path: str | Path) -> dict[str, Any]:
-    """Return {name: value}, structures as dicts, cells as arrays of objects.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no MATLAB file, or of version 7.3.
-    FileNotFoundError
-        When there is no such file.
-    """
+    """Return {name: value}, structures as dicts, cells as arrays of objects."""
     wrong = _cut(file_path(path).read_bytes())
     kind, found = ("cut off", {}) if wrong else in_child("matlab", path, keep="matlab")
     if kind != "value":

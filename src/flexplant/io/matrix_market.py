@@ -213,13 +213,7 @@ def _mirrored(entries: Any, head: _Header, path: Path) -> Any:
 
 
 def _refuse_both_triangles(entries: Any, head: _Header, path: Path) -> None:
-    """Refuse a symmetric file that lists entries on both sides of the diagonal.
-
-    Raises
-    ------
-    FlexplantError
-        When (i, j) and (j, i) are there: the matrix would have twice the value.
-    """
+    """Refuse a symmetric file that lists entries on both sides of the diagonal."""
     i, j = (np.asarray(place, dtype=np.int64) for place in entries.coords)
     above, below = np.flatnonzero(i < j), np.flatnonzero(i > j)
     if not above.size or not below.size:

@@ -37,21 +37,6 @@ def read_nodes(path: str | Path) -> Nodes:
 
     GRID, GRDSET and CORD2R, CORD2C, CORD2S in free, small or large fields, also in files that it
     INCLUDEs, up to ENDDATA; all other cards are passed over.
-
-    Parameters
-    ----------
-    path : str or Path
-        A .bdf, .dat or .nas file.
-
-    Raises
-    ------
-    FlexplantError
-        When a card cannot be read, a node or a system is defined twice, or an INCLUDEd file is not
-        there; the lines are named.
-    LabelError
-        When a coordinate system is not there.
-    FileNotFoundError
-        When there is no such file.
     """
     lines = _lines(file_path(path, "bdf"))
     grids: dict[int, list[str]] = {}
@@ -91,22 +76,7 @@ def nodes_of(
     systems: dict[int, tuple[str, list[str]]],
     path: str,
 ) -> Nodes:
-    """Return nodes of (system of the place, place, system of the displacements) by number.
-
-    Parameters
-    ----------
-    grids : mapping {node: (CP, (x1, x2, x3), CD)}
-        The nodes.
-    systems : dict {number: (kind, fields)}
-        CORD2R, CORD2C, CORD2S: number, base, and nine coordinates of three points.
-    path : str
-        The file, for messages.
-
-    Raises
-    ------
-    FlexplantError, LabelError, ModelError
-        When a coordinate system is not there, or cannot be made.
-    """
+    """Return nodes of (system of the place, place, system of the displacements) by number."""
     known = _Systems(systems, path)
     xyz, axes = {}, {}
     for node, (into, place, moves) in grids.items():
@@ -157,32 +127,12 @@ def _goes_on(line: str) -> bool:
 
 
 def nastran_float(text: str) -> float:
-    """Return a number as Nastran writes it: 1.5, 1.5E3, 1.5D3, 1.5+3; blank is 0.
-
-    Parameters
-    ----------
-    text : str
-        One field.
-
-    Examples
-    --------
-    >>> nastran_float("-2.5-3")
-    -0.0025
-    """
+    """Return a number as Nastran writes it: 1.5, 1.5E3, 1.5D3, 1.5+3; blank is 0."""
     return decimal(text) if text.strip() else 0.0
 
 
 def cards(lines: Iterable[str], kinds: tuple[str, ...]) -> Iterator[tuple[int, str, list[str]]]:
-    """Yield (line number, name, fields after the name) of the cards of some kinds.
-
-    Parameters
-    ----------
-    lines : iterable of str
-        Bulk data in free, small or large fields; a card goes on in lines that begin with `+`,
-        `*`, a comma or a blank.
-    kinds : tuple of str
-        Names of the cards to return.
-    """
+    """Yield (line number, name, fields after the name) of the cards of some kinds."""
     number, kind, fields = 0, "", list[str]()
     for at, raw in enumerate(lines, 1):
         line = raw.split("$", 1)[0].rstrip().expandtabs(8)

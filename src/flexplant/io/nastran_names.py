@@ -17,27 +17,7 @@ def named_matrices(
     endings: Sequence[str],
     path: str,
 ) -> list[str | None]:
-    """Return the names of stiffness, mass and damping; of the latter two None where not there.
-
-    Parameters
-    ----------
-    found : mapping {name: matrix}
-        What the file holds.
-    given : mapping {"stiffness", "mass", "damping": name or None}
-        What the caller says. "usual" takes the one that has a usual name, as does None; but no
-        damping is said by None.
-    endings : sequence of str
-        Of usual names, after the letter K, M or B.
-    path : str
-        The file, for messages.
-
-    Raises
-    ------
-    LabelError
-        When a name that is given is not there.
-    ModelError
-        When several may be meant, or there is no stiffness.
-    """
+    """Return the names of stiffness, mass and damping; of the latter two None where not there."""
     names: list[str | None] = []
     for what, said in given.items():
         if what == "damping" and said is None:

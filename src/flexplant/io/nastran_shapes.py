@@ -27,28 +27,7 @@ def shapes_at(
     masses: FloatArray | None,
     path: str,
 ) -> FileShapes:
-    """Return the FileShapes of eigenvectors.
-
-    Parameters
-    ----------
-    table : (ids, kinds, values)
-        Node numbers (m,), kinds (1 a grid, others scalar points) and numbers (m, 6, k).
-    omega : (k,) array
-        Frequencies.
-    nodes : Nodes, or path of the bulk data or of a table `node, x, y, z`
-        Places and displacement coordinate systems.
-    turned : bool
-        Whether the numbers are in the basic system already.
-    masses : (k,) array, optional
-        Generalised masses.
-    path : str
-        The file, for messages.
-
-    Raises
-    ------
-    LabelError
-        When there are no places, or not of all nodes.
-    """
+    """Return the FileShapes of eigenvectors."""
     ids, kinds, values = table
     grid = kinds == 1
     notes: tuple[str, ...] = ()

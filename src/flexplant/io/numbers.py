@@ -28,23 +28,7 @@ _DIGITS = re.compile(rb"[+-]?0*(\d*)\.?(\d*)")
 
 
 def decimal(text: str) -> float:
-    """Return a decimal number as Fortran or C writes it: 7.5, 7.5e3, 7.5D+03, 7.5+03.
-
-    Parameters
-    ----------
-    text : str
-        One number; blanks around it do not matter.
-
-    Raises
-    ------
-    ValueError
-        When it is anything else: a decimal comma, hexadecimal digits, underscores, nan.
-
-    Examples
-    --------
-    >>> decimal(" 7.5D+03"), decimal("-2.5-3")
-    (7500.0, -0.0025)
-    """
+    """Return a decimal number as Fortran or C writes it: 7.5, 7.5e3, 7.5D+03, 7.5+03."""
     match = _DECIMAL.fullmatch(text.strip())
     if match is None:
         raise ValueError(f"{text.strip()!r:.40} is no decimal number")
@@ -52,20 +36,7 @@ def decimal(text: str) -> float:
 
 
 def fixed_numbers(text: bytes, width: int) -> FloatArray | None:
-    """Return the numbers in fields of `width` characters, None when one is no number.
-
-    Parameters
-    ----------
-    text : bytes
-        The fields side by side; numbers of neighbours may touch.
-    width : int
-        Characters of a field.
-
-    Examples
-    --------
-    >>> fixed_numbers(b" 1.5D+00-2.5E+00", 8)
-    array([ 1.5, -2.5])
-    """
+    """Return the numbers in fields of `width` characters, None when one is no number."""
     fields = np.frombuffer(text, np.uint8).reshape(-1, width)
     shown = np.zeros((fields.shape[0], width + 1), dtype=bool)
     shown[:, 1:] = fields != ord(" ")
@@ -85,13 +56,6 @@ def spaced_numbers(text: bytes, count: int | None = None) -> FloatArray | None:
     """Return the numbers of a text that separates them with spaces or line ends.
 
     None when one is no number, or there are not `count`.
-
-    Parameters
-    ----------
-    text : bytes
-        Exponents may be written as 1e5, 1d5 or 1+5.
-    count : int, optional
-        How many there must be.
     """
     clean = text.translate(_LETTERS)
     seen = np.frombuffer(clean, np.uint8)
@@ -104,20 +68,7 @@ def spaced_numbers(text: bytes, count: int | None = None) -> FloatArray | None:
 
 
 def rows_of_numbers(text: bytes, width: int) -> FloatArray | None:
-    r"""Return the numbers (m, width) of m lines, None when a line does not hold `width` numbers.
-
-    Parameters
-    ----------
-    text : bytes
-        Numbers as in `spaced_numbers`; empty lines are passed over.
-    width : int
-        How many a line must hold.
-
-    Examples
-    --------
-    >>> rows_of_numbers(b"1 2.5D0\n\n2 -1+1\n", 2).tolist()
-    [[1.0, 2.5], [2.0, -10.0]]
-    """
+    r"""Return the numbers (m, width) of m lines, None when a line does not hold `width` numbers."""
     seen = np.frombuffer(text, np.uint8)
     shown = np.zeros(seen.size + 1, dtype=bool)
     shown[1:] = (seen > ord(" ")) & (seen != 127)
@@ -131,15 +82,7 @@ def rows_of_numbers(text: bytes, width: int) -> FloatArray | None:
 
 
 def wrong_line(lines: Iterable[bytes], width: int) -> int | None:
-    """Return the place (from 0) of the first line that does not hold `width` finite numbers.
-
-    Parameters
-    ----------
-    lines : iterable of bytes
-        Empty ones are passed over.
-    width : int
-        How many each must hold.
-    """
+    """Return the place (from 0) of the first line that does not hold `width` finite numbers."""
     for place, line in enumerate(lines):
         words = line.decode("latin-1").split()
         try:
@@ -169,18 +112,6 @@ def printed_digits(words: Iterable[bytes]) -> int | None:
     A program that rounds prints all numbers alike: in a fixed field, up to the places that sign and
     exponent take, or with as many digits, less the zeros at the end. Numbers of a few digits, such
     as 5 or 2.5, and some long ones among them, may be exact.
-
-    Parameters
-    ----------
-    words : iterable of bytes
-        Numbers as printed; zeros do not count.
-
-    Examples
-    --------
-    >>> printed_digits([b"1.500000000D+00", b"-3.245226567D+06"])
-    10
-    >>> printed_digits([b"1.", b"-2."]), printed_digits([b"1.", b"2.5", b"1234.5678"])
-    (None, None)
     """
     found = []
     for word in words:
@@ -198,20 +129,6 @@ def cut_short(content: bytes, words: Iterable[bytes]) -> bool:
     r"""Return whether a text ends, without a line end, in a number shorter than all others.
 
     A number without its last digits still is a number.
-
-    Parameters
-    ----------
-    content : bytes
-        The text.
-    words : iterable of bytes
-        Numbers of it as printed, some or all.
-
-    Examples
-    --------
-    >>> cut_short(b"1 1.500000E+00\n2 2.5", [b"1.500000E+00"])
-    True
-    >>> cut_short(b"1 1.500000E+00\n2 2.5\n", [b"1.500000E+00"])
-    False
     """
     last = content[-80:].split()[-1:]
     if content.endswith((b"\n", b"\r")) or not last:

@@ -19,19 +19,7 @@ from .paths import damaged, defined_twice
 
 @dataclass(frozen=True)
 class Block:
-    """A data block: its name, and its logical records as bytes, the name, trailer and header out.
-
-    Parameters
-    ----------
-    name : str
-        Such as OUGV1, LAMA or GEOM1.
-    records : list of bytes
-        The data.
-    order : {"<", ">"}
-        Byte order.
-    size : {4, 8}
-        Bytes of a word, integer or real.
-    """
+    """A data block: its name, and its logical records as bytes without trailer and header."""
 
     name: str
     records: list[bytes]
@@ -54,20 +42,6 @@ class Block:
 def blocks(content: bytes, path: str) -> Iterator[Block]:
     """Yield the data blocks of a file.
 
-    Parameters
-    ----------
-    content : bytes
-        The file.
-    path : str
-        Its name, for messages.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no OUTPUT2 file, cut off or damaged; the byte is named.
-
-    Notes
-    -----
     Format: MSC Nastran DMAP Programmer's Guide, OUTPUT2. Fortran records, of which those of one
     word are keys: above 0 as many words follow as the next record, below 0 a logical record ends,
     0 ends a data block, and once more the file. Each logical record begins with its kind.
@@ -139,24 +113,7 @@ _CARDS = {4501: ("GRID", 8), 2101: ("CORD2R", 13), 2001: ("CORD2C", 13), 2201: (
 
 
 def read_op2_shapes(path: Path, nodes: Path | None) -> FileShapes:
-    """Return the mode shapes of an .op2 file.
-
-    Parameters
-    ----------
-    path : Path
-        The file (PARAM,POST,-1 or -2), of 32 or 64 bit words in either byte order.
-    nodes : Path, optional
-        The bulk data, where the file has no GEOM1.
-
-    Raises
-    ------
-    FlexplantError
-        When it is damaged, or holds no modes.
-    ModelError
-        When it holds several sets of modes.
-    LabelError
-        When a node or its coordinate system is not there.
-    """
+    """Return the mode shapes of an .op2 file."""
     found = list(blocks(path.read_bytes(), str(path)))
     vectors = [block for block in found if block.name.lstrip("B").startswith(("OUG", "OPHIG"))]
     sets = [(block, part) for block in vectors for part in _modes(block, str(path))]

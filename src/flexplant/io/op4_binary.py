@@ -71,20 +71,7 @@ class _Words:
 
 
 def binary_matrices(content: bytes, path: str) -> Iterable[tuple[str, Any, int, int | None]]:
-    """Yield (name, matrix, form, significant digits or None) of each matrix.
-
-    Parameters
-    ----------
-    content : bytes
-        The file.
-    path : str
-        Its name, for messages.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no binary OUTPUT4 file, damaged or cut off; the byte is named.
-    """
+    """Yield (name, matrix, form, significant digits or None) of each matrix."""
     words = _Words(content, path)
     size, marker = words.layout.integer, words.layout.marker
     at = 0

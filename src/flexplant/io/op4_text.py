@@ -21,20 +21,7 @@ _FORMAT = re.compile(r"(?:(\d+)P,?)?\s*(\d+)\s*[EDG](\d+)\.(\d+)")
 
 
 def text_matrices(content: bytes, path: str) -> list[tuple[str, Any, int, int]]:
-    """Return (name, matrix, form, significant digits) of each matrix.
-
-    Parameters
-    ----------
-    content : bytes
-        The file.
-    path : str
-        Its name, for messages.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no text of OUTPUT4, or cut off; the line is named.
-    """
+    """Return (name, matrix, form, significant digits) of each matrix."""
     reader = _Reader(content.splitlines(), path)
     matrices = []
     while reader.more():
@@ -202,13 +189,7 @@ _TIMES = 16
 
 
 def check_shape(columns: int, rows: int, held: int, path: str) -> None:
-    """Refuse a size of a matrix that a file of `held` bytes cannot hold.
-
-    Raises
-    ------
-    FlexplantError
-        When rows or columns are too many: a damaged count.
-    """
+    """Refuse a size of a matrix that a file of `held` bytes cannot hold."""
     check_size(max(columns, abs(rows)), held, path)
 
 

@@ -17,13 +17,7 @@ GLOBAL = "Only global coordinates and directions are read: export these."
 
 
 def file_path(path: Any, name: str = "path") -> Path:
-    """Return the path of a file; its absence is left to what opens it.
-
-    Raises
-    ------
-    FlexplantError
-        When it is no path, or that of a folder.
-    """
+    """Return the path of a file; its absence is left to what opens it."""
     if not isinstance(path, str | Path):
         raise FlexplantError(
             f"{name} must name a file, got {short(path)}. Pass matrices that are in memory already "
@@ -82,13 +76,7 @@ def no_motion(path: object, kinds: object) -> ModelError:
 
 
 def three_units(units: Any) -> tuple[Any, ...]:
-    """Return the units of length, mass and time.
-
-    Raises
-    ------
-    ModelError
-        When they are not three.
-    """
+    """Return the units of length, mass and time."""
     sizes = tuple(units) if isinstance(units, Iterable) and not isinstance(units, str) else ()
     if len(sizes) != 3:
         raise ModelError(
@@ -99,35 +87,14 @@ def three_units(units: Any) -> tuple[Any, ...]:
 
 
 def check_whole(content: bytes, words: Iterable[bytes], path: object) -> None:
-    """Refuse a text that ends, without a line end, in a number shorter than all others.
-
-    Parameters
-    ----------
-    content : bytes
-        The text.
-    words : iterable of bytes
-        Numbers of it as printed, some or all.
-    path : object
-        The file, for the message.
-
-    Raises
-    ------
-    FlexplantError
-        When it does: a number without its last digits still is a number.
-    """
+    """Refuse a text that ends, without a line end, in a number shorter than all others."""
     if cut_short(content, words):
         raise damaged(path, "the last number is shorter than all others")
 
 
 @contextmanager
 def parsing(path: object, do: str = "Write it again.") -> Iterator[None]:
-    """Turn whatever a parser of another package raises into the error of a damaged file.
-
-    Raises
-    ------
-    FlexplantError
-        When anything is raised but an error of ours.
-    """
+    """Turn whatever a parser of another package raises into the error of a damaged file."""
     try:
         yield
     except FlexplantError:
@@ -137,36 +104,13 @@ def parsing(path: object, do: str = "Write it again.") -> Iterator[None]:
 
 
 def check_size(size: int, held: int, path: object) -> None:
-    """Refuse a number of rows or columns that a damaged count has made.
-
-    Parameters
-    ----------
-    size : int
-        The count.
-    held : int
-        Bytes of the file: rows beyond a million that hold an entry take more bytes than one each.
-    path : object
-        The file, for the message.
-
-    Raises
-    ------
-    FlexplantError
-        When the file cannot hold so many.
-    """
+    """Refuse a number of rows or columns that a damaged count has made."""
     if size > max(2**20, held):
         raise damaged(path, f"a matrix of {size} rows or columns in {held} bytes")
 
 
 def text_of(path: Path, encoding: str = "utf-8-sig") -> str:
-    """Return the text of a file.
-
-    Raises
-    ------
-    FlexplantError
-        When its bytes are no such text.
-    FileNotFoundError
-        When there is no such file.
-    """
+    """Return the text of a file."""
     try:
         return path.read_text(encoding=encoding)
     except UnicodeDecodeError as error:

@@ -22,20 +22,6 @@ def read_punch_shapes(path: Path, nodes: Path | None) -> FileShapes:
 
     Two lines a point: number, kind and three displacements, then `-CONT-` and three rotations;
     columns 73 to 80 count lines. A header `$EIGENVALUE = ... MODE = ...` begins each mode.
-
-    Parameters
-    ----------
-    path : Path
-        The .pch file.
-    nodes : Path, optional
-        The bulk data, which the file needs: it does not hold the nodes.
-
-    Raises
-    ------
-    FlexplantError
-        When it holds no modes, or a line has another form; it is named.
-    LabelError
-        When nodes are not in the bulk data.
     """
     lines = [line[:72] for line in path.read_bytes().splitlines()]
     parts: list[tuple[float, dict[int, tuple[bytes, list[float]]]]] = []

@@ -130,18 +130,7 @@ def read_dofs(
 
 
 def read_nodes_table(path: str | Path) -> tuple[IntArray, FloatArray]:
-    """Return the node numbers (m,) and coordinates (m, 3) of a text table `node, x, y, z`.
-
-    Parameters
-    ----------
-    path : str or Path
-        Commas, semicolons, tabs or spaces; with or without a first line of names.
-
-    Raises
-    ------
-    FlexplantError
-        When it has another form.
-    """
+    """Return the node numbers (m,) and coordinates (m, 3) of a text table `node, x, y, z`."""
     return _nodes(_table(path, plain=("node", "x", "y", "z")))
 
 

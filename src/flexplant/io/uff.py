@@ -276,11 +276,6 @@ def raw_nodes(path: str | Path) -> tuple[IntArray, FloatArray, tuple[float, floa
     """Return node numbers (n,), their places (n, 3) and the factors of length and force to SI.
 
     Numbers divided by these factors are in SI; 1 where the file has no dataset 164.
-
-    Raises
-    ------
-    FlexplantError, ModelError
-        As `read_nodes_uff`.
     """
     sets = datasets(path, (15, 2411, 164, 2420))
     factors = next((part for part in sets if part["type"] == 164), dict.fromkeys(_FACTORS, 1.0))
@@ -315,22 +310,7 @@ UNIVERSAL = Elsewhere(
 
 
 def read_uff_shapes(path: Path, nodes: Path | None) -> FileShapes:
-    """Return the normal modes of a universal file.
-
-    Parameters
-    ----------
-    path : Path
-        A .uff, .unv or .uf file. Needs pyuff.
-    nodes : Path, optional
-        Another universal file, or a table `node, x, y, z`, for the nodes.
-
-    Raises
-    ------
-    FlexplantError
-        When pyuff is missing, the file is damaged, or holds no normal modes.
-    LabelError
-        When a node has no place.
-    """
+    """Return the normal modes of a universal file."""
     parts = [p for p in mode_records(path, measured=False) if p.analysis == NORMAL_MODE]
     if not parts:
         raise FlexplantError(

@@ -29,26 +29,7 @@ DISPLACEMENT = 8
 
 
 class AnalysisData(NamedTuple):
-    """Motions of nodes in one result of an analysis.
-
-    Attributes
-    ----------
-    analysis, result : int
-        What kind: 2 normal mode, 3 and 7 complex modes, 5 frequency response; 8 displacement, 11
-        velocity, 12 acceleration.
-    load, mode : int
-        The numbers of the load set and of the mode.
-    freq : float [Hz]
-        Of a mode or a response.
-    mass, viscous, hysteretic : float
-        Generalised mass, damping ratio and loss factor of a normal mode.
-    eigenvalue : complex [rad/s]
-        Of a complex mode.
-    nodes : (n,) array of int
-        Node numbers.
-    motions : (n, 6) array
-        Along x, y, z, rx, ry, rz; zero where the file has none.
-    """
+    """Motions of nodes in one result of an analysis."""
 
     analysis: int
     result: int
@@ -77,20 +58,7 @@ class AnalysisData(NamedTuple):
 
 
 def mode_records(path: Path, *, measured: bool) -> list[AnalysisData]:
-    """Return the modes of a file.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    measured : bool
-        Of datasets 55 and 2414, the former are measured: prefer these, or those of a model.
-
-    Raises
-    ------
-    FlexplantError
-        When pyuff is missing, the file is damaged, or modes are at different nodes.
-    """
+    """Return the modes of a file."""
     of_tests = [_of_55(part, path) for part in datasets(path, (55,))]
     of_models = [part for part in read_analysis(path) if part.result == DISPLACEMENT]
     kinds = (NORMAL_MODE, *COMPLEX_MODES)
@@ -136,13 +104,7 @@ def _of_55(part: dict[str, Any], path: Path) -> AnalysisData:
 
 
 def read_analysis(path: Path) -> list[AnalysisData]:
-    """Return all motions at nodes in the datasets 2414 of a file; other results are passed over.
-
-    Raises
-    ------
-    FlexplantError
-        When a dataset is damaged.
-    """
+    """Return all motions at nodes in the datasets 2414 of a file; other results are passed over."""
     found = [_parsed(lines, place, path) for place, lines in _blocks(path)]
     return [part for part in found if part is not None]
 
@@ -214,26 +176,7 @@ def _numbers(line: bytes, path: Path, what: str) -> FloatArray:
 def responses_of_model(
     path: Path, factors: dict[str, Any] | None, quantity: str | None, scale: float | None
 ) -> Frf | None:
-    """Return the frequency responses of dataset 2414, None when there are none.
-
-    Parameters
-    ----------
-    path : Path
-        The file.
-    factors : dict, optional
-        Its dataset 164: lengths divided by its factor are in metres.
-    quantity : str, optional
-        What the outputs shall be; that of the file when not given.
-    scale : float, optional
-        Factor that brings displacements to SI, in place of `factors`.
-
-    Raises
-    ------
-    FlexplantError
-        When frequencies or nodes of load sets differ, or results are there twice.
-    ModelError
-        When the file holds several quantities and none is chosen, or would be integrated at 0 Hz.
-    """
+    """Return the frequency responses of dataset 2414, None when there are none."""
     parts = [
         part
         for part in read_analysis(path)

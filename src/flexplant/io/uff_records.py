@@ -238,24 +238,7 @@ _SECONDS = re.compile(r"\(?s(?:ec)?(?:\^|\*\*)?2?\)?")
 def record_scale(
     part: dict[str, Any], factors: dict[str, Any] | None, quantity: str | None, path: str
 ) -> float:
-    """Return the factor that brings a response of dataset 58 to SI.
-
-    Parameters
-    ----------
-    part : dict
-        The record.
-    factors : dict or None
-        Dataset 164: numbers divided by its factors are in SI.
-    quantity : str or None
-        What the output is.
-    path : str
-        For messages.
-
-    Raises
-    ------
-    ModelError
-        When a label is unknown, or contradicts dataset 164.
-    """
+    """Return the factor that brings a response of dataset 58 to SI."""
     above = _label(part, "ordinate_axis_units_lab")
     below = _label(part, "orddenom_axis_units_lab")
     if "/" in above and not below:  # all in one label: m/s^2/N

@@ -22,17 +22,7 @@ Model = FEModel | ReducedModel
 
 
 class Component(NamedTuple):
-    """A component of a machine.
-
-    Attributes
-    ----------
-    name : str
-        What its labels begin with.
-    model : FEModel or ReducedModel
-        Where it stands.
-    static_rows : (s, n_full) array
-        Loads whose static shapes a reduced model has.
-    """
+    """A component of a machine."""
 
     name: str
     model: Any
@@ -73,15 +63,7 @@ class Component(NamedTuple):
 
 
 def components_of(models: Any, placed: Any) -> list[Component]:
-    """Return the components of a machine where they stand.
-
-    Raises
-    ------
-    ModelError
-        When one is no model, or no pose.
-    LabelError
-        When a name cannot begin a label, or a pose is given for another.
-    """
+    """Return the components of a machine where they stand."""
     instance(models, Mapping, "components", "Pass {'stage': model, 'frame': model}.")
     if not models:
         raise ModelError("there is no component to join. Pass {'stage': model, 'frame': model}.")

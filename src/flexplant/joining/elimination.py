@@ -25,17 +25,7 @@ _ROUNDING = 1e-15
 
 
 class Elimination(NamedTuple):
-    """Coordinates (n,) that fulfil constraints, by those that are left (k,): ``q = T q_k``.
-
-    Attributes
-    ----------
-    T : (n, k) sparse array
-        The expansion: unit rows for those that are left.
-    kept : (k,) array of int
-        Which are left.
-    rank : int
-        How many constraints are independent.
-    """
+    """Coordinates (n,) that fulfil constraints, by those that are left (k,): ``q = T q_k``."""
 
     T: sp.csc_array
     kept: IntArray
@@ -48,15 +38,6 @@ def eliminated(B: sp.csr_array, size: FloatArray, order: IntArray) -> Eliminatio
     Coordinates that no constraint names are left alone, one that a single constraint names follows
     it, and of the others, constraints that share no coordinate are solved apart: sparse matrices
     stay sparse.
-
-    Parameters
-    ----------
-    B : (m, n) sparse array
-        The constraints.
-    size : (n,) array
-        How far each coordinate moves its component at most: makes them comparable.
-    order : (n,) array of int
-        Of equally good ones, the later follows: the number of the component.
     """
     n = B.shape[1]
     lead = _own_followers(B, size, order)

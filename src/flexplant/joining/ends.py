@@ -35,35 +35,7 @@ class Jointed(Protocol):
 
 
 class JointEnd:
-    """One end of a joint.
-
-    Parameters
-    ----------
-    parts : sequence of Jointed
-        All components.
-    end : str, (str, (3,) array) or Patch
-        As in `Joint`.
-    size : float [m]
-        Of the machine: lever arms below 1e-9 of it are none.
-    motions : sequence of (n, 6) arrays
-        The rigid-body motions of the machine at the DOFs of each component.
-
-    Attributes
-    ----------
-    index : int
-        Which component it is of.
-    point : (3,) array [m]
-        Where it is.
-    axes : tuple of str
-        The directions it moves in.
-    label : bool
-        Whether it is one DOF: without lever arm.
-
-    Raises
-    ------
-    LabelError
-        When there is no such place.
-    """
+    """One end of a joint."""
 
     def __init__(
         self, parts: Sequence[Jointed], end: Any, size: float, motions: Sequence[FloatArray]
@@ -135,12 +107,6 @@ class JointEnd:
         """Return the motion (n,) along an axis at a point that moves with this end.
 
         A displacement there is ``u + theta x (point - own point)``.
-
-        Raises
-        ------
-        LabelError
-            When the end does not move along the axis, or a rotation that the lever arm needs is
-            not there.
         """
         if axis not in self._rows:
             raise LabelError(
@@ -194,13 +160,7 @@ class JointEnd:
 
 
 def joint_axes(joint: Joint, first: JointEnd, second: JointEnd | None) -> tuple[str, ...]:
-    """Return the axes that a joint joins: those given, that of a DOF, or those of both ends.
-
-    Raises
-    ------
-    LabelError
-        When the ends have different ones and none are given.
-    """
+    """Return the axes that a joint joins: those given, that of a DOF, or those of both ends."""
     if joint.axes is not None:
         return tuple(joint.axes)
     for place in (first, second):

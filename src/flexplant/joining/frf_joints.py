@@ -25,16 +25,7 @@ _BENDS = 0.1
 
 
 class FrfEnd(NamedTuple):
-    """What one end of a joint feels, and how its force is spread.
-
-    Attributes
-    ----------
-    owner : str
-        The component.
-    outputs, inputs : mapping {str: float}
-        The motion of the end by the component's outputs, and what a unit force on it is on the
-        component's inputs; negative at the second end.
-    """
+    """What one end of a joint feels, and how its force is spread."""
 
     owner: str
     outputs: Mapping[str, float]
@@ -56,23 +47,7 @@ class FrfLink(NamedTuple):
 
 
 def frf_links(joints: Sequence[Any], parts: Sequence[Channels]) -> list[FrfLink]:
-    """Return all axes of joints between responses.
-
-    Parameters
-    ----------
-    joints : sequence of Joint
-        Between DOFs, "stage/41:z", nodes, "stage/41", or, where places are known, patches and
-        nodes with lever arms.
-    parts : sequence of Channels
-        Of all components.
-
-    Raises
-    ------
-    LabelError
-        When a channel is not both an output and an input of its component.
-    ModelError
-        When an end is none of responses, or places would be needed.
-    """
+    """Return all axes of joints between responses."""
     return [link for joint in joints for link in _links(joint, parts)]
 
 
@@ -202,12 +177,6 @@ def softness(links: Sequence[FrfLink], freq: FloatArray, quantity: str | None) -
     """Return what links give way (m, n_freq) per force: ``(2 pi i f)^p / (k + 2 pi i f c)``.
 
     p is 0, 1 or 2 where displacements, velocities or accelerations are measured.
-
-    Raises
-    ------
-    ModelError
-        When there are springs and the quantity is not known, or one of them has neither stiffness
-        nor rate at a frequency.
     """
     s = 2j * np.pi * freq
     found = np.zeros((len(links), freq.size), dtype=np.complex128)

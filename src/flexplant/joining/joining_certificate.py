@@ -101,28 +101,7 @@ def certified(
     expected: int,
     patches: Mapping[str, float],
 ) -> JoiningCertificate:
-    """Return the checks of a joined machine.
-
-    Parameters
-    ----------
-    parts, links, groups
-        Components, joints, and what these hold together.
-    done : Elimination
-        What was eliminated.
-    matrices : mapping {str: (k, k) matrix}
-        "M" and "K" of what is left.
-    rigid : (k, r) array
-        The machine's rigid-body motions.
-    expected : int
-        How many of its components' motions stretch no joint.
-    patches : mapping
-        Errors of patches.
-
-    Raises
-    ------
-    CertificateError
-        When a joint opens, forces do not balance, inertia is lost, or the counts differ.
-    """
+    """Return the checks of a joined machine."""
     B = rows_of([link for link in links if link.joint.is_rigid], parts)
     opening: Any = abs(B @ done.T).max(axis=1)
     most: Any = (abs(B) @ abs(done.T)).max(axis=1)

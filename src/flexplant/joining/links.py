@@ -31,21 +31,7 @@ class Felt(NamedTuple):
 
 
 class Link(NamedTuple):
-    """One axis of one joint.
-
-    Attributes
-    ----------
-    joint : Joint
-        Which.
-    axis : str
-        Of x, y, z, rx, ry, rz.
-    ends : tuple of Felt
-        What is felt of its components: the stretch is the sum.
-    stiffness, rate : float
-        Zero of a rigid one.
-    carried : (6,) array
-        The stretch by the six rigid-body motions of the machine; of a grounded one, zero.
-    """
+    """One axis of one joint."""
 
     joint: Joint
     axis: str
@@ -66,15 +52,7 @@ class Link(NamedTuple):
 
 
 def links_of(joints: Any, parts: Sequence[Component]) -> list[Link]:
-    """Return all axes of all joints.
-
-    Raises
-    ------
-    LabelError
-        When a place or an axis is not there.
-    ModelError
-        When a rigid joint would hold the machine against the ground.
-    """
+    """Return all axes of all joints."""
     listed = (
         [joints]
         if isinstance(joints, Joint)

@@ -15,17 +15,7 @@ from ..values import FloatArray, instance
 
 
 class Side(NamedTuple):
-    """The outputs, or the inputs, of a component that are DOFs.
-
-    Attributes
-    ----------
-    name : str
-        The component.
-    dofs : DofSet
-        What the channels are; at the origin when their places are not known.
-    channels : tuple of str
-        Their names.
-    """
+    """The outputs, or the inputs, of a component that are DOFs."""
 
     name: str
     dofs: DofSet
@@ -33,17 +23,7 @@ class Side(NamedTuple):
 
 
 class Channels(NamedTuple):
-    """The channels of a component that joints can name.
-
-    Attributes
-    ----------
-    name : str
-        The component.
-    outputs, inputs : Side
-        Those "41:z"; an input may be named "u 41:z" as well.
-    is_placed : bool
-        Whether it is known where they are.
-    """
+    """The channels of a component that joints can name."""
 
     name: str
     outputs: Side
@@ -62,24 +42,7 @@ class Channels(NamedTuple):
 
 
 def channels_of(name: str, frf: Frf, dofs: DofSet | None, *, inside: bool = False) -> Channels:
-    """Return the channels of a component that are DOFs.
-
-    Parameters
-    ----------
-    name : str
-        The component.
-    frf : Frf
-        Its responses; or those of a machine that it is part of.
-    dofs : DofSet, optional
-        Where its nodes are, in the coordinates of the machine.
-    inside : bool
-        Whether the channels are those of a machine, "stage/41:z".
-
-    Raises
-    ------
-    LabelError
-        When places are given, and a channel's node has none.
-    """
+    """Return the channels of a component that are DOFs."""
     if dofs is not None:
         instance(dofs, DofSet, f"dofs of {name!r}", "Pass DofSet(nodes, directions, xyz).")
     sides = [_side(name, names, dofs, inside=inside) for names in (frf.outputs, frf.inputs)]
@@ -121,25 +84,13 @@ def _side(name: str, names: Sequence[str], dofs: DofSet | None, *, inside: bool)
 
 
 def parts_of(frfs: Mapping[str, Frf], dofs: Mapping[str, DofSet] | None) -> list[Channels]:
-    """Return the channels of all components.
-
-    Raises
-    ------
-    LabelError
-        When places are given for another component.
-    """
+    """Return the channels of all components."""
     places = known_places(dofs, frfs)
     return [channels_of(name, frf, places.get(name)) for name, frf in frfs.items()]
 
 
 def known_places(dofs: object, names: Mapping[str, object] | Sequence[str]) -> dict[str, DofSet]:
-    """Return the places of components.
-
-    Raises
-    ------
-    ModelError, LabelError
-        When they are no mapping, or of other components.
-    """
+    """Return the places of components."""
     if dofs is None:
         return {}
     found: Mapping[str, DofSet] = instance(dofs, Mapping, "dofs", "Pass {'stage': DofSet(...)}.")

@@ -43,21 +43,6 @@ def left_motions(
 
     For each part of the machine first those of the whole, then those of one component against
     others (a slide, a hinge): all are combinations of the components' own motions.
-
-    Parameters
-    ----------
-    parts : sequence of Component
-        All components.
-    groups : sequence of (c,) arrays of int
-        Which are held together.
-    rows : (m, n) sparse array
-        The stretches of joints by the coordinates of all components.
-    M : (k, k) matrix
-        Mass of what is left.
-    kept : (k,) array of int
-        The coordinates that are left.
-    free : bool
-        Only motions that cost the component no energy; else those that springs hold too.
     """
     starts = np.concatenate([[0], np.cumsum([part.n for part in parts])])
     found = []

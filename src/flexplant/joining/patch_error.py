@@ -50,17 +50,7 @@ def patch_errors(links: Sequence[Link], parts: Sequence[Component]) -> dict[str,
 def compliances(
     part: Component, patch: Patch, axes: Sequence[int]
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the elastic compliance (k,) along axes: of the mean motion, and of a rigid patch.
-
-    Parameters
-    ----------
-    part : Component
-        The patch's.
-    patch : Patch
-        Of nodes.
-    axes : sequence of k int
-        From 0: x, y, z, rx, ry, rz, those that are joined.
-    """
+    """Return the elastic compliance (k,) along axes: of the mean motion, and of a rigid patch."""
     rows, point = patch.rows(part.dofs), patch.point(part.dofs)
     W, A, _ = patch.mean(part.dofs, point)
     if rows.size > _MOST or part.model.n_unstable:

@@ -95,11 +95,6 @@ def turned(dofs: DofSet, pose: Pose) -> tuple[DofSet, sp.csc_array]:
 
     The interpolation is left out. C is orthogonal: it turns each node's displacements, and its
     rotations.
-
-    Raises
-    ------
-    ModelError
-        When a node has only some of its directions and the rotation makes the others oblique.
     """
     kinds, n = np.array(dofs.kinds), len(dofs)
     rows, columns, values = [np.zeros(0, np.int64)], [np.zeros(0, np.int64)], [np.zeros(0)]

@@ -155,15 +155,7 @@ def _aliased(lines: FloatArray, variance: FloatArray, freq: FloatArray, rate: fl
 def _sampled(
     lines: FloatArray, data: ComplexArray, freq: FloatArray, rate: float, late: float, held: bool
 ) -> ComplexArray:
-    """Return a measured plant as its samples show it, with delay and, unless held=False, aliases.
-
-    Parameters
-    ----------
-    lines, data : (n_lines,) and (n_out, n_in, n_lines) arrays
-        The measurement; zero beyond its lines, and conjugate at negative frequencies.
-    freq : (n_freq,) array [Hz]
-        Lines below half the rate.
-    """
+    """Return a measured plant as its samples show it, with delay and aliases (held=True)."""
     if not held:
         turned = np.exp(-2j * np.pi * freq * late / rate)
         return np.asarray(data[:, :, : freq.size] * turned)
@@ -185,13 +177,7 @@ def _images(lines: FloatArray, freq: FloatArray, rate: float) -> list[FloatArray
 
 
 def static_map(given: System | FloatArray | None, names: Sequence[str], side: str) -> StateSpace:
-    """Return a transformation from or to named channels of the plant.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When it has states, or does not fit.
-    """
+    """Return a transformation from or to named channels of the plant."""
     if given is None:
         eye = np.eye(len(names))
         return StateSpace([], [], [], eye, inputs=names, outputs=names)

@@ -55,13 +55,6 @@ def commands(
     """Return the response of the blocks from y to the driven actuators, each by its own structure.
 
     With G of all blocks beside each other: outputs ``v = G (route v + enter y)``, ``u = leave v``.
-
-    Parameters
-    ----------
-    systems : sequence of StateSpace
-        The blocks.
-    read, driven : sequences of str
-        Channels of y and u.
     """
     needed = {name for sys in systems for name in sys.inputs}
     used = [[n for n in sys.outputs if n in driven or n in needed] for sys in systems]
@@ -106,13 +99,7 @@ def commands(
 
 
 def as_block(block: Any, place: int, dt: float) -> StateSpace:
-    """Return a block as a StateSpace of the plant's dt.
-
-    Raises
-    ------
-    ModelError
-        When it is no system, or of another sampling time.
-    """
+    """Return a block as a StateSpace of the plant's dt."""
     inner = getattr(block, "system", block)
     if isinstance(block, StandardPlant) or not (
         isinstance(inner, StateSpace) or hasattr(inner, "input_labels")
@@ -133,13 +120,7 @@ def as_block(block: Any, place: int, dt: float) -> StateSpace:
 def drives(
     plant: StandardPlant, systems: Sequence[StateSpace], idle: tuple[str, ...]
 ) -> tuple[list[str], list[str]]:
-    """Return the driven actuators and the monitored outputs.
-
-    Raises
-    ------
-    LabelError
-        When a name is driven twice, or an actuator not at all and is not idle.
-    """
+    """Return the driven actuators and the monitored outputs."""
     produced = [name for sys in systems for name in sys.outputs]
     taken = {name: side for side in "wzy" for name in getattr(plant, side)}
     for name in produced:

@@ -33,23 +33,7 @@ _BESIDE = 1e-15
 
 @dataclass(frozen=True)
 class BrokenLoop:
-    """A loop broken into plant and controller: y = P u, u = K y.
-
-    Parameters
-    ----------
-    u, y : tuple of str
-        The channels between the two.
-    controller, plant : function of frequency [Hz]
-        K (nu, ny, n_freq) and P (ny, nu, n_freq).
-    poles : function
-        Of the closed loop; of the controller when the plant was measured.
-    dt : float [s]
-        Sampling time, 0 when continuous.
-    measured : (n_freq,) array [Hz], optional
-        The frequencies of a measured plant.
-    units : mapping {channel: unit}
-        Of the u and y where they are known.
-    """
+    """A loop broken into plant and controller: y = P u, u = K y."""
 
     u: tuple[str, ...]
     y: tuple[str, ...]
@@ -68,13 +52,7 @@ class BrokenLoop:
         )
 
     def gain(self, freq: FloatArray, at: Side = "u") -> ComplexArray:
-        """Return K P (broken at u) or P K (at y), frequency first.
-
-        Raises
-        ------
-        LabelError
-            When `at` is neither.
-        """
+        """Return K P (broken at u) or P K (at y), frequency first."""
         if at not in ("u", "y"):
             raise LabelError(f"a loop is broken at 'u' or 'y', got {short(at)}. Pass one of them.")
         K, P = self.respond(freq)

@@ -123,20 +123,6 @@ def source_variances(
 
     The observability Gramian Q of the output gives all sources at once, ``trace(G' Q G) + D D'``;
     the covariance of the states under all of them gives the sum once more.
-
-    Parameters
-    ----------
-    monitored : StateSpace
-        A stable closed loop.
-    row : int
-        The output.
-    noises : sequence of Source
-        Its white noises.
-
-    Raises
-    ------
-    CertificateError
-        When the two differ by more than 1e-6.
     """
     c = monitored.C[[row]]
     solve = solve_stein if monitored.dt else solve_lyapunov

@@ -110,13 +110,7 @@ def close_loop(
 
 
 def _completed(plant: StandardPlant, larger: Any) -> StandardPlant | None:
-    """Return the plant with the modes left out, None where they are not known.
-
-    Raises
-    ------
-    ModelError
-        When the plant is seen through a block, which the larger one is not.
-    """
+    """Return the plant with the modes left out, None where they are not known."""
     if not plant.is_weighted:
         return larger_plant(plant, larger)
     if larger is not None:

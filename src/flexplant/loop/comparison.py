@@ -192,20 +192,7 @@ def _channels(loop: ClosedLoop, reference: str | None, error: str | None) -> tup
 def error_sensitivity(
     loop: ClosedLoop, reference: str | None = None, error: str | None = None
 ) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies [Hz] and |S| from the reference to the error, refined where it is largest.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        Stable.
-    reference, error : str, optional
-        As for `compare_loops`.
-
-    Raises
-    ------
-    LabelError
-        When the loop lacks the channels.
-    """
+    """Return frequencies [Hz] and |S| from reference to error, refined where it is largest."""
     if reference is None or error is None:
         pair = _channels(loop, reference, error)
         if not pair:

@@ -27,19 +27,7 @@ FEWEST = LINES + 2
 
 
 class HiddenModes(NamedTuple):
-    """What is known of a loop in each interval between two lines of its plant.
-
-    Parameters
-    ----------
-    step : (n - 1,) array [rad]
-        Change of the argument of det(I - L), turns about modes found in the interval included.
-    unknown, undecided : (n - 1,) bool array
-        Whether that is not known, or a mode found there may be stable in the loop or not.
-    width : (n - 1,) array [Hz]
-        Half-power width of the widest mode there that could destabilise the loop unseen.
-    found : (k,) array [Hz]
-        Frequencies through the modes found between lines, in the plant and in the loop.
-    """
+    """What is known of a loop in each interval between two lines of its plant."""
 
     step: FloatArray
     unknown: npt.NDArray[np.bool_]
@@ -63,13 +51,6 @@ def hidden_modes(freq: FloatArray, plant: ComplexArray, controller: ComplexArray
     d rho over what 1 - g is beside it. Three fits through four lines each, by S K of both ends,
     find p and d. Where they agree a mode is there, unstable in the loop when its half-width Im p
     is below -Im d; where they do not, d bounds what may be there unseen.
-
-    Parameters
-    ----------
-    freq : (n,) array [Hz]
-        The lines; at least `FEWEST`.
-    plant, controller : (ny, nu, n) and (nu, ny, n) complex arrays
-        P and K there.
     """
     slope = 2 if low_slope(freq, plant) > 1.0 else 0  # f^slope P is level at the lowest lines
     plant, controller = (np.moveaxis(part, -1, 0) for part in (plant, controller))

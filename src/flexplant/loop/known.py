@@ -32,15 +32,7 @@ def is_known(name: str, refs: Sequence[str], actuators: Sequence[str]) -> bool:
 
 
 def with_known(plant: StandardPlant, systems: Sequence[StateSpace]) -> StandardPlant:
-    """Return the plant with the known signals that blocks read as references, in w and y.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        With references.
-    systems : sequence of StateSpace
-        The blocks.
-    """
+    """Return the plant with the known signals that blocks read as references, in w and y."""
     read = [name for sys in systems for name in sys.inputs]
     refs = references(plant)
     fresh = [n for n in dict.fromkeys(read) if n not in plant.y and is_known(n, refs, plant.u)]

@@ -39,11 +39,6 @@ def white_names(plant: StandardPlant) -> tuple[list[str], list[str]]:
     """Return the channels of w that are white noise: disturbances, then noises per sample.
 
     The latter are those of sensors, and disturbances that are held over each sample.
-
-    Raises
-    ------
-    AssumptionError
-        When a disturbance reaches an output directly: its variance there would be infinite.
     """
     loud = [name for name, level in plant.asd.items() if level > 0]
     held = plant.held if plant.dt else ()
@@ -65,13 +60,6 @@ def white_noise(plant: StandardPlant) -> WhiteNoise:
 
     The disturbances' covariance over a sample is exact, so what they excite above half the rate
     is in the samples; a sensor's noise has the variance ``asd^2 rate / 2`` of a sample.
-
-    Raises
-    ------
-    AssumptionError
-        When white noise reaches an output directly.
-    ModelError
-        When the plant's process noise is not known.
     """
     white, sensors = white_names(plant)
     factor = continuous_factor(plant) if white else np.zeros((plant.system.n_states, 0))
@@ -87,23 +75,7 @@ def continuous_factor(plant: StandardPlant) -> FloatArray:
 
 
 def sources(plant: StandardPlant, monitored: StateSpace) -> list[Source]:
-    """Return the white noises of a plant as they enter its closed loop, each by itself.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Continuous or sampled.
-    monitored : StateSpace
-        Its closed loop; states of the plant first.
-
-    Raises
-    ------
-    AssumptionError
-        When white noise reaches an output directly (for a continuous loop: any output of
-        `monitored`).
-    ModelError
-        When the process noise of a sampled plant is not known.
-    """
+    """Return the white noises of a plant as they enter its closed loop, each by itself."""
     white, sensors = white_names(plant)
     found = []
     for name, factor in _factors(plant, white).items() if plant.dt else ():
@@ -143,24 +115,7 @@ def _factors(plant: StandardPlant, white: list[str]) -> dict[str, FloatArray]:
 def stationary_row(
     plant: StandardPlant, monitored: StateSpace, problem: object, channel: str
 ) -> int:
-    """Return the row of an output of a closed loop that has a stationary state.
-
-    Parameters
-    ----------
-    plant, monitored : StandardPlant, StateSpace
-        The plant, and the closed loop to all outputs.
-    problem : Obstacle or None
-        The pole in the way of a stationary state.
-    channel : str
-        The output.
-
-    Raises
-    ------
-    LabelError
-        When it has no such output.
-    AssumptionError
-        When the plant is weighted, or the loop is not stable.
-    """
+    """Return the row of an output of a closed loop that has a stationary state."""
     if plant.is_weighted:
         raise AssumptionError(
             "the plant is weighted, so its z and w are not physical signals: close the loop "
@@ -174,15 +129,7 @@ def stationary_row(
 
 
 def check_stationary(problem: object, what: str) -> None:
-    """Raise AssumptionError when a closed loop has no stationary state.
-
-    Parameters
-    ----------
-    problem : Obstacle or None
-        The pole in the way.
-    what : str
-        What was to be computed.
-    """
+    """Raise AssumptionError when a closed loop has no stationary state."""
     if problem is not None:
         raise AssumptionError(
             f"{what} needs a stable closed loop, this one is {getattr(problem, 'reason', problem)}:"

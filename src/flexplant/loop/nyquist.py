@@ -19,18 +19,7 @@ _BELOW = 1e-3
 
 
 class NyquistCount(NamedTuple):
-    """Unstable poles of a closed loop by the argument principle; None: the reason says why.
-
-    Parameters
-    ----------
-    unstable : int or None
-        Poles of the closed loop outside the stability region.
-    reason : str
-        Why they could not be counted.
-    narrowest, near : float [Hz]
-        The count holds if the plant has no mode of a half-power width below it that the lines do
-        not show, and where that would be; 0 when they show all.
-    """
+    """Unstable poles of a closed loop by the argument principle; None: the reason says why."""
 
     unstable: int | None
     reason: str = ""
@@ -53,21 +42,6 @@ def nyquist_count(
     From 0+ to the highest frequency the argument of ``F = det(I - K P)`` changes by
     ``pi (p + n0 / 2 - z)``: p unstable and n0 integrating poles of K P, z unstable ones of the
     loop. Below the lines F continues as ``c / (i w)^n0``, c real; above them it ends positive.
-
-    Parameters
-    ----------
-    lines : (n,) array [Hz]
-        Increasing, positive.
-    plant : (ny, nu, n) complex array
-        P there; the critical point of K P is +1.
-    controller : function of frequency
-        K (nu, ny, n_freq).
-    hidden : HiddenModes
-        What lies between the lines.
-    slope : int
-        2 for a free rigid body, 0 for a held structure.
-    at_zero, unstable : int
-        n0 and p: poles of plant and controller at zero frequency, and outside the stability region.
     """
     freq, L = _continued(lines, plant, controller, slope)
     F = np.linalg.det(np.eye(L.shape[-1]) - L)

@@ -276,21 +276,7 @@ def loop_margins(
     *,
     sampled: bool = False,
 ) -> LoopMargins:
-    """Return the margins of one loop gain (n_freq,); the critical point is +1.
-
-    Parameters
-    ----------
-    name : str
-        Of the channel.
-    freq : (n_freq,) array [Hz]
-        Increasing.
-    L : (n_freq,) complex array
-        The loop gain.
-    exact : function of frequency [Hz], optional
-        The loop gain between the lines; interpolated unless given.
-    sampled : bool
-        Whether the loop gain ends on the real axis, at half the rate.
-    """
+    """Return the margins of one loop gain (n_freq,); the critical point is +1."""
 
     def between(f: float) -> complex:
         return complex(np.interp(f, freq, L.real) + 1j * np.interp(f, freq, L.imag))

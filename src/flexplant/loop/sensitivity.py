@@ -180,15 +180,7 @@ def control_sensitivity(loop: Loop, *, freq: npt.ArrayLike | None = None) -> Frf
 
 
 def taken_apart(loop: Loop) -> BrokenLoop:
-    """Return plant and controller between u and y.
-
-    Raises
-    ------
-    LabelError
-        When channels of plant and controller do not match.
-    ModelError
-        When `loop` is of another type.
-    """
+    """Return plant and controller between u and y."""
     if isinstance(loop, ClosedLoop):
         return loop.broken
     if not isinstance(loop, tuple):
@@ -221,13 +213,7 @@ def taken_apart(loop: Loop) -> BrokenLoop:
 
 
 def _fed_back(gain: Any) -> tuple[Any, StateSpace]:
-    """Return a loop gain as a plant, and the negative unity feedback that closes it.
-
-    Raises
-    ------
-    ModelError
-        When it is none.
-    """
+    """Return a loop gain as a plant, and the negative unity feedback that closes it."""
     if isinstance(gain, Frf) or hasattr(gain, "frdata"):
         gain = gain if isinstance(gain, Frf) else Frf.from_control(gain)
     elif hasattr(gain, "system") or not hasattr(gain, "dt"):
@@ -326,13 +312,7 @@ def _prepared(loop: Loop, freq: npt.ArrayLike | None) -> tuple[BrokenLoop, Float
 
 
 def _checked(parts: BrokenLoop, freq: npt.ArrayLike) -> FloatArray:
-    """Return frequencies that were given.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When they are no array of positive frequencies, or were not measured.
-    """
+    """Return frequencies that were given."""
     grid = sampled_freq(freq, parts.dt)
     if not grid.size:
         raise ShapeError("freq must hold at least one frequency [Hz], got none. Pass one.")

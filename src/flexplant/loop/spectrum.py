@@ -60,15 +60,6 @@ def densities(monitored: StateSpace, row: int, noises: Sequence[Source]) -> Dens
     Sampled: ``2 h |C (z I - A)^-1 G + D|^2`` with ``z = exp(2 pi i f h)``; G is the exact
     covariance of a sample, so the density holds all that folds back from above half the rate.
     Continuous: ``2 |C (s I - A)^-1 G + D|^2``.
-
-    Parameters
-    ----------
-    monitored : StateSpace
-        The closed loop.
-    row : int
-        The output.
-    noises : sequence of Source
-        Its white noises.
     """
     n = monitored.n_states
     none = np.zeros((n, 1))
@@ -95,15 +86,6 @@ def integrated(find: Densities, monitored: StateSpace, variances: FloatArray) ->
 
     Intervals begin between the resonances and are halved where the rules of 7 and of 15 points
     differ. A continuous loop is integrated to infinity, over ``t = f / (f + f_c)``.
-
-    Parameters
-    ----------
-    find : function
-        The densities.
-    monitored : StateSpace
-        The closed loop, whose poles say where to begin.
-    variances : (n_source,) array
-        The size of each integral: errors are relative to it.
     """
     top = 0.5 / monitored.dt if monitored.dt else np.inf
     grid = _starts(monitored, top)

@@ -157,16 +157,6 @@ def growing_modes(
     The part of state k in an eigenvalue is ``|left_k right_k|``, of its own left and right
     eigenvectors (participation factors, [PerezArriaga1982]_); they do not depend on the
     units of the states.
-
-    Parameters
-    ----------
-    loop : StateSpace
-        The closed loop: states of the plant, then of the controller.
-    states : sequence of str
-        Names of the plant's states; `mode7:q` and `mode7:v` are those of mode 7.
-    near : float [Hz], optional
-        Instead of all that grows, the eigenvalue that makes the peak at this frequency: the one
-        nearest to ``e^(2 pi i f dt)`` (or ``2 pi i f``).
     """
     numbers = _numbers(states, loop.n_states)
     if not np.any(numbers):

@@ -14,19 +14,7 @@ from ..values import inner_names
 def tapped(
     plant: StandardPlant, driven: Sequence[str], watched: Sequence[str], units: Mapping[str, str]
 ) -> StateSpace:
-    """Return [w; driven; watched] -> [z; y; driven; watched; y of the loop], named `y1|loop`.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Open.
-    driven : sequence of str
-        The actuators that the controller drives.
-    watched : sequence of str
-        Its other outputs.
-    units : mapping {channel: unit}
-        Of all channels.
-    """
+    """Return [w; driven; watched] -> [z; y; driven; watched; y of the loop], named `y1|loop`."""
     g = plant.system
     shown = [*plant.z, *plant.y, *driven, *watched]
     rows = g.output_index([*plant.z, *plant.y])

@@ -26,20 +26,6 @@ def between_lines(
     ``(a + b f) / (1 + c f)`` through three neighbours is exact for one mode on a constant, where
     a straight line cuts its circle. Each frequency lies in two such triples: the result is their
     mean.
-
-    Parameters
-    ----------
-    lines : (n,) array [Hz]
-        Increasing; at least 4.
-    data : (..., n) complex array
-        The response there.
-    freq : (k,) array [Hz]
-        Within the lines.
-
-    Returns
-    -------
-    response : (..., k) complex array
-    error : (..., k) array
     """
     last = lines.size - 3
     i = np.searchsorted(lines, freq, side="right") - 1
@@ -62,17 +48,7 @@ def followed(lines: FloatArray, data: ComplexArray, freq: FloatArray) -> Complex
 
 
 def steps_between(lines: FloatArray, data: ComplexArray, places: IntArray) -> FloatArray:
-    """Return frequencies [Hz] in some intervals, dense where the circles through lines turn.
-
-    Parameters
-    ----------
-    lines : (n,) array [Hz]
-        As for `between_lines`.
-    data : (n,) complex array
-        One response.
-    places : (k,) array
-        Intervals, by the line that each begins with.
-    """
+    """Return frequencies [Hz] in some intervals, dense where the circles through lines turn."""
     low, wide = lines[places], lines[places + 1] - lines[places]
     found = [low + share * wide for share in _SHARES]
     for first in (places - 1, places):
@@ -91,20 +67,6 @@ def pole_between(
 
     Third divided differences of g over the lines f_j, in which a + b f is nothing, are
     ``[g] = -rho / prod(f_j - p)`` and ``[f g] = p [g]``.
-
-    Parameters
-    ----------
-    lines : (LINES, k) array [Hz]
-        Of k responses, from any origin.
-    data : (LINES, k) complex array
-        The responses there.
-
-    Returns
-    -------
-    pole, residue : (k,) complex array
-    tail : (k,) array
-        Size of the residue that a mode at the origin has, were [g] of it alone.
-        A straight line has residue 0.
     """
     apart = lines[:, None] - lines[None]
     apart[range(LINES), range(LINES)] = 1.0

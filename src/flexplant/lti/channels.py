@@ -37,13 +37,7 @@ def chosen_names(known: Sequence[str], key: Channels, side: str) -> list[str]:
 def chosen_pair(
     outputs: Sequence[str], inputs: Sequence[str], key: tuple[Channels, Channels]
 ) -> tuple[list[str], list[str]]:
-    """Return the outputs and inputs that `sys[output, input]` selects.
-
-    Raises
-    ------
-    LabelError
-        When a name or number is unknown, or the key is not a pair.
-    """
+    """Return the outputs and inputs that `sys[output, input]` selects."""
     if not isinstance(key, tuple) or len(key) != 2:
         raise LabelError(
             f"a channel is a pair, sys[output, input], by name or number, got {short(key)}."

@@ -18,20 +18,7 @@ def dips(
     find: Callable[[FloatArray], ComplexArray],
     grid: FloatArray,
 ) -> FloatArray:
-    """Return the antiresonances [Hz] of responses: deep local minima of the size of a channel.
-
-    Parameters
-    ----------
-    find : function
-        Of frequencies (m,) [Hz], gives responses (m, ...).
-    grid : (n_freq,) array [Hz]
-        Where minima are bracketed; each is then found within its bracket to 1e-9 of it.
-
-    Returns
-    -------
-    (m,) array [Hz]
-        Of all channels, the deepest first.
-    """
+    """Return the antiresonances [Hz] of responses: deep local minima of the size of a channel."""
     size = np.abs(find(grid)).reshape(grid.size, -1)
     place, channel = np.nonzero((size[1:-1] <= size[:-2]) & (size[1:-1] < size[2:]))
     lowest = size[place + 1, channel]

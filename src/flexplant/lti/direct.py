@@ -11,13 +11,7 @@ from ..values import FloatArray, real_array
 
 
 def direct_gain(D: Any, B: Any, C: Any) -> FloatArray:
-    """Return D (p, m) of a system with inputs B and outputs C; the number 0 stands for zeros.
-
-    Raises
-    ------
-    ShapeError
-        When it is another number, or no matrix.
-    """
+    """Return D (p, m) of a system with inputs B and outputs C; the number 0 stands for zeros."""
     if np.ndim(D):
         return real_array(D, "D", (None, None))
     (m,) = real_array(B, "B", (None, None)).shape[1:]

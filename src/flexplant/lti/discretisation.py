@@ -311,11 +311,6 @@ def bilinear(sys: System, rate: float) -> StateSpace:
 
     ``z = (a + s) / (a - s)`` with a = 2 rate: stability, norms and (with w = a tan(theta / 2))
     frequency responses are the same, so that continuous methods solve sampled problems exactly.
-
-    Raises
-    ------
-    ModelError
-        When the system has a pole at z = -1.
     """
     g = as_statespace(sys)
     a = 2.0 * positive(rate, "rate")

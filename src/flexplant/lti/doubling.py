@@ -180,13 +180,7 @@ class DoublingResult(NamedTuple):
 @one_thread()
 @np.errstate(over="ignore", invalid="ignore")
 def solved(problem: RiccatiProblem, kind: Discrete | Continuous) -> DoublingResult:
-    """Return the stabilising solution, scaled back.
-
-    Raises
-    ------
-    SolverError
-        When there is none that is strictly stabilising, or it stays inaccurate.
-    """
+    """Return the stabilising solution, scaled back."""
     n = problem.A.shape[0]
     if not n:
         empty = np.zeros((0, problem.C.shape[0]))

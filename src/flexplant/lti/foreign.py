@@ -13,11 +13,6 @@ def foreign_fields(sys: Any) -> dict[str, Any]:
 
     A transfer function becomes sections in series (`tf_fields`), each channel of a matrix with
     states of its own: `minimal` removes what they share.
-
-    Raises
-    ------
-    ModelError
-        When it is neither, or its sampling time is not stated.
     """
     dt = _sampling_time(sys)
     if all(hasattr(sys, part) for part in ("A", "B", "C", "D")):

@@ -149,19 +149,7 @@ def _turn(a: ComplexArray, b: ComplexArray) -> FloatArray:
 def resonance_grid(
     poles: ComplexArray, dt: float, *, points: int = 600, around: Sequence[float] = DRAWN
 ) -> FloatArray:
-    """Return frequencies [Hz], log-spaced over all poles and dense around each resonance.
-
-    Parameters
-    ----------
-    poles : (n,) complex array
-        In rad/s, or of a sampled system.
-    dt : float [s]
-        Sampling time, 0 when continuous; sampled systems are covered up to half the rate.
-    points : int
-        Of the logarithmic part.
-    around : sequence of float
-        Distances from each resonance, from 0 on, in half-power half-widths.
-    """
+    """Return frequencies [Hz], log-spaced over all poles and dense around each resonance."""
     s: ComplexArray = np.array(poles, dtype=np.complex128)
     if dt:
         s = np.asarray(np.log(s[np.abs(s) > 1e-12]) / dt, dtype=np.complex128)
@@ -200,17 +188,7 @@ def _between(grid: FloatArray, tops: IntArray, parts: int = 8) -> FloatArray:
 def climbed(
     find: Callable[[FloatArray], FloatArray], grid: FloatArray, rounds: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return frequencies and values of a function of them, refined where it is highest.
-
-    Parameters
-    ----------
-    find : function
-        Of frequencies [Hz], gives a value for each.
-    grid : (n_freq,) array [Hz]
-        Where it begins.
-    rounds : int
-        How often frequencies are added between the neighbours of the highest local maxima.
-    """
+    """Return frequencies and values of a function of them, refined where it is highest."""
     values = find(grid)
     for _ in range(rounds):
         fresh = _between(grid, _tops(values))
@@ -227,13 +205,6 @@ def highest(
 
     The brackets around the highest local maxima of a grid are divided, until a parabola through
     each says that it gains no more; those that can no longer be the highest are left.
-
-    Parameters
-    ----------
-    find, grid
-        As for `climbed`.
-    rounds : int
-        How often brackets are divided at most.
     """
     values = find(grid)
     ends = np.clip(_tops(values)[:, None] + _ASIDE, 0, grid.size - 1)
@@ -274,14 +245,7 @@ def checked_freq(freq: npt.ArrayLike) -> FloatArray:
 
 
 def sampled_freq(freq: npt.ArrayLike, dt: float) -> FloatArray:
-    """Return frequencies [Hz] at which a system of sampling time dt has a response.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When they are no array, a frequency is negative or above half the rate, or they do not
-        increase.
-    """
+    """Return frequencies [Hz] at which a system of sampling time dt has a response."""
     grid = checked_freq(freq)
     if dt and grid.size and grid.max() > 0.5 / dt * (1 + 1e-12):
         raise ModelError(

@@ -173,13 +173,7 @@ def lft(P: System, K: System) -> StateSpace:
 
 
 def loop_poles(g: StateSpace, K: StateSpace) -> ComplexArray:
-    """Return the poles of the loop of g and ``u = K y``, channels of both in one order.
-
-    Raises
-    ------
-    ModelError
-        When the loop is ill-posed.
-    """
+    """Return the poles of the loop of g and ``u = K y``, channels of both in one order."""
     P, back = (g.A, g.B, g.C, g.D), (K.A, K.B, K.C, K.D)
     A, *_ = _looped(P, back, _well_posed(K.D @ g.D), _well_posed(g.D @ K.D))
     return np.asarray(la.eigvals(A), dtype=np.complex128)

@@ -20,15 +20,7 @@ Matrices: TypeAlias = tuple[FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def in_series(g1: Any, g2: Any) -> dict[str, Any]:
-    """Return the fields of ``g2 g1``: the outputs of g1 drive the inputs of g2, in order.
-
-    Raises
-    ------
-    ShapeError
-        When the numbers of channels differ.
-    ModelError
-        When sampling times differ.
-    """
+    """Return the fields of ``g2 g1``: the outputs of g1 drive the inputs of g2, in order."""
     if len(g1.outputs) != len(g2.inputs):
         raise ShapeError(
             f"series needs as many outputs of the first system as inputs of the second, got "
@@ -60,15 +52,7 @@ def cascaded(first: Matrices, second: Matrices) -> Matrices:
 
 
 def in_parallel(g1: Any, g2: Any) -> dict[str, Any]:
-    """Return the fields of ``g1 + g2``: same channels, outputs added.
-
-    Raises
-    ------
-    LabelError
-        When the channel names differ.
-    ModelError
-        When sampling times differ.
-    """
+    """Return the fields of ``g1 + g2``: same channels, outputs added."""
     if g1.inputs != g2.inputs or g1.outputs != g2.outputs:
         first, second = (f"{short_list(g.inputs)} -> {short_list(g.outputs)}" for g in (g1, g2))
         raise LabelError(
@@ -115,13 +99,7 @@ def stacked(matrices: Sequence[FloatArray]) -> FloatArray:
 
 
 def common_dt(systems: Iterable[Any]) -> float:
-    """Return the sampling time that systems share; static gains fit any.
-
-    Raises
-    ------
-    ModelError
-        When they differ.
-    """
+    """Return the sampling time that systems share; static gains fit any."""
     found = {sys.dt for sys in systems if sys.n_states} or {sys.dt for sys in systems}
     if len(found) > 1 and not np.allclose(list(found), next(iter(found)), rtol=1e-12, atol=0):
         raise ModelError(

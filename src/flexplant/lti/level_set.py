@@ -27,11 +27,6 @@ def level_set_peak(g: StateSpace, tolerance: float, bar: Progress) -> tuple[floa
 
     What a search finds is improved from the middles of the crossings of its level, until none is
     left at (1 + tolerance) times it.
-
-    Raises
-    ------
-    SolverError
-        When the level set does not settle.
     """
     top = 0.5 / g.dt if g.dt else np.inf
     find = _largest(responder(g))

@@ -18,13 +18,7 @@ LEAST, FARTHEST = 1e-3, 40
 
 
 def checked_correlation(value: Any, shape: tuple[int, ...]) -> ComplexArray:
-    """Return the correlation (n_out, n_out, n_freq) of errors of outputs of responses of a shape.
-
-    Raises
-    ------
-    ShapeError, ModelError
-        When sizes do not match, or it is no correlation.
-    """
+    """Return the correlation (n_out, n_out, n_freq) of the errors of outputs."""
     correlation = np.array(value, dtype=np.complex128)
     if correlation.shape != (shape[0], shape[0], shape[2]):
         raise ShapeError(
@@ -73,17 +67,6 @@ def line_correlation(
 
     over the shifts s between segments: 4/9 and 1/36 for neighbours under a Hann window without
     overlap ([BendatPiersol2010]_, section 11.5; [Welch1967]_).
-
-    Parameters
-    ----------
-    freq : (n_freq,) array [Hz]
-        Increasing.
-    window : str or tuple
-        As `scipy.signal.get_window` takes.
-    resolution : float [Hz]
-        Inverse of the length of a segment.
-    overlap : float
-        Of segments, from 0 to below 0.95.
     """
     n = freq.size
     diagonals: Any = [np.ones(n)]

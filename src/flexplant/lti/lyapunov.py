@@ -281,13 +281,7 @@ def scale_of(variance: FloatArray) -> FloatArray:
 
 
 def symmetric(value: FloatArray, name: str, n: int) -> FloatArray:
-    """Return `value` as a symmetric (n, n) array.
-
-    Raises
-    ------
-    ShapeError, ModelError
-        When it has another shape, is not finite or not symmetric to 1e-8 of its diagonal scale.
-    """
+    """Return `value` as a symmetric (n, n) array."""
     array = real_array(value, name, (n, n))
     scale = np.sqrt(np.abs(array.diagonal()))
     bound = 1e-8 * (np.outer(scale, scale) + 1e-4 * np.max(np.abs(array), initial=0.0))

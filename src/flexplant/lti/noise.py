@@ -26,17 +26,6 @@ def accumulated_noise(
     so short that ten nodes are exact, then ``G(2 t) = [G(t), e^(A t) G(t)]``: log2(time rate)
     steps, however fast the modes are. Sums of squares, so that G G' is positive semidefinite in
     any units; the block exponential of [VanLoan1978]_ was seen to lose that on large models.
-
-    Parameters
-    ----------
-    at : function of a time
-        ``e^(A t)``.
-    force : (n, m) array
-        Noise of unit intensity enters by it.
-    time : float [s]
-        Length of the interval.
-    rate : float [rad/s]
-        Size of A.
     """
     n, m = force.shape
     # the error is a Bessel function of order 2 count and argument |A| time: nothing beyond there
@@ -61,20 +50,6 @@ def noise_factor(g: StateSpace, asd: FloatArray, h: float) -> FloatArray:
 
     ``Q_d = int_0^h e^(A s) B S B' e^(A' s) ds`` with S = diag(asd^2 / 2), the intensity of noise
     with the one-sided amplitude spectral density asd (`accumulated_noise`).
-
-    Parameters
-    ----------
-    g : StateSpace
-        Continuous, m inputs.
-    asd : (m,) array [input unit / sqrt(Hz)]
-        One-sided; zero for inputs without noise.
-    h : float [s]
-        Sampling time.
-
-    Returns
-    -------
-    (n, r) array
-        r <= n.
     """
     n = g.n_states
     active = np.flatnonzero(asd)

@@ -33,30 +33,7 @@ _MIXED, _CONDITION = 5.0, 1e3
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Prepared(Value):
-    """A scaled problem ``[w; u] -> [z; y]`` with D22 = 0, continuous unless `direct`.
-
-    Parameters
-    ----------
-    A, B1, B2, C1, C2, D11, D12, D21 : arrays
-        Of the scaled problem.
-    D22 : (ny, nu) array
-        What was taken out, in scaled channels; `restored` puts it back into the controller.
-    u_scale : (nu, nu) array
-        ``u = u_scale u_scaled``.
-    y_scale : (ny, ny) array
-        ``y_scaled = y_scale y``.
-    speed : float [rad/s]
-        Unit of the scaled frequency.
-    dt : float [s]
-        Of the original plant.
-    u, y : sequences of str
-        Names of the controller's outputs and inputs.
-    departure : float
-        Size of the given A, its states balanced, beside that of its poles: 1 in modal coordinates,
-        large where the coordinates of the states mix modes, and rounding with them.
-    direct : bool
-        A sampled problem in its own recursion, not mapped to continuous time.
-    """
+    """A scaled problem ``[w; u] -> [z; y]`` with D22 = 0, continuous unless `direct`."""
 
     A: FloatArray
     B1: FloatArray
@@ -131,23 +108,7 @@ class Prepared(Value):
         return float(image_freq(self.speed * omega, 0.0 if self.direct else self.dt))
 
     def restored(self, A: FloatArray, B: FloatArray, C: FloatArray, D: FloatArray) -> StateSpace:
-        """Return the controller of the original plant from that of the scaled problem.
-
-        Parameters
-        ----------
-        A, B, C, D : arrays
-            The controller y -> u of the scaled problem.
-
-        Returns
-        -------
-        StateSpace
-            In the user's channels, units and sampling time; the states are the scaled ones.
-
-        Raises
-        ------
-        ModelError
-            When the loop of the controller and D22 is ill-posed.
-        """
+        """Return the controller of the original plant from that of the scaled problem."""
         # the plant's own D22 is subtracted: u = K (y - D22 u)
         inner = np.eye(D.shape[0]) + D @ self.D22
         if la.svdvals(inner)[-1] < 1e-12 * (1.0 + float(np.linalg.norm(D @ self.D22))):
@@ -177,22 +138,7 @@ class Prepared(Value):
 def prepared(
     P: StateSpace, u: Sequence[str], y: Sequence[str], *, direct: bool = False
 ) -> Prepared:
-    """Return a standard plant ``[w; u] -> [z; y]``, made ready for synthesis.
-
-    Parameters
-    ----------
-    P : StateSpace
-        The plant; u are its last inputs, y its last outputs.
-    u, y : sequences of str
-        Channels of the controller.
-    direct : bool
-        Keep a sampled plant's recursion, for H2 norms: the bilinear map keeps gains only.
-
-    Raises
-    ------
-    ModelError
-        When a sampled plant that is mapped has a pole at z = -1.
-    """
+    """Return a standard plant ``[w; u] -> [z; y]``, made ready for synthesis."""
     # balanced first: whether I + A can be inverted must not depend on the units of the states
     s = np.exp(1j) * (1.5 if P.dt else mean_speed(P.poles()))
     A, B, C = _balanced(P.A, P.B, P.C, s)

@@ -18,19 +18,7 @@ _LIGHT = 0.3
 
 
 def check_rate(modes: FloatArray, rate: float, delay: float) -> None:
-    """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate.
-
-    Raises
-    ------
-    ModelError
-        When the lowest mode lies far above half the rate; when a delay is a negligible part of a
-        sample, or more than 1000 samples.
-
-    Warns
-    -----
-    FlexplantWarning
-        When all modes lie above half the rate.
-    """
+    """Judge a sampling rate [Hz] by the elastic modes [Hz] of a system, and a delay by the rate."""
     rate, delay = positive(rate, "rate"), positive(delay, "delay", zero=True)
     if 0 < delay < _NO_DELAY:
         raise ModelError(

@@ -23,11 +23,6 @@ def zpk_fields(
 
     Each pair of poles is a block of two states with the zeros nearest to it, the least damped
     first, so that A keeps its poles to rounding: a companion form of many poles does not.
-
-    Raises
-    ------
-    ModelError
-        When a complex number lacks its conjugate, or there are more zeros than poles.
     """
     z, p = _roots(zeros, "zeros"), _roots(poles, "poles")
     if z.size > p.size:
@@ -56,13 +51,7 @@ def zpk_fields(
 def tf_fields(
     numerator: npt.ArrayLike, denominator: npt.ArrayLike, dt: float = 0.0
 ) -> dict[str, Any]:
-    """Return A, B, C, D and blocks of a ratio of polynomials, highest power first.
-
-    Raises
-    ------
-    ModelError
-        When the denominator is zero, or of a lower degree than the numerator.
-    """
+    """Return A, B, C, D and blocks of a ratio of polynomials, highest power first."""
     num, den = (
         np.trim_zeros(np.atleast_1d(real_array(part, name)), "f")
         for part, name in ((numerator, "the numerator"), (denominator, "the denominator"))

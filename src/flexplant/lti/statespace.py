@@ -189,13 +189,7 @@ class StateSpace(SystemArithmetic):
         return chosen
 
     def __getitem__(self, key: tuple[Channels, Channels]) -> StateSpace:
-        """Return the channel `sys["output", "input"]` or `sys[0, 1]`; lists and slices: several.
-
-        Raises
-        ------
-        LabelError
-            When a name or number is unknown, or the key is not a pair.
-        """
+        """Return the channel `sys["output", "input"]` or `sys[0, 1]`; lists and slices: several."""
         return self.select(*chosen_pair(self.outputs, self.inputs, key))
 
     def _like(self, other: Any) -> StateSpace:
@@ -249,11 +243,6 @@ class StateSpace(SystemArithmetic):
         """Return the gain at one complex frequency s (z when sampled).
 
         A number for one input and one output, else (p, m), as systems of python-control answer.
-
-        Raises
-        ------
-        ModelError
-            When s is a pole.
         """
         gain = self.evaluated(s)
         return complex(gain[0, 0]) if gain.shape == (1, 1) else gain

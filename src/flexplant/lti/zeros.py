@@ -28,15 +28,6 @@ def invariant_zeros(g: Any) -> ComplexArray:
     input directly are states, and states of the rest. What is left is a regular pencil, whose
     eigenvalues are the zeros; those at infinity have left with the compressed states.
 
-    Parameters
-    ----------
-    g : StateSpace
-        Continuous or sampled, with any numbers of inputs and outputs.
-
-    Returns
-    -------
-    (k,) complex array [rad/s, or z]
-
     References
     ----------
     [EmamiNaeiniVanDooren1982]_.
@@ -98,15 +89,6 @@ def axis_zeros(g: Any) -> ComplexArray:
     the generalised eigenvalues of the pencil with its outputs mixed down to as many as inputs;
     candidates near the limit are moved onto it. The rank of the whole matrix, states, inputs and
     outputs scaled to unit size, decides.
-
-    Parameters
-    ----------
-    g : StateSpace
-        (p, m) with p >= m, continuous or sampled.
-
-    Returns
-    -------
-    (k,) complex array [rad/s, or z]
 
     References
     ----------

@@ -23,13 +23,7 @@ _NEGLIGIBLE = 1e-9
 
 
 def places(at: Place | Iterable[Place]) -> list[Place]:
-    """Return one place, or several, as a list.
-
-    Raises
-    ------
-    ModelError
-        When it is neither.
-    """
+    """Return one place, or several, as a list."""
     if isinstance(at, str | Mapping):
         return [at]
     try:
@@ -71,11 +65,6 @@ def attachment_vectors(
     The static response to a unit load at each place (free structures accelerate as rigid bodies
     under it: inertia relief), less the part that the modes give; then made M-orthogonal to the
     modes, mass-normalised, and diagonal in K among each other.
-
-    Raises
-    ------
-    ModelError
-        When the modes already hold the compliance of a place, or two places give the same vector.
     """
     M, K, rigid = model.M, model.K, model.rigid_body
     loads = np.column_stack([model.dofs.row(place) for place in at])
@@ -115,11 +104,6 @@ def static_response(M: Matrix, K: Matrix, rigid: FloatArray, loads: FloatArray) 
     ``K u = f - M R R^T f``: the load less the inertia of the rigid-body acceleration it causes.
     The structure is held at r DOFs, where its rigid-body motions are best distinguished; in
     balance, these carry no force, and the rigid-body part of the answer is taken out afterwards.
-
-    Raises
-    ------
-    ModelError
-        When K is singular beyond the rigid-body motions.
     """
     balanced = loads - np.asarray(M @ (rigid @ (rigid.T @ loads)))
     n, r = rigid.shape

@@ -24,21 +24,7 @@ PLANT = "assemble_plant(model, ports) takes such damping as it is, in dense form
 
 
 class ComplexModes(NamedTuple):
-    """Solutions of ``(lambda^2 + lambda C + Omega^2) x = 0``.
-
-    Attributes
-    ----------
-    poles : (k,) complex array [rad/s]
-        The growing poles of u unstable pairs, then those in the upper half plane, by magnitude.
-    mix : (n, k) complex array
-        Their shapes, normalised as in `NormalForm`.
-    decaying : (u,) array [1/s]
-        The decaying poles of the unstable pairs.
-    overdamped : (m,) array [1/s]
-        Negative real poles of motions that do not oscillate, by magnitude.
-    overdamped_mix : (n, m) array
-        Their shapes, of length 1.
-    """
+    """Solutions of ``(lambda^2 + lambda C + Omega^2) x = 0``."""
 
     poles: ComplexArray
     mix: ComplexArray
@@ -59,25 +45,7 @@ def check_oscillating(oscillates: FloatArray | np.ndarray, omega: FloatArray) ->
 
 
 def complex_modes(omega: FloatArray, C: FloatArray, *, lowest: int | None) -> ComplexModes:
-    """Return the complex modes of ``p'' + C p' + Omega^2 p = 0``.
-
-    Parameters
-    ----------
-    omega : (n,) array [rad/s]
-        Undamped frequencies, the negative ones of u unstable modes first.
-    C : (n, n) array [1/s]
-        Damping, symmetric.
-    lowest : int, optional
-        How many of the modes that oscillate, at most, overdamped motions being set apart. None:
-        all, and overdamped ones are refused.
-
-    Raises
-    ------
-    ModelError
-        When a mode is overdamped.
-    SolverError
-        When the modes fail their check.
-    """
+    """Return the complex modes of ``p'' + C p' + Omega^2 p = 0``."""
     k, u = omega.size, int(np.count_nonzero(omega < 0))
     values, vectors = _eigen(omega, C, low=lowest is not None)
     up, down, upper = _kinds(values)
@@ -130,13 +98,7 @@ def _kinds(values: ComplexArray) -> tuple[IntArray, IntArray, IntArray]:
 
 
 def _unstable_pairs(grow: ComplexArray, decay: ComplexArray) -> ComplexArray:
-    """Return shapes (k, u) of which growing and decaying ones are ``Re +- Im``; both are real.
-
-    Raises
-    ------
-    SolverError
-        When they are not.
-    """
+    """Return shapes (k, u) of which growing and decaying ones are ``Re +- Im``; both are real."""
     both = np.hstack([grow, decay])
     if np.abs(both.imag).max() > 1e-9 * np.abs(both).max():
         raise SolverError(

@@ -50,32 +50,6 @@ def damped_modes(
     + K) x = 0``, again and again (Davidson's method for the quadratic problem), until they leave no
     more than undamped modes may.
 
-    Parameters
-    ----------
-    model : FEModel
-        With a D that is not proportional.
-    phi : (n, k) array
-        Its undamped modes, more than are wanted; see `wider`.
-    count : int
-        How many modes are wanted, by magnitude of their poles.
-    top : float [rad^2/s^2]
-        And up to which omega^2.
-    method : Pardiso, optional
-        How K is factorised.
-
-    Returns
-    -------
-    Modes
-        With `residual` of each, and in the certificate how many vectors the basis has. A count
-        that none is missing is known for undamped modes only.
-
-    Raises
-    ------
-    SolverError
-        When they are not found.
-    ModelError
-        As `normal_form`.
-
     References
     ----------
     [Sleijpen1996]_.

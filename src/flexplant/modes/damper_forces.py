@@ -22,11 +22,6 @@ def damper_forces(model: FEModel) -> FloatArray:
     """Return orthonormal forces (n, m) that span those of dampers.
 
     None, (n, 0), where D is a multiple of K and M, or at so many DOFs that it is a material's.
-
-    Parameters
-    ----------
-    model : FEModel
-        With a D or without.
     """
     none = np.zeros((model.n_dof, 0))
     if model.D is None or is_rayleigh(model):

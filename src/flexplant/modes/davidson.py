@@ -34,17 +34,6 @@ class BlockDavidson(BlockLanczos):
 
     The basis of Lanczos, but extended by corrections of its Ritz vectors: P may be in error, since
     the residuals are those of K and M [MorganScott1986]_.
-
-    Parameters
-    ----------
-    solve : callable
-        Forces (n, m) to ``P`` times them.
-    K, M : (n, n) matrix
-        Stiffness and mass, M positive definite.
-    sigma : float [rad^2/s^2]
-        The shift: below zero, or above the modes that are wanted.
-    locked, want, rng, start
-        As those of `BlockLanczos`.
     """
 
     def __init__(
@@ -73,11 +62,6 @@ class BlockDavidson(BlockLanczos):
 
         `needed` says of shapes (n, m) which residuals (m,), relative to ``||K phi||``, they may
         leave.
-
-        Raises
-        ------
-        SolverError
-            When they do not converge: P is far from the inverse, or sigma far from the modes.
         """
         found = np.zeros(count, dtype=bool)
         self._limit, self._left = np.zeros(count), np.full(count, np.inf)

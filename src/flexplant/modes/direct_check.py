@@ -28,17 +28,7 @@ _GRID, _BETWEEN = 300, 5
 
 @dataclass(frozen=True)
 class DirectCheck:
-    """What direct solutions said of responses.
-
-    Parameters
-    ----------
-    freq : (c,) array [Hz]
-        Where.
-    of_peak : (c,) array
-        Error of the worst channel, relative to the largest size that this channel has at all.
-    there : (c,) array
-        Error of the worst channel, relative to its own size at this frequency.
-    """
+    """What direct solutions said of responses."""
 
     freq: FloatArray
     of_peak: FloatArray
@@ -77,21 +67,6 @@ def checked_response(
 
     Where the error is larger, the direct solutions join the basis, which is checked again at other
     frequencies.
-
-    Parameters
-    ----------
-    basis : DynamicBasis
-        What is tried first.
-    freq : (n_freq,) array [Hz]
-        Where responses are wanted.
-    rows, loads : (p, n), (n, q) arrays
-        Of motions and of loads.
-    checks : int
-        How many direct solutions; 0 for none.
-    tolerance : float
-        Error relative to the peak; relative to the response at each point it is 1 %.
-    seen : function, optional
-        Of frequencies and the responses there: what is wanted of them, through filters say.
     """
     view = seen or (lambda _, response: response)
 

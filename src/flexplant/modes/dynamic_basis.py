@@ -61,19 +61,6 @@ class DynamicBasis:
     and the static responses to the forces of dampers, M-orthonormal and diagonal in K. Responses
     between loads then have an error of order ``(f / f_cut)^8`` of what the modes left out give,
     f_cut being the last frequency of the modes.
-
-    Parameters
-    ----------
-    model : FEModel
-        The structure.
-    modes : Modes
-        Its lowest ones, real.
-    loads : (n, m) array
-        Where it is pushed and watched.
-    damping : Damping, optional
-        In place of the model's D. A `Hysteretic` is the complex stiffness itself, a `Rayleigh` its
-        matrix; other laws hold for the modes and shapes of the basis, and what is beyond them
-        decays at the rate of the last mode. None: the model's D.
     """
 
     def __init__(
@@ -128,13 +115,7 @@ class DynamicBasis:
         return found
 
     def response(self, freq: FloatArray, rows: FloatArray, loads: FloatArray) -> ComplexArray:
-        """Return the responses (n_freq, p, q) of motions (p, n) to loads (n, q).
-
-        Raises
-        ------
-        ModelError
-            When a frequency is one of an undamped motion.
-        """
+        """Return the responses (n_freq, p, q) of motions (p, n) to loads (n, q)."""
         return self._answered(freq, rows @ self.V, self.V.T @ loads)
 
     def _answered(self, freq: FloatArray, left: FloatArray, right: FloatArray) -> ComplexArray:
@@ -215,13 +196,7 @@ class DynamicBasis:
         return np.asarray(np.tile(loads, freq.size) - force)
 
     def solved(self, freq: float, loads: FloatArray) -> ComplexArray:
-        """Return the motion (n, q) of all DOFs under loads, from the matrices alone.
-
-        Raises
-        ------
-        SolverError
-            When the dynamic stiffness is singular, or rounding spoils the solution.
-        """
+        """Return the motion (n, q) of all DOFs under loads, from the matrices alone."""
         model, law, omega = self.model, self.losses, 2 * np.pi * freq
         M, K = model.M, model.K
         stiff = 1 + 1j * (law.eta + omega * law.b)

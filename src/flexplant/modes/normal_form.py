@@ -193,19 +193,7 @@ def modal(real: RealForm, *, lowest: int | None = None) -> NormalForm:
 
 
 class RealForm(NamedTuple):
-    """A model in its undamped modes: ``p'' + C p' + Omega^2 p = phi' f, q = phi p``.
-
-    Attributes
-    ----------
-    omega : (k,) array [rad/s]
-        Undamped frequencies, the rigid-body ones first and exactly 0.
-    phi : (n, k) array
-        Undamped shapes, ``phi' M phi = I``.
-    C : (k, k) array [1/s]
-        ``phi' D phi``: any damping.
-    n_rigid : int
-        How many rigid-body motions there are.
-    """
+    """A model in its undamped modes: ``p'' + C p' + Omega^2 p = phi' f, q = phi p``."""
 
     omega: FloatArray
     phi: FloatArray
@@ -254,22 +242,7 @@ def real_form(
     rigid: FloatArray,
     motions: Callable[[], FloatArray] | None = None,
 ) -> RealForm:
-    """Return a second-order model in its undamped modes, whatever its damping.
-
-    Parameters
-    ----------
-    M, D, K, rigid, motions
-        As in `normal_form`.
-
-    Returns
-    -------
-    RealForm
-
-    Raises
-    ------
-    ModelError
-        When M is not positive definite, or an elastic mode has no stiffness or a negative one.
-    """
+    """Return a second-order model in its undamped modes, whatever its damping."""
     M, K = dense(M), dense(K)
     rigid = orthonormalised(M, real_array(rigid, "rigid", (M.shape[0], None)))
     omega, phi = elastic_modes(M, K, rigid, motions=motions)

@@ -33,22 +33,6 @@ class StiffnessFactor:
     """``K - sigma M = L L^T`` of a sparse model, with sigma just below zero.
 
     Get it from `stiffness_factor`, which returns the same one as long as it is in use.
-
-    Parameters
-    ----------
-    model : FEModel
-        The structure; K may be singular for its rigid-body motions.
-    method : Pardiso, optional
-        In place of the multifrontal factor.
-    single : bool
-        Whether it is in single precision, sigma further from zero: to precondition with.
-
-    Raises
-    ------
-    ModelError
-        When K is indefinite.
-    SolverError
-        When K - sigma M is not definite in single precision.
     """
 
     def __init__(
@@ -96,11 +80,6 @@ class StiffnessFactor:
 
         ``K u = f - M R R^T f`` (inertia relief) by conjugate gradients, preconditioned with the
         factor: a few steps, since sigma is small.
-
-        Raises
-        ------
-        SolverError
-            When K is singular beyond the rigid-body motions.
         """
         R = self.rigid
         inertia = np.asarray(self.M @ R)
@@ -140,13 +119,6 @@ class CountingFactor:
 
     One factor counts the modes below sigma and is what their search needs [Grimes1994]_. Get it
     from `counting_factor`.
-
-    Parameters
-    ----------
-    signed : SignedFactor
-        Of ``K - sigma M``, accurate enough to count.
-    sigma : float [rad^2/s^2]
-        The shift.
     """
 
     single = True
@@ -169,20 +141,7 @@ def counting_factor(model: FEModel, square: float) -> CountingFactor | None:
 
 
 def stiffness_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
-    """Return the factor of a sparse model, the same one as long as it is in use.
-
-    Parameters
-    ----------
-    model : FEModel
-        The structure.
-    method : Pardiso, optional
-        How a new one is made; None: multifrontal.
-
-    Raises
-    ------
-    ModelError
-        When K is indefinite.
-    """
+    """Return the factor of a sparse model, the same one as long as it is in use."""
     known = _held.get(model)
     factor = known() if known is not None else None
     if factor is None:
@@ -198,20 +157,7 @@ def held_factor(model: FEModel) -> StiffnessFactor | None:
 
 
 def search_factor(model: FEModel, method: Pardiso | None = None) -> StiffnessFactor:
-    """Return a factor to search modes with: the one in use, or one in single precision if it pays.
-
-    Parameters
-    ----------
-    model : FEModel
-        The structure.
-    method : Pardiso, optional
-        How a new one is made; None: multifrontal.
-
-    Raises
-    ------
-    ModelError
-        When K is indefinite.
-    """
+    """Return a factor to search modes with: the one in use, or one in single precision."""
     known, order = _held.get(model), dissection_of(model)
     unused = known is None or known() is None
     if unused and method is None and not model.n_unstable and order.is_costly:
@@ -238,11 +184,6 @@ def modes_below(model: FEModel, square: float, *, single: bool = True) -> int:
     """Return how many modes, rigid-body ones included, have an omega^2 below `square` (Sturm).
 
     Without `single`, single precision is not tried: it was refused before.
-
-    Raises
-    ------
-    SolverError
-        When `square` is so close to a mode that the count is not sure.
     """
     shifted = _shifted(model.K, model.M, square)
     return multifrontal_inertia(shifted, dissection_of(model), single=single)

@@ -182,15 +182,6 @@ def modes_reaching(model: FEModel, freq: float, *, least: int = 0) -> Modes:
     """Return the undamped modes of a structure up to a frequency, and perhaps further.
 
     Those that `solve_modes` found for this model are taken while they are in use and reach so far.
-
-    Parameters
-    ----------
-    model : FEModel
-        The structure.
-    freq : float [Hz]
-        Up to where; those just solved for reach half as far again.
-    least : int
-        How many modes at least.
     """
     known = _solved.get(model)
     modes = known() if known is not None else None

@@ -52,33 +52,6 @@ def counted_modes(
 
     Block Lanczos finds them, a Sturm count in a gap above the last one says how many there are;
     what is missing is looked for beside those found until the count agrees.
-
-    Parameters
-    ----------
-    model : FEModel
-        The structure, sparse.
-    count : int
-        How many elastic modes at most.
-    top : float [rad^2/s^2]
-        Largest omega^2.
-    method : Pardiso, optional
-        In place of the multifrontal factor; the count does without.
-
-    Returns
-    -------
-    squares : (k,) array
-        omega^2 of the elastic modes.
-    phi : (n, k) array
-        M-orthonormal shapes.
-    certificate : dict
-        `shift` [Hz], modes `counted` and `found` below it.
-
-    Raises
-    ------
-    ModelError
-        When K is indefinite or an elastic mode has no stiffness.
-    SolverError
-        When the count does not agree, or is not sure.
     """
     with one_thread():
         return _counted(model, count, top, method)

@@ -18,13 +18,7 @@ Groups: TypeAlias = tuple[tuple[IntArray, int], ...]
 
 @dataclass(frozen=True, eq=False)
 class Branch:
-    """All choices with given counts in disjoint groups of candidates, and none elsewhere.
-
-    Parameters
-    ----------
-    groups : tuple of (array of int, int)
-        Indices of candidates, ascending, and how many of them are chosen, at least one.
-    """
+    """All choices with given counts in disjoint groups of candidates, and none elsewhere."""
 
     groups: Groups
 
@@ -62,16 +56,7 @@ class Branch:
         return float(sum(np.sort(slope[group])[:count].sum() for group, count in self.groups))
 
     def halves(self, rows: FloatArray, weights: FloatArray) -> Iterator[Branch]:
-        """Return the parts that arise when the most diverse group is cut in two.
-
-        Parameters
-        ----------
-        rows : (N, r) array
-            Candidates with similar rows stay together: where only similar ones share a weight, a
-            relaxation is sharp.
-        weights : (N,) array
-            Candidates count by them.
-        """
+        """Return the parts that arise when the most diverse group is cut in two."""
         open_groups = [i for i, (group, count) in enumerate(self.groups) if count < group.size]
         spread = [_spread(rows[g], weights[g]) for g, _ in (self.groups[i] for i in open_groups)]
         most = open_groups[int(np.argmax([size for size, _ in spread]))]
@@ -117,19 +102,6 @@ def ascended(
 
     Projected gradient steps of Barzilai and Borwein [BarzilaiBorwein1988]_. Whatever w is,
     ``h(w) + h'(w) (x - w)`` is above h at every choice x: that is the bound.
-
-    Parameters
-    ----------
-    function : callable
-        Returns h and its gradient (N,) at weights (N,); None where it has no value.
-    branch : Branch
-        The choices.
-    start : (N,) array
-        First weights.
-    steps : int
-        At most so many.
-    close : callable
-        Of the value and the bound: whether they are close enough.
     """
     weights, step = branch.nearest(start), 0.0
     most, kept, highest = np.inf, weights, -np.inf

@@ -17,23 +17,7 @@ from .criterion import Criterion, Scorer
 
 @dataclass(frozen=True, eq=False)
 class Shapes:
-    """Mass-normalised shapes of a plant's modes, rigid-body modes first.
-
-    Parameters
-    ----------
-    phi : (N, m) array
-        At the candidates.
-    omega : (m,) array [rad/s]
-        Frequencies, 0 of rigid-body modes.
-    zeta : (m,) array
-        Damping ratios.
-    rows : (N, n) array
-        Of the candidates over the model's DOFs.
-    full : (n, m) array
-        Shapes at the model's DOFs.
-    asd : (N,) array
-        Noise of sensors, 1 of those without any and of actuators.
-    """
+    """Mass-normalised shapes of a plant's modes, rigid-body modes first."""
 
     phi: FloatArray
     omega: FloatArray
@@ -63,13 +47,7 @@ def shapes_of(plant: StandardPlant, ports: Sequence[Any]) -> Shapes:
 
 
 def noise_sizes(ports: Sequence[Any]) -> FloatArray:
-    """Return the densities (N,) of sensors; 1 of actuators, and of sensors if none has noise.
-
-    Raises
-    ------
-    AssumptionError
-        When some sensors have noise and others have not.
-    """
+    """Return the densities (N,) of sensors; 1 of actuators, and of sensors if none has noise."""
     sizes = np.array([p.asd if isinstance(p, SensorPort) else 1.0 for p in ports])
     silent = [port.name for port, size in zip(ports, sizes, strict=True) if not size]
     if 0 < len(silent) < sizes.size:

@@ -57,13 +57,7 @@ def sides_of(ports: Iterable[Port]) -> Any:
 
 
 def checked_plant(given: Any) -> StandardPlant:
-    """Return a plant that is sampled and not weighted.
-
-    Raises
-    ------
-    ModelError
-        When it is another one.
-    """
+    """Return a plant that is sampled and not weighted."""
     plant: StandardPlant = standard_plant(given)
     if plant.is_weighted:
         raise ModelError(
@@ -98,15 +92,7 @@ def _restricted(plant: StandardPlant, kept: dict[str, list[str]]) -> StandardPla
 
 
 def known_candidates(plant: StandardPlant, side: str, given: Iterable[Any]) -> dict[str, Port]:
-    """Return candidates by name; a text stands for the plant's own sensor (actuator).
-
-    Raises
-    ------
-    LabelError
-        When a name is unknown, or two different candidates have the same one.
-    ModelError
-        When something is no Sensor (Actuator).
-    """
+    """Return candidates by name; a text stands for the plant's own sensor (actuator)."""
     if isinstance(given, str) or not isinstance(given, Iterable):
         raise ModelError(
             f"candidates are a list of {_NAME[side]}s or names, got {short(given)}. "

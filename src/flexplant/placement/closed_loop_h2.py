@@ -60,14 +60,6 @@ class ClosedLoopH2(MotionAndEffort):
         """Return the cost [m^2] on a sampled plant.
 
         By the formula, checked against the stationary covariance of the loop of filter and gain.
-
-        Raises
-        ------
-        AssumptionError
-            When u does not reach, y does not see, w does not excite or the axes do not see a
-            rigid-body mode.
-        CertificateError
-            When the two costs differ.
         """
         self.check(plant, ())
         plant.check().require(("stabilisable", "detectable"), "a stationary controller")

@@ -31,13 +31,7 @@ class Constraint(Value):
 
 
 def limits(at_least: Any, at_most: Any) -> tuple[int | None, int | None]:
-    """Return two counts, checked; None where there is no limit.
-
-    Raises
-    ------
-    ModelError
-        When they are no whole numbers, or at_least is above at_most.
-    """
+    """Return two counts, checked; None where there is no limit."""
     low, high = (
         None if n is None else whole(n, name, minimum=0)
         for n, name in ((at_least, "at_least"), (at_most, "at_most"))

@@ -175,13 +175,7 @@ class _Function(Criterion):
 
 
 def as_criterion(given: Any, side: str = "") -> Criterion:
-    """Return a criterion of one side, made of any callable from plant to float.
-
-    Raises
-    ------
-    ModelError
-        When it is not callable, or of the other side.
-    """
+    """Return a criterion of one side, made of any callable from plant to float."""
     if not callable(given):
         raise ModelError(
             "a criterion is a value such as PoiVariance(...) or PoiLqr(...), or a callable from "

@@ -66,19 +66,7 @@ class Exchange(Search):
 def best_start(
     problem: Problem, starts: int, relaxed: tuple[float, FloatArray] | None, work: Work
 ) -> tuple[tuple[int, ...], tuple[tuple[float, ...], ...], int]:
-    """Return the best choice of several starts, the values on the way of each, evaluations.
-
-    Parameters
-    ----------
-    problem : Problem
-        What is sought.
-    starts : int
-        How many.
-    relaxed : (bound, weights) or None
-        From `problem.relaxed`.
-    work : Work
-        What it runs on.
-    """
+    """Return the best choice of several starts, the values on the way of each, evaluations."""
     rounded = None if relaxed is None else problem.rounded(relaxed[1])
     runs = work.mapped(
         partial(_run, problem),

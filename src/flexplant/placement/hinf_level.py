@@ -72,13 +72,6 @@ class HinfLevel(Criterion):
         """Return the level that was reached and verified on a plant.
 
         Channels of w and z that are not weighted, nor noise or effort, do not count.
-
-        Raises
-        ------
-        AssumptionError
-            When the standard assumptions of the synthesis fail.
-        SynthesisError
-            When no controller was found.
         """
         z = {name: self.z.get(name) for name in plant.z}
         w = {name: self.w.get(name) for name in plant.w}

@@ -26,23 +26,7 @@ _BLOCK = 64
 
 @dataclass(frozen=True, eq=False)
 class Layouts:
-    """Candidates on a plant, and the scores of choices among them.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Sampled, assembled from a structure.
-    side : {"y", "u"}
-        Whether sensors or actuators are chosen.
-    candidates : sequence of Sensor or Actuator
-        All of them.
-    criterion : Criterion
-        Plant to float.
-    rigid : RigidPart
-        Part of each candidate in the rigid-body modes.
-    scorer : Scorer
-        The criterion over these candidates.
-    """
+    """Candidates on a plant, and the scores of choices among them."""
 
     plant: StandardPlant
     side: Side
@@ -115,18 +99,7 @@ def _floats(row: Any) -> FloatArray:
 def layouts_of(
     plant: StandardPlant, side: Side, candidates: Sequence[Port], criterion: Any
 ) -> Layouts:
-    """Return the layouts of candidates on a plant, with everything checked.
-
-    Raises
-    ------
-    ModelError
-        When the plant is not a sampled one of a structure, or the criterion is not callable or is
-        of the other side.
-    AssumptionError
-        When the criterion has no meaning on this plant, whatever is chosen.
-    LabelError
-        When a candidate is off the structure, or a name is used twice.
-    """
+    """Return the layouts of candidates on a plant, with everything checked."""
     plant = checked_plant(plant)
     if criterion is None:
         criterion = {"y": PoiVariance(), "u": PoiLqr(), "yu": ClosedLoopH2()}[side]

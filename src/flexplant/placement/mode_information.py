@@ -15,19 +15,7 @@ from .summed import SummedMatrices
 
 @dataclass(frozen=True, eq=False)
 class ModeRows(SummedMatrices):
-    """Minus log det of the information, and the rows that it is made of.
-
-    Parameters
-    ----------
-    matrices : (N, m, m) array
-        ``phi_i phi_i' / asd_i^2``.
-    measure : str
-        "log det".
-    rows : (N, m) array
-        ``phi_i / asd_i``.
-    driving_point : (N,) array
-        ``sum_j phi_ij^2 / omega_j^2`` over the elastic modes.
-    """
+    """Minus log det of the information, and the rows that it is made of."""
 
     rows: FloatArray = field(default_factory=lambda: np.zeros((0, 0)))
     driving_point: FloatArray = field(default_factory=lambda: np.zeros(0))

@@ -20,15 +20,7 @@ Named: TypeAlias = "str | Sequence[str] | Mapping[str, float] | None"
 
 
 def checked_names(given: Any, what: str) -> tuple[str, ...] | Mapping[str, float] | None:
-    """Return names as a tuple, or as a mapping to factors; None stays None.
-
-    Raises
-    ------
-    LabelError
-        When a name appears twice, or there is none.
-    ModelError
-        When a factor is not positive, or these are no names.
-    """
+    """Return names as a tuple, or as a mapping to factors; None stays None."""
     if given is None:
         return None
     if isinstance(given, Mapping):
@@ -74,17 +66,7 @@ def channels_of(plant: StandardPlant) -> dict[str, dict[str, str]]:
 
 
 def factors_of(plant: StandardPlant, poi: Named, axes: Named, *, every: bool) -> dict[str, float]:
-    """Return {z channel: factor}, the factor of the POI times that of the axis.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        With POIs.
-    poi, axes : names, or mappings to factors
-        None: the only POI; its first axis.
-    every : bool
-        Whether all axes count where none is named.
-    """
+    """Return {z channel: factor}, the factor of the POI times that of the axis."""
     known = channels_of(plant)
     if poi is None and len(known) != 1:
         raise LabelError(
@@ -166,13 +148,6 @@ def plain(plant: StandardPlant, candidates: Sequence[Any]) -> bool:
     """Return whether candidates change rows of B or C only: they, y and u have no states.
 
     Disturbances may have: a shape, the acceleration of the base.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        With ports, or made elsewhere.
-    candidates : sequence of Sensor or Actuator
-        All that may be chosen.
     """
     if not plant.is_assembled:
         return not np.any(plant.D22)

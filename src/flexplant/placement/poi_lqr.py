@@ -64,13 +64,7 @@ class MotionAndEffort(Criterion):
 
 
 def confirmed(cost: float, found: float) -> float:
-    """Return the cost by Riccati equations, confirmed by that of the loop's covariance.
-
-    Raises
-    ------
-    CertificateError
-        When they differ.
-    """
+    """Return the cost by Riccati equations, confirmed by that of the loop's covariance."""
     if not abs(found - cost) <= 1e-6 * abs(cost):
         raise CertificateError(
             f"the loop costs {found:.9g}, its Riccati equations say {cost:.9g}: the problem is "
@@ -120,13 +114,6 @@ class PoiLqr(MotionAndEffort):
 
         The cost to go by a Riccati equation, checked against the stationary covariance of the
         closed loop of its gain.
-
-        Raises
-        ------
-        AssumptionError
-            When u does not reach, w does not excite or the axes do not see a rigid-body mode.
-        CertificateError
-            When the two costs differ.
         """
         self.check(plant, ())
         plant.check().require(("stabilisable",), "a stationary controller")

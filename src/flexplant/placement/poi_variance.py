@@ -119,13 +119,7 @@ class PoiVariance(Criterion):
         return f"PoiVariance({', '.join(given)})"
 
     def __call__(self, plant: StandardPlant) -> float:
-        """Return the variance [m^2] on a sampled plant, by its certified Kalman filter.
-
-        Raises
-        ------
-        AssumptionError
-            When no stationary filter exists: the message names what the sensors miss.
-        """
+        """Return the variance [m^2] on a sampled plant, by its certified Kalman filter."""
         return self._value(plant, plant if self._own else self.larger)
 
     def _value(self, plant: StandardPlant, larger: Any) -> float:

@@ -36,19 +36,6 @@ class Quadratic(Value, Convex):
     For a filter X is the covariance of the state before and X+ after the measurement (A is the
     transpose of the plant's), g_i = c_i / (standard deviation of sensor i). For a controller X is
     the cost to go and g_i = b_i / (weight of effort i). More candidates never cost more.
-
-    Parameters
-    ----------
-    A, H : (n, n) arrays
-        In states in which X has a diagonal near one (see `quadratic`).
-    S : (k, n) array
-        What the cost looks at.
-    items : (N, n) array
-        g_i, one row per candidate.
-    owned : (N, m) array of int
-        States that are there only with their candidate (the last of a delay line).
-    constant : float
-        What no candidate can change.
     """
 
     A: FloatArray
@@ -59,13 +46,7 @@ class Quadratic(Value, Convex):
     constant: float
 
     def value(self, chosen: Sequence[int]) -> float:
-        """Return J with some candidates.
-
-        Raises
-        ------
-        SolverError
-            When no stationary solution exists.
-        """
+        """Return J with some candidates."""
         return float(np.sum(self.terms(chosen))) + self.constant
 
     def terms(self, chosen: Sequence[int]) -> FloatArray:
@@ -114,11 +95,6 @@ class Quadratic(Value, Convex):
         g_i g_i' X+``, solved for all i by the eigenvectors of M, or one by one where it lacks some;
         the adjoint equation confirms the slopes. Directions of no variance are left out: a
         compression of an inverse has an inverse that is concave as well.
-
-        Raises
-        ------
-        SolverError
-            When J is infinite, or the slopes do not confirm the gradient.
         """
         cost, after, closed, adjoint, seen = self._stationary(weights)
         sizes, axes = np.linalg.eigh(0.5 * (after + after.T))
@@ -167,13 +143,7 @@ def quadratic(
     constant: float = 0.0,
     owned: IntArray | None = None,
 ) -> Quadratic:
-    """Return the problem in states in which X, with all candidates, has a unit diagonal.
-
-    Raises
-    ------
-    SolverError
-        When even all candidates together have no stationary solution.
-    """
+    """Return the problem in states in which X, with all candidates, has a unit diagonal."""
     X = control_dare(A, items.T, Q=H, R=np.eye(items.shape[0])).P
     variance = np.maximum(X.diagonal(), 0.0)
     s = np.sqrt(np.where(variance > 1e-200, variance, 1.0))
@@ -188,13 +158,7 @@ def quadratic(
 
 
 def solved(A: FloatArray, H: FloatArray, g: FloatArray) -> FloatArray:
-    """Return X of ``X = A' (X^-1 + g' g)^-1 A + H``: doubling, its residual checked.
-
-    Raises
-    ------
-    SolverError
-        When there is none; the message is that of `solve_dare`.
-    """
+    """Return X of ``X = A' (X^-1 + g' g)^-1 A + H``: doubling, its residual checked."""
     X = _doubled(A, g.T @ g, H)
     if X is not None:
         residual = A.T @ measured(X, g)[1] @ A + H - X
@@ -273,15 +237,7 @@ def _terms(S: FloatArray, X: FloatArray, g: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class WorstRow(Scorer):
-    """``max_a (s_a X+ s_a' + constant_a)`` over the rows of a quadratic cost.
-
-    Parameters
-    ----------
-    costs : Quadratic
-        Its rows S are the terms.
-    constants : (k,) array
-        What no candidate can change of each.
-    """
+    """``max_a (s_a X+ s_a' + constant_a)`` over the rows of a quadratic cost."""
 
     costs: Quadratic
     constants: FloatArray

@@ -18,15 +18,7 @@ _SLACK = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class LinearRows:
-    """``lower <= A x <= upper``, x 1 for chosen candidates and 0 for others.
-
-    Parameters
-    ----------
-    A : (r, N) array
-        Coefficients.
-    lower, upper : (r,) arrays
-        Limits.
-    """
+    """``lower <= A x <= upper``, x 1 for chosen candidates and 0 for others."""
 
     A: FloatArray
     lower: FloatArray

@@ -20,25 +20,6 @@ class Separation(Scorer):
 
     P_d is the covariance of the state predicted d samples ahead, ``A^d P A'^d`` and what is added
     meanwhile, P that of the filter.
-
-    Parameters
-    ----------
-    A : (n, n) array
-        Of the structure.
-    noise : (n, r) array
-        Factor of the process noise W.
-    rows : (k, n) array
-        POI motions.
-    sensors : (Ny, n) array
-        Rows of sensors over their deviation.
-    actuators : (Nu, n) array
-        Columns of actuators over the effort.
-    delay : int [samples]
-        d.
-    measuring : (N,) array of bool
-        Which candidates are sensors; sensors and actuators keep their order among themselves.
-    counts : (int, int), optional
-        How many sensors and actuators are chosen, for a sharper bound.
     """
 
     A: FloatArray

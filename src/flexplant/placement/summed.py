@@ -26,13 +26,7 @@ _AT_ONCE = 200_000
 
 @dataclass(frozen=True, eq=False)
 class SummedWorth(Scorer):
-    """Minus the sum of a worth (N,) of each candidate: a million sets in a second, an exact bound.
-
-    Parameters
-    ----------
-    worth : (N,) array
-        Of each candidate.
-    """
+    """Minus the sum of a worth (N,) of each candidate; its bound is exact."""
 
     worth: FloatArray
 
@@ -59,13 +53,6 @@ class SummedMatrices(Convex):
     Minus the logarithm of the determinant is convex in weights of the candidates, so that it has a
     relaxation [JoshiBoyd2009]_. The other measures grow with
     each candidate: the bound is that of all of them.
-
-    Parameters
-    ----------
-    matrices : (N, n, n) array
-        W_i.
-    measure : {"log det", "least"}
-        Of the sum.
     """
 
     matrices: FloatArray
@@ -149,7 +136,7 @@ class _LogDet(Below):
         return self.costs.score(sets)
 
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of every choice of a branch, and weights near the least.
+        """Return a number below the cost of all choices of a branch, and weights near the least.
 
         A weight of zero may make the sum singular, so that the start is moved inwards.
         """

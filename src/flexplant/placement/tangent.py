@@ -33,15 +33,7 @@ class Below(ABC):
 
     @abstractmethod
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of every choice of a branch, and weights near the least.
-
-        Parameters
-        ----------
-        branch : Branch
-            The choices.
-        start : (N,) array
-            First weights.
-        """
+        """Return a number below the cost of all choices of a branch, and weights near the least."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,19 +42,6 @@ class Tangent(Below):
 
     The cost is ``tr(S Y(w)^-1 S') + constant``. Its information Y is concave in w, as a matrix, so
     Y is below its tangent at v, and the cost is above the cost of this tangent.
-
-    Parameters
-    ----------
-    face : (n, k) array
-        F.
-    slopes : (N, n, n) array
-        Z_i, positive semidefinite.
-    at : (N,) array
-        v.
-    constant : float
-        What no candidate can change.
-    rows : (N, r) array
-        Effect of each candidate on the cost; of like candidates alike.
     """
 
     face: FloatArray
@@ -83,7 +62,7 @@ class Tangent(Below):
         return _safe(np.einsum("ij,mij->m", self.face, solved) + self.constant)
 
     def least(self, branch: Branch, start: FloatArray) -> tuple[float, FloatArray]:
-        """Return a number below the cost of every choice of a branch, and weights near the least.
+        """Return a number below the cost of all choices of a branch, and weights near the least.
 
         ``h = 1 / (cost - constant)`` is concave in w: a harmonic sum of concave information.
         """
@@ -122,13 +101,7 @@ class Convex(Scorer):
     """Scores that are a convex cost of weights of the candidates, in [0, 1]: they have bounds."""
 
     def tangent(self, weights: FloatArray) -> Below:
-        """Return the tangent of the cost's information at weights (N,).
-
-        Raises
-        ------
-        SolverError
-            When the cost at these weights is infinite, or its derivatives are not certain.
-        """
+        """Return the tangent of the cost's information at weights (N,)."""
         raise NotImplementedError
 
     def cost(self, weights: FloatArray) -> float:

@@ -28,21 +28,7 @@ def problem_of(
     required: Sequence[str],
     constraints: Sequence[Constraint],
 ) -> Problem:
-    """Return the problem of choosing so many candidates of each side, with everything checked.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Sampled.
-    wanted : mapping {side: (candidates, count)}
-        One side or both.
-    criterion : Criterion, callable or None
-        Plant to float.
-    required : sequence of str
-        Candidates that any choice includes.
-    constraints : sequence of Constraint
-        What every choice satisfies.
-    """
+    """Return the problem of choosing so many candidates of each side, with everything checked."""
     listed = {side: _listed(plant, side, given) for side, (given, _) in wanted.items()}
     ports = tuple(port for part in listed.values() for port in part)
     names = [port.name for port in ports]

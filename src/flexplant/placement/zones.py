@@ -199,13 +199,7 @@ class MinimumDistance(Constraint):
 
 
 def rows_of(constraints: Any, places: Places, side: str) -> LinearRows:
-    """Return the rows of all constraints, OffPoi() among them for sensors unless one is given.
-
-    Raises
-    ------
-    ModelError
-        When something is no constraint.
-    """
+    """Return the rows of all constraints, OffPoi() among them for sensors unless one is given."""
     return LinearRows.stacked([c.rows(places) for c in all_of(constraints, side)], places.total)
 
 

@@ -28,15 +28,7 @@ P = TypeVar("P", bound=Partition)
 
 
 def wired(cls: type[P], origin: Assembled) -> P:
-    """Return the plant of an origin: what is static is added to its physical system.
-
-    Parameters
-    ----------
-    cls : type
-        Of the plant.
-    origin : Assembled
-        Its ports and its physical system.
-    """
+    """Return the plant of an origin: what is static is added to its physical system."""
     physical, ports = origin.physical, origin.ports
     pois = [poi.channel(axis) for poi in ports.z for axis in poi.axes]
     sensors, actuators = [s.name for s in ports.y], [a.name for a in ports.u]
@@ -76,15 +68,7 @@ def wired(cls: type[P], origin: Assembled) -> P:
 
 
 def continuous_plant(cls: type[P], realisation: ModalRealisation, ports: Ports) -> P:
-    """Return the continuous plant of a structure's modes with its channels.
-
-    Raises
-    ------
-    LabelError
-        When a place is not on the structure.
-    ModelError
-        When the ports are no Ports value, or a side is empty.
-    """
+    """Return the continuous plant of a structure's modes with its channels."""
     given: object = ports
     instance(given, Ports, "ports", "Pass Ports(w=[...], u=[...], z=[...], y=[...]).")
     physical = with_filters(structure_system(realisation, ports), realisation, ports)
@@ -166,11 +150,6 @@ def rebuilt(
     """Return a plant with other ports or of other modes, sampled like the old one.
 
     Ports that are among its own are rows and columns of it.
-
-    Raises
-    ------
-    ModelError
-        When the plant was not assembled from a structure, or is weighted.
     """
     if plant.is_weighted:
         raise ModelError(
@@ -196,11 +175,6 @@ def with_modes_of(plant: P, larger: object) -> P:
     """Return the plant of a larger structure, with the ports of the given one and sampled like it.
 
     Of a reduced model the modes that it left out itself count as well.
-
-    Raises
-    ------
-    ModelError
-        When it is no structure, or the plant has no ports to assemble it with.
     """
     given = instance(larger, FEModel | Modes | ReducedModel, "larger", "Pass one, or a plant.")
     whole = given.completed() if isinstance(given, ReducedModel) else given
@@ -208,15 +182,7 @@ def with_modes_of(plant: P, larger: object) -> P:
 
 
 def with_flexibility(plant: P, flexibility: FloatArray) -> P:
-    """Return a plant whose motions (p, m) also answer forces at once, sampled alike.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Assembled, not weighted.
-    flexibility : (p, m) array
-        From `ports.forces` to the motions of POIs and sensors, between the filters of the ports.
-    """
+    """Return a plant whose motions (p, m) also answer forces at once, sampled alike."""
     ports, realisation = plant.assembled.ports, plant.assembled.realisation
     bare = structure_system(realisation, ports)
     physical = with_filters(bare.replace(D=bare.D + flexibility), realisation, ports)

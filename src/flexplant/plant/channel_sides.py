@@ -28,11 +28,6 @@ def sides(g: StateSpace) -> Sides:
     w. Outputs that are efforts, errors (`die:error`) or motions of POIs (`die:z`) are z; the
     others are y: references (`die:ref`, an input too), outputs with a noise `y1:noise` in w, and
     plain names.
-
-    Raises
-    ------
-    LabelError
-        When the names are not of this kind, or contradict each other.
     """
     efforts = [name.removesuffix(":effort") for name in g.outputs if name.endswith(":effort")]
     u = [name for name in g.inputs if name in efforts]

@@ -13,13 +13,7 @@ from .realisation import ModalRealisation
 
 
 def structure_system(realisation: ModalRealisation, ports: Ports) -> StateSpace:
-    """Return the structure alone, from all forces to the motions of POIs and sensors.
-
-    Raises
-    ------
-    ModelError
-        When a side is empty.
-    """
+    """Return the structure alone, from all forces to the motions of POIs and sensors."""
     if not ports.forces or not (ports.z or ports.y):
         raise ModelError(
             f"a plant needs inputs (w or u) and outputs (z or y), got {ports!r}. Add ports."
@@ -57,11 +51,6 @@ def with_filters(structure: StateSpace, realisation: ModalRealisation, ports: Po
 
     States are those of the sensors' filters, the structure's, those of the forces' filters: what
     drives stands behind what is driven, so that A is block upper triangular.
-
-    Raises
-    ------
-    ModelError
-        When an absolute motion is unbounded.
     """
     before = {port.name: _named(port.filter, port.name) for port in ports.forces}
     filters = {sensor.name: sensor.filter for sensor in ports.y}

@@ -18,15 +18,7 @@ _ZERO = 1e-9
 
 
 class Carried(NamedTuple):
-    """What moves with the ground.
-
-    Parameters
-    ----------
-    order : int
-        Which time derivative of a displacement is seen.
-    gains : mapping {name: float}
-        Its motion with that of each BaseAcceleration, those that it moves with only.
-    """
+    """What moves with the ground."""
 
     order: int
     gains: Mapping[str, float]
@@ -61,11 +53,6 @@ def with_ground(parts: Parts, carried: Mapping[str, Carried]) -> Parts:
     The ground moves by ``a / s^p``, p = 2 for displacements and 1 for velocities. A filter of a
     sensor with m zeros at 0 Hz integrates m times without a state more, ``F / s^m`` being
     ``(A, A^-m B, C, 0)``, and so does a shape, ``(A, B, C A^-m, 0)``.
-
-    Raises
-    ------
-    ModelError
-        When they have fewer zeros than there are integrals: the motion is unbounded.
     """
     structure, before, after = parts.structure, dict(parts.before), dict(parts.after)
     needed: dict[str, set[int]] = {}

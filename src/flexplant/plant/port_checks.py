@@ -103,13 +103,7 @@ def _term(name: str, place: Any) -> Any:
 
 
 def checked_filter(name: str, what: str, given: Any) -> StateSpace | None:
-    """Return a stable continuous system of one input and output, named like its port.
-
-    Raises
-    ------
-    ModelError
-        When it is something else.
-    """
+    """Return a stable continuous system of one input and output, named like its port."""
     if given is None:
         return None
     if hasattr(given, "shape") and hasattr(given, "asd"):

@@ -16,15 +16,6 @@ class Flow:
     The modes are 2 x 2 blocks that do not see each other, so e^(A t) is a sum over them of
     exponentials of the size of head, pair and tail: O(n) for n modes instead of O(n^3), and the
     modes' own blocks in closed form, rigid-body ones exact.
-
-    Parameters
-    ----------
-    A : (n, n) array
-        The matrix.
-    head : int
-        States before the modes.
-    pairs : (b, 2, 2) array
-        The modes' diagonal blocks.
     """
 
     def __init__(self, A: FloatArray, head: int, pairs: FloatArray) -> None:

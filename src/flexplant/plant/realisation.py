@@ -42,29 +42,6 @@ class ModalRealisation(Value):
     ``dx/dt = A x + N' f, q = S x`` with forces f and displacements q at the model's DOFs; each mode
     is one 2 x 2 block of A. A rigid-body mode has the states (omega_r q, dq/dt), where omega_r is
     the first elastic frequency, so that both have similar size.
-
-    Parameters
-    ----------
-    model : FEModel, Modes or ReducedModel
-        The structure.
-    pairs : (b, 2, 2) array [rad/s]
-        Diagonal blocks of A.
-    inputs : (n, 2 b) array
-        N, states' response to unit forces at the DOFs.
-    outputs : (n, 2 b) array
-        S, displacements at the DOFs per unit state.
-    names : sequence of str
-        Of the states.
-    n_rigid : int
-        The first blocks are rigid-body modes.
-    static_outputs, static_inputs : (n, s) arrays, optional
-        Factors of a flexibility ``static_outputs static_inputs'`` [m/N] that answers at once: that
-        of modes left out by `Feedthrough`.
-    coupling : (b, b) array [1/s], optional
-        Damping between modes, zero on the diagonal: the velocity of block j decelerates that of
-        block i. None where every mode is damped by itself.
-    form : str
-        `modal blocks`, or `dense: ` and why the modes are coupled.
     """
 
     model: Structure
@@ -148,13 +125,7 @@ class ModalRealisation(Value):
 
 
 def realised(model: Structure | ModalRealisation) -> ModalRealisation:
-    """Return the modal realisation of a structure; one that is given passes through.
-
-    Raises
-    ------
-    ModelError
-        When `model` is of another type, or too large for a dense eigenproblem.
-    """
+    """Return the modal realisation of a structure; one that is given passes through."""
     if isinstance(model, ModalRealisation):
         return model
     if isinstance(model, Modes):

@@ -118,18 +118,7 @@ class Feedthrough(ResidualForm):
 def modes_of(
     model: Structure | ModalRealisation, residual: ResidualForm | None = None
 ) -> ModalRealisation:
-    """Return the modes of a structure as a plant takes them; FastStates where nothing is given.
-
-    Raises
-    ------
-    ModelError
-        When the model or `residual` is of another type.
-
-    Warns
-    -----
-    FlexplantWarning
-        When damping couples the modes so that blocks cannot hold it.
-    """
+    """Return the modes of a structure as a plant takes them; FastStates where nothing is given."""
     way = FastStates() if residual is None else residual
     instance(way, ResidualForm, "residual", "Pass FastStates() or Feedthrough().")
     realisation = realised(model)

@@ -59,31 +59,6 @@ def sampled_physical(
     is the new sample for the last t - f and the old one before that. A late output is the motion
     at its own instant between samples, a state of its own; its noise is the part of the same
     noise that has acted until then.
-
-    Parameters
-    ----------
-    g : StateSpace
-        Continuous: filters, modes, filters.
-    rate : float [Hz]
-        Sampling rate.
-    head : int
-        States before the modes.
-    pairs : (b, 2, 2) array
-        The modes' blocks.
-    late_inputs, late_outputs : mapping {name: float} [s]
-        Delays.
-    asd : (m,) array
-        One-sided amplitude spectral densities of the white inputs.
-
-    Returns
-    -------
-    Sampled
-        States: late outputs (oldest first), those of g, late inputs (oldest first).
-
-    Raises
-    ------
-    AssumptionError
-        When white noise reaches a late output directly.
     """
     h = 1.0 / rate
     inputs = Late.of(g.inputs, late_inputs, h)

@@ -70,14 +70,7 @@ class ModeVisibility(Value):
 
 
 def mode_visibility(plant: Partition) -> tuple[ModeVisibility, ...]:
-    """Return the visibility of every elastic mode; none for a plant without a structure.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Of a weighted one the channels that are left count, y through the block that reads it; of
-        a sampled one the continuous modes.
-    """
+    """Return the visibility of every elastic mode; none for a plant without a structure."""
     given, plant = plant, plant.unweighted.continuous
     if not plant.is_assembled:
         return ()

@@ -62,11 +62,6 @@ def shown_in(axis: Axis, size: float, unit: str | None) -> tuple[float, str]:
     """Return the factor and the unit in which an axis shows values up to a size.
 
     An axis that has a label with a unit keeps it, so that what is drawn later lies right.
-
-    Raises
-    ------
-    ModelError
-        When it shows another quantity.
     """
     label = re.search(r"\[(.+)\]$", axis.get_label_text())
     if label is None:

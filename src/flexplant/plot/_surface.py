@@ -26,19 +26,7 @@ _EDGE = 0.8
 
 
 class Surface(NamedTuple):
-    """The surface of a structure.
-
-    Parameters
-    ----------
-    xyz : (n, 3) array [m]
-        The nodes.
-    rows : (n, 3) array of int
-        The DOFs x, y and z of each node; -1 where it has none.
-    triangles : (t, 3) array of int
-        Nodes of the surface: both sides of a solid, the middle of a plate; none of a beam.
-    edges : (e, 2) array of int
-        Nodes of the edges of the body; of a beam from node to node.
-    """
+    """The surface of a structure."""
 
     xyz: FloatArray
     rows: IntArray
@@ -66,11 +54,6 @@ def surface_of(dofs: DofSet) -> Surface:
 
     Edges much longer than the distance between nodes are left out: holes and notches stay open
     where they are wider than two elements, half an element of their corners is filled.
-
-    Raises
-    ------
-    ModelError
-        When there are more nodes than a picture could show.
     """
     numbers, first, node = np.unique(dofs.nodes, return_index=True, return_inverse=True)
     if numbers.size > MOST:

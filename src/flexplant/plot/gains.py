@@ -29,13 +29,7 @@ class Curve(NamedTuple):
 
 
 def labelled(found: Any) -> dict[str, Any]:
-    """Return what to draw by label: of a mapping, a list of systems (numbered from 1), or one.
-
-    Raises
-    ------
-    ModelError
-        When there is nothing in it.
-    """
+    """Return what to draw by label: of a mapping, a list of systems (numbered from 1), or one."""
     numbers = (int, float, list, tuple)  # of a static gain
     if isinstance(found, list | tuple) and not any(isinstance(one, numbers) for one in found):
         found = {f"system {k}": one for k, one in enumerate(found, 1)}
@@ -43,13 +37,7 @@ def labelled(found: Any) -> dict[str, Any]:
 
 
 def by_label(found: Any, one: type = Frf) -> dict[str, Any]:
-    """Return the entries of a mapping, or {"": found} of anything else and of `one` kind of them.
-
-    Raises
-    ------
-    ModelError
-        When there is nothing in it.
-    """
+    """Return the entries of a mapping, or {"": found} of anything else and of kind `one`."""
     several = isinstance(found, Mapping) and not isinstance(found, one)
     named = {str(label): part for label, part in found.items()} if several else {"": found}
     if not named:
@@ -63,11 +51,6 @@ def curves(
     """Return what to draw of a system, an Frf, or a mapping {label: one of these} or list.
 
     Systems are evaluated at `freq`; when it is not given, on their own grids.
-
-    Raises
-    ------
-    ModelError
-        When it is none of these, or a mapping without entries.
     """
     named = labelled(found)
     measured = [label for label, one in named.items() if _is_measured(label, one)]

@@ -54,19 +54,7 @@ Find: TypeAlias = Callable[[FloatArray], ComplexArray]
 
 
 class FullResponses:
-    """The responses of a full structure, wherever they are wanted.
-
-    Parameters
-    ----------
-    full : FEModel or Modes
-        The structure.
-    modes : Modes
-        Its modes, beyond the band.
-    B, C : (n, q), (p, n) arrays
-        Loads and outputs.
-    loss : float, optional
-        Loss factor, of a structure without damping.
-    """
+    """The responses of a full structure, wherever they are wanted."""
 
     def __init__(
         self,
@@ -127,15 +115,7 @@ class FullResponses:
 def check_frequencies(
     low: float, high: float, both: Sequence[tuple[Find, FloatArray]]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return frequencies [Hz] over a band, and of these the resonances and antiresonances.
-
-    Parameters
-    ----------
-    low, high : float [Hz]
-        The band.
-    both : sequence of (responses, resonances)
-        Of the full and of the reduced model.
-    """
+    """Return frequencies [Hz] over a band, and of these the resonances and antiresonances."""
     start = low if low > 0 else high / 1000
     resonances = np.concatenate([own for _, own in both])
     resonances = resonances[(resonances >= low) & (resonances <= high)]

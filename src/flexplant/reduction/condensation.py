@@ -338,13 +338,7 @@ class Serep(ReductionMethod):
 
 
 def mode_numbers(numbers: Any) -> tuple[int, ...]:
-    """Return mode numbers as a sorted tuple.
-
-    Raises
-    ------
-    ModelError
-        When they are not whole numbers from 1, or one is there twice.
-    """
+    """Return mode numbers as a sorted tuple."""
     if isinstance(numbers, str) or not isinstance(numbers, Iterable):
         raise ModelError(f"modes are given by their numbers, got {numbers!r:.60}: [1, 2, 3, 7].")
     listed = [whole(number, "a mode number") for number in numbers]
@@ -354,13 +348,7 @@ def mode_numbers(numbers: Any) -> tuple[int, ...]:
 
 
 def kept_columns(numbers: tuple[int, ...], modes: Modes) -> IntArray:
-    """Return the columns of mode numbers, all rigid-body modes among them.
-
-    Raises
-    ------
-    ModelError
-        When a number is beyond the modes, or a rigid-body mode is left out.
-    """
+    """Return the columns of mode numbers, all rigid-body modes among them."""
     if numbers[-1] > modes.n_modes:
         raise ModelError(f"mode {numbers[-1]} is required, but there are {modes.n_modes}.")
     left = sorted(set(range(1, modes.n_rigid + 1)) - set(numbers))

@@ -156,13 +156,7 @@ class DesiredDofs(ReductionMethod):
 def refused_partition(
     dofs: DofSet, basis: FloatArray, labels: tuple[str, ...], what: str, limit: float
 ) -> float:
-    """Return the condition of phi_kk.
-
-    Raises
-    ------
-    ModelError
-        When it is beyond the limit, with DOFs that can be inverted instead.
-    """
+    """Return the condition of phi_kk."""
     partition = basis[dofs.indices(labels)]
     singular = la.svdvals(partition)
     condition = float(singular[0] / singular[-1]) if singular[-1] > 0 else np.inf

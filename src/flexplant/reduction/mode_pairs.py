@@ -26,19 +26,7 @@ _FREQUENCY = 0.1
 
 
 class ModePairs(NamedTuple):
-    """The pairs of m modes with those of another model.
-
-    Attributes
-    ----------
-    partner : (m,) array of int
-        Column of the other model's mode (from 0), -1 for none.
-    mac : (m,) array
-        Modal assurance criterion with it; of a cluster the squared cosines of the angles between
-        the two subspaces, which hold for every basis of a repeated mode; 0 without a partner there.
-    group : (m,) array of int
-        First (from 0) of the modes whose shapes cannot be distinguished from that of each: a
-        cluster, or shapes that are alike as far as they are known.
-    """
+    """The pairs of m modes with those of another model."""
 
     partner: IntArray
     mac: FloatArray
@@ -58,18 +46,6 @@ def paired(
 
     Minimises the sum of ``1 - MAC + 0.1 |ln(f_j / f_i)|`` over the pairs. Modes of a cluster share
     the part of the other mode that lies in their span; a pair with less than half is none.
-
-    Parameters
-    ----------
-    freq, other_freq : (m,), (k,) arrays [Hz]
-        Rising, rigid-body modes first.
-    gram, other_gram : (m, m), (k, k) arrays
-        Inner products ``phi^H W phi`` of each model's shapes, W the mass matrix or, where only
-        sensors are known, one.
-    cross : (m, k) array
-        ``phi^H W psi``.
-    n_rigid : int
-        Rigid-body modes, the first ones of both: paired in order.
     """
     size, other_size = np.real(np.diag(gram)), np.real(np.diag(other_gram))
     alike = np.abs(cross) ** 2 / np.outer(size, other_size)
@@ -165,13 +141,6 @@ def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
     another span they are as like as the nearest two shapes of both (the cosine squared of the
     smallest principal angle); among themselves 1 where their shapes, as far as they are known,
     are nearly dependent, else 0. A mode with a node at all places is like no other.
-
-    Parameters
-    ----------
-    shapes : (p, m) array
-        Of unit modal mass, at the places where they are known.
-    freq : (m,) array [Hz]
-        Within 1e-3 of the next: as good as repeated.
     """
     order = np.argsort(freq, kind="stable")
     apart = np.flatnonzero(np.diff(freq[order]) > CLUSTER * freq[order][1:]) + 1
@@ -193,15 +162,7 @@ def likeness(shapes: ComplexArray, freq: FloatArray) -> FloatArray:
 
 
 def groups_alike(alike: FloatArray, clusters: Sequence[IntArray] = ()) -> IntArray:
-    """Return for each mode the first one whose shape cannot be distinguished from its own.
-
-    Parameters
-    ----------
-    alike : (m, m) array
-        MAC of a model's modes with each other, as far as their shapes are known.
-    clusters : sequence of arrays of int
-        Modes that belong together whatever their MAC.
-    """
+    """Return for each mode the first one whose shape cannot be distinguished from its own."""
     group = np.arange(len(alike), dtype=np.int64)
     for members in clusters:
         group[members] = members[0]

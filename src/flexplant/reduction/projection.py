@@ -67,13 +67,7 @@ class Solver:
 
 
 def labels_given(dofs: Iterable[str], what: str) -> tuple[str, ...]:
-    """Return labels as a tuple, none of them twice.
-
-    Raises
-    ------
-    LabelError
-        When there is none, or one is there twice.
-    """
+    """Return labels as a tuple, none of them twice."""
     labels = name_list(dofs, what)
     if not labels:
         raise LabelError(f"no {what} are given: name at least one DOF, such as '41:z'.")
@@ -90,13 +84,7 @@ def shown(labels: Sequence[str]) -> str:
 
 
 def fe_model(structure: FEModel | Modes, method: object) -> FEModel:
-    """Return the structure when it has the matrices that a method needs.
-
-    Raises
-    ------
-    ModelError
-        When it is no FEModel.
-    """
+    """Return the structure when it has the matrices that a method needs."""
     if isinstance(structure, FEModel):
         return structure
     raise ModelError(
@@ -139,13 +127,7 @@ def modal_damping(
 
 
 def checked_damping(damping: object) -> Damping | None:
-    """Return a damping law or None.
-
-    Raises
-    ------
-    ModelError
-        When it is something else.
-    """
+    """Return a damping law or None."""
     if damping is None or isinstance(damping, Damping):
         return damping
     raise ModelError(
@@ -168,13 +150,7 @@ def projected(
     singular: str = "",
     static_at: Sequence[str] = (),
 ) -> ReducedModel:
-    """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``.
-
-    Raises
-    ------
-    ModelError
-        When T depends on itself or does not hold the rigid-body motions.
-    """
+    """Return the model in the span of T: ``T^T M T``, ``T^T K T``, ``T^T D T``."""
     M, K = inner(model.M, T), inner(model.K, T)
     scaled, scale = unit_diagonal(M)
     values = la.eigvalsh(dense(scaled))

@@ -170,13 +170,7 @@ def rank_modes(
 def channels(
     modes: Modes, inputs: Place | Iterable[Place], outputs: Place | Iterable[Place]
 ) -> tuple[tuple[str, ...], tuple[str, ...], FloatArray, FloatArray]:
-    """Return names of inputs and outputs, and modal forces (k, q) and motions (p, k) there.
-
-    Raises
-    ------
-    ModelError
-        When `modes` are none or complex, or no input is given.
-    """
+    """Return names of inputs and outputs, and modal forces (k, q) and motions (p, k) there."""
     if not isinstance(modes, Modes) or np.iscomplexobj(modes.phi):
         kind = "complex modes" if isinstance(modes, Modes) else type(modes).__name__
         raise ModelError(

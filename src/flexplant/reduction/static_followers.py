@@ -16,18 +16,6 @@ def static_followers(
 
     ``q_light = -K_ll^-1 K_lh q_heavy + K_ll^-1 f_light``, exactly; the flexibility (k, k) is that
     of the second term, K (c, c) what is left of the stiffness.
-
-    Parameters
-    ----------
-    D, K : (k, k) arrays
-        Damping and stiffness.
-    light : (l,) array of int
-        The coordinates without mass.
-
-    Raises
-    ------
-    ModelError
-        When one of these is damped or has no stiffness.
     """
     k = K.shape[0]
     heavy = np.setdiff1d(np.arange(k), light)

@@ -15,30 +15,7 @@ _SEEN = 1e-12
 
 
 def split_law(loop: ClosedLoop, recovery: float | None) -> tuple[FloatArray, FloatArray]:
-    """Return the command, and then the rest, of a controller whose commands are not all applied.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        Its blocks that read an actuator's name are fed what the actuator applies.
-    recovery : float or None [samples]
-        Time constant in which integrators of blocks that drive actuators return to what was
-        applied: ``c+ = A c + B y + L (u - command)``. None leaves them alone.
-
-    Returns
-    -------
-    command : (nu, nc + ny) array
-        ``command = [C D] [c; y]``.
-    law : (nc + nu + nwatched, nc + ny + nu) array
-        ``[c+; u; watched] = law [c; y; u]``.
-
-    Raises
-    ------
-    AssumptionError
-        When a command depends on what is applied in the same sample.
-    ModelError
-        When slow states of the driving blocks cannot be found from the commands.
-    """
+    """Return the command, and then the rest, of a controller whose commands are not all applied."""
     plant, driven = loop.plant, list(loop.driven)
     law = joined(plant, loop.blocks, driven, list(loop.watched), applied=True)
     nc, ny, nu = law.n_states, len(plant.y), len(driven)

@@ -46,11 +46,6 @@ def finer_loop(loop: ClosedLoop, finer: int) -> ClosedLoop:
     """Return a loop whose plant is sampled so many times in a sample of its controller.
 
     The same plant before sampling, with the same delay in seconds.
-
-    Raises
-    ------
-    ModelError
-        When the plant before sampling is not known.
     """
     if whole(finer, "finer") == 1:
         return loop

@@ -236,15 +236,7 @@ def known_forces(plant: StandardPlant) -> StateSpace:
 
 
 def tracked(plant: Any, reference: str | None) -> tuple[StandardPlant, Poi, str]:
-    """Return the plant, and the POI and channel of its reference.
-
-    Raises
-    ------
-    LabelError
-        When there is not one reference, or no such one.
-    ModelError
-        When the plant was not assembled from a structure, or is weighted.
-    """
+    """Return the plant, and the POI and channel of its reference."""
     plant = standard_plant(plant)
     if plant.is_weighted:
         raise ModelError("the plant is weighted: design the feedforward on plant.unweighted.")
@@ -326,13 +318,7 @@ def _term(term: Any) -> int:
 
 
 def term_numbers(terms: Any) -> list[int]:
-    """Return the orders of derivatives that are named.
-
-    Raises
-    ------
-    LabelError
-        When one is none.
-    """
+    """Return the orders of derivatives that are named."""
     return [_term(term) for term in name_list(terms, "terms")]
 
 

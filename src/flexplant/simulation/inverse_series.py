@@ -21,22 +21,7 @@ Inverse: TypeAlias = Callable[[complex], tuple[ComplexArray, ComplexArray]]
 
 
 def coefficients(find: Inverse, dt: float, axes: Sequence[str]) -> FloatArray:
-    """Return k_0, ..., k_4 (p, r, 5) of F(s), G F = rhs, on the largest circle that allows it.
-
-    Parameters
-    ----------
-    find : function
-        Gives G (p, q, r) and the right side (q, 1) or (p, q, 1) at s.
-    dt : float [s]
-        Sampling time; 0 when continuous.
-    axes : sequence of str
-        For the message.
-
-    Raises
-    ------
-    AssumptionError
-        When G is singular, or no circle is found.
-    """
+    """Return k_0, ..., k_4 (p, r, 5) of F(s), G F = rhs, on the largest circle that allows it."""
     radius = min(_LARGEST, 0.5 / dt) if dt else _LARGEST
     powers = np.arange(5)
     outer = _on_circle(find, radius, axes)

@@ -188,15 +188,7 @@ class MachinePipeline(Value):
         return f"{self.ports.references[0].poi}:error"
 
     def __call__(self, machine: Any, rng: Any = None) -> dict[str, Any]:
-        """Return the row of one machine, and write its report where there is a folder.
-
-        Parameters
-        ----------
-        machine : Frf, MeasuredModes or a virtual machine
-            See above.
-        rng : int or numpy.random.Generator, optional
-            Of the noise of its run, and of a virtual measurement.
-        """
+        """Return the row of one machine, and write its report where there is a folder."""
         report = self.report(machine, rng)
         row = dict(report.row)
         if self.folder is not None:

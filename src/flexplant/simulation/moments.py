@@ -14,13 +14,6 @@ def moving_moments(signal: FloatArray, count: int) -> tuple[FloatArray, FloatArr
     edge: it is the tail of one stretch and the head of the next. Both are taken relative to the
     sample at the edge, which the window holds, so that an offset or a far-away motion, however
     large, costs no digits.
-
-    Parameters
-    ----------
-    signal : (..., n) array
-        Equidistant samples.
-    count : int
-        1 to n; windows are cut off at the ends of the record.
     """
     n = signal.shape[-1]
     before = count // 2

@@ -145,15 +145,7 @@ class Acting:
 def split_elements(
     elements: Any, sensors: Sequence[str], driven: Sequence[str]
 ) -> tuple[dict[str, Element], dict[str, Element]]:
-    """Return the elements on sensors and on actuators, by channel.
-
-    Raises
-    ------
-    LabelError
-        When a channel is neither.
-    ModelError
-        When there is no element.
-    """
+    """Return the elements on sensors and on actuators, by channel."""
     if elements is None:
         return {}, {}
     instance(elements, Mapping, "elements", "Name the channel: {'u1': Saturation(10.0)}.")

@@ -62,15 +62,6 @@ def on_grid(distance: float, bounds: tuple[float, ...], rate: float) -> tuple[fl
     Any durations give the distance exactly with one level of the highest derivative. For those of
     the levels 1 to n - 1 the last one, a constant velocity, is as short as all bounds allow:
     ``w_n >= distance / (bound_m w_(n-1) ... w_(n-m+1))``. So every bound holds for every choice.
-
-    Parameters
-    ----------
-    distance : float
-        Positive.
-    bounds : tuple of float
-        Of velocity, acceleration and upwards, n of them.
-    rate : float [Hz]
-        Of the grid.
     """
     off = shortest(distance, bounds)
     choices = []

@@ -276,27 +276,7 @@ class InBlocks:
 def lifted(
     loop: ClosedLoop, factor: FloatArray, columns: IntArray, hold: int, states: bool
 ) -> Recursion:
-    """Return a sampled loop whose controller acts in the first of every `hold` samples.
-
-    Parameters
-    ----------
-    loop : ClosedLoop
-        Its plant in the finer samples, without feedthrough from u to y.
-    factor : (n, r) array
-        How white samples enter the plant's states.
-    columns : (k,) int array
-        Of w that are inputs.
-    hold : int
-        Samples of the plant in one of the controller.
-    states : bool
-        Whether the plant's states are outputs too.
-
-    Returns
-    -------
-    Recursion
-        From `hold` stacked inputs [w[columns]; white] to as many outputs [z; y; driven; monitored;
-        states]; states of the plant, then of the controller.
-    """
+    """Return a sampled loop whose controller acts in the first of every `hold` samples."""
     plant, law, g = loop.plant, loop.controller, loop.plant.system
     used = [plant.u.index(name) for name in loop.driven]
     enter = np.hstack([plant.B1[:, columns], factor])

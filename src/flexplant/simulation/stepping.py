@@ -156,13 +156,6 @@ class Drawn:
     samples are mixed into the few that are not rounding, ``L V'`` the factor. They are drawn as r,
     whose number and order do not hang on rounding. And always for a whole stretch: a longer run
     begins with the shorter one, bit by bit.
-
-    Attributes
-    ----------
-    factor, mix : (n, few) and (r, few) arrays
-        L and V.
-    columns : (k,) int array
-        Of w that have noises of their own.
     """
 
     def __init__(self, noise: WhiteNoise, plant: StandardPlant) -> None:

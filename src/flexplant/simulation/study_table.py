@@ -125,13 +125,7 @@ def _misfit(row: Mapping[str, Any], kinds: Mapping[str, type]) -> str:
 
 
 def checked_row(row: Any) -> dict[str, Any]:
-    """Return what a pipeline returned as plain numbers, truths and texts.
-
-    Raises
-    ------
-    ModelError
-        When it is no mapping of names to these.
-    """
+    """Return what a pipeline returned as plain numbers, truths and texts."""
     instance(row, Mapping, "what the pipeline returns", "Return {column: number, truth or text}.")
     plain: dict[str, Any] = {}
     for name, value in row.items():

@@ -24,18 +24,6 @@ class ComplexSymmetricFactor:
     Each pivot block D is factored with row exchanges of its own; pivots are not moved between
     fronts. That is stable for the dynamic stiffness ``K + i omega D - omega^2 M`` of a damped
     structure; the residual of a solution shows it.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse matrix
-        Both triangles stored; the lower one is used.
-    dissection : Dissection, optional
-        From `dissect`; None: found from the graph of the matrix.
-
-    Raises
-    ------
-    SolverError
-        When a pivot block is singular.
     """
 
     def __init__(self, matrix: Any, dissection: Dissection | None = None) -> None:

@@ -97,11 +97,6 @@ def diagonal_lu(matrix: Any, singular: str) -> Any:
     """Return the SuperLU factorisation of a symmetric sparse matrix, real or complex.
 
     Pivots are taken from the diagonal where they are not zero, so that solutions need a refinement.
-
-    Raises
-    ------
-    SolverError
-        When the matrix is singular; `singular` says what that means.
     """
     splu: Any = spla.splu
     try:
@@ -118,13 +113,7 @@ def diagonal_lu(matrix: Any, singular: str) -> Any:
 
 
 def dynamic_lu(stiffness: Any) -> Any:
-    """Return the factorisation of a sparse dynamic stiffness ``s^2 M + s D + K``.
-
-    Raises
-    ------
-    SolverError
-        When it is singular.
-    """
+    """Return the factorisation of a sparse dynamic stiffness ``s^2 M + s D + K``."""
     return diagonal_lu(
         stiffness,
         "the frequency of a dynamic stiffness is a resonance of the undamped structure. Move it a "
@@ -133,13 +122,7 @@ def dynamic_lu(stiffness: Any) -> Any:
 
 
 def symmetric_lu(matrix: Matrix) -> Any:
-    """Return the SuperLU factorisation of a symmetric sparse matrix with diagonal pivots only.
-
-    Raises
-    ------
-    SolverError
-        When the matrix is singular, or SuperLU had to leave the diagonal.
-    """
+    """Return the SuperLU factorisation of a symmetric sparse matrix with diagonal pivots only."""
     lu = diagonal_lu(
         matrix,
         "the shift hits an eigenvalue, or DOFs without any stiffness are in the model. Remove "

@@ -34,11 +34,6 @@ def multifrontal_inertia(
     first, and taken if refinement shows that its rounding changes no sign. In double precision the
     factor is not kept. A random ``b = A x`` is eliminated along: ``x^T A x = y^T D^-1 y`` with
     ``L y = b`` shows whether pivots restricted to the blocks were stable.
-
-    Raises
-    ------
-    SolverError
-        When the factorisation is not accurate: the matrix is close to singular.
     """
     lower = sp.csc_array(matrix)
     chosen = dissect(lower) if dissection is None else dissection
@@ -81,18 +76,6 @@ class SignedFactor:
     """``A = L D L^T`` of a sparse symmetric matrix in single precision, D of +1 and -1.
 
     Pivots are not moved between fronts: `error_radius` shows whether that was stable.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse matrix
-        Both triangles stored; the lower one is used.
-    dissection : Dissection
-        From `dissect`.
-
-    Raises
-    ------
-    SolverError
-        When a pivot is zero.
     """
 
     def __init__(self, matrix: Any, dissection: Dissection) -> None:

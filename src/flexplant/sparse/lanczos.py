@@ -49,21 +49,6 @@ class BlockLanczos:
 
     Every new block is made M-orthogonal to all before it, so that no value appears twice
     [Grimes1994]_.
-
-    Parameters
-    ----------
-    solve : callable
-        Forces (n, m) to ``(K - sigma M)^-1`` times them.
-    M : (n, n) matrix
-        Mass, positive definite.
-    locked : (n, r) array
-        M-orthonormal vectors, modes already known: deflated.
-    want : int
-        About how many modes will be requested.
-    rng : int, SeedSequence or Generator
-        Of the starting block: the same one gives the same answer.
-    start : (n, s) array, optional
-        Shapes like those of the lowest modes, in the starting block.
     """
 
     def __init__(
@@ -119,11 +104,6 @@ class BlockLanczos:
         its rounding hides them, or where a value has as many copies as the block has vectors, which
         see no more of them: with those returned locked, another search, of a larger block, finds
         the rest.
-
-        Raises
-        ------
-        SolverError
-            When they do not converge.
         """
         n = self._V.shape[1]
         count = min(count, n - self._r)

@@ -35,24 +35,7 @@ _MOST = 64
 
 @dataclass(frozen=True)
 class Lowest:
-    """The lowest eigenvalues of ``K phi = lambda M phi``.
-
-    Attributes
-    ----------
-    values : (k,) array [1/s^2]
-        Ascending in size, the zero ones first, those of the known motions before all.
-    shapes : (n, k) array
-        M-orthonormal.
-    spread : (k,) array [1/s^2]
-        ``|phi|^T |K| |phi|``: times the relative error of the entries of K, that of the eigenvalue.
-    n_zero : int
-        How many of them are zero, to the rounding of the entries.
-    below : int or None
-        Eigenvalues below the first that is not zero, counted by a factorisation (Sylvester); None
-        when it was not possible. Less `n_zero` it is the number of negative ones, or missed ones.
-    negative : ((q,), (n, q) arrays) or None
-        The negative eigenvalues and their shapes, where they were found.
-    """
+    """The lowest eigenvalues of ``K phi = lambda M phi``."""
 
     values: FloatArray
     shapes: FloatArray
@@ -76,25 +59,6 @@ def lowest_modes(
 
     By inverse iteration at a shift below zero, hence exact to rounding also where K is singular
     and M has massless rows.
-
-    Parameters
-    ----------
-    K, M : (n, n) sparse matrix
-        Symmetric; M positive semi-definite and nonzero.
-    count : int
-        How many at least.
-    known : (n, r) array, optional
-        M-orthonormal motions without energy. What is softest beside them is judged by the rounding
-        of its own energy, as the modes of a structure are; without them, by that of their sum too.
-    rounding : float
-        Relative error of the entries of K: of a text file, say.
-    nodes, xyz : (n,), (n, 3) arrays, optional
-        Of each row: they make the factorisations of a large model cheaper.
-
-    Raises
-    ------
-    SolverError
-        When no shift makes K + s M regular, or the iteration does not converge.
     """
     K, M = sp.csc_array(K), sp.csc_array(M)
     first = np.zeros((K.shape[0], 0)) if known is None else known
@@ -211,13 +175,7 @@ def _both_ways(K: Any, M: Any, shift: float, count: int, factor: Any) -> FloatAr
 
 
 def definite_solver(K: Any, M: Any, shift: float) -> Callable[[FloatArray], FloatArray]:
-    """Return the solution of ``(K + shift M) x = b`` as a function of b (n, m).
-
-    Raises
-    ------
-    SolverError
-        When the sum is singular.
-    """
+    """Return the solution of ``(K + shift M) x = b`` as a function of b (n, m)."""
     small = K.shape[0] <= _DENSE
     if small or not all(sp.issparse(part) for part in (K, M)):
         try:

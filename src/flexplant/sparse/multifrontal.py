@@ -21,25 +21,7 @@ _INVERTED = 128
 
 
 class MultifrontalCholesky:
-    """``A = L L^T`` of a sparse symmetric positive definite matrix [DuffReid1983]_.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse matrix
-        Both triangles stored; the lower one is used.
-    dissection : Dissection, optional
-        From `dissect`; None: found from the graph of the matrix.
-    keep : bool
-        Whether the factor is kept; without it only the definiteness of the matrix is seen.
-    single : bool
-        Whether it is computed and kept in single precision, at half the cost: solutions are then
-        approximate, to precondition with.
-
-    Raises
-    ------
-    SolverError
-        When the matrix is not positive definite.
-    """
+    """``A = L L^T`` of a sparse symmetric positive definite matrix [DuffReid1983]_."""
 
     def __init__(
         self,

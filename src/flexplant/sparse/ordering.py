@@ -72,18 +72,6 @@ def dissect(
 
     Parts are cut in two across their longest side, through the median; the nodes on one side that
     touch the other come after both [George1973]_.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse matrix
-        Its pattern is used.
-    nodes : (n,) array, optional
-        The node of each DOF: DOFs of a node stay together. None: each DOF by itself.
-    xyz : (n, 3) array [m], optional
-        Coordinates of the DOFs. None, or such as do not fit the graph: distances through the
-        graph are used instead.
-    leaf : int
-        Parts of fewer DOFs are not cut.
     """
     n = matrix.shape[0]
     if nodes is None:

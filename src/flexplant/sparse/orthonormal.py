@@ -14,20 +14,7 @@ _DEPENDENT = 1e-5
 
 
 def beyond(M: Any, V: FloatArray, part: FloatArray, *, dependent: float = _DEPENDENT) -> FloatArray:
-    """Return M-orthonormal vectors that span, with V, what V and `part` span.
-
-    Parameters
-    ----------
-    M : (n, n) matrix
-        The mass.
-    V : (n, k) array
-        M-orthonormal.
-    part : (n, m) array
-        Any vectors; those that depend on the others add none.
-    dependent : float
-        M-norm of what is new in a vector, of the whole vector, below which it adds nothing. Its
-        square must stay above rounding.
-    """
+    """Return M-orthonormal vectors that span, with V, what V and `part` span."""
     if not part.shape[1]:
         return part
     length = np.sqrt(np.sum(part * np.asarray(M @ part), axis=0))

@@ -52,20 +52,7 @@ class Pardiso(Value):
 
 
 class PardisoCholesky:
-    """``A = L L^T`` of a sparse symmetric positive definite matrix, held by MKL.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse matrix
-        Both triangles stored; the upper one is used.
-    method : Pardiso
-        Where the library is.
-
-    Raises
-    ------
-    SolverError
-        When MKL is missing, or the matrix is not positive definite.
-    """
+    """``A = L L^T`` of a sparse symmetric positive definite matrix, held by MKL."""
 
     def __init__(self, matrix: Any, method: Pardiso) -> None:
         self._mkl = _loaded(method.library)

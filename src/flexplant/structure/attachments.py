@@ -229,13 +229,7 @@ class HeldShape(Interpolation):
 
 
 def added_matrices(dofs: DofSet, parts: Iterable[Part] | Part) -> dict[str, sp.csc_array]:
-    """Return what parts add to M, K and D, those that are touched only.
-
-    Raises
-    ------
-    ModelError
-        When one of them is no part.
-    """
+    """Return what parts add to M, K and D, those that are touched only."""
     listed = (
         [parts]
         if isinstance(parts, Part)
@@ -267,13 +261,7 @@ def summed(matrix: Matrix | None, change: Matrix | None) -> Matrix | None:
 
 
 def checked_place(at: Any, owner: str) -> Any:
-    """Return a label, a point as a tuple or a mapping as they are.
-
-    Raises
-    ------
-    LabelError
-        When it is none of these.
-    """
+    """Return a label, a point as a tuple or a mapping as they are."""
     if isinstance(at, str | Mapping):
         return at
     try:

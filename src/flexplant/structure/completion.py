@@ -12,15 +12,7 @@ from ..values import FloatArray, real_array
 
 
 def square(given: Any, name: str) -> sp.csc_array:
-    """Return a square sparse matrix with finite real entries, without stored zeros.
-
-    Raises
-    ------
-    ShapeError
-        When it is not square.
-    ModelError
-        When entries are no finite real numbers.
-    """
+    """Return a square sparse matrix with finite real entries, without stored zeros."""
     stored: Any = given
     if not sp.issparse(given):
         array = real_array(given, name)
@@ -44,30 +36,6 @@ def completed(given: Any, name: str) -> tuple[sp.csc_array, str | None]:
 
     A matrix that stores every pair (i, j), (j, i) at most once, in either triangle, is completed;
     one that stores both is left as it is, for `check` to compare them.
-
-    Parameters
-    ----------
-    given : (n, n) array or sparse matrix
-        As stored.
-    name : str
-        What to call it.
-
-    Returns
-    -------
-    matrix : (n, n) csc_array
-    note : str or None
-
-    Raises
-    ------
-    ShapeError
-        When it is not square.
-    ModelError
-        When entries are no finite real numbers.
-
-    Examples
-    --------
-    >>> completed(np.array([[2.0, -1.0], [0.0, 1.0]]), "K")[1]
-    'K: upper triangle only, completed'
     """
     matrix = square(given, name)
     lower: Any = sp.tril(matrix, -1, format="csc")

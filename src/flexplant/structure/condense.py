@@ -46,12 +46,6 @@ def condensed(
     """Return K, M, D without the massless DOFs s: ``K_mm - K_ms K_ss^-1 K_sm``, M_mm, D_mm.
 
     Exact: ``K_sm q_m + K_ss q_s = 0`` holds at every frequency. All finite eigenvalues stay.
-
-    Raises
-    ------
-    ModelError
-        When damping acts on a massless DOF (it would not follow statically), when one has no
-        stiffness either, or when the result would be too large.
     """
     s, m = np.flatnonzero(without), np.flatnonzero(~without)
     if not m.size:

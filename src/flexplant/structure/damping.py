@@ -334,26 +334,7 @@ def damping_matrix(
     motions: Callable[[], FloatArray],
     dofs: DofSet,
 ) -> FloatArray:
-    """Return the full D of a damping law, ``M Phi 2 Z Omega Phi^T M`` over all modes.
-
-    Parameters
-    ----------
-    stiffness, mass : (n, n) matrix
-        K and M.
-    rigid : (n, r) array
-        M-orthonormal rigid-body motions.
-    damping : Damping
-        The law.
-    motions : function
-        Gives the rigid-body motions of every piece, whether held or not.
-    dofs : DofSet
-        The n rows.
-
-    Raises
-    ------
-    ModelError
-        When n is above 5000: D would not fit the memory comfortably.
-    """
+    """Return the full D of a damping law, ``M Phi 2 Z Omega Phi^T M`` over all modes."""
     n = rigid.shape[0]
     if n > _LIMIT:
         raise ModelError(

@@ -38,15 +38,7 @@ def check_semidefinite(matrix: Matrix, name: str) -> None:
 
 
 def symmetric(given: Any, name: str, n: int) -> Matrix:
-    """Return a finite symmetric (n, n) matrix, dense or sparse.
-
-    Raises
-    ------
-    ShapeError
-        When its shape differs.
-    ModelError
-        When entries are not finite real numbers, or it is not symmetric.
-    """
+    """Return a finite symmetric (n, n) matrix, dense or sparse."""
     value, matrix = given, cast(Any, None)
     if sp.issparse(given):
         if value.shape != (n, n):
@@ -105,13 +97,7 @@ def without_inertia(M: Matrix, K: Matrix) -> str:
 
 
 def slow(M: Matrix, K: Matrix, directions: Sequence[str]) -> str:
-    """Return in words that no motion of a structure is as fast as one has; empty when one is.
-
-    Raises
-    ------
-    ModelError
-        When M, too, is a stiffness: DOFs that all move alike by it feel no force.
-    """
+    """Return in words that no motion of a structure is as fast as one has; empty when one is."""
     fastest = _fastest(M, K)
     if not 0.0 < fastest < _SLOW:
         return ""

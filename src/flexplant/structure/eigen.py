@@ -46,11 +46,6 @@ def elastic_modes(
     The transformation that makes M the identity leaves an error of a rounding of the largest
     eigenvalue in all of them. Soft modes are therefore improved by inverse iteration with the
     scaled Cholesky factor of K + s M, whose error is a rounding of each entry [Demmel1989]_.
-
-    Raises
-    ------
-    ModelError
-        When M is not positive definite, an elastic mode has no stiffness, or a negative one.
     """
     n, r = rigid.shape
     kept = n - r if count is None else min(count, n - r)

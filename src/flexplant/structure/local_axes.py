@@ -14,15 +14,7 @@ from ..values import instance, real_array
 
 
 def cosines(dofs: DofSet, rotations: Any) -> Any:
-    """Return C (n, n), sparse, ``q_local = C q_global``, from {node: (3, 3) direction cosines}.
-
-    Raises
-    ------
-    LabelError
-        When a node has no DOF.
-    ModelError
-        When cosines are not orthogonal, or a node has only some of its three directions.
-    """
+    """Return C (n, n), sparse, ``q_local = C q_global``, from {node: (3, 3) direction cosines}."""
     rows, columns, values = [np.arange(len(dofs))], [np.arange(len(dofs))], [np.ones(len(dofs))]
     instance(rotations, Mapping, "rotations", "Pass {node: (3, 3) cosines}.", LabelError)
     for node, given in rotations.items():

@@ -132,13 +132,7 @@ class LossRegion(Value):
 
 
 def checked_loss_factor(value: Any) -> float:
-    """Return a loss factor in [0, 2).
-
-    Raises
-    ------
-    ModelError
-        When it is not there.
-    """
+    """Return a loss factor in [0, 2)."""
     why = (
         "The equivalent damping ratio is half of it, and from 1 on there is no oscillation left: "
         "give 0.02 for 2 %."

@@ -29,17 +29,7 @@ def signed_square(omega: FloatArray) -> FloatArray:
 
 
 def rigid_shares(M: Any, motions: FloatArray, phi: FloatArray) -> FloatArray:
-    """Return the parts (k,) of the kinetic energy of M-orthonormal shapes in rigid-body motions.
-
-    Parameters
-    ----------
-    M : (n, n) array or sparse matrix
-        Mass.
-    motions : (n, r) array
-        M-orthonormal rigid-body motions.
-    phi : (n, k) array
-        Shapes.
-    """
+    """Return the parts (k,) of the kinetic energy of M-orthonormal shapes in rigid-body motions."""
     part = np.asarray(by_rows(M) @ motions).T @ phi
     return np.asarray(np.sum(part**2, axis=0))
 
@@ -63,15 +53,7 @@ def unstable_stiffness(K: Any, motions: FloatArray) -> FloatArray:
 
 
 def refuse_unstable(model: Any, what: str) -> None:
-    """Raise ModelError when springs of negative stiffness make a model unstable.
-
-    Parameters
-    ----------
-    model : FEModel, Modes or ReducedModel
-        The structure.
-    what : str
-        What cannot be done with it.
-    """
+    """Raise ModelError when springs of negative stiffness make a model unstable."""
     count = int(getattr(model, "n_unstable", 0))
     if count:
         raise ModelError(

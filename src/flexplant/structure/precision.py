@@ -36,18 +36,6 @@ def digits_of(given: Any) -> int | None:
     Rounding to nearest changes an entry by half a unit in the last place: 2^-24 of it, hence 7
     digits, in single precision. Entries in double precision that came from a text of few digits
     show it: written with as few digits as distinguish them, none has more.
-
-    Parameters
-    ----------
-    given : array, sparse matrix or sequence
-        As it was read, before it is made double.
-
-    Examples
-    --------
-    >>> digits_of(np.eye(2, dtype=np.float32)), digits_of(np.eye(2))
-    (7, None)
-    >>> digits_of([[float(f"{np.sin(i + 9 * j):.5e}") for i in range(9)] for j in range(9)])
-    6
     """
     kind = np.dtype(given.dtype if hasattr(given, "dtype") else np.asarray(given).dtype)
     if kind.kind not in "fc":
@@ -78,13 +66,6 @@ def shown_digits(K: Any, dofs: DofSet) -> int | None:
     Rigid translations t cost no energy, so that ``K t`` is rounding: in every row, of either sign.
     Springs to ground act in few rows, or with the motion. Errors uniform up to a relative d leave
     ``|K t|_i = 0.39 d (sum_j K_ij^2 t_j^2)^(1/2)`` in the median.
-
-    Parameters
-    ----------
-    K : (n, n) sparse matrix
-        Stiffness.
-    dofs : DofSet
-        What its rows are; coordinates are not needed.
     """
     stiffness: Any = sp.csr_array(K)
     size = stiffness.multiply(stiffness)
@@ -141,19 +122,7 @@ def verdict(error: float | None, digits: int) -> str | None:
 def held_by_rounding(
     K: Any, M: Any, dofs: DofSet, digits: int, found: FloatArray | None = None
 ) -> str | None:
-    """Return what to say when only rounding of the entries of K holds rigid-body motions.
-
-    Parameters
-    ----------
-    K, M : (n, n) arrays or sparse matrices
-        Stiffness and mass.
-    dofs : DofSet
-        With coordinates.
-    digits : int
-        Of the entries of K.
-    found : (n, r) array, optional
-        Rigid-body motions of the model that are known already.
-    """
+    """Return what to say when only rounding of the entries of K holds rigid-body motions."""
     nearly = nearly_free(K, M, dofs, digits).shape[1]
     if found is not None and force_free(M, K, found):
         nearly -= found.shape[1]

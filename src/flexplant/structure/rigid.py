@@ -226,14 +226,7 @@ def _null_vectors(
 
 
 def orthonormalised(M: Matrix, basis: FloatArray, *, dependent: str = "raise") -> FloatArray:
-    """Return the M-orthonormal vectors of a basis, in order, by Gram-Schmidt done twice.
-
-    Raises
-    ------
-    ModelError
-        When a vector depends on those before it, unless `dependent` is "drop"; when M is not
-        positive definite.
-    """
+    """Return the M-orthonormal vectors of a basis, in order, by Gram-Schmidt done twice."""
     done = np.zeros((basis.shape[0], 0))
     loaded = np.zeros((basis.shape[0], 0))  # M done, for as few products with M as possible
     for i in range(basis.shape[1]):
@@ -272,17 +265,7 @@ def _length(M: Matrix, vector: FloatArray) -> float:
 
 @dataclass(frozen=True)
 class RigidMass:
-    """What M says of the body as a whole; NaN where the DOFs do not determine it.
-
-    Attributes
-    ----------
-    mass : (3,) array [kg]
-        Inertia against translation in x, y, z.
-    center : (3,) array [m]
-        Centre of gravity.
-    inertia : (3, 3) array [kg m^2]
-        About the centre of gravity.
-    """
+    """What M says of the body as a whole; NaN where the DOFs do not determine it."""
 
     mass: FloatArray
     center: FloatArray

@@ -30,11 +30,6 @@ def null_motions(M: Any, digits: int | None) -> FloatArray:
 
     M is scaled to a unit diagonal first; eigenvalues below 1e-11, or below what the digits of a
     text leave, are none.
-
-    Raises
-    ------
-    ModelError
-        When M is indefinite, or too large and coupled to be searched.
     """
     n = M.shape[0]
     tolerance = _SINGULAR if digits is None else max(_SINGULAR, 10.0 ** (1 - digits))
@@ -81,11 +76,6 @@ def projected(
     Where N has no inertia, ``N^T K q = 0`` at every frequency. It gives q of the DOFs, s, by the
     others, ``q_s = -(N^T K)_s^-1 (N^T K)_m q_m``: exact, all finite eigenvalues stay, and the
     DOFs that are kept keep their meaning.
-
-    Raises
-    ------
-    ModelError
-        When such a motion has no stiffness or is damped, or the model is too large.
     """
     n, q = motions.shape
     if n > _LARGEST:
@@ -139,24 +129,7 @@ def inertial(
     digits: int | None,
     massless: str,
 ) -> Inertial:
-    """Return matrices whose M is definite: motions without inertia follow the others statically.
-
-    Parameters
-    ----------
-    K, M, D : (n, n) sparse; D or None
-        The matrices.
-    names : function
-        Of rows (from 0), gives their labels.
-    digits : int or None
-        Significant digits of the entries; None: double precision.
-    massless : "refuse" or "condense"
-        What to do with such motions.
-
-    Raises
-    ------
-    ModelError
-        When there are such motions and they are to be refused, or cannot be condensed.
-    """
+    """Return matrices whose M is definite: motions without inertia follow the others statically."""
     notes: tuple[str, ...] = ()
     rows: IntArray = np.arange(M.shape[0])
     without = empty_rows(M)

@@ -28,15 +28,6 @@ def unheld(K: Matrix, motions: FloatArray, rounding: float = PRECISION) -> Float
     Rounding of K leaves forces at all DOFs, of about the same size relative to what cancels there.
     A few springs leave larger ones at a few DOFs, however soft they are; springs everywhere, a
     bed, leave work of one sign, which sums to an energy above that of rounding.
-
-    Parameters
-    ----------
-    K : (n, n) matrix
-        Stiffness of one body.
-    motions : (n, r) array
-        Of zero energy, but for rounding and soft springs.
-    rounding : float
-        Relative error of the entries of K: of a text with few digits, say.
     """
     mix = np.eye(motions.shape[1])
     if not motions.size:

@@ -45,11 +45,6 @@ class Units:
     """One unit of length, mass and time of a foreign model, in SI.
 
     Forces follow, ``F = m L / t^2``: mm, t and s give N (and MPa); mm, kg and ms give kN.
-
-    Examples
-    --------
-    >>> units("mm", "t").force
-    1.0
     """
 
     length: float
@@ -83,13 +78,7 @@ class Units:
         return np.where(dofs.kinds < 3, self.length, 1.0)
 
     def placed(self, dofs: DofSet) -> DofSet:
-        """Return the DOFs with their coordinates in metres.
-
-        Raises
-        ------
-        ModelError
-            When they carry an interpolation, which would stay in the old unit.
-        """
+        """Return the DOFs with their coordinates in metres."""
         if self.length == 1.0:
             return dofs
         if dofs.interpolation is not None:
@@ -118,27 +107,7 @@ class Units:
 
 
 def units(length: Any = "m", mass: Any = "kg", time: Any = "s") -> Units:
-    """Return a unit system by the names of its units, or by their size in SI.
-
-    Parameters
-    ----------
-    length : str or float [m]
-        One of m, dm, cm, mm, um, in, ft, or what one unit is in metres.
-    mass : str or float [kg]
-        One of kg, t, g, mg, lb, slug, slinch (lbf s^2/in), or what one unit is in kilograms.
-    time : str or float [s]
-        One of s, ms, us, or what one unit is in seconds.
-
-    Raises
-    ------
-    ModelError
-        When a unit is unknown or not positive.
-
-    Examples
-    --------
-    >>> units("mm", "t")
-    Units(length=0.001, mass=1000.0, time=1.0)
-    """
+    """Return a unit system by the names of its units, or by their size in SI."""
     return Units(
         _size(length, "length", LENGTHS), _size(mass, "mass", MASSES), _size(time, "time", TIMES)
     )

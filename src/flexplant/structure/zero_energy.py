@@ -31,29 +31,7 @@ _LARGEST = 6000
 
 @dataclass(frozen=True)
 class ZeroEnergy:
-    """How the motions of zero energy compare with those the geometry allows.
-
-    Attributes
-    ----------
-    free : tuple of str
-        Which of x, y, z, rx, ry, rz (about the centre) cost no energy.
-    grounded : tuple of str
-        Which do.
-    absent : tuple of str
-        Which the DOFs cannot make.
-    n_rigid : int
-        Independent rigid-body motions without energy, combinations and those of all bodies
-        included.
-    n_bodies : int
-        Pieces that nothing joins, each with motions of its own.
-    rigid : (n, n_rigid) array
-        A basis of them.
-    every : (n, m) array
-        Orthonormal motions of all bodies, free or held.
-    length_factor : float or None
-        By which the coordinates would have to be multiplied to fit K, when another unit explains
-        why rotations cost energy.
-    """
+    """How the motions of zero energy compare with those the geometry allows."""
 
     free: tuple[str, ...]
     grounded: tuple[str, ...]
@@ -177,13 +155,7 @@ def nearly_free(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
 
 
 def freed(K: Any, M: Any, dofs: DofSet, digits: int | None) -> FloatArray:
-    """Return ``P^T K P``, ``P = I - R R^T M``, which the nearly free motions R cost nothing.
-
-    Raises
-    ------
-    ModelError
-        When no motion is nearly free, or the full matrix would be too large.
-    """
+    """Return ``P^T K P``, ``P = I - R R^T M``, which the nearly free motions R cost nothing."""
     if len(dofs) > _LARGEST:
         raise ModelError(
             f"freeing fills K: too large for {len(dofs)} DOFs (limit {_LARGEST}). Export in binary."

@@ -55,27 +55,13 @@ class Answer(NamedTuple):
 
 
 def answered(plant: StandardPlant, problem: Prepared, method: SynthesisMethod) -> Answer:
-    """Return the answer of one method, verified on the plant.
-
-    Raises
-    ------
-    FlexplantError
-        Whatever the method raises.
-    CertificateError
-        When the closed loop misses the norm that was claimed.
-    """
+    """Return the answer of one method, verified on the plant."""
     one = _verified(plant, problem, method, method.solve(problem))
     return one._replace(lower=lower_bound(problem, one.gamma, one.lower))
 
 
 def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) -> Answer:
-    """Return the first answer that is close to its lower bound, or the best of all methods.
-
-    Raises
-    ------
-    FlexplantError
-        When no method gives a controller: what the first one found, then what else was tried.
-    """
+    """Return the first answer that is close to its lower bound, or the best of all methods."""
     search = _Search(plant, problem)
     riccati = Riccati(progress=progress)
     search.attempt("Riccati()", riccati, riccati.solve)
@@ -92,13 +78,7 @@ def best_answer(plant: StandardPlant, problem: Prepared, progress: bool | None) 
 
 
 def idle_answer(plant: StandardPlant, problem: Prepared, failure: FlexplantError) -> Answer:
-    """Return no feedback, K = 0, which a stable plant needs none of, with its verified norm.
-
-    Raises
-    ------
-    CertificateError
-        When the norm of the plant itself cannot be verified.
-    """
+    """Return no feedback, K = 0, which a stable plant needs none of, with its verified norm."""
     n_u, n_y = len(plant.u), len(plant.y)
     note = f"no feedback (K = 0), which is stable here, because no other was found: {failure}"
     parts = np.zeros((0, 0)), np.zeros((0, n_y)), np.zeros((n_u, 0)), np.zeros((n_u, n_y))
@@ -135,13 +115,7 @@ class _Search:
         method: SynthesisMethod,
         solve: Callable[[Prepared], SolvedController],
     ) -> None:
-        """Keep the answer of a method, or why it failed.
-
-        Raises
-        ------
-        InfeasibleError
-            When there is none: no other method finds what does not exist.
-        """
+        """Keep the answer of a method, or why it failed."""
         self.tried[name] = np.inf
         try:
             found = solve(self.problem)
@@ -174,13 +148,7 @@ class _Search:
         return found
 
     def best(self) -> Answer:
-        """Return the answer with the smallest gamma, or an earlier one that is as good.
-
-        Raises
-        ------
-        FlexplantError
-            When there is none.
-        """
+        """Return the answer with the smallest gamma, or an earlier one that is as good."""
         for method, found in self.broken if not self.answers else ():
             with suppress(FlexplantError):
                 self.answers.append(self._beyond_claim(method, found))

@@ -32,13 +32,6 @@ class AxisLaw:
     a tenth of it. The logarithms of w_b, a, b, c and, of each notch, frequency, depth and width
     are its numbers. A notch lies above the bandwidth or at a mode: others would lower the loop gain
     below the bandwidth until nothing is left of it but its crossover.
-
-    Parameters
-    ----------
-    axis : MeasuredAxis
-        The plant.
-    peak : float
-        Bound on |S|.
     """
 
     axis: MeasuredAxis

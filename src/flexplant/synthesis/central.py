@@ -56,11 +56,6 @@ def central(
     controllers are F_l(K, Q) with ||Q|| < gamma, the central one has Q = 0. It may need infinite
     gain once D22 is put back (where D12 and D21 are square it makes the sensitivity zero at
     infinite frequency); then Q is a constant that keeps I + D22 K away from singular.
-
-    Raises
-    ------
-    LinAlgError
-        When gamma is so small that a factor does not exist.
     """
     m1, m2, p1, p2 = p.B1.shape[1], p.B2.shape[1], p.C1.shape[0], p.C2.shape[0]
     B = np.hstack([p.B1, p.B2])
@@ -113,13 +108,7 @@ def require_shown(p: Prepared) -> None:
 
 
 def quadratic(p: Prepared) -> StateSpace:
-    """Return the controller of least H2 norm, feedthrough apart (gamma without bound).
-
-    Raises
-    ------
-    AssumptionError
-        When it does not exist, which no gamma mends: the message says where.
-    """
+    """Return the controller of least H2 norm, feedthrough apart (gamma without bound)."""
     rows, columns = p.B2.shape[1], p.C2.shape[0]
     require_shown(p)
     try:
@@ -194,13 +183,6 @@ def stabilising(
 
     R is indefinite. By the stable invariant subspace of the Hamiltonian: unlike doubling it does
     not need X to be reached from zero, which an indefinite R does not guarantee.
-
-    Raises
-    ------
-    OnAxisError
-        When there is none: eigenvalues on the imaginary axis.
-    LinAlgError
-        When X is infinite, or too inaccurate to decide anything.
     """
     n = A.shape[0]
     inner = np.linalg.solve(R, np.hstack([B.T, S.T]))

@@ -21,28 +21,7 @@ AGREEMENT = 1e-3
 def certified_norm(
     loop: StateSpace, claim: float, respond: Responder | None = None
 ) -> dict[str, float]:
-    """Return what was verified of a closed loop: its norm by two routes, and its stability.
-
-    Parameters
-    ----------
-    loop : StateSpace
-        lft(P, K) of the standard plant and its controller, in the user's units.
-    claim : float
-        The norm that the synthesis claims.
-    respond : function of frequency [Hz], optional
-        The loop's response, where it is kept for a second sweep.
-
-    Returns
-    -------
-    dict
-        `norm` by `peak_gain`, with proof; `swept norm` by a sweep refined at the resonances,
-        `spectral radius` when sampled, else `largest real part` [rad/s], and `claim`.
-
-    Raises
-    ------
-    CertificateError
-        When the loop is unstable, the norms differ by more than 1e-3, or exceed the claim.
-    """
+    """Return what was verified of a closed loop: its norm by two routes, and its stability."""
     least = stability(loop.poles(), loop.dt)
     if not least < (1.0 if loop.dt else 0.0):
         raise CertificateError(

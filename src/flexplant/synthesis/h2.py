@@ -150,13 +150,7 @@ def _least(p: Prepared) -> SolvedController:
 
 
 def _solved(p: Prepared) -> SolvedController:
-    """Return the optimal controller of a regular prepared problem.
-
-    Raises
-    ------
-    AssumptionError
-        When a Riccati equation has no stabilising solution; it says of which side.
-    """
+    """Return the optimal controller of a regular prepared problem."""
     solve_control, solve_filter = (
         (control_dare, solve_dare) if p.direct else (control_care, solve_care)
     )
@@ -187,13 +181,7 @@ def _solved(p: Prepared) -> SolvedController:
 
 
 def _certified(P: StateSpace, K: StateSpace, claim: float) -> dict[str, float]:
-    """Return what was verified of lft(P, K): its H2 norm by both Gramians, and its stability.
-
-    Raises
-    ------
-    CertificateError
-        When the loop is unstable or its norm is not the claim (the least cost).
-    """
+    """Return what was verified of lft(P, K): its H2 norm by both Gramians, and its stability."""
     loop = lft(P, K)
     least, norm = stability(loop.poles(), loop.dt), h2_norm(loop)
     if not (least < (1.0 if loop.dt else 0.0) and np.isfinite(norm)):

@@ -60,17 +60,7 @@ class Iterate(NamedTuple):
 
 
 def iterates(program: Program, y: FloatArray, size: float) -> Iterator[Iterate]:
-    """Yield the points of the method, until rounding stops it.
-
-    Parameters
-    ----------
-    program : Program
-        The program.
-    y : array
-        Where it starts.
-    size : float
-        Z starts at size I, X at I.
-    """
+    """Yield the points of the method, until rounding stops it."""
     X = [np.eye(const.shape[0]) for const in program.const]
     Z = [size * np.eye(const.shape[0]) for const in program.const]
     order = sum(const.shape[0] for const in program.const)
@@ -111,19 +101,7 @@ def smallest(
     tolerance: float,
     count: Callable[[], None] = lambda: None,
 ) -> list[Iterate]:
-    """Return the points up to a relative gap of tolerance.
-
-    Parameters
-    ----------
-    program : Program
-        The program, its cost the last of y.
-    y, size : array, float
-        Where it starts, as for `iterates`.
-    tolerance : float
-        Relative gap, and residuals beside the size of the constants.
-    count : callable
-        Called after each step.
-    """
+    """Return the points up to a relative gap of tolerance."""
     found: list[Iterate] = []
     for one in iterates(program, y, size):
         found.append(one)

@@ -34,21 +34,7 @@ class Worst(NamedTuple):
 
 @dataclass(frozen=True)
 class JointPlant:
-    """A plant in its own channels, and the static maps to them and from them.
-
-    Parameters
-    ----------
-    plant : StateSpace or Frf
-        What `before` drives and `after` reads; an Frf with hold and delay in it.
-    before, after : (nu, k), (k, ny) arrays
-        Commands of the axes to u, y to their motions.
-    axes : sequence of str
-        The axes.
-    rigid : int
-        Rigid-body modes, for the Nyquist count of an Frf.
-    kind : str
-        What is said of the plant where it matters: that it has the modes left out.
-    """
+    """A plant in its own channels, and the static maps to them and from them."""
 
     plant: StateSpace | Frf
     before: FloatArray

@@ -45,19 +45,7 @@ class JointLaws(NamedTuple):
 
 @dataclass(frozen=True)
 class JointSearch:
-    """The search for laws of the highest mean bandwidth that hold |S| on some plants.
-
-    Parameters
-    ----------
-    of : sequence of AxisLaw
-        The axes.
-    plants : sequence of JointPlant
-        Where |S| counts.
-    peak : float
-        Bound on |S|.
-    given : sequence of (n,) arrays
-        Numbers of each axis from which the search begins, such as those found alone.
-    """
+    """The search for laws of the highest mean bandwidth that hold |S| on some plants."""
 
     of: Sequence[AxisLaw]
     plants: Sequence[JointPlant]

@@ -23,15 +23,6 @@ class Section(NamedTuple):
     """``(b2 p^2 + b1 p + b0) / (a2 p^2 + a1 p + a0)``, p = s / omega.
 
     Of order 2; 1 where a2 is 0, and 0 where a1 is too.
-
-    Parameters
-    ----------
-    b, a : tuples of float
-        Coefficients of p^2, p and 1.
-    omega : float [rad/s]
-        Unit of p.
-    centre : float [rad/s]
-        Where a sampled section keeps its response exactly; 0: nowhere in particular.
     """
 
     b: tuple[float, float, float]
@@ -118,13 +109,7 @@ class Element(Value):
         return self.law * other
 
     def __truediv__(self, other: float) -> Law:
-        """Return the law over a number.
-
-        Raises
-        ------
-        ModelError
-            When it is no number, or zero.
-        """
+        """Return the law over a number."""
         if not isinstance(other, int | float | np.number) or not other:
             raise ModelError(
                 f"a law is divided by a number, not zero, got {short(other)}. The inverse of "
@@ -137,13 +122,7 @@ class Element(Value):
         return self.law * -1.0
 
     def __add__(self, other: object) -> Law:
-        """Refuse a sum: a law is a product.
-
-        Raises
-        ------
-        ModelError
-            Always.
-        """
+        """Refuse a sum: a law is a product."""
         raise ModelError(
             f"a law is a product of elements, {short(self)} + {short(other)} is a sum. Pid has "
             "proportional, integral and derivative action in one; other sums are a StateSpace, "

@@ -47,27 +47,13 @@ class FoundLaw(NamedTuple):
 
 @dataclass(frozen=True)
 class LawSearch:
-    """The search for the law of one axis with the highest bandwidth that holds |S|.
-
-    Parameters
-    ----------
-    of : AxisLaw
-        The axis, and the numbers of its law.
-    notches : int
-        At most so many.
-    """
+    """The search for the law of one axis with the highest bandwidth that holds |S|."""
 
     of: AxisLaw
     notches: int
 
     def best(self) -> FoundLaw:
-        """Return the law of the highest bandwidth.
-
-        Raises
-        ------
-        SolverError
-            When no bandwidth holds the peak.
-        """
+        """Return the law of the highest bandwidth."""
         given = starts(self.of, self.notches)
         rough = [one for start in given if (one := self.raised(start, _FEW)) is not None]
         if not rough:

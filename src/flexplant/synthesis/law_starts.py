@@ -27,15 +27,7 @@ _LACK, _LATER = 0.25, 4.0
 
 
 def starts(of: AxisLaw, notches: int) -> list[FloatArray]:
-    """Return numbers near the highest bandwidths, with and without notches at the modes.
-
-    Parameters
-    ----------
-    of : AxisLaw
-        The axis, and the numbers of its law.
-    notches : int
-        At most so many.
-    """
+    """Return numbers near the highest bandwidths, with and without notches at the modes."""
     if not of.lowest < of.highest:
         return []
     rows = _rows(of)

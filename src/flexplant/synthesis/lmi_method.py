@@ -67,13 +67,7 @@ def first_verified(
     lower: float,
     candidates: Iterable[Candidate],
 ) -> SolvedController:
-    """Return the first candidate whose closed loop keeps its target.
-
-    Raises
-    ------
-    SolverError
-        When none does.
-    """
+    """Return the first candidate whose closed loop keeps its target."""
     failures = []
     for name, target, compute in candidates:
         try:

@@ -110,11 +110,6 @@ def lqg_states(p: Plant) -> Plant:
     """Return the plant in LQG-balanced states, in the unit of frequency of the LQG loop.
 
     The Riccati solutions stand in for X and Y.
-
-    Raises
-    ------
-    SolverError
-        When a Riccati equation has no solution.
     """
     n, nu, ny = p.A.shape[0], p.B2.shape[1], p.C2.shape[0]
     # a little of everything: no rank of D12, D21 or observability of z is assumed

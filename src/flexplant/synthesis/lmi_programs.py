@@ -132,13 +132,6 @@ def solve_program(
     Where Clarabel stops without an answer, the next of `ATTEMPTS` is made; the last resort is a
     point at which progress became insufficient, which often is one that holds; with a larger
     `violation` also one at which numbers failed, its residuals below that.
-
-    Raises
-    ------
-    InfeasibleError
-        When the solver has a proof that there is no solution.
-    SolverError
-        When it stopped without a solution, or the solution violates an LMI.
     """
     data, chain, inverse = problem.get_problem_data("CLARABEL", solver_opts={})
     reached: Any = None

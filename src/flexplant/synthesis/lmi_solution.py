@@ -88,13 +88,7 @@ def changed_back(p: Plant, X: FloatArray, Y: FloatArray, changed: Matrices) -> M
 
 
 def verified(problem: Prepared, K: Matrices, target: float) -> float:
-    """Return the norm of the closed loop of a controller, computed anew.
-
-    Raises
-    ------
-    SolverError
-        When the loop is unstable or misses the target.
-    """
+    """Return the norm of the closed loop of a controller, computed anew."""
     A, B, C, D = K
     loop = lft(problem.system, StateSpace(A, B, C, D, inputs=problem.y, outputs=problem.u))
     if not loop.is_stable:

@@ -65,19 +65,7 @@ class LoopDesign(Value):
 
 @dataclass(frozen=True)
 class Axes:
-    """A square plant in its axes, and the way there from y and from there to u.
-
-    Parameters
-    ----------
-    plant : Frf or StateSpace
-        ``after G before``, with hold and delay where it is sampled.
-    before, after : StateSpace
-        Static transformations between the plant's channels and the axes.
-    rate : float [Hz]
-        Of the controller; 0 when continuous.
-    given : StandardPlant, optional
-        Where it came from.
-    """
+    """A square plant in its axes, and the way there from y and from there to u."""
 
     plant: Any
     before: StateSpace
@@ -99,14 +87,7 @@ def axes_of(
     delay: float,
     hold: bool,
 ) -> Axes:
-    """Return a plant in its decoupled axes; parameters as for `design_loops`.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When there are not as many commands as motions, a transformation is not static or does not
-        fit, or rate and plant do not go together.
-    """
+    """Return a plant in its decoupled axes; parameters as for `design_loops`."""
     given = plant if isinstance(plant, StandardPlant) else None
     if hasattr(plant, "frdata"):
         plant = Frf.from_control(plant)
@@ -262,23 +243,7 @@ def made(
 
 
 def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> StateSpace:
-    """Return [y, references] -> u of a controller in the axes.
-
-    Parameters
-    ----------
-    axes : Axes
-        The plant.
-    inner : StateSpace
-        Motions to commands of the axes, references then being taken from their motions; or
-        references of all axes and motions to commands.
-    references : mapping {axis: name}
-        References to add.
-
-    Raises
-    ------
-    LabelError
-        When an axis is unknown.
-    """
+    """Return [y, references] -> u of a controller in the axes."""
     require_known("axis", references, axes.names)
     names = name_list(references.values(), "references")
     chosen = np.zeros((len(axes.names), len(names)))
@@ -296,13 +261,7 @@ def connected(axes: Axes, inner: StateSpace, references: Mapping[str, str]) -> S
 
 
 def checked_laws(axes: Axes, laws: Element | Mapping[str, Element]) -> dict[str, Law]:
-    """Return a law for each axis, at the rate of the plant.
-
-    Raises
-    ------
-    LabelError, ModelError
-        When one is missing, unknown or no law, or runs at another rate.
-    """
+    """Return a law for each axis, at the rate of the plant."""
     each = dict.fromkeys(axes.names, laws) if isinstance(laws, Element) else laws
     if not isinstance(each, Mapping):
         raise ModelError(

@@ -29,15 +29,6 @@ def lower_bound(problem: Prepared, gamma: float, known: float) -> float:
 
     The largest of the one that the method gives and the pointwise one; where these are far from
     gamma that of the Riccati equations (`relaxed_bound`), and for small problems that of the LMIs.
-
-    Parameters
-    ----------
-    problem : Prepared
-        The problem.
-    gamma : float
-        What is reached.
-    known : float
-        A bound that the method proved.
     """
     found = raised_bound(problem, gamma, max(known, pointwise_bound(problem)))
     if found * (1.0 + _CLOSE) < gamma and problem.A.shape[0] <= _STATES:

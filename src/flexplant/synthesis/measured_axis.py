@@ -28,21 +28,7 @@ _CORNER = 0.45
 
 @dataclass(frozen=True)
 class MeasuredAxis:
-    """One axis of a plant on lines.
-
-    Parameters
-    ----------
-    name : str
-        Of the axis.
-    freq, G : (n,) arrays
-        Lines [Hz] and response; of a model on a grid through its resonances.
-    rate : float [Hz]
-        Of the controller; 0 when continuous.
-    free : bool
-        Whether it moves freely at zero frequency.
-    variance : (n,) array, optional
-        E|error|^2 of the lines; estimated from their scatter unless given.
-    """
+    """One axis of a plant on lines."""
 
     name: str
     freq: FloatArray

@@ -172,13 +172,7 @@ def loop_margin(G: StateSpace, K: StateSpace) -> tuple[float, float]:
 
 
 def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
-    """Return ``[K; I] (I - G K)^-1 [I, G]``.
-
-    Raises
-    ------
-    ModelError
-        When the two do not go together.
-    """
+    """Return ``[K; I] (I - G K)^-1 [I, G]``."""
     p, m = len(G.outputs), len(G.inputs)
     if (len(K.inputs), len(K.outputs)) != (p, m):
         raise ModelError(
@@ -209,15 +203,7 @@ def _four_block(G: StateSpace, K: StateSpace) -> StateSpace:
 def verified_controller(
     shaped: StateSpace, back_off: float
 ) -> tuple[StateSpace, float, dict[str, float]]:
-    """Return the controller of a shaped plant, the smallest gamma, and what was verified.
-
-    Raises
-    ------
-    AssumptionError
-        When a mode is hidden: the loop is not stable.
-    CertificateError
-        When the loop misses the norm that was claimed.
-    """
+    """Return the controller of a shaped plant, the smallest gamma, and what was verified."""
     part = minimal(shaped)  # modes that the decoupled axes do not reach leave no trace in G_s
     K, gamma, least = _robust(part, back_off)
     margin, least_stable = loop_margin(shaped, K)
@@ -306,13 +292,7 @@ def _robust(shaped: StateSpace, back_off: float) -> tuple[StateSpace, float, flo
 
 
 def require_model(plant: object) -> None:
-    """Refuse a measured plant.
-
-    Raises
-    ------
-    ModelError
-        When it is a frequency response.
-    """
+    """Refuse a measured plant."""
     if isinstance(plant, Frf) or hasattr(plant, "frdata"):
         raise ModelError(
             "the plant is a frequency response: loop shaping needs a model. Identify one, or tune "
@@ -321,13 +301,7 @@ def require_model(plant: object) -> None:
 
 
 def below_half_rate(freq: float, name: str, dt: float) -> float:
-    """Return a frequency [Hz] that a sampled loop can have.
-
-    Raises
-    ------
-    ModelError
-        When it is not positive, or not below half the rate.
-    """
+    """Return a frequency [Hz] that a sampled loop can have."""
     if dt and positive(freq, name) >= 0.5 / dt:
         raise ModelError(
             f"{name} must be below half the rate, {0.5 / dt:g} Hz, got {freq:g} Hz. Lower it (to a "
@@ -337,14 +311,7 @@ def below_half_rate(freq: float, name: str, dt: float) -> float:
 
 
 def integral_action(shaped: StateSpace, bandwidth: float) -> StateSpace:
-    """Return ``k_i (1 + w / (10 s))`` for each channel, of gain 1 with the plant's at bandwidth.
-
-    Raises
-    ------
-    ModelError
-        When the shaped plant is not square or has no gain there, or bandwidth is above half the
-        rate.
-    """
+    """Return ``k_i (1 + w / (10 s))`` for each channel, of gain 1 with the plant's at bandwidth."""
     count = len(shaped.inputs)
     if len(shaped.outputs) != count:
         raise ModelError(

@@ -26,22 +26,6 @@ def following(shaped: StateSpace, model: StateSpace, weight: float) -> tuple[Sta
     ``e = rho (y - rho T_ref r)``: the larger rho (`weight`), the closer the loop follows the model
     T_ref, the less robust it is. W brings the gain at zero frequency to that of the model.
 
-    Parameters
-    ----------
-    shaped : StateSpace
-        ``G_s``, continuous or sampled (mapped to continuous time and back, which keeps gains).
-    model : StateSpace
-        T_ref, continuous, stable, one reference for each y of the plant.
-    weight : float
-        rho, 1 to 3.
-
-    Raises
-    ------
-    ModelError
-        When the model does not fit or is not stable.
-    SolverError, AssumptionError, CertificateError
-        As for `design_hinf`.
-
     References
     ----------
     [Hoyle1991]_; [Limebeer1993]_.

@@ -66,17 +66,7 @@ class Maximum(Protocol):
 
 @dataclass(frozen=True)
 class Minimum:
-    """Where a minimisation ended.
-
-    Parameters
-    ----------
-    x : (n,) array
-        The parameters.
-    value : float
-        The largest function there.
-    settled : bool
-        Whether the search ended by itself.
-    """
+    """Where a minimisation ended."""
 
     x: FloatArray
     value: float
@@ -154,17 +144,6 @@ def minimax(
     functions weighted as the step weights their gradients, |H| with its negative eigenvalues
     turned round. A step that another peak refuses is tried again with the model of that peak, at
     x, and a larger mu. After so many steps, or when `spent` is true, it stops.
-
-    Parameters
-    ----------
-    function : Maximum
-        With a finite value at x; of size 1, such as the logarithm of a gain.
-    x : (n,) array
-        The start.
-    steps : int
-        At most.
-    spent : callable
-        True when no more evaluations are to be made.
 
     References
     ----------

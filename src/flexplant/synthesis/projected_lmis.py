@@ -59,11 +59,6 @@ class ProjectedLmis:
 
     R and S enter by their upper triangles. The multipliers X of the blocks satisfy
     ``adjoint(X) = cost`` at the optimum.
-
-    Parameters
-    ----------
-    plant : Plant
-        [w; u] -> [z; y] with D22 = 0.
     """
 
     def __init__(self, plant: Plant) -> None:
@@ -119,15 +114,7 @@ class ProjectedLmis:
         X: FloatArray,
         Z_inverse: FloatArray,
     ) -> FloatArray:
-        """Return ``M_ij = tr(A_i X A_j Z^-1)`` over the basis of y, summed over the blocks.
-
-        Parameters
-        ----------
-        X_roots, Z_roots : sequences of arrays
-            L with ``L L' = X`` and with ``L L' = Z^-1``, of the first two blocks.
-        X, Z_inverse : (2 n, 2 n) arrays
-            Of the third block.
-        """
+        """Return ``M_ij = tr(A_i X A_j Z^-1)`` over the basis of y, summed over the blocks."""
         n, N = self.n, self._I.size
         M = np.zeros((self.count, self.count))
         for i, side in enumerate(self.sides):

@@ -31,15 +31,7 @@ _ROLES = {
 def posed(
     given: StandardPlant | System, u: Sequence[str] | None, y: Sequence[str] | None, what: str
 ) -> StandardPlant:
-    """Return the plant of a synthesis: u and y named where it has no names of its own.
-
-    Raises
-    ------
-    ModelError
-        When a StandardPlant, which names them, is given with names.
-    AssumptionError
-        When a side has no channel, or u or y misses a rigid-body motion.
-    """
+    """Return the plant of a synthesis: u and y named where it has no names of its own."""
     if u is None and y is None:
         plant = standard_plant(given)
     elif isinstance(given, StandardPlant):

@@ -46,11 +46,6 @@ class FullInformation(NamedTuple):
         """Return X (n, n) of the game's value ``x' X x``, None where gamma is refuted.
 
         The sup over w of the inf over v of ``|z|^2 - gamma^2 |w|^2``, by a Riccati equation.
-
-        Raises
-        ------
-        OnAxisError, LinAlgError
-            When rounding, or a zero on the imaginary axis, decides nothing.
         """
         if gamma <= self.direct:
             return None
@@ -103,15 +98,6 @@ def relaxed_bound(p: Prepared, gamma: float, known: float) -> float:
     Where ||w -> z|| < gamma is reached, it is reached with a little noise and effort added too.
     Their Riccati equations have solutions X and Y with rho(X Y) < gamma^2, which are at least the
     values of the same problem with all states known and free states as inputs, and of its dual.
-
-    Parameters
-    ----------
-    p : Prepared
-        The problem, singular or not.
-    gamma : float
-        What is reached.
-    known : float
-        A bound that was proved.
 
     References
     ----------

@@ -29,19 +29,6 @@ class Axis:
     """``k (1 + w_i / s) (1 + r s / w_b) / (1 + s / (r w_b)) F(s)``, sampled by Tustin's rule.
 
     F is a second-order low-pass and the notches; k makes ``1 / s^2`` cross 1 at the bandwidth.
-
-    Parameters
-    ----------
-    bandwidth, rolloff, integrator : float [Hz]
-        The corners.
-    notches : tuple of float [Hz]
-        Centres.
-    rate : float [Hz]
-        Sampling rate; 0 when continuous.
-    lead : float
-        The factor r.
-    prewarped : bool
-        As for `Law`.
     """
 
     bandwidth: float

@@ -35,17 +35,6 @@ class ServoLoop:
 
     ``u = -c (T_u E_y y + T_u E_u u)``: c of an axis, E of the observer, which may read u too; T_u
     decouples. The plant moves y, so that only the path through y is broken, the other stays closed.
-
-    Parameters
-    ----------
-    freq : (n_freq,) array [Hz]
-        A grid through the resonances.
-    moved, own : (n_freq, m, m) complex array
-        ``T_u E_y P`` and ``T_u E_u`` there; own is None of an observer that does not read u.
-    modes : (k,) array [Hz]
-        Elastic modes of the plant at which a notch may be placed.
-    plant : StandardPlant
-        Of which u and their units are taken.
     """
 
     freq: FloatArray
@@ -118,13 +107,7 @@ class ServoLoop:
 
 @lru_cache(maxsize=_KEPT)
 def decoupling(plant: StandardPlant, poi: Poi) -> FloatArray:
-    """Return T_u (m, r): accelerations of the POI's axes to actuator forces, of least norm.
-
-    Raises
-    ------
-    AssumptionError
-        When the axes or actuators do not span the rigid-body motions.
-    """
+    """Return T_u (m, r): accelerations of the POI's axes to actuator forces, of least norm."""
     axes, r = poi.axes, plant.rigid_motions.modes.size
     plant.continuous.check().require(("stabilisable",), "a servo of the rigid body")
     gain = rigid_gain(plant, plant.rigid_motions, [poi.channel(a) for a in axes], plant.u)
@@ -192,15 +175,7 @@ def seeing(plant: StandardPlant, poi: Poi) -> StandardPlant:
 
 
 def observer_system(observer: Any, plant: StandardPlant, poi: Poi) -> StateSpace | None:
-    """Return the observer as a system of the plant's dt, checked to give the POI's estimates.
-
-    Raises
-    ------
-    LabelError
-        When it does not, or reads something that the plant has not.
-    FlexplantError
-        When it is no system.
-    """
+    """Return the observer as a system of the plant's dt, checked to give the POI's estimates."""
     if observer is None:
         return None
     inner = getattr(observer, "system", observer)

@@ -34,21 +34,7 @@ _TRIALS = 80
 
 @dataclass(frozen=True)
 class ServoTask:
-    """What does not depend on the bandwidth.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Sampled.
-    poi : Poi
-        What is moved.
-    rolloff, integrator, notches
-        As for `design_servo`.
-    observer : StateSpace, optional
-        Gives the estimates.
-    larger : StandardPlant, optional
-        The plant with the modes left out.
-    """
+    """What does not depend on the bandwidth."""
 
     plant: StandardPlant
     poi: Poi
@@ -122,11 +108,6 @@ class ServoTask:
 
         All axes have the same controller, so that the loop falls apart into those of the body's own
         motions, whatever the axes: free ones (0 Hz) and suspension modes.
-
-        Raises
-        ------
-        SolverError
-            When it is unstable.
         """
         radius = self._rigid_radius(axis)
         if not radius < 1.0:
@@ -147,13 +128,7 @@ class ServoTask:
         return max(rigid_peak(body, axis) for body in self._bodies)
 
     def largest(self, peak: float) -> float:
-        """Return the largest bandwidth that holds a peak of |S| at u.
-
-        Raises
-        ------
-        SolverError
-            When none does.
-        """
+        """Return the largest bandwidth that holds a peak of |S| at u."""
         slowest = max(3.0 * float(np.abs(self.motions.freq).max()) * (1 + 1e-9), 2e-4 * self.rate)
         best: tuple[float, float, float] = (np.inf, np.nan, np.nan)
 
@@ -213,13 +188,7 @@ def servo_task(
     observer: Any,
     larger: Any,
 ) -> ServoTask:
-    """Return the task of a servo; parameters as for `design_servo`.
-
-    Raises
-    ------
-    AssumptionError, LabelError, ModelError
-        As for `design_servo`.
-    """
+    """Return the task of a servo; parameters as for `design_servo`."""
     plant = standard_plant(given)
     port = _poi(plant, poi)
     if not plant.dt:

@@ -76,16 +76,6 @@ class Regularised:
     ``[w; v] -> y + level v`` and ``[z; level u]``, in multiples of what the plant itself does on
     the channel (`Prepared.own_sizes`). Any loop has at least the norm that it
     has without them: a gamma that is reached here is reached by the problem itself.
-
-    Parameters
-    ----------
-    problem : Prepared
-        The problem.
-    level : float
-        Size of noise and effort.
-    states : bool
-        Also noise on each state and a cost of each: for modes on the stability boundary that w
-        does not excite or z does not show.
     """
 
     def __init__(self, problem: Prepared, level: float, states: bool = False) -> None:
@@ -136,26 +126,7 @@ def made_regular(
     lacking: Sequence[str],
     norm: Callable[[StateSpace], float] = hinf_norm,
 ) -> SolvedController:
-    """Return the controller of a singular problem, found with a little noise and effort added.
-
-    Parameters
-    ----------
-    problem : Prepared
-        The problem; its own loop is what the returned gamma is of.
-    solve : callable
-        Solves a regular problem.
-    lacking : sequence of str
-        What makes the problem singular, in words.
-    norm : callable
-        The norm of a closed loop; infinite when it is not stable.
-
-    Raises
-    ------
-    InfeasibleError
-        When gamma falls to zero with what is added.
-    AssumptionError, SolverError
-        When no level gives a controller.
-    """
+    """Return the controller of a singular problem, found with a little noise and effort added."""
     found: list[_Found] = []
     errors: list[FlexplantError] = []
     for level in _LEVELS:

@@ -18,23 +18,7 @@ CLOSE = ", and one that differs a little from the model may be unstable"
 
 
 def spill_over(plant: StandardPlant, blocks: Sequence[Any], larger: Any) -> SpillOver | None:
-    """Return the check of a design's loop with the modes left out; None: they are not known.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        What was designed on; weights do not matter, a block that it is seen through does.
-    blocks : sequence
-        The controller, from that plant's y to its u.
-    larger : Modes, FEModel, ReducedModel, StandardPlant or None
-        As for `larger_plant`.
-
-    Warns
-    -----
-    FlexplantWarning
-        When the loop is unstable there or |S| at u above 8 dB because of them, with the numbers of
-        the modes.
-    """
+    """Return the check of a design's loop with the modes left out; None: they are not known."""
     whole = larger_plant(plant, larger)
     if whole is None:
         return None

@@ -187,13 +187,7 @@ def design_structured(
 
 
 def _plants(given: Any, u: Sequence[str] | None, y: Sequence[str] | None) -> list[StandardPlant]:
-    """Return the plants, all with the same channels and rate.
-
-    Raises
-    ------
-    ModelError
-        When they differ, or there is none.
-    """
+    """Return the plants, all with the same channels and rate."""
     many = given if isinstance(given, list | tuple) else [given]
     named = u is not None or y is not None
     plants = [
@@ -295,13 +289,7 @@ class _StructureSearch:
         )
 
     def best(self, starts: int, rng: np.random.Generator, bar: Progress) -> _End:
-        """Return the best end of all starts.
-
-        Raises
-        ------
-        InfeasibleError
-            When none is stabilised.
-        """
+        """Return the best end of all starts."""
         ends: list[_End] = []
         nested = self.family.nested(self._minimised)
         if nested is not None:

@@ -280,11 +280,6 @@ def _eliminated(Q: FloatArray, P: FloatArray, C: FloatArray) -> FloatArray:
     """Return K with ``Q + P K C + (P K C)' < 0`` ([Skelton1998]_, theorem 2.3.12).
 
     ``K = -r P' F C' (C F C')^-1`` with ``F = (r P P' - Q)^-1`` positive definite.
-
-    Raises
-    ------
-    SolverError
-        When no weight r makes it so: the projections do not hold.
     """
     size = float(np.linalg.norm(P, 2)) ** 2
     if size == 0.0 or not np.any(C):

@@ -112,19 +112,7 @@ class ScaledLoop:
         return peak_gain(loop.system)
 
     def pieces(self, K: Matrices, jacobian: FloatArray, freq: float, *, sweep: bool) -> Pieces:
-        """Return the logarithms of the gains at a frequency, and where others are near them.
-
-        Parameters
-        ----------
-        K : Matrices
-            A controller that stabilises.
-        jacobian : (n, rows, columns) array
-            The derivatives of [A, B; C, D] by the parameters.
-        freq : float
-            A frequency that counts, infinite for the feedthrough.
-        sweep : bool
-            Whether others are sought.
-        """
+        """Return the logarithms of the gains at a frequency, and where others are near them."""
         loop = self.closed(K)
         assert loop is not None  # noqa: S101 - K stabilises
         by = self._out @ jacobian @ self._in

@@ -35,17 +35,7 @@ Minimise: TypeAlias = "Callable[[ControllerFamily], FloatArray | None]"
 
 
 class ControllerFamily(Protocol):
-    """A structure made ready for a plant: from parameters of size 1 to a controller.
-
-    Parameters
-    ----------
-    order : int
-        States of the controller.
-    first : (n,) array
-        Where the first start is.
-    spread : float
-        Standard deviation of the others around it.
-    """
+    """A structure made ready for a plant: from parameters of size 1 to a controller."""
 
     order: int
     first: FloatArray

@@ -138,13 +138,7 @@ def tune_loops(
 def _together(
     alone: Sequence[tuple[AxisLaw, FoundLaw]], plants: Sequence[JointPlant], peak: float
 ) -> JointLaws:
-    """Return laws that hold the peak together, or come closest to it.
-
-    Raises
-    ------
-    SolverError
-        When none that were found are stable together.
-    """
+    """Return laws that hold the peak together, or come closest to it."""
     of = [law for law, _ in alone]
     search = JointSearch(of, plants, peak, [one.numbers for _, one in alone])
     found = search.best()

@@ -44,15 +44,6 @@ def coordinates(family: Family, loads: FloatArray, top: float) -> FloatArray | N
     frequencies, :math:`b_i/(\omega_i^2 - \sigma)`. That is rational interpolation over the band
     of how they follow it; eigenvalues have its error squared. Columns are orthonormal, and
     diagonal in K.
-
-    Parameters
-    ----------
-    family : Family
-        Its start in modal coordinates: M = I, K diagonal.
-    loads : (k, r) array
-        Forces by which the changes couple modes.
-    top : float [rad/s]
-        The highest frequency that is compared.
     """
     squares = np.diag(family.K)
     low = squares <= (BEYOND * top) ** 2

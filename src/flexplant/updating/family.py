@@ -63,16 +63,6 @@ class Family:
     deflated, neither happens. DOFs that no mass and no damper touches (rotations of a lumped mass
     matrix, the boundary of MacNeal's reduction) are condensed statically at each value of the
     parameters; then the coordinates are the model's own.
-
-    Parameters
-    ----------
-    model : ReducedModel or FEModel
-        The model.
-    parameters : sequence of q Parameter
-        What changes.
-    highest : int, optional
-        The highest mode number that will be needed; an undamped model with condensed DOFs is
-        solved no further.
     """
 
     def __init__(
@@ -185,13 +175,7 @@ class Family:
         return np.asarray(right[int(np.sum(sizes > HELD)) :].T, dtype=np.float64)
 
     def at(self, p: FloatArray) -> Eigen:
-        """Return the oscillating modes at the parameters `p`.
-
-        Raises
-        ------
-        ModelError
-            When M is not positive definite there, or K is indefinite.
-        """
+        """Return the oscillating modes at the parameters `p`."""
         if np.any(self._curves(p)[0]):
             return self._solved(p)
         if not self._unchanged:

@@ -36,13 +36,7 @@ MOST_ROUNDS = 10
 
 
 def is_large(model: Any) -> bool:
-    """Return whether a model is an FEModel that is updated in a basis.
-
-    Raises
-    ------
-    ModelError
-        When it is too large for that too.
-    """
+    """Return whether a model is an FEModel that is updated in a basis."""
     if not isinstance(model, FEModel) or model.n_dof <= LARGE:
         return False
     if model.n_dof > TOO_LARGE:
@@ -61,25 +55,6 @@ class FullBasis:
     reduced model has coordinates, the static response ``u = G f`` to unit forces f at all places of
     the measurement and of the parameters, and ``G M u``. Modes are those of the full model up to
     rounding; responses have an error of order ``(f / f_cut)^8`` of what the truncated modes give.
-
-    Parameters
-    ----------
-    full : FEModel
-        The full structure. Where it has no D, the damping forces of the reduced model act on the
-        motions that it can make: ``D = (M T) M*^-1 D* M*^-1 (M T)^T``, so that ``T^T D T = D*``.
-    parameters : sequence of q Parameter
-        What changes.
-    residuals : sequence of Residual
-        The measurement.
-    reduced : ReducedModel, optional
-        What was made from it. None: the basis holds the modes up to four times the highest number
-        and frequency of the measurement.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When one is no model, they are not of one structure, or a parameter has matrices of the
-        reduced model only.
     """
 
     def __init__(

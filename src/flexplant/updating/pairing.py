@@ -29,13 +29,6 @@ def pair(old_poles: ComplexArray, old_X: ComplexArray, X: ComplexArray) -> IntAr
     together, by what of each new shape lies in their subspace; inside it, shapes that have
     nothing of each other keep to themselves and may cross, all others keep their order of
     frequency, since two modes that couple veer instead of crossing.
-
-    Parameters
-    ----------
-    old_poles : (m,) complex array
-        Eigenvalues, by rising frequency.
-    old_X, X : (k, m), (k, m') complex arrays
-        Shapes by rising frequency, in coordinates where the mass matrix is about the unit matrix.
     """
     from scipy.optimize import linear_sum_assignment
 
@@ -61,13 +54,6 @@ def measured_pairs(
     """Return for each measured mode the column of the model's, one to one.
 
     Minimises the sum of ``1 - MAC + |ln(f_j / f_i)|`` over the pairs.
-
-    Parameters
-    ----------
-    psi, X : (k, m), (k, m') complex arrays
-        Measured shapes and those of the model at the same places.
-    psi_poles, poles : (m,), (m',) complex arrays
-        Their eigenvalues.
     """
     from scipy.optimize import linear_sum_assignment
 

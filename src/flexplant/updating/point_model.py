@@ -17,19 +17,7 @@ TOGETHER = 1_000_000
 
 
 class Point:
-    """The model at the parameters `p`, its modes labelled by their numbers in the start model.
-
-    Parameters
-    ----------
-    family : Family
-        The pencils.
-    p : (q,) array
-        Values of the parameters.
-    eigen : Eigen
-        Modes there.
-    labels : (m,) int array
-        The mode number each column continues, 0 for none.
-    """
+    """The model at the parameters `p`, its modes labelled by their numbers in the start model."""
 
     def __init__(self, family: Family, p: FloatArray, eigen: Eigen, labels: IntArray) -> None:
         #: with the derivatives at p
@@ -51,13 +39,7 @@ class Point:
         return {int(n): c for c, n in enumerate(self.labels.tolist()) if n}
 
     def columns(self, numbers: Sequence[int]) -> list[int]:
-        """Return the columns of modes by number.
-
-        Raises
-        ------
-        ModelError
-            When one of them no longer oscillates.
-        """
+        """Return the columns of modes by number."""
         where = self._where
         lost = [n for n in numbers if n not in where]
         if lost:

@@ -30,21 +30,6 @@ def corrected(
 
     Where a round moves the estimate no more, r and dr/dp are those of the full model.
 
-    Parameters
-    ----------
-    objective : Objective
-        Of the reduced model, at the end of its search.
-    basis : FullBasis
-        The full model.
-    method : UpdateMethod
-        Of the search.
-    end : SearchEnd
-        Of the search on the reduced model alone.
-    rounds : int
-        At most.
-    most, tolerance
-        Of each search.
-
     References
     ----------
     [Stetter1978]_; [AlexandrovLewis2001]_ (the derivative).

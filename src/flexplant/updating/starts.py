@@ -105,17 +105,7 @@ NEAR = 0.15
 
 
 def check_units(objective: Objective, begin: FloatArray, start: Any = None) -> None:
-    """Raise ModelError where all measured poles are 2 pi below or above those of the model.
-
-    Parameters
-    ----------
-    objective : Objective
-        Of the update.
-    begin : (q,) array
-        Where it began.
-    start : (m,) complex array, optional
-        The poles there, if they are known.
-    """
+    """Raise ModelError where all measured poles are 2 pi below or above those of the model."""
     data = objective.poles_measured
     if data is None:
         return

@@ -26,22 +26,6 @@ def suspended(
     In first-order form, as no mass is known for truncated complex modes: ``x' = A x + N' f``,
     ``q = S x`` and ``f = -rows' (k rows q + d rows q')`` give A', the residues of which,
     ``S v w' N' = phi phi' / (2i Im lambda)``, are the new shapes. Exact within the span.
-
-    Parameters
-    ----------
-    modes : Modes
-        Complex.
-    rows : (s, n) array
-        Motions that the springs feel.
-    stiffness, damping : (s,) arrays
-        Of the springs and of the dampers beside them.
-    kept : (r, left) array
-        Orthonormal combinations of the rigid-body modes that stretch no spring.
-
-    Raises
-    ------
-    ModelError
-        When a mode would not oscillate.
     """
     given, r = realised(modes), modes.n_rigid
     left = kept.shape[1]

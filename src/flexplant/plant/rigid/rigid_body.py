@@ -21,22 +21,7 @@ _SEEN = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class RigidBody(Value):
-    """The rigid-body motions that a structure can make, about its centre of gravity.
-
-    Parameters
-    ----------
-    axes : sequence of str
-        Those of x, y, z, rx, ry, rz that exist.
-    motions : (n, r) array
-        Of the model's DOFs, per metre and radian, rotations about the centre of gravity.
-    mass : (r, r) array [kg, kg m, kg m^2]
-        ``motions' M motions``.
-    centre : (3,) array [m]
-        The centre of gravity; what the motions do not determine of it is 0.
-    lost : mapping {axis: float}
-        Axes along which the model has DOFs, but which its shapes do not make, by how much of the
-        motion they miss it; or which held DOFs prevent.
-    """
+    """The rigid-body motions that a structure can make, about its centre of gravity."""
 
     axes: tuple[str, ...]
     motions: FloatArray
@@ -46,13 +31,7 @@ class RigidBody(Value):
 
 
 def inertia_load(realisation: ModalRealisation, direction: str, about: FloatArray) -> FloatArray:
-    """Return the load (n,) ``-M r`` of a unit base acceleration.
-
-    Raises
-    ------
-    ModelError
-        When the model does not determine its inertia against this motion.
-    """
+    """Return the load (n,) ``-M r`` of a unit base acceleration."""
     key = ("inertia", direction, *np.asarray(about).tolist())
     return realisation.once(key, lambda: _inertia_load(realisation, direction, about))
 
@@ -80,13 +59,7 @@ def _inertia_load(realisation: ModalRealisation, direction: str, about: FloatArr
 
 
 def rigid_body_of(realisation: ModalRealisation) -> RigidBody:
-    """Return the rigid body of a free or suspended structure.
-
-    Raises
-    ------
-    ModelError
-        When the structure cannot make any rigid-body motion.
-    """
+    """Return the rigid body of a free or suspended structure."""
     body, why = realisation.once("rigid body", lambda: _rigid_body(realisation.model))
     if body is None:
         raise ModelError(
@@ -126,21 +99,7 @@ def refuse_lost(
     below: float,
     do: str,
 ) -> None:
-    """Raise AssumptionError when channels have part in a rigid-body axis that a model has lost.
-
-    Parameters
-    ----------
-    body : RigidBody
-        Of the model.
-    realisation : ModalRealisation
-        The model.
-    rows : rows (n,) over the model's DOFs
-        What the channels see or push.
-    below : float
-        Axes whose motion the shapes miss by more are held: there is nothing to lose.
-    do : str
-        What to do else, for the message.
-    """
+    """Raise AssumptionError when channels have part in a rigid-body axis that a model has lost."""
     lost = {axis: part for axis, part in body.lost.items() if part < below}
     if not lost:
         return

@@ -25,17 +25,7 @@ _WEAK = 3.0
 
 
 class RigidModes(NamedTuple):
-    """The rigid-body motions that cost no force, or only that of weak springs.
-
-    Parameters
-    ----------
-    shapes : (n, r) array
-        Over the model's DOFs, mass-orthonormal.
-    modes : (r,) array of int
-        Which modes of the realisation they are, from 0: those at 0 Hz, then suspension modes.
-    freq : (r,) array [Hz]
-        Of these modes; 0 of the free ones, negative where negative stiffness makes them unstable.
-    """
+    """The rigid-body motions that cost no force, or only that of weak springs."""
 
     shapes: FloatArray
     modes: IntArray
@@ -87,15 +77,7 @@ def body_of(realisation: ModalRealisation) -> RigidBody | None:
 
 
 def rigid_modes_of(plant: Partition) -> RigidModes:
-    """Return the rigid-body motions of a plant.
-
-    Raises
-    ------
-    ModelError
-        When it was not assembled from a structure.
-    AssumptionError
-        When the structure is held, or stiff springs bend an axis that its channels have part in.
-    """
+    """Return the rigid-body motions of a plant."""
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     body = body_of(realisation)
     if body is not None:
@@ -164,24 +146,6 @@ def rigid_gain(
 
     ``rows R m^-1 R' pushes'`` with R the rigid-body motions and m their mass; filters of the ports
     count with their static gains.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Assembled from a free or suspended structure.
-    motions : RigidModes
-        Its motions.
-    outputs, inputs : sequences of str
-        Displacements in z or y; forces in w or u.
-
-    Returns
-    -------
-    (n_out, n_in) array [1/kg and the like]
-
-    Raises
-    ------
-    LabelError
-        When a name is unknown.
     """
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     forces = {port.name: port for port in ports.forces}

@@ -35,15 +35,6 @@ def covering(
     ``|w|^2 = p_0 + sum_k p_k t_k`` with p > 0: t_k is ``1 / |d_k(i omega)|^2`` of a resonance or of
     a well damped pair, or a hump ``omega^4 / |d_k d_k'|^2``. With ``x = omega^2`` the right side
     is a rational function of x, positive for x >= 0; w has its zeros and poles ``s = -sqrt(-x)``.
-
-    Parameters
-    ----------
-    freq, height : (n_freq,) arrays [Hz, any]
-        The curve; the first frequency may be 0.
-    poles : (k,) complex array [rad/s]
-        Resonances that the weight may have, slowest first.
-    resonances : int
-        How many of them at most: the lowest ones that stand out of the curve.
     """
     unit = 2 * np.pi * freq[-1]
     own = _standing_out(freq, height, poles)[:resonances] / unit

@@ -49,13 +49,6 @@ def delta_channels(uncertain: UncertainPlant[Any]) -> DeltaChannels:
     undamped), are nearly affine in the Deltas: each Delta's channels are the difference of the
     machines at its ends, widened by what is curved, and the whole is compared with machines at
     corners of the uncertainty.
-
-    Raises
-    ------
-    CertificateError
-        When the sampled machines are further from affine than 5 %.
-    ModelError
-        When the plant is sampled, its Deltas are parameters and its ports have delays.
     """
     plant = uncertain.plant
     if not plant.dt:

@@ -59,11 +59,6 @@ def by_parameters(
     ``dM_i = U s U'`` the change is the force ``-U s d_i U' q''``, a feedback around the (absolute)
     acceleration, and so for velocities and displacements. Each Delta has as many channels as its
     matrices have rank. Exact for any port and any damping.
-
-    Raises
-    ------
-    ModelError
-        When the plant is not of the fit's model.
     """
     realisation, ports = plant.assembled.realisation, plant.assembled.ports
     model = realisation.model

@@ -39,13 +39,7 @@ def shape_deltas(
     chosen: Sequence[int],
     deviations: float,
 ) -> list[Delta]:
-    """Return a Delta for each direction (n,) of `shapes` (m, n, r) of the chosen modes.
-
-    Raises
-    ------
-    ShapeError
-        When there is not one row for each DOF of the plant's modes.
-    """
+    """Return a Delta for each direction (n,) of `shapes` (m, n, r) of the chosen modes."""
     realisation = modal_realisation(plant)
     n = realisation.outputs.shape[0]
     given = real_array(shapes, "shapes", (len(measured), n, None))
@@ -71,15 +65,6 @@ def with_shape_channels(
     ``d v q''`` of its motion more: four channels at most, of which q'' feels what the first one
     drives. Their columns are read off the plant assembled with forces or motions changed alone, so
     that they hold for any port and filter.
-
-    Parameters
-    ----------
-    plant : StandardPlant
-        Continuous.
-    system : StateSpace
-        Its system with the channels of `others`.
-    others, deltas : sequences of Delta
-        On frequencies and damping; on shapes.
     """
     base, g = system_matrix(plant.system), plant.system
     n, m = g.n_states, len(g.inputs)

@@ -64,13 +64,7 @@ class Delta(Value):
 
 
 def modal_realisation(plant: Partition) -> ModalRealisation:
-    """Return the modes of a plant, each of which has its own frequency and damping.
-
-    Raises
-    ------
-    ModelError
-        When the plant is weighted or made elsewhere, or damping couples its modes.
-    """
+    """Return the modes of a plant, each of which has its own frequency and damping."""
     if plant.is_weighted:
         raise ModelError(
             f"the plant is {plant.alteration}: uncertain modes are those of plant.unweighted."
@@ -120,13 +114,7 @@ def reshaped(
     inputs: bool = True,
     outputs: bool = True,
 ) -> ModalRealisation:
-    """Return a realisation with ``phi + amount along`` where forces act, motions show, or both.
-
-    Raises
-    ------
-    ModelError
-        When the mode is complex.
-    """
+    """Return a realisation with ``phi + amount along`` where forces act, motions show, or both."""
     first = 2 * delta.mode - 2
     if np.any(realisation.inputs[:, first]) or np.any(realisation.outputs[:, first + 1]):
         raise ModelError(

@@ -14,19 +14,7 @@ Kind = TypeVar("Kind")
 
 
 class Design:
-    """Named values in the order in which they were given.
-
-    Parameters
-    ----------
-    parts : sequence
-        Values of this package, and mappings {name: value}; several of one kind without names are
-        numbered.
-
-    Raises
-    ------
-    ModelError
-        When one is no value of this package, or a name is given twice.
-    """
+    """Named values in the order in which they were given."""
 
     def __init__(self, parts: Sequence[Any]) -> None:
         self.named: dict[str, Any] = {}

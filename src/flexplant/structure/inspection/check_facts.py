@@ -87,15 +87,7 @@ class Facts:
 
 
 def facts(given: FEMatrices, model: FEModel | None = None) -> Facts:
-    """Return the facts on some matrices, all that can be known of them.
-
-    Parameters
-    ----------
-    given : FEMatrices
-        The matrices.
-    model : FEModel, optional
-        Whose matrices they are: symmetric, and M and D definite.
-    """
+    """Return the facts on some matrices, all that can be known of them."""
     proven = model is not None
     skew = {
         name: (0.0, 0, 0) if proven else _skew(matrix)

@@ -158,13 +158,7 @@ def field_of(
     counts: Sequence[int],
     present: Any = None,
 ) -> Any:
-    """Return one number, or an array (nz, ny, nx) of positive numbers where elements are present.
-
-    Raises
-    ------
-    ModelError, ShapeError
-        When a number is not positive or there is not one for each element.
-    """
+    """Return one number, or an array (nz, ny, nx) of positive ones where elements are."""
     if callable(value):
         chosen = np.full(int(np.prod(counts)), True) if present is None else present.ravel()
         found = np.ones(chosen.size)
@@ -217,13 +211,7 @@ def poisson_of(value: Any, lengths: Sequence[float], counts: Sequence[int], pres
 def present_of(
     holes: Any, lengths: Sequence[float], counts: Sequence[int], *, corners: bool
 ) -> Any:
-    """Return which elements exist (nz, ny, nx), None when all do.
-
-    Raises
-    ------
-    ModelError
-        When nothing is left, or it falls apart: `corners` says whether a common corner holds.
-    """
+    """Return which elements exist (nz, ny, nx), None when all do."""
     import scipy.ndimage
 
     if holes is None or (isinstance(holes, Sequence) and not len(holes)):

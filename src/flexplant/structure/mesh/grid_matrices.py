@@ -23,15 +23,6 @@ class Grid:
 
     A node sees up to 3^d nodes through up to 2^d elements; which of these exist decides what its
     rows hold. Elements and nodes are counted with x fastest; an element's nodes likewise.
-
-    Parameters
-    ----------
-    counts : d int
-        Number of elements along x, y, z.
-    per_node : int
-        DOFs of a node.
-    present : (nz, ny, nx) array of bool, or fewer axes
-        Which elements exist.
     """
 
     counts: tuple[int, ...]
@@ -124,14 +115,7 @@ class Grid:
         return indices, pointer
 
     def matrix(self, terms: Sequence[tuple[FloatArray, Any]]) -> sp.csc_array:
-        """Return the sum of element matrices, each term weighted element by element.
-
-        Parameters
-        ----------
-        terms : sequence of (element, weight)
-            Element matrices (2^d f, 2^d f), symmetric, and what each element multiplies them with:
-            arrays like `present`.
-        """
+        """Return the sum of element matrices, each term weighted element by element."""
         f, n_corners, n_seen = self.per_node, 2**self._ndim, 3**self._ndim
         table = np.zeros((len(terms), n_corners, f, n_seen, f))
         weights = []

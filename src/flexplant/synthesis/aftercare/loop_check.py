@@ -81,13 +81,7 @@ def required(before: LoopFacts, after: LoopFacts, loss: float, cure: str) -> Non
 
 
 def stable_before(plant: StandardPlant, controller: StateSpace) -> Any:
-    """Return the facts of the loop as it was designed.
-
-    Raises
-    ------
-    CertificateError
-        When it is not stable itself.
-    """
+    """Return the facts of the loop as it was designed."""
     facts = loop_facts(plant, controller)
     if not facts.is_stable:
         raise CertificateError(

@@ -230,13 +230,7 @@ def _rates(problem: ObjectivePrograms) -> tuple[float, ...]:
 def _verified(
     plant: StandardPlant, K: StateSpace, minimize: Any, subject_to: Sequence[Any]
 ) -> dict[str, float]:
-    """Return what every objective reaches, computed from the closed loop.
-
-    Raises
-    ------
-    CertificateError
-        When the loop is unstable, or a bound does not hold.
-    """
+    """Return what every objective reaches, computed from the closed loop."""
     closed = lft(plant.system, K)
     if not closed.is_stable:
         raise CertificateError("the closed loop is not stable.")

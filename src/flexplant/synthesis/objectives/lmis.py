@@ -34,16 +34,6 @@ class Variables:
         P = [Y I; I X],   A = [A Y + B2 C_   A + B2 D_ C2],   B = [B1 + B2 D_ D21  ],
                               [A_            X A + B_ C2 ]        [X B1 + B_ D21   ]
         C = [C1 Y + D12 C_,  C1 + D12 D_ C2],   D = D11 + D12 D_ D21
-
-    Parameters
-    ----------
-    plant : Plant
-        Of a sampled system A holds ``(A - I) / t``, B and C their matrices over t^(1/2): with
-        small t the LMIs are those of continuous time, and as well conditioned.
-    root : float
-        t^(1/2) of a sampled system, 0 of a continuous one.
-    proper : bool
-        Whether the controller has no feedthrough.
     """
 
     def __init__(self, plant: Plant, root: float, *, proper: bool) -> None:

@@ -52,13 +52,7 @@ def damped(ratio: float) -> list[PoleEdge]:
 
 
 def within(speed: float) -> PoleDisc:
-    """Return the largest disc in which stable poles z have ``|log z|`` below a speed.
-
-    Parameters
-    ----------
-    speed : float
-        Bound on ``|s| dt``, below pi.
-    """
+    """Return the largest disc in which stable poles z have ``|log z|`` below a speed."""
     angle = np.linspace(0.5 * np.pi, np.pi, _POINTS)
     curve = np.exp(speed * np.exp(1j * angle))
     centres = np.linspace(np.exp(-speed), 1.0, _CENTRES)

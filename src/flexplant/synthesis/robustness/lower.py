@@ -307,21 +307,7 @@ def destabilising(
     level: float,
     rng: np.random.Generator,
 ) -> Destabilising | None:
-    """Return the smallest perturbation found that makes a loop unstable.
-
-    Parameters
-    ----------
-    M : StateSpace
-        Continuous and stable.
-    blocks : sequence of blocks
-        In the order of its channels.
-    omegas : sequence of float [rad/s]
-        Where to search.
-    level : float
-        mu from above: nothing smaller than its inverse destabilises.
-    rng : Generator
-        Of the starts.
-    """
+    """Return the smallest perturbation found that makes a loop unstable."""
     where = places(blocks)
     least = 1.0 / max(level, 1e-300)
     best: Destabilising | None = None

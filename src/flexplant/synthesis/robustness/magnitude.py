@@ -15,15 +15,6 @@ def fitted_magnitude(omega: FloatArray, size: FloatArray, order: int) -> StateSp
     """Return ``k prod (s + a_i) / (s + b_i)`` near a magnitude, of at most some order.
 
     Least squares of the logarithm; the fewest factors that come close.
-
-    Parameters
-    ----------
-    omega : (n,) array [rad/s]
-        Positive and increasing.
-    size : (n,) array
-        Positive.
-    order : int
-        Most factors.
     """
     from scipy.optimize import least_squares  # not loaded with the package
 

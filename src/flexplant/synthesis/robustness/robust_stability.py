@@ -258,13 +258,7 @@ def _shown(
 def _tried(
     loop: UncertainLoop, upper: float, count: int, rng: np.random.Generator
 ) -> dict[str, float]:
-    """Return how stable machines at corners are, each closed exactly.
-
-    Raises
-    ------
-    CertificateError
-        When one is unstable within the size that is proven.
-    """
+    """Return how stable machines at corners are, each closed exactly."""
     names = [block.name for block in loop.blocks if not isinstance(block, FullBlock)]
     size = min(1.0, 0.999 / upper)
     worst = -np.inf

@@ -273,21 +273,5 @@ def covered(
     least: float = 1e-12,
     accuracy: float = _ABOVE,
 ) -> Covered:
-    """Return an upper level that holds at all frequencies of a stable continuous system.
-
-    Parameters
-    ----------
-    M : StateSpace
-        w -> z of the uncertainty, w = Delta z.
-    blocks : sequence of blocks
-        In the order of the channels.
-    leveled : sequence of bool, optional
-        Blocks that the level belongs to; the others are bounded by one.
-    heights : function, optional
-        Factors of the columns of M by frequency: magnitudes of weights.
-    least : float
-        Levels below are not resolved.
-    accuracy : float
-        Relative distance of the root of the level to the largest bound of one frequency.
-    """
+    """Return an upper level that holds at all frequencies of a stable continuous system."""
     return _Cover(M, blocks, leveled, heights, least, accuracy).run()

@@ -134,22 +134,7 @@ def open_plant(
     seen: Sequence[str] | None = None,
     driven: Sequence[str] | None = None,
 ) -> OpenPlant:
-    """Return an uncertain plant with its channels, weighted w and z, and all y and u.
-
-    Parameters
-    ----------
-    uncertain : UncertainPlant
-        The plant.
-    w, z : sequence of str or mapping {name: weight}
-        Channels of performance.
-    seen, driven : sequences of str, optional
-        Channels of y and u to which neglected modes are confined; all when not given.
-
-    Raises
-    ------
-    ModelError
-        When `uncertain` is no uncertain plant, or a weight does not fit.
-    """
+    """Return an uncertain plant with its channels, weighted w and z, and all y and u."""
     _require_uncertain(uncertain)
     channels = delta_channels(uncertain)
     into, weights_in = _weighted_names(w, "w")
@@ -190,15 +175,7 @@ def uncertain_loop(
     w: Any = (),
     z: Any = (),
 ) -> UncertainLoop:
-    """Return the loop of an uncertain plant with its channels, and some of w and z.
-
-    Raises
-    ------
-    AssumptionError
-        When the loop is not stable on the nominal plant.
-    ModelError
-        When `uncertain` is no uncertain plant.
-    """
+    """Return the loop of an uncertain plant with its channels, and some of w and z."""
     _require_uncertain(uncertain)
     loop = close_loop(uncertain.plant, *blocks)
     if loop.obstacle is not None:

@@ -81,15 +81,7 @@ Block: TypeAlias = RepeatedScalar | FullBlock
 
 
 def checked_blocks(blocks: Any, w: int, z: int) -> tuple[Block, ...]:
-    """Return blocks that fill w outputs and z inputs of an uncertainty.
-
-    Raises
-    ------
-    ModelError
-        When they are no blocks.
-    ShapeError
-        When their sizes do not add up.
-    """
+    """Return blocks that fill w outputs and z inputs of an uncertainty."""
     if not isinstance(blocks, Sequence) or not blocks or any(
         not isinstance(block, RepeatedScalar | FullBlock) for block in blocks
     ):  # fmt: skip
@@ -135,13 +127,6 @@ class Scalings:
     alone, is Hermitian. With F > 0 no w = Delta z of ``|Delta|^2 <= 1 / level`` closes the loop
     z = M w: level = mu^2 from above [Fan1991]_. Blocks that are not `leveled` keep
     level 1: their Delta is bounded by one (skewed mu).
-
-    Parameters
-    ----------
-    blocks : sequence of blocks
-        In the order of the channels.
-    leveled : sequence of bool, optional
-        One for each block; all when not given.
     """
 
     def __init__(self, blocks: Sequence[Block], leveled: Sequence[bool] | None = None) -> None:

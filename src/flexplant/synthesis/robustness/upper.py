@@ -42,22 +42,6 @@ def upper_level(
     Generalised eigenvalue minimisation by the method of centres [BoydElGhaoui1993]_: at a
     level, Newton steps to the maximum of ``log det F + sum log det D`` with the trace of D fixed;
     the next level lies between it and what those scalings reach.
-
-    Parameters
-    ----------
-    M : (z, w) array
-        At one frequency.
-    scalings : Scalings
-        Their structure.
-    start : array, optional
-        Scalings of a frequency nearby.
-    enough : float
-        A level below which it need not go.
-
-    Returns
-    -------
-    Certified
-        An infinite level when a skewed problem has none: the Deltas of level 1 are too large.
     """
     W = np.vstack([np.eye(scalings.w), M])
     size = float(np.linalg.norm(M)) ** 2

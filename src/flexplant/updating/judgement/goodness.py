@@ -24,15 +24,6 @@ def chi_square(objective: Objective, point: Point, free: FloatArray) -> tuple[fl
     ``min_d |N^-1/2 (r + J d)|^2`` to first order, which for residuals weighted by their own
     covariance is ``|r|^2``: distributed as chi-square with (residuals and priors) - (parameters
     that are free) degrees of freedom, whatever the weights of the fit.
-
-    Parameters
-    ----------
-    objective : Objective
-        At the answer.
-    point : Point
-        The answer.
-    free : (q,) bool array
-        Parameters that were fitted and did not end at a bound.
     """
     r = objective.values(point)
     dof = r.size - int(np.sum(free))

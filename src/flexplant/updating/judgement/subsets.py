@@ -53,15 +53,6 @@ class Subsets:
     Where modes alone are compared and the changes are of low rank, each is fitted in few
     coordinates (see `flexplant.updating.confined`); what it leaves is that of all coordinates to
     second order, and it is fitted in all of them where these differ, or by `polish`.
-
-    Parameters
-    ----------
-    whole : Objective
-        Of all candidates, then the nuisance.
-    residuals : sequence of Residual
-        The measurement.
-    count : int
-        Number of candidates.
     """
 
     def __init__(self, whole: Objective, residuals: Any, count: int) -> None:
@@ -137,15 +128,7 @@ class Subsets:
         return (None if found is None else found.chi2), dof
 
     def best(self, singles: Iterable[int], most: int) -> Subset:
-        """Return the subset of up to `most` candidates with the least extended BIC.
-
-        Parameters
-        ----------
-        singles : sequence of int
-            Candidates to begin with.
-        most : int
-            Largest subset.
-        """
+        """Return the subset of up to `most` candidates with the least extended BIC."""
         best: Subset = ()
         layer: list[Subset] = [(i,) for i in singles]
         for size in range(1, min(most, self.rows - 1 - len(self.beside)) + 1):

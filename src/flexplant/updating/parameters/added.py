@@ -249,13 +249,7 @@ def checked_place(at: Any, direction: str, what: str = "at") -> tuple[Place, str
 
 
 def checked_text(value: Any, what: str) -> str:
-    """Return a text.
-
-    Raises
-    ------
-    LabelError
-        When it is another thing.
-    """
+    """Return a text."""
     if not isinstance(value, str):
         raise LabelError(f"{what} must be a text, got {short(value)}. Use quotes.")
     return value

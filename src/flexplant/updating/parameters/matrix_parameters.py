@@ -300,13 +300,7 @@ class ModeDamping(Parameter):
 
 
 def projected(part: Matrix | None, model: Any, name: str) -> Matrix | None:
-    """Return a matrix of a model's own DOFs, ``T^T A T`` of one of its full structure.
-
-    Raises
-    ------
-    ShapeError
-        When it belongs to neither.
-    """
+    """Return a matrix of a model's own DOFs, ``T^T A T`` of one of its full structure."""
     if part is None:
         return None
     k, n = model.M.shape[0], len(getattr(model, "full_dofs", model.dofs))

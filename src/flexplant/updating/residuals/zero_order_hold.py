@@ -19,21 +19,6 @@ class Held:
     All from one exponential of ``S = [0 s 0; -M^-1 K/s  -M^-1 D  M^-1 B; 0 0 0]``, with the states
     (s q, q', u) of one size, and its Frechet derivatives: exact with rigid-body modes, real poles
     and repeated ones, where sums over modes are not.
-
-    Parameters
-    ----------
-    point : Point
-        The model.
-    B : (k, i) array
-        Forces.
-    C : (o, k) array
-        Displacements.
-    rate : float [Hz]
-        Of the hold.
-    delay : float [samples]
-        Of the inputs.
-    order : int
-        1 where the outputs are velocities.
     """
 
     def __init__(

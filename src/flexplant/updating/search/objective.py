@@ -34,19 +34,6 @@ class Objective:
     (zero, or the bound nearest to it) the most probable, the farther bound three standard
     deviations away. The priors take part where the noise of every residual is known (else their
     weight against the data would not be).
-
-    Parameters
-    ----------
-    model : ReducedModel or FEModel
-        The model.
-    parameters : sequence of q Parameter
-        Unknowns.
-    residuals : sequence of Residual
-        Data.
-    prior : bool
-        Whether priors take part.
-    family : Family, optional
-        Of the same model and parameters, to save making it again.
     """
 
     def __init__(
@@ -102,20 +89,7 @@ class Objective:
         return point
 
     def at(self, p: FloatArray, *, refer: bool = False) -> Point:
-        """Return the model at `p`, its modes paired with those of the reference point.
-
-        Parameters
-        ----------
-        p : (q,) array
-            Values of the parameters.
-        refer : bool
-            Whether it becomes the reference: a point the search has moved to.
-
-        Raises
-        ------
-        ModelError
-            When the matrices are indefinite there, or a mode is lost.
-        """
+        """Return the model at `p`, its modes paired with those of the reference point."""
         if self._point is not None and np.array_equal(self._point.p, p):
             return self._set(self._point, refer=refer)
         if self.reference is None:
